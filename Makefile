@@ -1,0 +1,54 @@
+# Every target sets up its own virtual environment and touches no file outside this clone.
+PYTHON ?= python3
+BIN := .venv/bin
+TESTS ?= tests
+
+# Caches, temporary files and state stay inside the clone.
+export PIP_CACHE_DIR := $(CURDIR)/.cache/pip
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export XDG_CACHE_HOME := $(CURDIR)/.cache
+export XDG_CONFIG_HOME := $(CURDIR)/.cache/config
+export XDG_STATE_HOME := $(CURDIR)/.state
+export XDG_DATA_HOME := $(CURDIR)/.state/share
+export TMPDIR := $(CURDIR)/.tmp
+export FLEET_STATE_DIR := $(CURDIR)/.state
+
+.PHONY: help demo test soak lint bench proto picture readme clean
+help: ## what can be made
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+.venv/.ready: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is %s: make PYTHON=python3.12 ..." % sys.version.split()[0])'
+	@mkdir -p .cache .tmp .state
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: .venv/.ready ## three simulated cars do a job, recorded, checked, ready for Rerun (about half a minute)
+	@mkdir -p .tmp
+	$(BIN)/fleet demo
+
+test: .venv/.ready ## the test suite (under ten minutes)
+	@mkdir -p .tmp
+	$(BIN)/python -m pytest $(TESTS) -m 'not soak' -n auto --dist loadgroup
+
+soak: .venv/.ready ## what takes longer than a test may
+	@mkdir -p .tmp
+	$(BIN)/python -m pytest tests -m soak -s --timeout 3600
+
+lint: .venv/.ready ## ruff, mypy, import-linter, generated files up to date
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m schemas.generate --check
+
+bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in the same run
+	@mkdir -p .tmp
+	$(BIN)/python -m tests.bench
+
+proto: .venv/.ready ## generate schemas/gen from schemas/proto
+	$(BIN)/python -m schemas.generate
+
+clean: ## remove everything that is not tracked
+	rm -rf .venv .cache .tmp .state .hypothesis .pytest_cache .mypy_cache .ruff_cache sessions

@@ -1,0 +1,1 @@
+"""Several cars from one laptop: drive, watch, record and replay them."""

@@ -1,0 +1,1 @@
+"""What the fleet should do, pure: plans, and what follows from readings."""

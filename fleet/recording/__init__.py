@@ -1,0 +1,1 @@
+"""Sessions on disk: MCAP segments and what belongs to them."""

@@ -1,0 +1,1 @@
+"""Simulated cars that behave like the real ones do, hazards included."""

@@ -1,0 +1,1 @@
+"""The contract between all processes: messages, keys, topics, and the bus."""

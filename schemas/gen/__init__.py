@@ -1,0 +1,1 @@
+"""Generated from schemas/proto; do not edit (`make proto`)."""
