@@ -1,0 +1,367 @@
+"""The only place that opens a Zenoh session: publications, subscriptions, queries, tokens, and the way to the hub.
+
+A Zenoh callback runs on a foreign thread and does one thing: hand over (`Handover`) to the asyncio loop that owns
+the state.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final, Generic, Self, TypeVar
+
+import zenoh
+from google.protobuf.message import Message
+
+from schemas import messages
+from schemas.topics import Qos, Topic
+
+T = TypeVar("T")
+
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
+
+_ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
+_LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})
+
+_QOS: Final[dict[Qos, dict[str, Any]]] = {
+    Qos.READING: {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA},
+    Qos.STATE: {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA_HIGH},
+    Qos.COMMAND: {
+        "congestion_control": zenoh.CongestionControl.BLOCK,
+        "priority": zenoh.Priority.REAL_TIME,
+        "express": True,
+    },
+}
+
+
+class BusError(Exception):
+    """The bus cannot be had; its text names the endpoint and what to do."""
+
+
+class NoFleet(BusError):
+    """Nothing listens at the endpoint."""
+
+
+class BadEndpoint(BusError):
+    """An endpoint that Zenoh cannot take."""
+
+
+def resolve_endpoint(argument: str | None = None) -> str:
+    """The endpoint to use: the argument, else FLEET_ENDPOINT, else loopback port 7447; raises BadEndpoint."""
+    endpoint = argument or os.environ.get(ENDPOINT_VARIABLE) or DEFAULT_ENDPOINT
+    _host_and_port(endpoint)
+    return endpoint
+
+
+def _host_and_port(endpoint: str) -> tuple[str, int]:
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or not 0 < int(match["port"]) < 65536:
+        raise BadEndpoint(
+            f"endpoint {endpoint!r} is not allowed: write it as tcp/HOST:PORT (tls, udp, quic or ws also), "
+            f"port 1 to 65535, for example {DEFAULT_ENDPOINT}"
+        )
+    return match["host"], int(match["port"])
+
+
+_COMMON: Final[dict[str, Any]] = {
+    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+    "timestamping": {"enabled": True},
+    "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": 2000}}},
+}
+
+
+def router_config(endpoint: str) -> zenoh.Config:
+    """The hub's configuration: it listens, everyone else is its client."""
+    _host_and_port(endpoint)
+    listen = {"endpoints": [endpoint], "exit_on_failure": True, "timeout_ms": 0}
+    return zenoh.Config.from_json5(json.dumps({"mode": "router", "listen": listen, **_COMMON}))
+
+
+def _client_config(endpoint: str, timeout_s: float) -> zenoh.Config:
+    connect = {
+        "endpoints": [endpoint],
+        "timeout_ms": int(timeout_s * 1000),
+        "exit_on_failure": True,
+        "retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2},
+    }
+    return zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect, **_COMMON}))
+
+
+def accepts(endpoint: str, timeout_s: float = 1.0) -> bool:
+    """Whether something accepts connections at the endpoint; a datagram endpoint cannot be asked and counts as yes."""
+    host, port = _host_and_port(endpoint)
+    if endpoint.startswith(("udp/", "quic/")):
+        return True
+    try:
+        with socket.create_connection((host.strip("[]"), port), timeout=timeout_s):
+            return True
+    except OSError:
+        return False
+
+
+def ensure_hub(endpoint: str, timeout_s: float = 10.0) -> None:
+    """Start a hub if nothing accepts at a loopback endpoint, and wait until it does; raises BusError.
+
+    The hub outlives its starter: it is a session leader of its own, so that Ctrl-C at a terminal does not take the bus
+    away before the cars are stopped. It ends by itself 10 s after its last link.
+    """
+    if accepts(endpoint):
+        return
+    host, _ = _host_and_port(endpoint)
+    if host not in _LOOPBACK:
+        raise NoFleet(f"nothing listens at {endpoint}: start a Zenoh router there, or name another with --connect")
+    command = [sys.executable, "-m", "schemas.hub", "--endpoint", endpoint]
+    hub = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + timeout_s
+    while not accepts(endpoint):
+        if time.monotonic() > deadline:
+            raise BusError(f"no hub came up at {endpoint} within {timeout_s:g} s: is the port used by something else?")
+        # A hub that lost the race for the port has ended; the winner accepts in a moment.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            hub.wait(0.02)
+            time.sleep(0.02)
+    # The hub is nobody's child to wait for; without this the interpreter warns that it still runs.
+    hub.returncode = 0 if hub.returncode is None else hub.returncode
+
+
+class Handover(Generic[T]):
+    """Hands objects from Zenoh's threads to one asyncio loop, in order and bounded; what does not fit is counted."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, take: Callable[[T], None], *, limit: int = 1024) -> None:
+        self._loop = loop
+        self._take = take
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._waiting: deque[T] = deque()
+        self.dropped = 0
+
+    def __call__(self, item: T) -> bool:
+        """Called on a Zenoh thread; False if the item was dropped."""
+        with self._lock:
+            if len(self._waiting) >= self._limit:
+                self.dropped += 1
+                return False
+            self._waiting.append(item)
+            if len(self._waiting) > 1:
+                return True
+        try:
+            self._loop.call_soon_threadsafe(self._drain)
+        except RuntimeError:  # the loop is closed: nobody is left to take it
+            return False
+        return True
+
+    def _drain(self) -> None:
+        with self._lock:
+            batch = list(self._waiting)
+            self._waiting.clear()
+        for item in batch:
+            self._take(item)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One publication or reply as it came: payload bytes untouched."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    time_ns: int
+    """Zenoh timestamp of the publisher's session, ns since the epoch; the time of receipt where there is none."""
+    sequence: int
+    """The publisher's number for the key, modulo 2^32; 0 if it gave none."""
+    deleted: bool = False
+
+    def message(self) -> Message:
+        """The payload as the message that the encoding names; raises messages.BadPayload or KeyError."""
+        name = messages.name_in(self.encoding)
+        if name is None:
+            raise messages.BadPayload(f"{self.key}: encoding {self.encoding!r} names no message")
+        return messages.parse(name, self.payload, self.encoding)
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An error reply."""
+
+    words: str
+
+
+def sample_of(sample: zenoh.Sample) -> Sample:
+    """Copy what is wanted out of a Zenoh sample."""
+    stamp = sample.timestamp
+    info = sample.source_info
+    return Sample(
+        key=str(sample.key_expr),
+        payload=sample.payload.to_bytes(),
+        encoding=str(sample.encoding),
+        time_ns=stamp.get_time_as_ntp64().as_nanos() if stamp is not None else time.time_ns(),
+        sequence=int(info.source_sn) if info is not None else 0,
+        deleted=sample.kind == zenoh.SampleKind.DELETE,
+    )
+
+
+class Publisher:
+    """Publishes one topic of one car; numbers the messages and fills their common fields."""
+
+    def __init__(self, session: zenoh.Session, key: str, topic: Topic, source: str, boot_id: str) -> None:
+        self._publisher = session.declare_publisher(
+            key, encoding=zenoh.Encoding(messages.encoding_of(topic.message)), **_QOS[topic.qos]
+        )
+        self._source = source
+        self._boot_id = boot_id
+        self._headed = topic.message.startswith("fleet.v1.")
+        self.key = key
+        self.topic = topic
+        self.sequence = 0
+
+    def put(self, message: Any, stamp_ns: int) -> None:
+        """Publish; `stamp_ns`: ns since the epoch, when the bytes were had or the decision was made."""
+        self.sequence += 1
+        if self._headed:
+            message.stamp.seconds, message.stamp.nanos = divmod(stamp_ns, 1_000_000_000)
+            message.car = self._source
+            message.seq = self.sequence
+            message.boot_id = self._boot_id
+        payload: bytes = message.SerializeToString()
+        source = zenoh.SourceInfo(self._publisher.id, self.sequence & 0xFFFFFFFF)
+        self._publisher.put(payload, source_info=source)
+
+
+class Bus:
+    """One Zenoh session. Close it (`with`): an open session with callbacks keeps the interpreter from ending."""
+
+    def __init__(self, session: zenoh.Session, endpoint: str) -> None:
+        self._session = session
+        self._kept: list[Any] = []
+        self.endpoint = endpoint
+        self.boot_id = uuid.uuid4().hex
+
+    @classmethod
+    def open(cls, endpoint: str | None = None, *, start_hub: bool = False, timeout_s: float = 3.0) -> Self:
+        """Open a session at the endpoint (see `resolve_endpoint`).
+
+        `start_hub`: for those who must run: start a hub if there is none. Without it a missing hub raises NoFleet.
+        """
+        where = resolve_endpoint(endpoint)
+        if start_hub:
+            ensure_hub(where)
+        elif not accepts(where):
+            raise NoFleet(
+                f"no fleet is running at {where}: start one (`gateway run`, or `make demo` to see one), "
+                "or name another with --connect"
+            )
+        try:
+            session = zenoh.open(_client_config(where, timeout_s))
+        except zenoh.ZError as error:
+            raise BusError(f"what listens at {where} is no Zenoh router: {error}") from None
+        return cls(session, where)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Undeclare everything and close the session."""
+        self._kept.clear()
+        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+
+    @property
+    def id(self) -> str:
+        """The session's Zenoh id, for ordering two of a kind."""
+        return str(self._session.zid())
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a link to a router now."""
+        return bool(self._session.info.routers_zid())
+
+    def publisher(self, key: str, topic: Topic, source: str) -> Publisher:
+        """Declare a publisher of `topic` under `key`; `source` becomes the messages' `car`."""
+        return Publisher(self._session, key, topic, source, self.boot_id)
+
+    def subscribe(self, expression: str, callback: Callable[[Sample], object]) -> zenoh.Subscriber[None]:
+        """Call back for every publication, on a Zenoh thread: hand over and return."""
+        subscriber = self._session.declare_subscriber(expression, lambda sample: callback(sample_of(sample)))
+        self._kept.append(subscriber)
+        return subscriber
+
+    def queryable(self, expression: str, callback: Callable[[zenoh.Query], object]) -> zenoh.Queryable[None]:
+        """Call back for every query, on a Zenoh thread: hand over and return."""
+        queryable = self._session.declare_queryable(expression, callback, complete=True)
+        self._kept.append(queryable)
+        return queryable
+
+    def token(self, key: str) -> zenoh.LivelinessToken:
+        """Declare a liveliness token; it lasts until it is undeclared or the session ends."""
+        token = self._session.liveliness().declare_token(key)
+        self._kept.append(token)
+        return token
+
+    def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
+        """The tokens alive now."""
+        replies = self._session.liveliness().get(expression, timeout=timeout_s)
+        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+
+    def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> zenoh.Subscriber[None]:
+        """Call back with (key, alive) for every token there is and every change, on a Zenoh thread."""
+        subscriber = self._session.liveliness().declare_subscriber(
+            expression,
+            lambda sample: callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT),
+            history=True,
+        )
+        self._kept.append(subscriber)
+        return subscriber
+
+    def query(
+        self,
+        selector: str,
+        *,
+        payload: bytes | None = None,
+        encoding: str | None = None,
+        timeout_s: float = 1.0,
+        qos: Qos = Qos.COMMAND,
+    ) -> Iterator[Sample | Failure]:
+        """Ask everyone (target all, no consolidation), yield the answers as they come; a time-out yields a Failure."""
+        replies = self._session.get(
+            selector,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            payload=payload,
+            encoding=encoding,
+            **_QOS[qos],
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                yield sample_of(reply.ok)
+            elif reply.err is not None:
+                yield Failure(reply.err.payload.to_string())
+
+    def put_command(self, key: str, payload: bytes, encoding: str, sequence: int = 0) -> None:
+        """Publish one command of a stream (drive); `sequence` counts within it."""
+        source = zenoh.SourceInfo(self._session.id, sequence & 0xFFFFFFFF)
+        self._session.put(key, payload, encoding=encoding, source_info=source, **_QOS[Qos.COMMAND])
+
+
+def reply(query: zenoh.Query, key: str, payload: bytes, encoding: str) -> None:
+    """Answer a query with one value under a concrete key."""
+    query.reply(key, payload, encoding=encoding, **_QOS[Qos.COMMAND])

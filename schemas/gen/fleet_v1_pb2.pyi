@@ -1,0 +1,810 @@
+import datetime
+
+from google.protobuf import timestamp_pb2 as _timestamp_pb2
+from google.protobuf.internal import containers as _containers
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Range(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "range_m", "no_echo")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    RANGE_M_FIELD_NUMBER: _ClassVar[int]
+    NO_ECHO_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    range_m: float
+    no_echo: bool
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., range_m: _Optional[float] = ..., no_echo: _Optional[bool] = ...) -> None: ...
+
+class Battery(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "voltage_v", "charge", "charge_error", "level")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    VOLTAGE_V_FIELD_NUMBER: _ClassVar[int]
+    CHARGE_FIELD_NUMBER: _ClassVar[int]
+    CHARGE_ERROR_FIELD_NUMBER: _ClassVar[int]
+    LEVEL_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    voltage_v: float
+    charge: float
+    charge_error: float
+    level: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., voltage_v: _Optional[float] = ..., charge: _Optional[float] = ..., charge_error: _Optional[float] = ..., level: _Optional[str] = ...) -> None: ...
+
+class Grayscale(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "raw")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    RAW_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    raw: int
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., raw: _Optional[int] = ...) -> None: ...
+
+class Line(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "left_outer", "left_inner", "right_inner", "right_outer")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    LEFT_OUTER_FIELD_NUMBER: _ClassVar[int]
+    LEFT_INNER_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_INNER_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_OUTER_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    left_outer: bool
+    left_inner: bool
+    right_inner: bool
+    right_outer: bool
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., left_outer: _Optional[bool] = ..., left_inner: _Optional[bool] = ..., right_inner: _Optional[bool] = ..., right_outer: _Optional[bool] = ...) -> None: ...
+
+class Obstacle(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "left", "right")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    LEFT_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    left: bool
+    right: bool
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., left: _Optional[bool] = ..., right: _Optional[bool] = ...) -> None: ...
+
+class Light(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "left", "right")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    LEFT_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    left: bool
+    right: bool
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., left: _Optional[bool] = ..., right: _Optional[bool] = ...) -> None: ...
+
+class Imu(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "gyro_x_raw", "gyro_y_raw", "gyro_z_raw", "accel_x_raw", "accel_y_raw", "accel_z_raw")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    GYRO_X_RAW_FIELD_NUMBER: _ClassVar[int]
+    GYRO_Y_RAW_FIELD_NUMBER: _ClassVar[int]
+    GYRO_Z_RAW_FIELD_NUMBER: _ClassVar[int]
+    ACCEL_X_RAW_FIELD_NUMBER: _ClassVar[int]
+    ACCEL_Y_RAW_FIELD_NUMBER: _ClassVar[int]
+    ACCEL_Z_RAW_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    gyro_x_raw: float
+    gyro_y_raw: float
+    gyro_z_raw: float
+    accel_x_raw: float
+    accel_y_raw: float
+    accel_z_raw: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., gyro_x_raw: _Optional[float] = ..., gyro_y_raw: _Optional[float] = ..., gyro_z_raw: _Optional[float] = ..., accel_x_raw: _Optional[float] = ..., accel_y_raw: _Optional[float] = ..., accel_z_raw: _Optional[float] = ...) -> None: ...
+
+class Arm(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "joint_deg")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    JOINT_DEG_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    joint_deg: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., joint_deg: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Link(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "state", "reason", "url", "rx_bytes", "tx_bytes", "rx_frames", "tx_frames", "rejects", "reconnects", "tx_airtime", "since_s", "last_rx_s")
+    class RejectsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    URL_FIELD_NUMBER: _ClassVar[int]
+    RX_BYTES_FIELD_NUMBER: _ClassVar[int]
+    TX_BYTES_FIELD_NUMBER: _ClassVar[int]
+    RX_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    TX_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    REJECTS_FIELD_NUMBER: _ClassVar[int]
+    RECONNECTS_FIELD_NUMBER: _ClassVar[int]
+    TX_AIRTIME_FIELD_NUMBER: _ClassVar[int]
+    SINCE_S_FIELD_NUMBER: _ClassVar[int]
+    LAST_RX_S_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    state: str
+    reason: str
+    url: str
+    rx_bytes: int
+    tx_bytes: int
+    rx_frames: int
+    tx_frames: int
+    rejects: _containers.ScalarMap[str, int]
+    reconnects: int
+    tx_airtime: float
+    since_s: float
+    last_rx_s: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., state: _Optional[str] = ..., reason: _Optional[str] = ..., url: _Optional[str] = ..., rx_bytes: _Optional[int] = ..., tx_bytes: _Optional[int] = ..., rx_frames: _Optional[int] = ..., tx_frames: _Optional[int] = ..., rejects: _Optional[_Mapping[str, int]] = ..., reconnects: _Optional[int] = ..., tx_airtime: _Optional[float] = ..., since_s: _Optional[float] = ..., last_rx_s: _Optional[float] = ...) -> None: ...
+
+class Mode(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "asked", "inferred", "verdict", "evidence", "evidence_age_s", "candidates")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    INFERRED_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    EVIDENCE_FIELD_NUMBER: _ClassVar[int]
+    EVIDENCE_AGE_S_FIELD_NUMBER: _ClassVar[int]
+    CANDIDATES_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    asked: str
+    inferred: str
+    verdict: str
+    evidence: str
+    evidence_age_s: float
+    candidates: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., asked: _Optional[str] = ..., inferred: _Optional[str] = ..., verdict: _Optional[str] = ..., evidence: _Optional[str] = ..., evidence_age_s: _Optional[float] = ..., candidates: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class Motion(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "motion", "source", "speed", "owner", "expires_in_s", "fan", "servo_deg")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    MOTION_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    SPEED_FIELD_NUMBER: _ClassVar[int]
+    OWNER_FIELD_NUMBER: _ClassVar[int]
+    EXPIRES_IN_S_FIELD_NUMBER: _ClassVar[int]
+    FAN_FIELD_NUMBER: _ClassVar[int]
+    SERVO_DEG_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    motion: str
+    source: str
+    speed: float
+    owner: str
+    expires_in_s: float
+    fan: bool
+    servo_deg: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., motion: _Optional[str] = ..., source: _Optional[str] = ..., speed: _Optional[float] = ..., owner: _Optional[str] = ..., expires_in_s: _Optional[float] = ..., fan: _Optional[bool] = ..., servo_deg: _Optional[float] = ...) -> None: ...
+
+class Estop(_message.Message):
+    __slots__ = ("id", "by", "why", "stamp", "scope")
+    ID_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    SCOPE_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    by: str
+    why: str
+    stamp: _timestamp_pb2.Timestamp
+    scope: str
+    def __init__(self, id: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., scope: _Optional[str] = ...) -> None: ...
+
+class Hold(_message.Message):
+    __slots__ = ("by", "since")
+    BY_FIELD_NUMBER: _ClassVar[int]
+    SINCE_FIELD_NUMBER: _ClassVar[int]
+    by: str
+    since: _timestamp_pb2.Timestamp
+    def __init__(self, by: _Optional[str] = ..., since: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
+
+class Lease(_message.Message):
+    __slots__ = ("holder", "kind", "expires_in_s")
+    HOLDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    EXPIRES_IN_S_FIELD_NUMBER: _ClassVar[int]
+    holder: str
+    kind: str
+    expires_in_s: float
+    def __init__(self, holder: _Optional[str] = ..., kind: _Optional[str] = ..., expires_in_s: _Optional[float] = ...) -> None: ...
+
+class Safety(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    ESTOPS_FIELD_NUMBER: _ClassVar[int]
+    ENDED_FIELD_NUMBER: _ClassVar[int]
+    HOLD_FIELD_NUMBER: _ClassVar[int]
+    LEASE_FIELD_NUMBER: _ClassVar[int]
+    MOTORS_FIELD_NUMBER: _ClassVar[int]
+    WORST_STOP_S_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    estops: _containers.RepeatedCompositeFieldContainer[Estop]
+    ended: _containers.RepeatedScalarFieldContainer[str]
+    hold: Hold
+    lease: Lease
+    motors: str
+    worst_stop_s: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ...) -> None: ...
+
+class Health(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    HOST_FIELD_NUMBER: _ClassVar[int]
+    LINK_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    PLATFORM_FIELD_NUMBER: _ClassVar[int]
+    PLATFORM_EVIDENCE_FIELD_NUMBER: _ClassVar[int]
+    CAPABILITIES_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_S_FIELD_NUMBER: _ClassVar[int]
+    LOOP_LAG_S_FIELD_NUMBER: _ClassVar[int]
+    CPU_FIELD_NUMBER: _ClassVar[int]
+    RSS_MB_FIELD_NUMBER: _ClassVar[int]
+    BUS_DROPS_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    host: str
+    link: str
+    pid: int
+    version: str
+    platform: str
+    platform_evidence: _containers.RepeatedScalarFieldContainer[str]
+    capabilities: _containers.RepeatedScalarFieldContainer[str]
+    uptime_s: float
+    loop_lag_s: float
+    cpu: float
+    rss_mb: float
+    bus_drops: int
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., host: _Optional[str] = ..., link: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., platform: _Optional[str] = ..., platform_evidence: _Optional[_Iterable[str]] = ..., capabilities: _Optional[_Iterable[str]] = ..., uptime_s: _Optional[float] = ..., loop_lag_s: _Optional[float] = ..., cpu: _Optional[float] = ..., rss_mb: _Optional[float] = ..., bus_drops: _Optional[int] = ...) -> None: ...
+
+class RxFrame(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "data", "verdict", "published")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    PUBLISHED_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    data: bytes
+    verdict: str
+    published: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., data: _Optional[bytes] = ..., verdict: _Optional[str] = ..., published: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class TxFrame(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "data", "command_id", "why", "written")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_ID_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    WRITTEN_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    data: bytes
+    command_id: str
+    why: str
+    written: bool
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., data: _Optional[bytes] = ..., command_id: _Optional[str] = ..., why: _Optional[str] = ..., written: _Optional[bool] = ...) -> None: ...
+
+class CommandEvent(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "id", "verb", "sender", "kind", "phase", "reason", "words", "request", "request_encoding", "age_s", "worst_case_s", "took_s", "evidence", "count")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    VERB_FIELD_NUMBER: _ClassVar[int]
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    PHASE_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    WORDS_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ENCODING_FIELD_NUMBER: _ClassVar[int]
+    AGE_S_FIELD_NUMBER: _ClassVar[int]
+    WORST_CASE_S_FIELD_NUMBER: _ClassVar[int]
+    TOOK_S_FIELD_NUMBER: _ClassVar[int]
+    EVIDENCE_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    id: str
+    verb: str
+    sender: str
+    kind: str
+    phase: str
+    reason: str
+    words: str
+    request: bytes
+    request_encoding: str
+    age_s: float
+    worst_case_s: float
+    took_s: float
+    evidence: _containers.RepeatedScalarFieldContainer[str]
+    count: int
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., id: _Optional[str] = ..., verb: _Optional[str] = ..., sender: _Optional[str] = ..., kind: _Optional[str] = ..., phase: _Optional[str] = ..., reason: _Optional[str] = ..., words: _Optional[str] = ..., request: _Optional[bytes] = ..., request_encoding: _Optional[str] = ..., age_s: _Optional[float] = ..., worst_case_s: _Optional[float] = ..., took_s: _Optional[float] = ..., evidence: _Optional[_Iterable[str]] = ..., count: _Optional[int] = ...) -> None: ...
+
+class Truth(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "x_m", "y_m", "heading_rad", "mode", "motor_left", "motor_right", "blocked", "fan", "led")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    Y_M_FIELD_NUMBER: _ClassVar[int]
+    HEADING_RAD_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    MOTOR_LEFT_FIELD_NUMBER: _ClassVar[int]
+    MOTOR_RIGHT_FIELD_NUMBER: _ClassVar[int]
+    BLOCKED_FIELD_NUMBER: _ClassVar[int]
+    FAN_FIELD_NUMBER: _ClassVar[int]
+    LED_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    x_m: float
+    y_m: float
+    heading_rad: float
+    mode: str
+    motor_left: int
+    motor_right: int
+    blocked: bool
+    fan: bool
+    led: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., heading_rad: _Optional[float] = ..., mode: _Optional[str] = ..., motor_left: _Optional[int] = ..., motor_right: _Optional[int] = ..., blocked: _Optional[bool] = ..., fan: _Optional[bool] = ..., led: _Optional[str] = ...) -> None: ...
+
+class Plan(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "text", "version")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    text: str
+    version: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., text: _Optional[str] = ..., version: _Optional[str] = ...) -> None: ...
+
+class Role(_message.Message):
+    __slots__ = ("name", "cars")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    CARS_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    cars: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, name: _Optional[str] = ..., cars: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class Assignment(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "roles")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    ROLES_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    roles: _containers.RepeatedCompositeFieldContainer[Role]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., roles: _Optional[_Iterable[_Union[Role, _Mapping]]] = ...) -> None: ...
+
+class Decision(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "subject", "decided", "why", "readings", "would_change")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SUBJECT_FIELD_NUMBER: _ClassVar[int]
+    DECIDED_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    READINGS_FIELD_NUMBER: _ClassVar[int]
+    WOULD_CHANGE_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    subject: str
+    decided: str
+    why: str
+    readings: _containers.RepeatedScalarFieldContainer[str]
+    would_change: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., subject: _Optional[str] = ..., decided: _Optional[str] = ..., why: _Optional[str] = ..., readings: _Optional[_Iterable[str]] = ..., would_change: _Optional[str] = ...) -> None: ...
+
+class Recording(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "session", "state", "bytes", "messages", "drops", "free_bytes", "error")
+    class DropsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    BYTES_FIELD_NUMBER: _ClassVar[int]
+    MESSAGES_FIELD_NUMBER: _ClassVar[int]
+    DROPS_FIELD_NUMBER: _ClassVar[int]
+    FREE_BYTES_FIELD_NUMBER: _ClassVar[int]
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    session: str
+    state: str
+    bytes: int
+    messages: int
+    drops: _containers.ScalarMap[str, int]
+    free_bytes: int
+    error: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., bytes: _Optional[int] = ..., messages: _Optional[int] = ..., drops: _Optional[_Mapping[str, int]] = ..., free_bytes: _Optional[int] = ..., error: _Optional[str] = ...) -> None: ...
+
+class DriveCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "motion", "duration_s")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    MOTION_FIELD_NUMBER: _ClassVar[int]
+    DURATION_S_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    motion: str
+    duration_s: float
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., motion: _Optional[str] = ..., duration_s: _Optional[float] = ...) -> None: ...
+
+class ModeCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "mode")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    mode: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., mode: _Optional[str] = ...) -> None: ...
+
+class LedCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "r", "g", "b")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    R_FIELD_NUMBER: _ClassVar[int]
+    G_FIELD_NUMBER: _ClassVar[int]
+    B_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    r: int
+    g: int
+    b: int
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., r: _Optional[int] = ..., g: _Optional[int] = ..., b: _Optional[int] = ...) -> None: ...
+
+class LightCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "light")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    LIGHT_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    light: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., light: _Optional[str] = ...) -> None: ...
+
+class ServoCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "servo", "action", "deg")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    SERVO_FIELD_NUMBER: _ClassVar[int]
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    DEG_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    servo: str
+    action: str
+    deg: int
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., servo: _Optional[str] = ..., action: _Optional[str] = ..., deg: _Optional[int] = ...) -> None: ...
+
+class ArmCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "joint_deg")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    JOINT_DEG_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    joint_deg: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., joint_deg: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class WhistleCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ...) -> None: ...
+
+class SpeedCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "step")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    step: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., step: _Optional[str] = ...) -> None: ...
+
+class FanCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "state")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    state: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., state: _Optional[str] = ...) -> None: ...
+
+class StopCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ...) -> None: ...
+
+class EstopCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "why", "scope")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    SCOPE_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    why: str
+    scope: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., why: _Optional[str] = ..., scope: _Optional[str] = ...) -> None: ...
+
+class ResumeCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "ids")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    IDS_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    ids: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., ids: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class LeaseCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "release")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    RELEASE_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    release: bool
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., release: _Optional[bool] = ...) -> None: ...
+
+class FindCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ...) -> None: ...
+
+class Result(_message.Message):
+    __slots__ = ("id", "status", "reason", "words", "worst_case_s", "car")
+    ID_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    WORDS_FIELD_NUMBER: _ClassVar[int]
+    WORST_CASE_S_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    status: str
+    reason: str
+    words: str
+    worst_case_s: float
+    car: str
+    def __init__(self, id: _Optional[str] = ..., status: _Optional[str] = ..., reason: _Optional[str] = ..., words: _Optional[str] = ..., worst_case_s: _Optional[float] = ..., car: _Optional[str] = ...) -> None: ...

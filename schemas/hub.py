@@ -1,0 +1,53 @@
+"""The local rendezvous: a Zenoh router on loopback in a process of its own; it ends by itself when nobody is left.
+
+The listening port is the mutex: a second hub on it fails at once. Started by `bus.ensure_hub`, or by hand:
+`python -m schemas.hub --endpoint tcp/127.0.0.1:7447`.
+"""
+
+import argparse
+import signal
+import sys
+import threading
+import time
+from typing import Final
+
+import zenoh
+
+from schemas.bus import DEFAULT_ENDPOINT, BusError, router_config
+
+IDLE_S: Final = 10.0
+"""How long a hub outlives its last link."""
+_POLL_S: Final = 0.5
+
+
+def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
+    """Route until `stop` is set or nobody has had a link for `idle_s`; raises zenoh.ZError if the port is taken."""
+    with zenoh.open(router_config(endpoint)) as session:
+        last_link = time.monotonic()
+        while not stop.wait(_POLL_S):
+            now = time.monotonic()
+            if session.info.transports():
+                last_link = now
+            elif now - last_link > idle_s:
+                return
+
+
+def main() -> int:
+    """Run a hub; 0 when it ended by itself or was told to, 1 if it could not listen."""
+    parser = argparse.ArgumentParser(prog="python -m schemas.hub", description=__doc__)
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
+    parser.add_argument("--idle-s", type=float, default=IDLE_S, help="end after so long without a link (default 10)")
+    arguments = parser.parse_args()
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        serve(arguments.endpoint, arguments.idle_s, stop)
+    except (zenoh.ZError, BusError) as error:
+        sys.stderr.write(f"hub: cannot listen on {arguments.endpoint}: {error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,96 @@
+"""Message classes by name, their encodings, and the JSON mapping that any Zenoh tool can read; no bus here."""
+
+import json
+from functools import cache
+from typing import Any, Final
+
+from google.protobuf import json_format
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.message import DecodeError, Message
+
+from schemas.gen import fleet_v1_pb2
+
+PROTOBUF: Final = "application/protobuf"
+JSON: Final = "application/json"
+
+
+class BadPayload(ValueError):
+    """A payload that is not the message it should be; its text says why."""
+
+
+@cache
+def message_class(name: str) -> type[Message]:
+    """The class of a full message name (`fleet.v1.Range`, `foxglove.Log`); raises KeyError for an unknown one."""
+    if name == "foxglove.Log":
+        from foxglove_schemas_protobuf.Log_pb2 import Log
+
+        return Log
+    package, _, short = name.rpartition(".")
+    found = getattr(fleet_v1_pb2, short, None) if package == "fleet.v1" else None
+    if found is None:
+        raise KeyError(name)
+    return found  # type: ignore[no-any-return]  # getattr on the generated module
+
+
+def encoding_of(name: str) -> str:
+    """The Zenoh encoding of a message: the full name stands in the schema part."""
+    return f"{PROTOBUF};{name}"
+
+
+def name_in(encoding: str) -> str | None:
+    """The message name in a Zenoh encoding; None if it is not protobuf with a schema part."""
+    kind, _, name = encoding.partition(";")
+    return name if kind == PROTOBUF and name else None
+
+
+def to_dict(message: Message) -> dict[str, Any]:
+    """Protobuf's JSON mapping with the field names of the .proto; fields that were not measured are left out."""
+    return json_format.MessageToDict(
+        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+    )
+
+
+def to_json(message: Message) -> str:
+    """`to_dict` as one line of JSON."""
+    return json.dumps(to_dict(message), separators=(",", ":"))
+
+
+def parse(name: str, payload: bytes, encoding: str) -> Message:
+    """Read a payload as message `name`, protobuf or JSON by its encoding; raises BadPayload."""
+    kind, _, schema = encoding.partition(";")
+    message = message_class(name)()
+    if kind == PROTOBUF:
+        if schema not in ("", name):
+            raise BadPayload(f"the payload is a {schema}, this key takes {name}")
+        try:
+            message.ParseFromString(payload)
+        except DecodeError:
+            raise BadPayload(f"the payload does not parse as {name}") from None
+        return message
+    # Any other encoding is read as JSON: shells and REST clients seldom set one.
+    try:
+        json_format.Parse(payload, message)
+    except (json_format.ParseError, UnicodeDecodeError) as error:
+        words = " ".join(str(error).split())
+        raise BadPayload(f"the payload is not the JSON of {name}: {words}") from None
+    return message
+
+
+@cache
+def descriptor_set(name: str) -> bytes:
+    """The FileDescriptorSet of a message, dependencies first, as MCAP embeds it in a schema."""
+    files = FileDescriptorSet()
+    seen: set[str] = set()
+
+    def add(descriptor: Any) -> None:  # the stubs know two FileDescriptor types, upb's and pure Python's
+        if descriptor.name in seen:
+            return
+        seen.add(descriptor.name)
+        for dependency in descriptor.dependencies:
+            add(dependency)
+        proto = FileDescriptorProto()
+        descriptor.CopyToProto(proto)
+        files.file.append(proto)
+
+    add(message_class(name).DESCRIPTOR.file)
+    return files.SerializeToString()

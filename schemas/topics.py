@@ -1,0 +1,248 @@
+"""The one table of topics: name, message, units, rate, staleness, QoS, recorded or not, Rerun entity. Pure."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Final
+
+
+class Qos(StrEnum):
+    """How a publication travels; bus.py turns it into Zenoh's priority, congestion control and express.
+
+    Publications are dropped under congestion, never blocked: one stalled subscriber must not freeze a gateway.
+    """
+
+    READING = "reading"  # batched
+    STATE = "state"  # overtakes readings
+    COMMAND = "command"  # overtakes everything, sent at once
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One row: what is published under `<fleet>/<car>/<name>`."""
+
+    name: str
+    message: str
+    """Full protobuf name."""
+    about: str
+    qos: Qos
+    rate_hz: float = 0.0
+    """Expected rate at its fastest; 0: on events only."""
+    stale_after_s: float | None = None
+    """Age at which a value no longer says how things are; None: it never expires."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Unit by field, where a field has one."""
+    recorded: bool = True
+    entity: str = ""
+    """Rerun entity below the car; empty: shown through frames and logs only."""
+
+    @property
+    def family(self) -> str:
+        """`sensor`, `state`, `frame`, `event` or `sim`; a service's topics have none."""
+        return self.name.partition("/")[0]
+
+
+# A mode-0 report comes about once a second and may be blocked for another (protocol.md, "From the car: readings"), so a
+# reading is stale after 3 s; states are published on change and once a second.
+_READING: Final = 3.0
+_STATE: Final = 3.0
+_TRACKING_HZ: Final = 27.0  # protocol.md: the most frames the UART carries, in tracking
+
+CAR_TOPICS: Final = (
+    Topic(
+        "sensor/range",
+        "fleet.v1.Range",
+        "ultrasonic distance",
+        Qos.READING,
+        1.0,
+        _READING,
+        {"range_m": "m"},
+        entity="range",
+    ),
+    Topic(
+        "sensor/battery",
+        "fleet.v1.Battery",
+        "battery voltage",
+        Qos.READING,
+        1.0,
+        _READING,
+        {"voltage_v": "V", "charge": "1", "charge_error": "1"},
+        entity="battery",
+    ),
+    Topic(
+        "sensor/grayscale",
+        "fleet.v1.Grayscale",
+        "reflected light, raw ADC",
+        Qos.READING,
+        1.0,
+        _READING,
+        {"raw": "count"},
+        entity="grayscale",
+    ),
+    Topic("sensor/line", "fleet.v1.Line", "line sensors", Qos.READING, _TRACKING_HZ, _READING, entity="line"),
+    Topic(
+        "sensor/obstacle",
+        "fleet.v1.Obstacle",
+        "infrared obstacle sensors",
+        Qos.READING,
+        24.0,
+        _READING,
+        entity="obstacle",
+    ),
+    Topic("sensor/light", "fleet.v1.Light", "light sensors", Qos.READING, 23.0, _READING, entity="light"),
+    Topic(
+        "sensor/imu",
+        "fleet.v1.Imu",
+        "gyroscope and accelerometer, raw",
+        Qos.READING,
+        1.0,
+        _READING,
+        {f"{part}_{axis}_raw": "count" for part in ("gyro", "accel") for axis in "xyz"},
+        entity="imu",
+    ),
+    Topic(
+        "sensor/arm",
+        "fleet.v1.Arm",
+        "arm joints",
+        Qos.READING,
+        1.0,
+        _READING,
+        {"joint_deg": "deg"},
+        entity="arm",
+    ),
+    Topic(
+        "state/link",
+        "fleet.v1.Link",
+        "whether the car is heard, and counters",
+        Qos.STATE,
+        1.0,
+        _STATE,
+        {"tx_airtime": "1", "since_s": "s", "last_rx_s": "s", "rx_bytes": "B", "tx_bytes": "B"},
+        entity="link",
+    ),
+    Topic(
+        "state/mode",
+        "fleet.v1.Mode",
+        "mode asked, inferred and the evidence",
+        Qos.STATE,
+        1.0,
+        _STATE,
+        {"evidence_age_s": "s"},
+        entity="mode",
+    ),
+    Topic(
+        "state/motion",
+        "fleet.v1.Motion",
+        "the motion that is held, and by whom",
+        Qos.STATE,
+        1.0,
+        _STATE,
+        {"speed": "1", "expires_in_s": "s", "servo_deg": "deg"},
+        entity="motion",
+    ),
+    Topic(
+        "state/safety",
+        "fleet.v1.Safety",
+        "e-stops, hold, lease, motors",
+        Qos.STATE,
+        1.0,
+        _STATE,
+        {"worst_stop_s": "s"},
+        entity="safety",
+    ),
+    Topic(
+        "state/health",
+        "fleet.v1.Health",
+        "the gateway's process",
+        Qos.STATE,
+        1.0,
+        _STATE,
+        {"uptime_s": "s", "loop_lag_s": "s", "cpu": "1", "rss_mb": "MB"},
+        entity="health",
+    ),
+    Topic("frame/rx", "fleet.v1.RxFrame", "bytes from the car", Qos.READING, _TRACKING_HZ, entity="frame/rx"),
+    Topic("frame/tx", "fleet.v1.TxFrame", "bytes to the car", Qos.READING, 0.0, entity="frame/tx"),
+    Topic(
+        "event/command",
+        "fleet.v1.CommandEvent",
+        "the life of a command",
+        Qos.STATE,
+        units={"age_s": "s", "worst_case_s": "s", "took_s": "s"},
+        entity="command",
+    ),
+    Topic("event/log", "foxglove.Log", "notable events", Qos.STATE, entity="log"),
+    Topic(
+        "sim/truth",
+        "fleet.v1.Truth",
+        "simulated cars: the true state",
+        Qos.READING,
+        10.0,
+        1.0,
+        {"x_m": "m", "y_m": "m", "heading_rad": "rad", "motor_left": "PWM", "motor_right": "PWM"},
+        entity="truth",
+    ),
+)
+
+SERVICE_TOPICS: Final = (
+    Topic("@coordinator/plan", "fleet.v1.Plan", "the plan in force", Qos.STATE, entity="coordinator/plan"),
+    Topic(
+        "@coordinator/assignment",
+        "fleet.v1.Assignment",
+        "which car has which role",
+        Qos.STATE,
+        entity="coordinator/assignment",
+    ),
+    Topic(
+        "@coordinator/decision",
+        "fleet.v1.Decision",
+        "what was decided, and why",
+        Qos.STATE,
+        entity="coordinator/decision",
+    ),
+    Topic(
+        "@recorder/status",
+        "fleet.v1.Recording",
+        "the recorder",
+        Qos.STATE,
+        1.0,
+        _STATE,
+        {"bytes": "B", "free_bytes": "B"},
+        entity="recorder",
+    ),
+)
+
+TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({topic.name: topic for topic in CAR_TOPICS + SERVICE_TOPICS})
+
+COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        verb: f"fleet.v1.{verb.capitalize()}Command"
+        for verb in (
+            "drive",
+            "mode",
+            "led",
+            "light",
+            "servo",
+            "arm",
+            "whistle",
+            "speed",
+            "fan",
+            "stop",
+            "estop",
+            "resume",
+            "lease",
+            "find",
+        )
+    }
+)
+"""Verb to the full name of its payload message."""
+
+RESULT: Final = "fleet.v1.Result"
+
+
+def of_key(key: str) -> Topic | None:
+    """The topic of a concrete key (`fleet/red/sensor/range`), None if it is not one of the table's."""
+    _, _, rest = key.partition("/")
+    if rest.startswith("@"):
+        return TOPICS.get(rest)
+    return TOPICS.get(rest.partition("/")[2])
