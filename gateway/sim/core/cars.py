@@ -1,0 +1,29 @@
+"""From the words of a car's description to a car in the world. Checking the words is spec.py's part."""
+
+from gateway.sim.core.arduino import ArduinoCar
+from gateway.sim.core.firmware import Firmware, Rng
+from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.core.world import CarBody, World
+
+PLATFORMS = ("arduino", "stm32", "raspberry_pi")
+OPTIONS = ("arm", "imu")
+
+
+def build(
+    platform: str,
+    world: World,
+    index: int,
+    rng: Rng,
+    *,
+    options: frozenset[str] = frozenset(),
+    transport: Transport = Transport.SERIAL,
+    now: float = 0.0,
+) -> Firmware:
+    """Car number `index` of the world, at rest on its start pose, its program just started.
+
+    `transport` matters to a Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART.
+    """
+    body = CarBody(world, world.start_pose(index), rng, now)
+    if platform == "raspberry_pi":
+        return RaspberryPiCar(body, rng, transport=transport, options=options, now=now)
+    return ArduinoCar(body, rng, options=options, now=now)
