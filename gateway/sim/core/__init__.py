@@ -1,1 +1,1 @@
-"""The simulated cars' pure core: firmware on virtual time, and the world. No I/O, no clock, no random numbers of its own."""
+"""The simulated cars' pure core: firmware on virtual time, and the world. No I/O, no clock, no randomness."""

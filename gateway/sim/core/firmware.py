@@ -351,7 +351,7 @@ def bits(values: tuple[bool, ...]) -> str:
 
 
 MOTIONS: Final = {"1": (1, 1), "2": (-1, -1), "3": (0, 1), "4": (1, 0)}
-"""Place 1 of the general frame: sign of the left and the right motor. A turn stops the inner wheels; all else is a stop."""
+"""Place 1 of the general frame: sign of the left and the right motor. A turn stops the inner wheels."""
 SPINS: Final = {"1": (-1, 1), "2": (1, -1)}
 """Place 2, which wins over place 1."""
 

@@ -1,0 +1,11 @@
+"""`python -m gateway.sim`: the simulated cars without the rest of the command line."""
+
+import argparse
+import sys
+
+from gateway.sim.command import add_arguments, run
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(prog="gateway sim")
+    add_arguments(parser)
+    sys.exit(run(parser.parse_args()))

@@ -1,0 +1,264 @@
+"""The ends of a simulated car's link that a host opens: a pseudo terminal or a listening TCP port.
+
+Bytes only; pacing and meaning are the core's. What comes from a host goes to the link's owner; what nobody
+takes is swallowed, as by a wire.
+"""
+
+import asyncio
+import contextlib
+import os
+import socket
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+READ_SIZE = 64
+
+
+class LinkError(Exception):
+    """A link cannot be opened; its text says why and what to do."""
+
+
+class Owner(Protocol):
+    """Who runs the car behind a link."""
+
+    def received(self, data: bytes) -> None:
+        """Bytes from the host."""
+        ...
+
+    def connected(self) -> None:
+        """A host has connected (TCP only: a wire does not tell)."""
+        ...
+
+    def disconnected(self) -> None:
+        """The host has gone away (TCP only)."""
+        ...
+
+
+class SimLink(Protocol):
+    """What the shell needs of either link."""
+
+    @property
+    def url(self) -> str:
+        """What a gateway opens."""
+        ...
+
+    async def up(self) -> None:
+        """Be there; raises LinkError."""
+        ...
+
+    async def down(self) -> None:
+        """Be gone, as after an unplugged cable or a lost network; `up` brings it back."""
+        ...
+
+    def send(self, data: bytes) -> None:
+        """Bytes to the host, if there is one."""
+        ...
+
+    def hold(self, *, on: bool) -> None:
+        """Stop or resume taking bytes from the host."""
+        ...
+
+    async def close(self) -> None:
+        """Be gone for good, leaving nothing behind."""
+        ...
+
+
+class PtySimLink:
+    """A pseudo terminal; POSIX only."""
+
+    def __init__(self, owner: Owner, path: str | None) -> None:
+        try:
+            import pty
+            import tty
+        except ImportError:
+            raise LinkError(
+                "a pty link needs Linux or macOS, this system has no pseudo terminals: use tcp://127.0.0.1:0"
+            ) from None
+        self._openpty: Callable[[], tuple[int, int]] = pty.openpty
+        self._setraw: Callable[[int], object] = tty.setraw
+        self._owner = owner
+        self._path = Path(path) if path else None
+        self._master = self._slave = -1
+        self._name = ""
+        self._reading = False
+
+    @property
+    def url(self) -> str:
+        """`serial://` and the device, or the stable symlink to it."""
+        return f"serial://{self._path.absolute() if self._path else self._name}"
+
+    async def up(self) -> None:
+        """Open a new terminal, and point the symlink at it."""
+        try:
+            self._master, self._slave = self._openpty()
+        except OSError as error:
+            raise LinkError(f"no pseudo terminal to be had: {error.strerror}") from None
+        # Our own hold on the slave keeps the terminal and its raw mode while no host has it open.
+        self._setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._name = os.ttyname(self._slave)
+        if self._path is not None:
+            try:
+                self._point(self._path)
+            except LinkError:
+                await self.down()
+                raise
+        self.hold(on=False)
+
+    def _point(self, path: Path) -> None:
+        """A symlink to a device may be replaced (a killed simulator leaves one), anything else may not."""
+        if path.is_symlink() and str(path.readlink()).startswith("/dev/"):
+            path.unlink(missing_ok=True)
+        try:
+            path.symlink_to(self._name)
+        except FileExistsError:
+            raise LinkError(f"{path} is there already and no symlink to a device: name another path") from None
+        except OSError as error:
+            raise LinkError(f"no symlink can be made at {path}: {error.strerror}") from None
+
+    def _readable(self) -> None:
+        try:
+            data = os.read(self._master, READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError:  # macOS: the last host has closed the slave; the next one is waited for
+            return
+        self._owner.received(data)
+
+    def hold(self, *, on: bool) -> None:
+        """Stop or resume reading; a host that goes on writing blocks after some kilobytes."""
+        if self._master < 0 or on != self._reading:
+            return
+        loop = asyncio.get_running_loop()
+        if on:
+            loop.remove_reader(self._master)
+        else:
+            loop.add_reader(self._master, self._readable)
+        self._reading = not on
+
+    def send(self, data: bytes) -> None:
+        """A UART does not wait: what does not fit is lost."""
+        if self._master >= 0:
+            with contextlib.suppress(BlockingIOError, OSError):
+                os.write(self._master, data)
+
+    async def down(self) -> None:
+        """Close both ends: for a host the same as an unplugged cable."""
+        if self._master < 0:
+            return
+        self.hold(on=True)
+        os.close(self._master)
+        os.close(self._slave)
+        self._master = self._slave = -1
+        if self._path is not None and self._path.is_symlink() and str(self._path.readlink()) == self._name:
+            self._path.unlink(missing_ok=True)
+
+    async def close(self) -> None:
+        """The same: its symlink goes with it."""
+        await self.down()
+
+
+class TcpSimLink:
+    """A listening port with one host at a time."""
+
+    def __init__(self, owner: Owner, host: str, port: int) -> None:
+        self._owner = owner
+        self._host = host
+        self._port = port
+        self._server: asyncio.Server | None = None
+        self._transport: asyncio.Transport | None = None
+
+    @property
+    def url(self) -> str:
+        """`tcp://HOST:PORT` with the real port."""
+        return f"tcp://[{self._host}]:{self._port}" if ":" in self._host else f"tcp://{self._host}:{self._port}"
+
+    async def up(self) -> None:
+        """Listen; after the first time on the same port again."""
+        if self._server is not None:
+            return
+        loop = asyncio.get_running_loop()
+        try:
+            self._server = await loop.create_server(
+                lambda: _Client(self), self._host, self._port, reuse_address=os.name == "posix"
+            )
+        except OSError as error:
+            words = error.strerror or str(error)
+            raise LinkError(
+                f"cannot listen on {self._host}:{self._port}: {words}; name another port, or 0 for any free one"
+            ) from None
+        self._port = self._server.sockets[0].getsockname()[1]
+
+    def joined(self, transport: asyncio.Transport) -> bool:
+        """Whether this host is the one; a second is sent away."""
+        if self._transport is not None:
+            return False
+        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._transport = transport
+        self._owner.connected()
+        return True
+
+    def received(self, data: bytes) -> None:
+        """Bytes from the host."""
+        self._owner.received(data)
+
+    def left(self, transport: asyncio.Transport) -> None:
+        """A connection has ended; it may have been cut from here before."""
+        if transport is self._transport:
+            self._transport = None
+            self._owner.disconnected()
+
+    def send(self, data: bytes) -> None:
+        """A host that does not read loses bytes, not we memory."""
+        if self._transport is not None and self._transport.get_write_buffer_size() < 65536:
+            self._transport.write(data)
+
+    def hold(self, *, on: bool) -> None:
+        """Stop or resume reading."""
+        if self._transport is not None:
+            if on:
+                self._transport.pause_reading()
+            else:
+                self._transport.resume_reading()
+
+    async def down(self) -> None:
+        """Refuse, and reset the connection there is."""
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        if self._transport is not None:
+            # Linger 0 makes the close a reset, which is what a host sees of a bridge that lost its power.
+            linger = struct.pack("HH" if os.name == "nt" else "ii", 1, 0)
+            self._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+            transport, self._transport = self._transport, None
+            transport.abort()
+            self._owner.disconnected()
+
+    async def close(self) -> None:
+        """The same."""
+        await self.down()
+
+
+class _Client(asyncio.Protocol):
+    """One TCP connection."""
+
+    def __init__(self, link: TcpSimLink) -> None:
+        self._link = link
+        self._transport: asyncio.Transport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        if self._link.joined(transport):
+            self._transport = transport
+        else:
+            transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        if self._transport is not None:
+            self._link.received(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's signature
+        if self._transport is not None:
+            self._link.left(self._transport)
