@@ -1,0 +1,668 @@
+"""Control of one car: commands, readings and link events go in, frames to write and records come out.
+
+No I/O, no threads, no clock: time comes in as an argument, in seconds of one monotonic clock. The loop around it calls
+`poll`, writes what it returns, and says `wrote` or `write_failed` before it polls again: so there is never more than
+one frame on its way.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+from gateway.control import arbiter, recipes, stop
+from gateway.control.ledger import Ledger, Pending
+from gateway.control.mode import ModeTruth, Verdict
+from gateway.control.outbox import Pacing
+from gateway.control.recipes import Gate, Recipe
+from gateway.control.records import (
+    Act,
+    Answer,
+    ChangeSpeed,
+    Command,
+    Drive,
+    Fan,
+    Find,
+    Kind,
+    Level,
+    Phase,
+    Reason,
+    Record,
+    Resume,
+    Sender,
+    SetMode,
+    Stop,
+    Why,
+    Write,
+)
+from gateway.control.stop import Running
+from gateway.protocol.encode import ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, encode
+from gateway.protocol.profile import Profile, StopStyle
+from gateway.protocol.readings import Event, Sensors
+from gateway.protocol.values import Mode, Motion
+
+PATIENCE_S: Final = 10.0
+"""How long a one-shot or a mode may wait for a busy car before it is too old to matter."""
+SENDER_GONE_S: Final = 1.0
+"""A sender is lost when its token has been away so long: a restarted hub takes all tokens down for half a second."""
+STALL_S: Final = 0.5
+"""A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
+WIRE_S: Final = 0.02  # protocol.md: 20 ms of wire for a frame of 19 bytes at 960 B/s
+RECOVERY_WORST_S: Final = 7.3  # protocol.md, "recovery": theory, never over 7.3 s outside avoidance
+UNDER_WAY_S: Final = 0.06
+"""A reading that came sooner after a frame was under way when the frame was sent."""
+FAN_SETTLED_S: Final = 2.0
+"""Readings this long after a toggle were sent with the fan as it is now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Who stopped the car, and when on the monotonic clock: the coordinator leaves it alone."""
+
+    by: str
+    since: float
+
+
+@dataclass(slots=True)
+class _Held:
+    """The motion that is held, for whom, and until when."""
+
+    motion: Motion
+    pending: Pending
+    expires_at: float
+    watched: bool
+    """Its sender had a liveliness token when it asked: losing it ends the motion."""
+
+    @property
+    def sender(self) -> Sender:
+        return self.pending.command.sender
+
+
+class Controller:
+    """One car's control. See the module's docstring for how it is driven."""
+
+    def __init__(self, car: str, profile: Profile, *, hold: Hold | None = None) -> None:
+        self.car = car
+        self.profile = profile
+        self.mode = ModeTruth(profile)
+        self.pacing = Pacing(profile)
+        self.hold = hold
+        self.fan: bool | None = None
+        self.servo_deg: int | None = None
+        self.speed = profile.speed.start
+        self.known = False
+        """The last recovery is complete and no write has failed since: what is sent will be read as it is meant."""
+        self._link_open = False
+        self._link_reason = "not connected yet"
+        self._gave_up = False
+        self._closing = False
+        self._ledger = Ledger()
+        self._running: Running | None = None
+        self._held: _Held | None = None
+        self._opening: Pending | None = None
+        self._acts: deque[Pending] = deque()
+        self._source: Running | _Held | Pending | None = None
+        """Whose frame `poll` returned last; None for a repetition."""
+        self._sent_motion = Motion.STOP
+        self._repeat = False
+        self._motors_on = False
+        self._mode_sent: Pending | None = None
+        self._led = ColorLed(0, 0, 0)
+        self._fan_at = float("-inf")
+        self._senders: dict[str, float | None] = {}
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def motors(self) -> str:
+        """`off` only after a stop that is complete; `unknown` while the car's state is."""
+        if not self.known:
+            return "unknown"
+        return "on" if self._motors_on else "off"
+
+    @property
+    def motion(self) -> Motion | None:
+        """The motion that was sent last; None while the car's state is unknown."""
+        return self._sent_motion if self.known else None
+
+    @property
+    def owner(self) -> str:
+        """Who holds the motion; empty if nobody does."""
+        return self._held.sender.name if self._held else ""
+
+    def expires_in_s(self, now: float) -> float:
+        """How long the held motion lasts; 0 if none is held."""
+        return max(0.0, self._held.expires_at - now) if self._held else 0.0
+
+    @property
+    def asked(self) -> Mode | None:
+        """The mode the car is in or about to be brought to, as far as we asked; None if unknown."""
+        if self._opening is not None and isinstance(self._opening.command.what, SetMode):
+            return self._opening.command.what.mode
+        return self.mode.asked
+
+    def take_records(self) -> list[Record]:
+        """The records since the last call."""
+        return self._ledger.take()
+
+    # ------------------------------------------------------------------ link, readings, senders, time
+
+    def link_up(self, now: float) -> None:
+        """The link is open: bring the car to a known state."""
+        self._link_open = True
+        self._gave_up = False
+        self.known = False
+        self.pacing.reset()
+        self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
+
+    def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
+        """The link is gone: nothing that waits can be sent, and the car may do anything."""
+        self._link_open = False
+        self._link_reason = reason
+        self.known = False
+        self._repeat = False
+        self._mode_sent = None
+        self._source = None
+        running, self._running = self._running, None
+        for pending in running.commands if running else ():
+            self._ledger.record(pending, Phase.FAILED, now, reason=cause, words=reason)
+        self._drop(Phase.FAILED, cause, reason, now)
+        self.mode.forget()
+        self.fan = None
+
+    def heard(self, event: Event, now: float) -> None:
+        """Take an event of the decoder as evidence."""
+        if not isinstance(event, Sensors):
+            return
+        before = self.mode.verdict
+        self.mode.heard(event)
+        self._note_verdict(before, now)
+        if event.signature is not Mode.MANUAL:
+            return
+        if event.range_cm is not None:
+            self.pacing.echo_seen = event.range_cm > 0
+        if now > self._fan_at + FAN_SETTLED_S and self.profile.stop_style is not StopStyle.RASPBERRY_PI:
+            self.fan = False  # protocol.md: a car whose fan runs sends no readings
+        running = self._running
+        if running is None:
+            if self._gave_up and self._link_open:
+                self._gave_up = False
+                self._ledger.log(Level.INFO, "answers_again", "a reading came: recovery begins again", now)
+                self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
+        elif running.recipe.confirmed and running.frames_sent and event.at > running.last_at + UNDER_WAY_S:
+            self._finish(running, now)
+
+    def tick(self, now: float) -> None:
+        """Weigh silence; called a few times a second."""
+        before = self.mode.verdict
+        if self._link_open and self.known and self._running is None:
+            self.mode.silent(now=now, blocked_until=self.pacing.flight_until, fan=bool(self.fan))
+        self._note_verdict(before, now)
+
+    def sender_alive(self, name: str, *, alive: bool, now: float) -> None:
+        """A sender's liveliness token appeared or went."""
+        if alive:
+            self._senders[name] = None
+        elif self._held is not None and self._held.sender.name == name:
+            self._senders[name] = now
+        else:
+            self._senders.pop(name, None)
+
+    def stalled(self, gap_s: float, now: float) -> None:
+        """The loop slept for `gap_s`: with motion held the car is stopped first."""
+        if gap_s > STALL_S and self._held is not None:
+            words = f"the gateway stalled for {gap_s:.1f} s with motion held: stopping"
+            self._ledger.log(Level.ERROR, "stalled", words, now)
+            self._release(Phase.EXPIRED, Reason.EXPIRED, words, now)
+
+    # ------------------------------------------------------------------ commands
+
+    def command(self, command: Command, now: float) -> Answer:
+        """Take a command: refuse it with a reason, or begin to carry it out. What becomes of it is recorded."""
+        pending = Pending(command, now)
+        if not command.streamed:
+            self._ledger.record(pending, Phase.ASKED, now)
+        what = command.what
+        if isinstance(what, Stop):
+            return self._stop(pending, now)
+        if self._ledger.known(command):
+            return self._reject(pending, Reason.DUPLICATE, f"a command with id {command.id} came already", now)
+        refusal = arbiter.refuse(command, self._situation())
+        if refusal is not None:
+            return self._reject(pending, *refusal, now)
+        self._ledger.accepted(command)
+        if command.sender.kind is not Kind.COORDINATOR and isinstance(what, Drive | SetMode | Resume):
+            self._end_hold(command.sender, now)
+        match what:
+            case Drive(Motion.STOP):
+                return self._release_asked(pending, now)
+            case Drive():
+                return self._drive(pending, what, now)
+            case SetMode(Mode.MANUAL):
+                return self._close_mode(pending, now)
+            case SetMode(mode):
+                return self._set_mode(pending, mode, now)
+            case Resume():
+                return self._done(pending, f"{self.car} is not on hold", now)
+            case Fan(bool() as on) if on == self.fan:
+                return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
+            case Fan():
+                pending.frames.append(General(Motion.STOP, fan=True))
+            case Act(frame):
+                pending.frames.append(frame)
+            case ChangeSpeed(step):
+                pending.frames.append(General(Motion.STOP, speed=step))
+            case Find():
+                whistle = General(Motion.STOP, whistle=True)
+                pending.frames.extend((whistle, ColorLed(255, 255, 255), whistle, self._led))
+        self._acts.append(pending)
+        return self._queued(pending, now)
+
+    def shutdown(self, now: float) -> None:
+        """The gateway ends: stop the car; nothing else is accepted."""
+        if self._closing:
+            return
+        self._closing = True
+        self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)
+        if self._link_open:
+            self._begin(stop.full(self.profile, known=self.known), Why.SHUTDOWN, now)
+
+    @property
+    def finished(self) -> bool:
+        """After `shutdown`: the last frame of the stop is written."""
+        return self._closing and (self._running is None or self._running.frames_sent)
+
+    # ------------------------------------------------------------------ frames out
+
+    def poll(self, now: float) -> Write | None:
+        """The frame to write now, if any."""
+        if not self._link_open:
+            return None
+        self._expire(now)
+        if self._running is not None:
+            return self._step(now)
+        if not self.known or now < self.pacing.flight_until:
+            return None
+        held = self._held
+        if held is not None and not held.pending.sent:
+            return self._write(General(held.motion), Why.COMMAND, held, held.pending)
+        if self._opening is not None:
+            return self._open_mode(self._opening, now)
+        if self._acts:
+            pending = self._acts[0]
+            return self._write(self._with_motion(pending.frames[0]), Why.COMMAND, pending, pending)
+        if self._repeat and now >= self.pacing.repeat_at:
+            return self._write(General(self._sent_motion), Why.REPEAT, None, held.pending if held else None)
+        return None
+
+    def wrote(self, write: Write, now: float) -> None:
+        """The frame that `poll` returned was handed to the link."""
+        source, self._source = self._source, None
+        self.pacing.wrote(write.frame, now)
+        self._note_frame(write.frame, now)
+        match source:
+            case Running():
+                self._stepped(source, now)
+            case _Held():
+                self._ledger.sent(source.pending, now)
+            case Pending() if source is self._opening:
+                self._opening = None
+                self._mode_sent = source
+                self._ledger.sent(source, now)
+            case Pending():
+                source.frames.popleft()
+                if not source.frames:
+                    self._ledger.sent(source, now)
+                    if self._acts and self._acts[0] is source:
+                        self._acts.popleft()
+            case None:
+                self._repeat = False
+
+    def write_failed(self, reason: str, now: float) -> None:
+        """The frame that `poll` returned did not go out whole: the caller closes the link and opens it again."""
+        self.link_down(reason, now, cause=Reason.WRITE_FAILED)
+
+    def next_at(self, now: float) -> float:
+        """When `poll` may have something to do, if nothing happens before; inf if never."""
+        if not self._link_open:
+            return float("inf")
+        times = [act.asked_at + PATIENCE_S for act in self._acts]
+        if self._held is not None:
+            times.append(self._held_until(self._held))
+        if self._opening is not None:
+            times.append(self._opening.asked_at + PATIENCE_S)
+        if self._running is not None:
+            times.append(self._running.wake_at(self.pacing))
+        elif self.known:
+            if self._acts or (self._held is not None and not self._held.pending.sent):
+                times.append(self.pacing.flight_until)
+            if self._opening is not None:
+                times.append(self.pacing.ready_at(Gate.ALONE if self.at_rest else Gate.FLIGHT))
+            if self._repeat:
+                times.append(self.pacing.repeat_at)
+        return max(now, min(times, default=float("inf")))
+
+    # ------------------------------------------------------------------ how long a stop takes
+
+    def worst_stop_s(self, now: float) -> float:
+        """The longest that a stop asked now takes until the motors are off (protocol.md, "Worst case of a stop")."""
+        running, style = self._running, self.profile.stop_style
+        if style is StopStyle.UNKNOWN or (style is StopStyle.MODE_FRAME and not self.known):
+            began = running.first_at if running is not None and running.first_at is not None else now
+            avoiding = self.profile.mode_turn_s(Mode.OBSTACLE_AVOIDANCE)
+            return max(0.0, began + RECOVERY_WORST_S - now) + avoiding
+        gate = Gate.FLIGHT if style is StopStyle.RASPBERRY_PI else Gate.ALONE
+        wait = max(0.0, self.pacing.ready_at(gate) - now)
+        if running is not None and running.recipe.rank >= recipes.FULL.rank and running.first_at is not None:
+            wait = 0.0  # the frame that stops it is on its way
+        mode = self.mode.asked or Mode.MANUAL
+        return wait + self.profile.mode_turn_s(mode) + WIRE_S
+
+    # ------------------------------------------------------------------ commands, one by one
+
+    def _stop(self, pending: Pending, now: float) -> Answer:
+        command = pending.command
+        if command.sender.kind is not Kind.COORDINATOR and self.hold is None:
+            self.hold = Hold(command.sender.name, now)
+        self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"{command.verb} by {command.sender.name}", now)
+        if not self._link_open or self._closing:
+            why = "its gateway is ending" if self._closing else self._link_reason
+            words = f"{self.car} cannot be reached: {why}; it is stopped first when its link is back"
+            return self._reject(pending, Reason.LINK_DOWN, words, now)
+        worst = self.worst_stop_s(now)
+        self._ledger.record(pending, Phase.QUEUED, now, worst_case_s=worst)
+        self._begin(stop.full(self.profile, known=self.known), Why.STOP, now, pending)
+        assert isinstance(command.what, Stop)
+        words = "stopped and held; this version latches nothing" if command.what.emergency else ""
+        return Answer(Phase.QUEUED, words=words, worst_case_s=worst)
+
+    def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
+        sender, held = pending.command.sender, self._held
+        free_at = self._free_at(now)
+        if now + drive.duration_s <= free_at:
+            words = (
+                f"{self.car} is busy for {free_at - now:.1f} s more, longer than this drive's {drive.duration_s:g} s"
+            )
+            return self._reject(pending, Reason.EXPIRED, words, now)
+        watched = self._senders.get(sender.name, 0.0) is None
+        if held is not None and held.motion is drive.motion and held.sender == sender:
+            return self._drive_on(held, pending, now + drive.duration_s, now)
+        words = f"{drive.motion} by {sender.name}"
+        self._close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        self._held = _Held(drive.motion, pending, now + drive.duration_s, watched)
+        running = self._running
+        if running is not None and running.recipe.rank == recipes.SOFT.rank:
+            # The car is wanted to move again: the rest of a soft stop would only jerk it.
+            self._running = None
+            for other in running.commands:
+                self._ledger.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
+        return self._queued(pending, now)
+
+    def _drive_on(self, held: _Held, pending: Pending, expires_at: float, now: float) -> Answer:
+        """The same sender wants the same motion for longer: nothing is written again."""
+        held.expires_at = expires_at
+        held.pending.count += 1
+        if pending.command.streamed:
+            return Answer(Phase.SENT if held.pending.sent else Phase.QUEUED)
+        if held.pending.sent:
+            return self._done(pending, "the motion is held on", now)
+        self._ledger.record(
+            held.pending, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words="asked again before it was sent"
+        )
+        pending.count = held.pending.count
+        held.pending = pending
+        return self._queued(pending, now)
+
+    def _release_asked(self, pending: Pending, now: float) -> Answer:
+        sender = pending.command.sender.name
+        self._close_held(Phase.COMPLETE, None, f"released by {sender}", now)
+        self._close_opening(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
+        if self._running is None and self.at_rest:
+            return self._done(pending, f"{self.car} is at rest", now)
+        worst = self.worst_stop_s(now)
+        if not pending.command.streamed:
+            self._ledger.record(pending, Phase.QUEUED, now, worst_case_s=worst)
+        self._begin(self._soft(), Why.STOP, now, None if pending.command.streamed else pending)
+        return Answer(Phase.QUEUED, worst_case_s=worst)
+
+    def _close_mode(self, pending: Pending, now: float) -> Answer:
+        self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {pending.command.sender.name}", now)
+        answer = self._queued(pending, now)
+        self._begin(stop.full(self.profile, known=self.known), Why.COMMAND, now, pending)
+        return answer
+
+    def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
+        words = f"mode {mode} by {pending.command.sender.name}"
+        self._close_opening(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        self._close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        settled = self.known and self._running is None and self.mode.verdict is not Verdict.CONTRADICTED
+        if settled and self.mode.asked is mode:
+            return self._done(pending, f"{self.car} is in {mode} already ({self.mode.verdict})", now)
+        self._opening = pending
+        return self._queued(pending, now)
+
+    def _done(self, pending: Pending, words: str, now: float) -> Answer:
+        if not pending.command.streamed:
+            self._ledger.sent(pending, now, words)
+        return Answer(Phase.SENT, words=words)
+
+    def _queued(self, pending: Pending, now: float) -> Answer:
+        self._ledger.record(pending, Phase.QUEUED, now)
+        return Answer(Phase.QUEUED)
+
+    def _reject(self, pending: Pending, reason: Reason, words: str, now: float) -> Answer:
+        self._ledger.refused(pending, reason, words, now)
+        return Answer(Phase.REJECTED, reason, words)
+
+    def _end_hold(self, sender: Sender, now: float) -> None:
+        if self.hold is not None:
+            words = f"the hold by {self.hold.by} was ended by {sender.name}"
+            self._ledger.log(Level.INFO, "hold_ended", words, now)
+            self.hold = None
+
+    def _situation(self) -> arbiter.Situation:
+        return arbiter.Situation(
+            car=self.car,
+            profile=self.profile,
+            link_open=self._link_open,
+            link_reason=self._link_reason,
+            answering=not self._gave_up,
+            closing=self._closing,
+            asked=self.asked,
+            held_by=self.hold.by if self.hold else None,
+            fan=self.fan,
+            queued=len(self._acts),
+        )
+
+    # ------------------------------------------------------------------ stops
+
+    @property
+    def _manual(self) -> bool:
+        return self.mode.asked is Mode.MANUAL and self.mode.verdict is not Verdict.CONTRADICTED
+
+    @property
+    def at_rest(self) -> bool:
+        """Known to stand in mode 0 after a complete stop."""
+        return self.known and self._manual and not self._motors_on
+
+    def _soft(self) -> Recipe:
+        return stop.soft(self.profile, known=self.known, manual=self._manual)
+
+    def _begin(self, recipe: Recipe, why: Why, now: float, pending: Pending | None = None) -> None:
+        """Carry out a recipe, or join the one that runs if that is no weaker."""
+        self._repeat = False
+        joining = [pending] if pending is not None else []
+        running = self._running
+        if running is None:
+            self._running = Running(recipe, why, now, joining)
+        elif running.recipe.rank < recipe.rank:
+            self._running = Running(recipe, why, now, running.commands + joining)
+        else:
+            running.commands.extend(joining)
+            if why is Why.SHUTDOWN:
+                running.why = why
+            if running.first_at is not None and pending is not None:
+                self._ledger.sent(pending, now, f"joined the {running.recipe.name} stop under way")
+
+    def _step(self, now: float) -> Write | None:
+        running = self._running
+        assert running is not None
+        if running.frames_sent:
+            self._unconfirmed(running, now)
+            return None
+        if now < running.due_at(self.pacing):
+            return None
+        return self._write(running.frame, running.why, running, running.commands[0] if running.commands else None)
+
+    def _stepped(self, running: Running, now: float) -> None:
+        if running.stepped(now):
+            for pending in running.commands:
+                self._ledger.sent(pending, now)
+                if isinstance(pending.command.what, SetMode):
+                    self._mode_sent = pending
+        if running is self._running and running.frames_sent and not running.recipe.confirmed:
+            self._finish(running, now)
+
+    def _finish(self, running: Running, now: float) -> None:
+        """The stop is complete: the motors are off."""
+        self._running = None
+        if not self.known:
+            self._ledger.log(Level.INFO, "recovered", f"{self.car} is in a known state: stopped, mode manual", now)
+        self.known = True
+        self._gave_up = False
+        self._motors_on = False
+        for pending in running.commands:
+            if not isinstance(pending.command.what, SetMode):
+                self._ledger.record(pending, Phase.COMPLETE, now)
+
+    def _unconfirmed(self, running: Running, now: float) -> None:
+        """No mode-0 reading has come since the last frame of a recovery: once more, up to three times."""
+        if now < running.last_at + recipes.CONFIRM_S:
+            return
+        if running.retries < recipes.RETRIES:
+            self._running = running.again(now)
+            return
+        self._running = None
+        self._gave_up = True
+        words = (
+            f"{self.car} sent no reading after {recipes.RETRIES + 1} recoveries: whether its motors run is not known "
+            "(off, out of reach, its fan on, another platform, or avoiding without an echo)"
+        )
+        self._ledger.log(Level.ERROR, "no_answer", words, now)
+        for pending in running.commands:
+            self._ledger.record(pending, Phase.FAILED, now, reason=Reason.LINK_DOWN, words=words)
+        self._drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
+
+    # ------------------------------------------------------------------ frames, one by one
+
+    def _write(self, frame: Frame, why: Why, source: Running | _Held | Pending | None, by: Pending | None) -> Write:
+        self._source = source
+        return Write(frame, encode(frame), why, by.command.id if by is not None else "")
+
+    def _with_motion(self, frame: Frame) -> Frame:
+        """Every general frame carries a motion: the one that holds now."""
+        if not isinstance(frame, General):
+            return frame
+        return General(self._sent_motion, frame.whistle, frame.speed, frame.servo, frame.sing, frame.light, frame.fan)
+
+    def _open_mode(self, pending: Pending, now: float) -> Write | None:
+        """Open a mode, from rest in mode 0 only: opening while driving leaves the motors as they were, blind."""
+        assert isinstance(pending.command.what, SetMode)
+        if not self.at_rest:
+            self._begin(stop.full(self.profile, known=self.known), Why.STOP, now)
+            return self._step(now)
+        if now < self.pacing.ready_at(Gate.ALONE):
+            return None
+        return self._write(ModeOpen(pending.command.what.mode), Why.COMMAND, pending, pending)
+
+    def _note_frame(self, frame: Frame, now: float) -> None:
+        """What a written frame does to what we know of the car."""
+        match frame:
+            case General():
+                if frame.motion is not Motion.STOP:
+                    self._repeat = self._repeat or frame.motion is not self._sent_motion
+                    self._motors_on = True
+                self._sent_motion = frame.motion
+                if frame.speed is not None:
+                    self.speed = self.profile.speed.step(self.speed, frame.speed)
+                if frame.fan:
+                    self.fan = None if self.fan is None else not self.fan
+                    self._fan_at = now
+            case ModeOpen(mode):
+                self._motors_on = True
+                self.mode.ask(mode, now=now, block_s=self.profile.block_s(frame))
+            case ModeClose():
+                self._sent_motion = Motion.STOP
+                self.mode.ask(Mode.MANUAL, now=now, block_s=self.profile.block_s(frame))
+            case Ptz(deg):
+                self.servo_deg = deg
+            case ColorLed():
+                self._led = frame
+            case _:
+                pass
+        if self.profile.stop_style is StopStyle.RASPBERRY_PI and self.mode.asked is None:
+            self.mode.ask(Mode.MANUAL, now=now, block_s=0.0)
+
+    # ------------------------------------------------------------------ time
+
+    def _held_until(self, held: _Held) -> float:
+        gone_at = self._senders.get(held.sender.name) if held.watched else None
+        return held.expires_at if gone_at is None else min(held.expires_at, gone_at + SENDER_GONE_S)
+
+    def _expire(self, now: float) -> None:
+        held = self._held
+        if held is not None and now >= self._held_until(held):
+            if now < held.expires_at:
+                self._release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.name} is gone", now)
+            elif held.pending.sent:
+                self._release(Phase.COMPLETE, None, "its time is over", now)
+            else:
+                self._release(Phase.EXPIRED, Reason.EXPIRED, f"{self.car} was busy until its time was over", now)
+        waited = f"waited {PATIENCE_S:g} s for a busy car"
+        while self._acts and now >= self._acts[0].asked_at + PATIENCE_S:
+            self._ledger.record(self._acts.popleft(), Phase.EXPIRED, now, reason=Reason.EXPIRED, words=waited)
+        if self._opening is not None and now >= self._opening.asked_at + PATIENCE_S:
+            self._close_opening(Phase.EXPIRED, Reason.EXPIRED, waited, now)
+
+    def _release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
+        """The held motion is over: a soft stop, unless the car stands and never got it."""
+        self._close_held(phase, reason, words, now)
+        if self._link_open and self._running is None and not self.at_rest:
+            self._begin(self._soft(), Why.STOP, now)
+
+    def _free_at(self, now: float) -> float:
+        """When the car can take a motion, as far as it is known."""
+        running = self._running
+        if running is None or running.recipe.rank == recipes.SOFT.rank:
+            return self.pacing.flight_until
+        return max(running.over_at(self.pacing, now), self.pacing.flight_until)
+
+    # ------------------------------------------------------------------ what waits or is held ends
+
+    def _drop(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
+        self._close_held(phase, reason, words, now)
+        self._close_opening(phase, reason, words, now)
+        while self._acts:
+            self._ledger.record(self._acts.popleft(), phase, now, reason=reason, words=words)
+
+    def _close_held(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
+        held, self._held = self._held, None
+        if held is not None:
+            self._ledger.record(held.pending, phase, now, reason=reason, words=words)
+
+    def _close_opening(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
+        pending, self._opening = self._opening, None
+        if pending is not None:
+            self._ledger.record(pending, phase, now, reason=reason, words=words)
+
+    def _note_verdict(self, before: Verdict, now: float) -> None:
+        verdict = self.mode.verdict
+        if verdict is before:
+            return
+        if verdict is Verdict.CONTRADICTED:
+            words = f"asked for mode {self.mode.asked}, but: {self.mode.evidence}"
+            self._ledger.log(Level.WARNING, "mode_contradicted", words, now)
+        elif verdict is Verdict.CONFIRMED and self._mode_sent is not None:
+            pending, self._mode_sent = self._mode_sent, None
+            what = pending.command.what
+            if isinstance(what, SetMode) and what.mode is self.mode.asked:
+                self._ledger.record(pending, Phase.EFFECT_SEEN, now, evidence=(self.mode.evidence,))

@@ -1,0 +1,94 @@
+"""Whether the car is heard: from its own bytes, never from a library's word that it is connected."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+
+BYTES_PER_S: Final = 960  # protocol.md: UART 9600 8N1
+AIRTIME_WINDOW_S: Final = 10.0
+STALE_S: Final = 3.0
+
+
+class LinkState(StrEnum):
+    """`quiet`: silence is expected in this mode; `stale`: it is not; `lost`: the port is gone."""
+
+    ONLINE = "online"
+    QUIET = "quiet"
+    STALE = "stale"
+    LOST = "lost"
+
+
+@dataclass(slots=True)
+class LinkHealth:
+    """State and counters of one link. Times are seconds on one monotonic clock."""
+
+    state: LinkState = LinkState.LOST
+    reason: str = "not connected yet"
+    since: float = 0.0
+    rx_bytes: int = 0
+    tx_bytes: int = 0
+    rx_frames: int = 0
+    tx_frames: int = 0
+    rejects: dict[str, int] = field(default_factory=dict)
+    reconnects: int = 0
+    last_rx_at: float | None = None
+    _up_at: float | None = None
+    _writes: deque[tuple[float, int]] = field(default_factory=deque)
+
+    def up(self, now: float) -> None:
+        """The port is open."""
+        self.reconnects += self._up_at is not None
+        self._up_at = now
+        self.last_rx_at = None
+        self._set(LinkState.STALE, "open, nothing heard yet", now)
+
+    def down(self, reason: str, now: float) -> None:
+        """The port is gone."""
+        self._set(LinkState.LOST, reason, now)
+
+    def received(self, count: int, now: float) -> None:
+        """Bytes came."""
+        self.rx_bytes += count
+        self.last_rx_at = now
+
+    def rejected(self, cause: str) -> None:
+        """Bytes were no reading."""
+        self.rejects[cause] = self.rejects.get(cause, 0) + 1
+
+    def wrote(self, count: int, now: float) -> None:
+        """A frame was written."""
+        self.tx_bytes += count
+        self.tx_frames += 1
+        self._writes.append((now, count))
+        while self._writes and self._writes[0][0] < now - AIRTIME_WINDOW_S:
+            self._writes.popleft()
+
+    def airtime(self, now: float) -> float:
+        """Share of the last ten seconds that our frames took on the wire, 0..1."""
+        sent = sum(count for at, count in self._writes if at >= now - AIRTIME_WINDOW_S)
+        return min(1.0, sent / (BYTES_PER_S * AIRTIME_WINDOW_S))
+
+    def judge(self, *, now: float, limit_s: float | None, why_quiet: str, blocked_until: float) -> bool:
+        """Bring the state up to date; `limit_s`: the longest normal silence, None if any is normal. True on a change."""
+        if self.state is LinkState.LOST:
+            return False
+        before = self.state
+        heard = self.last_rx_at if self.last_rx_at is not None else self._up_at or now
+        silence = now - max(heard, min(blocked_until, now))
+        if self.last_rx_at is not None and now - self.last_rx_at <= (limit_s if limit_s is not None else STALE_S):
+            self._set(LinkState.ONLINE, "heard", now)
+        elif limit_s is None:
+            self._set(LinkState.QUIET, why_quiet, now)
+        elif silence <= limit_s:
+            if self.last_rx_at is not None:
+                self._set(LinkState.QUIET, "the car is busy", now)
+        else:
+            self._set(LinkState.STALE, f"nothing heard for {now - heard:.1f} s, expected every {limit_s:g} s", now)
+        return self.state is not before
+
+    def _set(self, state: LinkState, reason: str, now: float) -> None:
+        if state is not self.state:
+            self.since = now
+        self.state = state
+        self.reason = reason

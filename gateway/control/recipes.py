@@ -1,0 +1,98 @@
+"""The stops, as tables of frames and times: what protocol.md, "Stopping, from the hazards", prescribes. No state."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from gateway.protocol.encode import Frame, General, ModeClose, Reset
+from gateway.protocol.values import Motion
+
+REPEAT_S: Final = 1.1
+"""A block that we know nothing of lasts up to 1.0 s; a frame sent 1.1 s after the last is alone in the buffer."""
+CONFIRM_S: Final = 4.5
+"""How long recovery waits for a mode-0 reading: avoidance blocks 4.3 s."""
+RETRIES: Final = 3
+
+
+class Gate(IntEnum):
+    """What a frame waits for."""
+
+    NOTHING = 0
+    FLIGHT = 1
+    """No frame of ours is in flight."""
+    ALONE = 2
+    """None is in flight, and none may be in the car's buffer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One frame of a recipe, at the earliest so many seconds after the one before it, or after the recipe's first."""
+
+    frame: Frame
+    gate: Gate = Gate.NOTHING
+    after_s: float = 0.0
+    from_start_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """A way to stop. `rank`: a running recipe is only replaced by one of a higher rank."""
+
+    name: str
+    rank: int
+    steps: tuple[Step, ...]
+    confirmed: bool = False
+    """Over only when a mode-0 reading has come after its last frame."""
+
+    @property
+    def length_s(self) -> float:
+        """From the first frame to the last, s, if nothing is waited for."""
+        at = 0.0
+        for index, step in enumerate(self.steps):
+            at = max(at + step.after_s if index else 0.0, step.from_start_s)
+        return at
+
+
+_STOP: Final = General(Motion.STOP)
+_MANUAL: Final = ModeClose()
+
+# protocol.md, stopping, soft
+SOFT: Final = Recipe("soft", 1, (Step(_STOP, Gate.FLIGHT), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+
+# protocol.md, stopping, full
+FULL: Final = Recipe("full", 2, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+
+# protocol.md, stopping, Raspberry Pi
+_PI_STEPS: Final = (Step(_STOP, Gate.FLIGHT), Step(_STOP, after_s=0.06), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S))
+PI_SOFT: Final = Recipe("raspberry_pi_soft", 1, _PI_STEPS)
+PI: Final = Recipe("raspberry_pi", 2, _PI_STEPS)
+
+# protocol.md, stopping, recovery
+RECOVERY: Final = Recipe(
+    "recovery",
+    3,
+    (
+        Step(Reset()),
+        Step(_MANUAL, after_s=0.05),
+        Step(_MANUAL, from_start_s=3.7),
+        Step(_STOP, from_start_s=4.8),
+    ),
+    confirmed=True,
+)
+
+# protocol.md, stopping, platform unknown
+UNKNOWN: Final = Recipe(
+    "unknown_platform",
+    3,
+    (
+        Step(_STOP),
+        Step(_MANUAL, after_s=0.06),
+        Step(_STOP, after_s=REPEAT_S),
+        Step(_MANUAL, from_start_s=3.7),
+        Step(_STOP, from_start_s=4.8),
+    ),
+    confirmed=True,
+)
+
+# protocol.md, stopping, "If none has come 4.5 s after it"
+RETRY: Final = Recipe("recovery_again", 3, (Step(_MANUAL), Step(_STOP, after_s=REPEAT_S)), confirmed=True)

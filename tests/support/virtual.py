@@ -1,0 +1,114 @@
+"""One gateway's control and one simulated car on virtual time, joined by a link without delay: as fast as the CPU allows."""
+
+import random
+from collections.abc import Callable
+
+from gateway.control.controller import Controller
+from gateway.control.records import Answer, Command, CommandRecord, LogRecord, Phase, Sender, What
+from gateway.protocol.decode import Decoder
+from gateway.protocol.profile import parse_platform
+from gateway.sim.core.cars import build
+from gateway.sim.core.firmware import Firmware
+from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.core.world import World
+
+STEP_S = 0.01
+"""How long the loop may sleep between two looks: a gateway's loop is woken by bytes and by its own deadlines."""
+
+
+class Pair:
+    """A controller, its decoder, and the car at the other end of the wire."""
+
+    def __init__(
+        self,
+        platform: str = "arduino",
+        *,
+        seed: int = 1,
+        world: World | None = None,
+        told: str | None = None,
+        transport: Transport = Transport.SERIAL,
+        start_s: float = 0.0,
+    ) -> None:
+        self.now = 0.0
+        self.car: Firmware = build(platform, world or World.room(), 0, random.Random(seed), transport=transport)
+        self.transport = transport
+        self.control = Controller("red", parse_platform(told or platform))
+        self.decoder = Decoder()
+        self.sent: list[tuple[float, bytes]] = []
+        self.records: list[CommandRecord] = []
+        self.logs: list[LogRecord] = []
+        self.number = 0
+        self.run(start_s, linked=False)
+
+    def connect(self) -> None:
+        """Open the link; recovery begins."""
+        if isinstance(self.car, RaspberryPiCar):
+            self.car.connected(self.now)
+        self.decoder = Decoder()
+        self.control.link_up(self.now)
+
+    def ready(self) -> "Pair":
+        """Connect and wait until recovery is complete and a reading has come."""
+        self.connect()
+        self.until(lambda: self.control.known and self.control.mode.inferred is not None, 30.0)
+        return self
+
+    def ask(self, what: What, *, verb: str = "test", sender: Sender | None = None, identity: str = "") -> Answer:
+        """Give a command, and pump once."""
+        self.number += 1
+        command = Command(identity or f"c{self.number}", verb, sender or Sender(), what)
+        answer = self.control.command(command, self.now)
+        self._pump()
+        return answer
+
+    def run(self, seconds: float, *, linked: bool = True) -> None:
+        """Let time pass."""
+        end = self.now + seconds
+        while self.now < end - 1e-9:
+            wake = min(self.now + STEP_S, end)
+            if linked:
+                wake = min(wake, max(self.now + 1e-6, self.control.next_at(self.now)))
+            self.now = wake
+            self._receive(linked=linked)
+            if linked:
+                self._pump()
+
+    def until(self, condition: Callable[[], bool], seconds: float) -> float:
+        """Let time pass until a condition holds; returns how long it took, fails if it takes longer."""
+        began = self.now
+        while not condition():
+            assert self.now - began < seconds, f"not within {seconds} s: {self.sent[-6:]}"
+            self.run(STEP_S)
+        return self.now - began
+
+    def off_for_good_at(self) -> float:
+        """When the motors went off and stayed off; the run so far is the judge."""
+        time, left, right = self.car.motor_log[-1]
+        assert (left, right) == (0, 0), f"the motors are on since {time}: {self.sent[-6:]}"
+        return time
+
+    def phases(self, identity: str) -> list[Phase]:
+        """The life of one command."""
+        return [record.phase for record in self.records if record.command.id == identity]
+
+    def _receive(self, *, linked: bool) -> None:
+        for at, data in self.car.advance(self.now):
+            if linked:
+                for event in self.decoder.feed(data, at):
+                    self.control.heard(event, self.now)
+        if linked:
+            for event in self.decoder.tick(self.now):
+                self.control.heard(event, self.now)
+            self.control.tick(self.now)
+
+    def _pump(self) -> None:
+        while (write := self.control.poll(self.now)) is not None:
+            self.sent.append((self.now, write.data))
+            self.car.feed(write.data, self.now)
+            self.control.wrote(write, self.now)
+            self.decoder.sent(write.data, self.now)
+        for record in self.control.take_records():
+            if isinstance(record, CommandRecord):
+                self.records.append(record)
+            else:
+                self.logs.append(record)
