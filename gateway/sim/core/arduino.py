@@ -83,6 +83,8 @@ class ArduinoCar(Firmware):
             self._serial_event()
             if self._complete:
                 yield from self._parse()
+                if not self._complete:
+                    continue  # what came during an opening is obeyed when its block is over, not a turn later
             match self._mode:
                 case 0:
                     yield from self._manual()
