@@ -17,9 +17,9 @@ JOINT_MAX: Final = 180.0
 # protocol.md, readings (table) and observed spellings: an unsigned number, decimals only for CSB and PV, bits as
 # digits. `[0-9]` in a bytes pattern is ASCII only.
 _SENSORS_TEXT = (
-    rb"\$4WD,CSB([0-9]+(?:\.[0-9]+)?),PV([0-9]+(?:\.[0-9]+)?),GS([0-9]+),LF([0-9]{4}),HW([0-9]{2}),GM([0-9]{2})(#)?"
+    rb"\$4WD,CSB([0-9]+(?:\.[0-9]+)?),PV([0-9]+(?:\.[0-9]+)?),GS([0-9]+),LF([0-9]{4}),HW([0-9]{2}),GM([0-9]{2})"
 )
-match_sensors = re.compile(_SENSORS_TEXT).match
+match_ended_sensors = re.compile(_SENSORS_TEXT + rb"#").match
 fullmatch_sensors = re.compile(_SENSORS_TEXT).fullmatch
 
 _WORD = re.compile(rb"(CSB|PV|GS|LF|HW|GM|(?:Servo)?J1|J[2-6]|MPU[ga][xyz])(.*)", re.DOTALL)
@@ -42,45 +42,33 @@ _BOTH = {b"%d%d" % (a, b): (bool(a), bool(b)) for a in (0, 1) for b in (0, 1)}
 _FOUR = {left + right: (*_BOTH[left], *_BOTH[right]) for left in _BOTH for right in _BOTH}
 
 
-def sensors(found: re.Match[bytes], at: float, *, by_silence: bool = False) -> Sensors:
-    """The reading of a match of the sensors pattern; fields out of range are rejected one by one."""
-    raw, csb, pv, gs, lf, hw, gm, end = found.group(0, 1, 2, 3, 4, 5, 6, 7)
-    range_cm, voltage_v, grayscale = float(csb), float(pv), float(gs)
+def sensors(found: re.Match[bytes], at: float, *, terminated: bool = True, by_silence: bool = False) -> Sensors:
+    """The reading of a match of a sensors pattern; fields out of range are rejected one by one."""
+    csb, pv, gs, lf, hw, gm = found.groups()
+    range_cm, voltage_v, grayscale = float(csb), float(pv), int(gs)
     line, obstacle, light = _FOUR.get(lf), _BOTH.get(hw), _BOTH.get(gm)
+    good = Sensors(found[0], at, range_cm, voltage_v, grayscale, line, obstacle, light, (), terminated, by_silence)
     if range_cm <= CSB_MAX and voltage_v <= PV_MAX and grayscale <= GS_MAX and line and obstacle and light:
-        return Sensors(
-            raw, at, range_cm, voltage_v, int(grayscale), line, obstacle, light, (), end is not None, by_silence
-        )
-    rejects = [
-        Reject(word, text.decode())
-        for word, text, good in (
-            ("CSB", csb, range_cm <= CSB_MAX),
-            ("PV", pv, voltage_v <= PV_MAX),
-            ("GS", gs, grayscale <= GS_MAX),
-            ("LF", lf, line),
-            ("HW", hw, obstacle),
-            ("GM", gm, light),
-        )
-        if not good
-    ]
-    return Sensors(
-        raw,
-        at,
-        range_cm if range_cm <= CSB_MAX else None,
-        voltage_v if voltage_v <= PV_MAX else None,
-        int(grayscale) if grayscale <= GS_MAX else None,
-        line,
-        obstacle,
-        light,
-        tuple(rejects),
-        end is not None,
-        by_silence,
+        return good
+    checks = (
+        ("CSB", csb, range_cm <= CSB_MAX),
+        ("PV", pv, voltage_v <= PV_MAX),
+        ("GS", gs, grayscale <= GS_MAX),
+        ("LF", lf, line),
+        ("HW", hw, obstacle),
+        ("GM", gm, light),
+    )
+    return good._replace(
+        range_cm=range_cm if range_cm <= CSB_MAX else None,
+        voltage_v=voltage_v if voltage_v <= PV_MAX else None,
+        grayscale=grayscale if grayscale <= GS_MAX else None,
+        rejects=tuple(Reject(word, text.decode()) for word, text, in_range in checks if not in_range),
     )
 
 
 def parse(raw: bytes, at: float) -> Event:
     """The event of one frame, `raw` from its `$` up to its `#`; never raises."""
-    if found := fullmatch_sensors(raw):
+    if found := match_ended_sensors(raw):
         return sensors(found, at)
     head, *fields = raw[1:-1].split(b",")
     if head != b"4WD":

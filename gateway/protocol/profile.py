@@ -1,6 +1,6 @@
-"""What each kind of car knows, how long a frame blocks it, how it is stopped, and which readings are filler.
+"""What each kind of car knows, how it is stopped, and which of its readings are measured.
 
-Every number cites its row of protocol.md. Nothing here decides when to send (that is `control`).
+Every number cites its row of protocol.md; the times are in `timing`. When to send is not decided here (see `control`).
 """
 
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from typing import Final
 
 from gateway.protocol.encode import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
 from gateway.protocol.readings import Sensors
+from gateway.protocol.timing import MODE_TURN_S, RASPBERRY_PI_FAN_S, RATE_HZ, block_s
 from gateway.protocol.values import Light, Mode, ServoAction, SpeedStep
 
 
@@ -31,36 +32,6 @@ class StopStyle(StrEnum):
 
 OPTIONS: Final = frozenset({"arm", "imu"})
 
-# protocol.md, framing: UART 9600 8N1, so at most 960 bytes/s each way
-BYTES_PER_S: Final = 960
-# protocol.md, observed about time: "0, but allow 0.06 s"; also the 60 ms between two writes (hazards, Raspberry Pi)
-FRAME_S: Final = 0.06
-WHISTLE_S: Final = 0.30  # observed about time: whistle
-SERVO_S: Final = 0.65  # observed about time: PTZ, front servo left/right/reset
-COLOR_S: Final = 0.10  # observed about time: colour frame
-MODE_CLOSE_S: Final = 1.0  # observed about time: mode closed (`x0`)
-RASPBERRY_PI_FAN_S: Final = 1.0  # observed about time: Raspberry Pi: fan
-LONGEST_BLOCK_S: Final = 3.5  # observed about time: "the longest block outside avoidance is 3.5 s"
-
-
-def mode_open_s(mode: Mode) -> float:
-    """How long opening a mode blocks: 2.1 s + 0.2 s x (x + 1) (observed about time: mode opened (`x1`))."""
-    return 2.1 + 0.2 * (mode.digit + 1)
-
-
-# observed about time, the longest turn of each mode's own loop
-_MODE_TURN_S: Final = {
-    Mode.MANUAL: 1.0,  # "once a second in mode 0, the report itself ... 1.0 s if the ranging gets no echo"
-    Mode.REMOTE_CONTROL: 0.1,  # no row: as the other modes without a ranging
-    Mode.TRACKING: 0.1,  # "tracking, light seeking, following: up to 0.1 s per turn"
-    Mode.OBSTACLE_AVOIDANCE: 4.3,  # "near an obstacle 4.3 s" (with no echo at all for ever, motors braked)
-    Mode.COLOR_LED: 0.75,  # "colour LED mode: 0.75 s per turn"
-    Mode.LIGHT_SEEKING: 0.1,
-    Mode.FOLLOWING: 0.1,
-}
-# readings, observed rates: frames per second at most
-_RATE_HZ: Final = {Mode.MANUAL: 1.0, Mode.TRACKING: 27.0, Mode.LIGHT_SEEKING: 23.0, Mode.FOLLOWING: 24.0}
-
 # observed placeholders: what each mode's frame measures
 _ALL: Final = frozenset({"range", "battery", "grayscale", "line", "obstacle", "light"})
 _MEASURED: Final = {
@@ -82,7 +53,7 @@ class SpeedModel:
 
     start: float
     increment: float
-    low: float  # a step down from here or lower goes to `rebound`
+    low: float  # a step down that would end below this ends at `rebound`
     rebound: float
     top: float
 
@@ -162,30 +133,17 @@ class Profile:
                 return self._unless("mode", "a lone '#'")
 
     def block_s(self, frame: Frame) -> float:
-        """How long the car may be blocked after this frame; parts of one frame add up. At least `FRAME_S`."""
-        match frame:
-            case General():
-                fan = RASPBERRY_PI_FAN_S if self.kind in {Platform.RASPBERRY_PI, Platform.UNKNOWN} else 0.0
-                parts = ((frame.whistle, WHISTLE_S), (frame.servo, SERVO_S), (frame.fan, fan))
-                return max(FRAME_S, sum(block for asked, block in parts if asked))
-            case Ptz() | ArmSet():  # the arm has no row: as one servo
-                return SERVO_S
-            case ColorLed():
-                return COLOR_S
-            case ModeOpen(mode):
-                return mode_open_s(mode)
-            case ModeClose():
-                return MODE_CLOSE_S
-            case Reset():
-                return FRAME_S
+        """How long the car may be blocked after this frame, seconds (see `timing.block_s`)."""
+        slow_fan = self.kind in {Platform.RASPBERRY_PI, Platform.UNKNOWN}
+        return block_s(frame, fan_s=RASPBERRY_PI_FAN_S if slow_fan else 0.0)
 
     def mode_turn_s(self, mode: Mode) -> float:
         """The longest block of one turn of this mode's own loop, during which nothing is obeyed."""
-        return _MODE_TURN_S[mode]
+        return MODE_TURN_S[mode]
 
     def rate_hz(self, mode: Mode) -> float:
         """Sensors frames per second at most; 0 in a silent mode."""
-        return _RATE_HZ.get(mode, 0.0)
+        return RATE_HZ.get(mode, 0.0)
 
     def resolved(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
         """The modes this frame can come from. `mode`, if confirmed otherwise, only chooses among the candidates."""
@@ -338,7 +296,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
 
 
 def _whole_cm(event: Sensors) -> bool:
-    return b"." not in event.raw[: event.raw.index(b",PV")]
+    return b"." not in event.raw.partition(b",PV")[0]
 
 
 def _pi_constants(event: Sensors) -> bool:

@@ -5,6 +5,7 @@ No parsing lives here (see `decode`), and nothing that depends on the platform (
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from gateway.protocol.values import Mode
 
@@ -30,13 +31,13 @@ class Reject:
     cause: Cause = Cause.OUT_OF_RANGE
 
 
-@dataclass(frozen=True, slots=True)
-class Sensors:
+class Sensors(NamedTuple):
     """The sensors frame, each field as on the wire; None where the field was rejected.
 
     `at` is the time of its last byte. `range_cm` 0 means no echo, not a distance. `line` is left-outer, left-inner,
     right-inner, right-outer. `obstacle` is not inverted here, whatever the mode (see `Profile.obstacle`).
     Whether a field is measured or filler is not said here either (see `Profile.measured`).
+    A named tuple, because a frozen dataclass of this size costs as much as decoding the frame.
     """
 
     raw: bytes
@@ -49,7 +50,7 @@ class Sensors:
     light: tuple[bool, bool] | None
     rejects: tuple[Reject, ...] = ()
     terminated: bool = True  # by `#`
-    by_silence: bool = False  # not terminated, and nothing followed for 50 ms: a `#` may have been late
+    by_silence: bool = False  # not terminated, and nothing followed (for 50 ms, or at all): a `#` may be late
 
     @property
     def candidates(self) -> tuple[Mode, ...]:
