@@ -1,4 +1,4 @@
-"""Every row of protocol.md's two hazards tables as a scenario for a stranger; run on virtual time and over real links."""
+"""Every row of the two hazards tables of protocol.md as a scenario, for virtual time and for real links."""
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 import serial
+
 from gateway.sim.core.arduino import ArduinoCar
 from gateway.sim.core.cars import build
 from gateway.sim.core.firmware import Firmware, Truth

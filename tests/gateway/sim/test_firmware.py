@@ -71,7 +71,7 @@ def test_opening_times_are_those_of_the_table() -> None:
 @pytest.mark.parametrize(("echo", "least", "most"), [(True, 0.004, 0.040), (False, 1.0, 1.0)])
 async def test_the_report_itself_blocks(echo: bool, least: float, most: float) -> None:
     blocks = []
-    for sent_at in range(0, 60):
+    for sent_at in range(60):
         # A frame anywhere in a period is obeyed on time, or when the report that it met is over.
         car = virtual(world=World.room() if echo else World.open_field())
         await car.wait(0.5 + sent_at / 40)
