@@ -231,8 +231,8 @@ class Publisher:
         self.topic = topic
         self.sequence = 0
 
-    def put(self, message: Any, stamp_ns: int) -> None:
-        """Publish; `stamp_ns`: ns since the epoch, when the bytes were had or the decision was made."""
+    def put(self, message: Any, stamp_ns: int) -> bytes:
+        """Publish, give the payload; `stamp_ns`: ns since the epoch, when the bytes were had or the decision was made."""
         self.sequence += 1
         if self._headed:
             message.stamp.seconds, message.stamp.nanos = divmod(stamp_ns, 1_000_000_000)
@@ -242,6 +242,7 @@ class Publisher:
         payload: bytes = message.SerializeToString()
         source = zenoh.SourceInfo(self._publisher.id, self.sequence & 0xFFFFFFFF)
         self._publisher.put(payload, source_info=source)
+        return payload
 
 
 class Bus:
@@ -301,6 +302,17 @@ class Bus:
     def subscribe(self, expression: str, callback: Callable[[Sample], object]) -> zenoh.Subscriber[None]:
         """Call back for every publication, on a Zenoh thread: hand over and return."""
         subscriber = self._session.declare_subscriber(expression, lambda sample: callback(sample_of(sample)))
+        self._kept.append(subscriber)
+        return subscriber
+
+    def subscribe_raw(self, expression: str, callback: Callable[[zenoh.Sample], object]) -> zenoh.Subscriber[None]:
+        """Call back with Zenoh's own sample on its receive thread, without a thread and a queue between.
+
+        For who takes everything (the recorder). That thread serves the whole session: copy, append, return; a Zenoh
+        call in the callback deadlocks.
+        """
+        handler = zenoh.handlers.Callback(callback, indirect=False)
+        subscriber = self._session.declare_subscriber(expression, handler)
         self._kept.append(subscriber)
         return subscriber
 

@@ -503,8 +503,15 @@ class Decision(_message.Message):
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., subject: _Optional[str] = ..., decided: _Optional[str] = ..., why: _Optional[str] = ..., readings: _Optional[_Iterable[str]] = ..., would_change: _Optional[str] = ...) -> None: ...
 
 class Recording(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "session", "state", "bytes", "messages", "drops", "free_bytes", "error")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "session", "state", "bytes", "messages", "drops", "free_bytes", "error", "missed")
     class DropsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+    class MissedEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
         VALUE_FIELD_NUMBER: _ClassVar[int]
@@ -522,6 +529,7 @@ class Recording(_message.Message):
     DROPS_FIELD_NUMBER: _ClassVar[int]
     FREE_BYTES_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
+    MISSED_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -533,7 +541,8 @@ class Recording(_message.Message):
     drops: _containers.ScalarMap[str, int]
     free_bytes: int
     error: str
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., bytes: _Optional[int] = ..., messages: _Optional[int] = ..., drops: _Optional[_Mapping[str, int]] = ..., free_bytes: _Optional[int] = ..., error: _Optional[str] = ...) -> None: ...
+    missed: _containers.ScalarMap[str, int]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., bytes: _Optional[int] = ..., messages: _Optional[int] = ..., drops: _Optional[_Mapping[str, int]] = ..., free_bytes: _Optional[int] = ..., error: _Optional[str] = ..., missed: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
 class DriveCommand(_message.Message):
     __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "motion", "duration_s")
