@@ -84,7 +84,7 @@ def _hold(command: Command, situation: Situation) -> Refusal | None:
         return None
     return (
         Reason.HELD,
-        f"{situation.car} was stopped by {situation.held_by} and is held: a person's or script's drive, mode or resume ends it",
+        f"{situation.car} is held since {situation.held_by} stopped it: a person's or script's drive, mode or resume ends that",
     )
 
 
@@ -98,7 +98,7 @@ def _link(command: Command, situation: Situation) -> Refusal | None:
     if not situation.answering:
         return (
             Reason.LINK_DOWN,
-            f"{situation.car} does not answer: no reading since its recovery; is it on, and of the platform that was named?",
+            f"{situation.car} does not answer: no reading since its recovery; is it on, and the platform right?",
         )
     return None
 

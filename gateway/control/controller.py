@@ -257,6 +257,13 @@ class Controller:
         self._acts.append(pending)
         return self._queued(pending, now)
 
+    def refused(self, command: Command, reason: Reason, words: str, now: float) -> Answer:
+        """Record a command that was no command, as its parser says."""
+        pending = Pending(command, now)
+        if not command.streamed:
+            self._ledger.record(pending, Phase.ASKED, now)
+        return self._reject(pending, reason, words, now)
+
     def shutdown(self, now: float) -> None:
         """The gateway ends: stop the car; nothing else is accepted."""
         if self._closing:

@@ -70,7 +70,7 @@ class LinkHealth:
         return min(1.0, sent / (BYTES_PER_S * AIRTIME_WINDOW_S))
 
     def judge(self, *, now: float, limit_s: float | None, why_quiet: str, blocked_until: float) -> bool:
-        """Bring the state up to date; `limit_s`: the longest normal silence, None if any is normal. True on a change."""
+        """Bring the state up to date; `limit_s`: the longest normal silence, None if any is. True on a change."""
         if self.state is LinkState.LOST:
             return False
         before = self.state

@@ -1,0 +1,439 @@
+"""One car: its link, decoder, control and publications in one asyncio loop. Read this file first.
+
+Up: `_read` takes bytes from the link, the decoder makes events of them, `Publications` publishes what was measured,
+and control takes them as evidence. Down: a query on `@cmd` is handed over to the loop, parsed, given to control, and
+answered when control has had the chance to write. `_pump` is the only place that writes to the car: what control says,
+one frame at a time.
+"""
+
+import asyncio
+import logging
+import random
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import zenoh
+
+from gateway import requests
+from gateway.control import backoff
+from gateway.control.controller import Controller, Hold
+from gateway.control.link_health import LinkHealth
+from gateway.control.mode import Verdict
+from gateway.control.records import Answer, Level, LogRecord, Phase
+from gateway.link import Link, LinkError, LinkLost, open_link
+from gateway.protocol.decode import Decoder
+from gateway.protocol.profile import Profile
+from gateway.protocol.readings import Event, Rejected
+from gateway.publish import Publications, wall_ns
+from gateway.store import Store, StoredHold
+from schemas import bus, keys, messages
+from schemas.gen import fleet_v1_pb2 as pb
+
+TICK_S: Final = 0.1
+"""How often silence is weighed, states are looked at, and the loop notes that it was not stalled."""
+HUB_GONE_S: Final = 0.5
+LOOK_AGAIN_S: Final = 0.5
+"""Two gateways that started at the same moment see each other when both have declared (design.md, "Keys")."""
+HEALTH_EVERY_S: Final = 1.0
+_LEVELS: Final = {Level.INFO: logging.INFO, Level.WARNING: logging.WARNING, Level.ERROR: logging.ERROR}
+
+log = logging.getLogger("gateway")
+
+
+class AlreadyServed(Exception):
+    """Another gateway serves this car; the text names it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What `gateway run` was told."""
+
+    car: str
+    url: str
+    profile: Profile
+    fleet: str
+    state_dir: Path
+    retry: bool
+    """Keep trying when the first attempt to open the link fails."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """A query that waits for its answer."""
+
+    query: zenoh.Query
+    key: str
+    command_id: str
+    answer: Answer
+    as_json: bool
+
+
+class Car:
+    """One car's gateway. `run` returns when it was told to stop and the car's stop is written."""
+
+    def __init__(self, settings: Settings, opened: bus.Bus) -> None:
+        self._settings = settings
+        self._bus = opened
+        self._loop = asyncio.get_running_loop()
+        now = self._loop.time()
+        self._store = Store(settings.state_dir, settings.fleet, settings.car)
+        self._control = Controller(
+            settings.car, settings.profile, hold=_restored(self._store.load(time.time_ns()), now)
+        )
+        self._saved_hold = self._control.hold
+        self._health = LinkHealth(since=now)
+        self._decoder = Decoder()
+        self._link: Link | None = None
+        self._out = Publications(opened, settings.fleet, settings.car, settings.profile, settings.url)
+        self._commands = bus.Handover(self._loop, self._query, limit=256)
+        self._stream = bus.Handover(self._loop, self._streamed, limit=256)
+        self._queries = bus.Handover(self._loop, self._out.answer, limit=1024)
+        self._senders = bus.Handover(self._loop, self._sender, limit=1024)
+        self._asked: list[_Asked] = []
+        self._sent: set[str] = set()
+        """Ids of commands whose first frame went out since the last answers."""
+        self._wake = asyncio.Event()
+        self._ending = False
+        self._stopped = asyncio.Event()
+        self._alive_at = now
+        self._lag_s = 0.0
+
+    async def run(self) -> None:
+        """Serve the car until `stop`, and until its stop is written; raises AlreadyServed, or LinkError at the start."""
+        self._refuse(self._others())
+        self._declare()
+        work = (self._connect(), self._write_frames(), self._tick(), self._keep_hub(), self._look_again())
+        tasks = [asyncio.ensure_future(each) for each in work]
+        stopped = asyncio.ensure_future(self._stopped.wait())
+        try:
+            done, _ = await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
+            failed = [task for task in done if task is not stopped]
+            if failed:
+                self.stop()
+                await asyncio.wait([stopped, tasks[1]], return_when=asyncio.FIRST_COMPLETED)
+                failed[0].result()
+        finally:
+            for task in (stopped, *tasks):
+                task.cancel()
+            await asyncio.gather(stopped, *tasks, return_exceptions=True)
+            if self._link is not None:
+                await self._link.close()
+            self._flush()
+            self._out.states(self._control, self._health, self._loop.time(), force=True)
+
+    def stop(self) -> None:
+        """Begin to end: the car is stopped first. Told again, end without waiting for it."""
+        if self._ending:
+            log.error("%s: told twice to end: its stop may be incomplete", self._settings.car)
+            self._control.link_down("the gateway was told twice to end", self._loop.time())
+        self._ending = True
+        self._control.shutdown(self._loop.time())
+        self._wake.set()
+
+    # ------------------------------------------------------------------ who serves this car
+
+    def _others(self) -> list[pb.Health]:
+        """The health of every other gateway that answers for this car."""
+        key = keys.topic_key(self._settings.fleet, self._settings.car, "state/health")
+        found = []
+        for answer in self._bus.query(key):
+            if isinstance(answer, bus.Sample):
+                health = messages.parse("fleet.v1.Health", answer.payload, answer.encoding)
+                if isinstance(health, pb.Health) and health.boot_id != self._bus.boot_id:
+                    found.append(health)
+        return found
+
+    def _refuse(self, others: list[pb.Health]) -> None:
+        for other in others:
+            raise AlreadyServed(
+                f"car {self._settings.car} is served already, by process {other.pid} on {other.host} "
+                f"(link {other.link}): stop that one first, or give this car another name"
+            )
+
+    async def _look_again(self) -> None:
+        """Of two that started at the same moment, the one with the higher id yields."""
+        await asyncio.sleep(LOOK_AGAIN_S)
+        others = await asyncio.to_thread(self._others)
+        self._refuse([other for other in others if other.boot_id < self._bus.boot_id])
+        await self._stopped.wait()
+
+    def _declare(self) -> None:
+        """Queryables first, then the token: whoever sees the token gets an answer."""
+        fleet, car = self._settings.fleet, self._settings.car
+        now = self._loop.time()
+        self._out.health(now, loop_lag_s=0.0, bus_drops=0)
+        self._out.states(self._control, self._health, now)
+        for family in ("sensor", "state"):
+            self._bus.queryable(f"{fleet}/{car}/{family}/*", self._queries)
+        self._bus.queryable(keys.command_key(fleet, car, "*"), self._commands)
+        self._bus.subscribe(keys.command_key(fleet, car, "drive"), self._stream)
+        self._bus.watch_tokens(
+            f"{fleet}/{keys.OPERATOR}/*", lambda key, alive: self._senders((key.rpartition("/")[2], alive))
+        )
+        self._bus.token(keys.car_token(fleet, car))
+
+    # ------------------------------------------------------------------ the link
+
+    async def _connect(self) -> None:
+        """Keep the link open, and read it."""
+        failures = 0
+        may_fail = self._settings.retry
+        while True:
+            try:
+                link = await open_link(self._settings.url)
+            except LinkError as error:
+                if not may_fail:
+                    raise
+                failures += 1
+                self._lost(str(error), once=failures == 1)
+                await asyncio.sleep(backoff.delay_s(failures, random.random()))  # noqa: S311 - jitter, no secret
+                continue
+            may_fail, failures = True, 0
+            now = self._loop.time()
+            self._link = link
+            self._decoder = Decoder()
+            self._health.up(now)
+            self._control.link_up(now)
+            self._log(Level.INFO, "link_open", f"{self._settings.url} is open: bringing the car to a known state")
+            self._wake.set()
+            try:
+                await self._read(link)
+            except LinkLost as error:
+                self._events(self._decoder.end())
+                if self._link is link:
+                    self._lost(str(error), once=True)
+            await link.close()
+            await asyncio.sleep(backoff.delay_s(1, random.random()))  # noqa: S311 - jitter, no secret
+
+    async def _read(self, link: Link) -> None:
+        """Bytes to events, until the link is lost."""
+        while True:
+            data = await link.read()
+            now = self._loop.time()
+            self._health.received(len(data), now)
+            self._events(self._decoder.feed(data, now))
+            self._wake.set()
+
+    def _events(self, events: list[Event]) -> None:
+        """Publish what was measured, and take it as evidence."""
+        now = self._loop.time()
+        for event in events:
+            self._control.heard(event, now)
+            mode = self._control.mode
+            confirmed = mode.asked if mode.verdict is Verdict.CONFIRMED else None
+            self._health.rx_frames += 1
+            if isinstance(event, Rejected):
+                self._health.rejected(event.cause)
+            self._out.event(event, wall_ns(event.at), confirmed, loaded=self._control.motors != "off")
+
+    def _lost(self, reason: str, *, once: bool) -> None:
+        now = self._loop.time()
+        self._link = None
+        self._health.down(reason, now)
+        self._control.link_down(reason, now)
+        if once:
+            self._log(Level.WARNING, "link_lost", reason)
+        self._wake.set()
+
+    # ------------------------------------------------------------------ frames to the car
+
+    async def _write_frames(self) -> None:
+        """Write what control wants when it wants it, answer queries, publish records."""
+        while True:
+            self._wake.clear()
+            await self._pump()
+            self._flush()
+            if self._control.finished:
+                self._stopped.set()
+            now = self._loop.time()
+            wake_at = min(self._control.next_at(now), self._decoder.deadline() or float("inf"), now + TICK_S)
+            timer = self._loop.call_at(wake_at, self._wake.set)
+            await self._wake.wait()
+            timer.cancel()
+
+    async def _pump(self) -> None:
+        now = self._loop.time()
+        self._control.stalled(now - self._alive_at - TICK_S, now)
+        self._events(self._decoder.tick(now))
+        while (link := self._link) is not None and (write := self._control.poll(self._loop.time())) is not None:
+            try:
+                await link.write(write.data)
+            except LinkLost as error:
+                reason = f"a write failed: {error}"
+                self._out.written(write, time.time_ns(), whole=False)
+                self._control.write_failed(reason, self._loop.time())
+                self._lost(reason, once=True)
+                await link.close()  # what reads it wakes, and opens it again
+                return
+            now = self._loop.time()
+            self._control.wrote(write, now)
+            self._decoder.sent(write.data, now)
+            self._health.wrote(len(write.data), now)
+            self._out.written(write, time.time_ns(), whole=True)
+
+    # ------------------------------------------------------------------ commands
+
+    def _query(self, query: zenoh.Query) -> None:
+        """Take a command that came as a query; it is answered when control has had the chance to write."""
+        expression = str(query.key_expr)
+        verb = expression.rpartition("/")[2]
+        encoding = str(query.encoding) if query.encoding is not None else ""
+        payload = query.payload.to_bytes() if query.payload is not None else None
+        as_json = query.parameters.get("format") == "json" or not encoding.startswith(messages.PROTOBUF)
+        if "*" in verb:
+            with query:
+                query.reply_err(f"{expression}: name the command, there is no command {verb}", encoding="text/plain")
+            return
+        request = requests.Request(verb, payload, encoding, time.time_ns(), by_wildcard="*" in expression)
+        command_id, answer = self._command(request)
+        key = keys.command_key(self._settings.fleet, self._settings.car, verb)
+        self._asked.append(_Asked(query, key, command_id, answer, as_json))
+        self._wake.set()
+
+    def _streamed(self, sample: bus.Sample) -> None:
+        """Take a drive that came as a publication."""
+        if not sample.deleted:
+            request = requests.Request(
+                "drive",
+                sample.payload,
+                sample.encoding,
+                time.time_ns(),
+                sampled_ns=sample.time_ns,
+                by_wildcard="*" in sample.key,
+            )
+            self._command(request)
+            self._wake.set()
+
+    def _command(self, request: requests.Request) -> tuple[str, Answer]:
+        """Parse a request and give it to control; its first record carries the request as it came."""
+        now = self._loop.time()
+        try:
+            command = requests.parse(request)
+            answer = self._control.command(command, now)
+        except requests.BadRequest as error:
+            command = error.command
+            answer = self._control.refused(command, error.reason, error.words, now)
+        self._publish_records(command.id, request)
+        return command.id, answer
+
+    def _reply(self, asked: _Asked, sent: set[str]) -> None:
+        answer = asked.answer
+        status = Phase.SENT if asked.command_id in sent and answer.status is Phase.QUEUED else answer.status
+        result = pb.Result(
+            id=asked.command_id,
+            car=self._settings.car,
+            status=status,
+            reason=answer.reason or "",
+            words=answer.words,
+            worst_case_s=answer.worst_case_s,
+        )
+        with asked.query as query:
+            if asked.as_json:
+                bus.reply(query, asked.key, messages.to_json(result).encode(), messages.JSON)
+            else:
+                bus.reply(query, asked.key, result.SerializeToString(), messages.encoding_of("fleet.v1.Result"))
+
+    def _flush(self) -> None:
+        """Publish records and states, answer what waits for an answer, keep what must survive a restart."""
+        self._publish_records()
+        sent, self._sent = self._sent, set()
+        asked, self._asked = self._asked, []
+        for each in asked:
+            self._reply(each, sent)
+        self._out.states(self._control, self._health, self._loop.time())
+        if self._control.hold != self._saved_hold:
+            self._saved_hold = hold = self._control.hold
+            try:
+                self._store.save(None if hold is None else StoredHold(hold.by, wall_ns(hold.since)))
+            except OSError as error:
+                self._log(Level.ERROR, "not_saved", f"the hold will not survive a restart: {error}")
+
+    def _publish_records(self, command_id: str = "", request: requests.Request | None = None) -> None:
+        for record in self._control.take_records():
+            if isinstance(record, LogRecord):
+                log.log(_LEVELS[record.level], "%s: %s", self._settings.car, record.words)
+                self._out.log(record)
+                continue
+            first = request if request is not None and record.command.id == command_id else None
+            self._out.command(record, None if first is None else (first.payload or b"", first.encoding))
+            request = None if first is not None else request
+            if record.phase is Phase.SENT:
+                self._sent.add(record.command.id)
+
+    def _log(self, level: Level, code: str, words: str) -> None:
+        log.log(_LEVELS[level], "%s: %s", self._settings.car, words)
+        self._out.log(LogRecord(level, code, words, self._loop.time()))
+
+    def _sender(self, change: tuple[str, bool]) -> None:
+        """A sender's liveliness token appeared or went."""
+        name, alive = change
+        self._control.sender_alive(name, alive=alive, now=self._loop.time())
+        self._wake.set()
+
+    # ------------------------------------------------------------------ time, and the hub
+
+    async def _tick(self) -> None:
+        """Weigh silence, look at the states, say once a second how the process does."""
+        next_health = self._loop.time()
+        worst = 0.0
+        while True:
+            due = self._loop.time() + TICK_S
+            await asyncio.sleep(TICK_S)
+            now = self._loop.time()
+            worst = max(worst, now - due)
+            self._control.stalled(now - due, now)
+            self._alive_at = now
+            self._control.tick(now)
+            mode = self._control.mode
+            limit = mode.silence_limit(fan=bool(self._control.fan))
+            self._health.judge(
+                now=now,
+                limit_s=limit,
+                why_quiet=f"{mode.asked or 'an unknown mode'} is silent",
+                blocked_until=self._control.pacing.flight_until,
+            )
+            self._out.states(self._control, self._health, now)
+            if now >= next_health:
+                next_health = now + HEALTH_EVERY_S
+                drops = self._commands.dropped + self._stream.dropped + self._queries.dropped + self._senders.dropped
+                self._out.health(now, loop_lag_s=worst, bus_drops=drops)
+                worst = 0.0
+
+    async def _keep_hub(self) -> None:
+        """Bring a hub back that has been gone for half a second; jitter keeps a hundred gateways from trying at once."""
+        gone_since: float | None = None
+        while True:
+            await asyncio.sleep(HUB_GONE_S / 2)
+            now = self._loop.time()
+            if self._bus.connected:
+                gone_since = None
+                continue
+            gone_since = now if gone_since is None else gone_since
+            if now - gone_since < HUB_GONE_S * (1 + random.random()):  # noqa: S311 - jitter, no secret
+                continue
+            try:
+                await asyncio.to_thread(bus.ensure_hub, self._bus.endpoint)
+            except bus.BusError as error:
+                self._log(Level.ERROR, "no_hub", str(error))
+
+
+def _restored(stored: StoredHold | None, now: float) -> Hold | None:
+    """A hold from before the restart, on this process's monotonic clock."""
+    if stored is None:
+        return None
+    return Hold(stored.by, now - (time.time_ns() - stored.since_ns) / 1e9)
+
+
+async def serve(settings: Settings, opened: bus.Bus) -> None:
+    """Serve one car until SIGINT or SIGTERM; raises AlreadyServed or LinkError."""
+    car = Car(settings, opened)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        try:
+            loop.add_signal_handler(number, car.stop)
+        except NotImplementedError:  # Windows has no signal handlers on the loop
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(car.stop))
+    await car.run()

@@ -1,0 +1,93 @@
+"""The `gateway` command: run one car's gateway, or simulated cars.
+
+argparse, and everything else imported where it is used: `gateway run` is started a hundred times.
+"""
+
+import argparse
+import asyncio
+import logging
+import sys
+from pathlib import Path
+
+from schemas.keys import DEFAULT_FLEET, BadKey, check_name
+
+_RUN_EPILOG = """\
+examples:
+  gateway run --car red --link /dev/ttyUSB0 --platform arduino
+  gateway run --car blue --link tcp://192.168.1.7:8888 --platform raspberry_pi
+
+Ctrl-C stops the car before the process ends."""
+
+
+def main() -> None:
+    """Entry point; exit code 2 for wrong use, 1 for a failure."""
+    parser = argparse.ArgumentParser(prog="gateway", description="One process per car: its bytes, keyed on the bus.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    run = commands.add_parser(
+        "run",
+        help="connect one car to the bus",
+        description="Connect one car to the bus: readings out, commands in.",
+        epilog=_RUN_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    run.add_argument("--car", required=True, help="its name: a-z, 0-9, _ and -, at most 32")
+    run.add_argument("--link", required=True, help="serial:///dev/ttyUSB0, a bare device path, or tcp://host:8888")
+    run.add_argument("--platform", default="unknown", help="arduino, stm32, raspberry_pi; +arm, +imu (default unknown)")
+    run.add_argument("--fleet", default=DEFAULT_FLEET, help="fleet name, the first part of every key (default fleet)")
+    run.add_argument(
+        "--connect", metavar="ENDPOINT", help="the bus, tcp/HOST:PORT (default FLEET_ENDPOINT, or loopback)"
+    )
+    run.add_argument(
+        "--state-dir", type=Path, help="where e-stops and holds are kept (default: FLEET_STATE_DIR, or the user's)"
+    )
+    run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
+    sim = commands.add_parser("sim", help="simulated cars that behave like the real ones, hazards included")
+    if "sim" in sys.argv[1:2]:
+        from gateway.sim import command as sim_command
+
+        sim_command.add_arguments(sim)
+    arguments = parser.parse_args()
+    sys.exit(_run(arguments) if arguments.command == "run" else _sim(arguments))
+
+
+def _sim(arguments: argparse.Namespace) -> int:
+    from gateway.sim import command as sim_command
+
+    return sim_command.run(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from gateway.car import AlreadyServed, Settings, serve
+    from gateway.link import BadUrl, LinkError, parse_url
+    from gateway.protocol.profile import parse_platform
+    from gateway.store import default_directory
+    from schemas.bus import BadEndpoint, Bus, BusError
+
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
+    try:
+        settings = Settings(
+            car=check_name(arguments.car),
+            url=str(parse_url(arguments.link)),
+            profile=parse_platform(arguments.platform),
+            fleet=check_name(arguments.fleet, "fleet name"),
+            state_dir=arguments.state_dir or default_directory(),
+            retry=arguments.retry,
+        )
+        with Bus.open(arguments.connect, start_hub=True) as opened:
+            asyncio.run(serve(settings, opened))
+    except (BadKey, BadUrl, BadEndpoint, ValueError) as error:
+        return _failed(str(error), 2)
+    except (AlreadyServed, LinkError, BusError) as error:
+        return _failed(str(error), 1)
+    except KeyboardInterrupt:  # before the loop has taken the signals over: no link was open yet
+        return 130
+    return 0
+
+
+def _failed(words: str, code: int) -> int:
+    sys.stderr.write(f"gateway: {words}\n")
+    return code
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""The values of one key, the latest and a ring of earlier ones, and the time ranges that a query may ask for. No bus.
+
+A time range is written as Zenoh writes it: `[now(-30s)..]`, `[now(-1m)..now(-30s)[`, `[2026-11-21T04:00:00Z;10s]`.
+"""
+
+import re
+from collections import deque
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Final
+
+RING: Final = 1500  # design.md, "Keys": one minute of the fastest readings
+_UNITS_NS: Final = {
+    "u": 1_000,
+    "us": 1_000,
+    "ms": 1_000_000,
+    "s": 1_000_000_000,
+    "m": 60_000_000_000,
+    "h": 3_600_000_000_000,
+    "d": 86_400_000_000_000,
+    "w": 604_800_000_000_000,
+}
+_DURATION: Final = re.compile(r"(-?\d+(?:\.\d+)?)(u|us|ms|s|m|h|d|w)?")
+_NOW: Final = re.compile(r"now\((.*)\)")
+_RANGE: Final = re.compile(r"([\[\]])(.*?)(\.\.|;)(.*)([\[\]])")
+_FOREVER_NS: Final = 1 << 63
+
+
+class BadRange(ValueError):
+    """A `_time` or `last` that cannot be read; its text says how to write one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """One published value; `time_ns`: ns since the epoch."""
+
+    time_ns: int
+    payload: bytes
+
+
+class Ring:
+    """The last values of one key, oldest first."""
+
+    def __init__(self, size: int) -> None:
+        self._values: deque[Value] = deque(maxlen=size)
+
+    def add(self, time_ns: int, payload: bytes) -> None:
+        """Keep a value; the oldest goes."""
+        self._values.append(Value(time_ns, payload))
+
+    def select(self, *, time_range: str | None, last: str | None, now_ns: int) -> list[Value]:
+        """The latest value, or those in a time range, or the last so many; raises BadRange."""
+        if time_range is None and last is None:
+            return [self._values[-1]] if self._values else []
+        values = list(self._values)
+        if time_range is not None:
+            begin, end = parse_range(time_range, now_ns)
+            values = [value for value in values if begin <= value.time_ns < end]
+        if last is not None:
+            if not last.isdecimal() or not last.isascii() or int(last) < 1:
+                raise BadRange(f"last={last}: give a whole number from 1 on, at most {RING} are kept")
+            values = values[-int(last) :]
+        return values
+
+
+def parse_range(text: str, now_ns: int) -> tuple[int, int]:
+    """The half-open range [begin, end) of a Zenoh time range, ns since the epoch; raises BadRange."""
+    match = _RANGE.fullmatch(text.strip())
+    if match is None:
+        raise _bad(text)
+    opening, first, between, second, closing = match.groups()
+    begin = _instant(first, now_ns, text) if first else 0
+    if between == ";":
+        if not first or not second:
+            raise _bad(text)
+        end = begin + _duration_ns(second, text)
+    else:
+        end = _instant(second, now_ns, text) if second else _FOREVER_NS
+    return begin + (opening == "]"), end + (closing == "]")
+
+
+def _instant(text: str, now_ns: int, whole: str) -> int:
+    found = _NOW.fullmatch(text)
+    if found is not None:
+        return now_ns + (_duration_ns(found[1], whole) if found[1] else 0)
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise _bad(whole) from None
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    return int(moment.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
+
+
+def _duration_ns(text: str, whole: str) -> int:
+    found = _DURATION.fullmatch(text)
+    if found is None:
+        raise _bad(whole)
+    return round(float(found[1]) * _UNITS_NS[found[2] or "s"])
+
+
+def _bad(text: str) -> BadRange:
+    return BadRange(
+        f"_time={text} cannot be read: write [now(-30s)..], [now(-1m)..now(-30s)] or [2026-11-21T04:00:00Z;10s] "
+        "(units u, ms, s, m, h, d, w)"
+    )

@@ -1,0 +1,332 @@
+"""One car's publications: readings, frames, states and records become messages under its keys, and answers to queries.
+
+What is published is decided elsewhere (`protocol.profile` for readings, `control` for states); here it gets its form.
+"""
+
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import zenoh
+
+from gateway.control import battery
+from gateway.control.controller import Controller
+from gateway.control.link_health import LinkHealth
+from gateway.control.records import CommandRecord, Level, LogRecord, Write
+from gateway.history import RING, BadRange, Ring
+from gateway.protocol.profile import Profile
+from gateway.protocol.readings import ArmReading, Echo, Event, ImuReading, Rejected, Sensors
+from gateway.protocol.values import Mode
+from schemas import bus, keys, messages, topics
+from schemas.gen import fleet_v1_pb2 as pb
+
+VERSION: Final = "0.1.0"
+STATE_EVERY_S: Final = 1.0
+"""States are published on change and once a second (design.md, "Keys")."""
+_CLASSES: Final[dict[str, Any]] = {
+    topic.name: messages.message_class(topic.message)
+    for topic in topics.CAR_TOPICS
+    if topic.message.startswith("fleet.v1.")
+}
+_LEVELS: Final = {Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
+
+
+def wall_ns(at: float) -> int:
+    """The wall clock, ns since the epoch, at moment `at` of the loop's monotonic clock."""
+    return time.time_ns() - int((time.monotonic() - at) * 1e9)
+
+
+class Publications:
+    """Publishers, latest values and rings of one car."""
+
+    def __init__(self, opened: bus.Bus, fleet: str, car: str, profile: Profile, url: str) -> None:
+        self._fleet = fleet
+        self._car = car
+        self._profile = profile
+        self._url = url
+        self._publishers: dict[str, bus.Publisher] = {}
+        self._rings: dict[str, Ring] = {}
+        self._scratch: dict[str, Any] = {}
+        self._told: dict[str, tuple[object, ...]] = {}
+        self._told_at: dict[str, float] = {}
+        for topic in topics.CAR_TOPICS:
+            if topic.family == "sim":
+                continue
+            key = keys.topic_key(fleet, car, topic.name)
+            self._publishers[topic.name] = opened.publisher(key, topic, car)
+            if topic.family in ("sensor", "state"):
+                self._rings[topic.name] = Ring(RING if topic.family == "sensor" else 1)
+            if topic.name in _CLASSES:
+                self._scratch[topic.name] = _CLASSES[topic.name]()
+        self._process = _Process()
+
+    # ------------------------------------------------------------------ readings
+
+    def event(self, event: Event, stamp_ns: int, confirmed: Mode | None, *, loaded: bool) -> None:
+        """Publish what was measured in an event, then the event itself. `loaded`: motors may pull the battery down."""
+        published: list[str] = []
+        match event:
+            case Sensors():
+                verdict = "sensors"
+                self._sensors(event, stamp_ns, confirmed, published, loaded=loaded)
+            case ArmReading():
+                verdict = "arm"
+                if all(joint is not None for joint in event.joint_deg):
+                    message = self._cleared("sensor/arm")
+                    message.joint_deg.extend(event.joint_deg)
+                    self._reading("sensor/arm", message, stamp_ns, published)
+            case ImuReading():
+                verdict = "imu"
+                message = self._cleared("sensor/imu")
+                message.gyro_x_raw, message.gyro_y_raw, message.gyro_z_raw = event.gyro
+                message.accel_x_raw, message.accel_y_raw, message.accel_z_raw = event.accel
+                self._reading("sensor/imu", message, stamp_ns, published)
+            case Echo():
+                verdict = "echo"
+            case Rejected():
+                verdict = str(event.cause)
+        frame = self._cleared("frame/rx")
+        frame.data = event.raw
+        frame.verdict = verdict
+        frame.published.extend(published)
+        self._publishers["frame/rx"].put(frame, stamp_ns)
+
+    def _sensors(
+        self, event: Sensors, stamp_ns: int, confirmed: Mode | None, published: list[str], *, loaded: bool
+    ) -> None:
+        measured = self._profile.measured(event, confirmed)
+        if "range" in measured and event.range_cm is not None:
+            message = self._cleared("sensor/range")
+            message.no_echo = event.range_cm == 0
+            if event.range_cm:
+                message.range_m = event.range_cm / 100
+            self._reading("sensor/range", message, stamp_ns, published)
+        if "battery" in measured and event.voltage_v is not None:
+            message = self._cleared("sensor/battery")
+            message.voltage_v = event.voltage_v
+            message.charge, message.charge_error = battery.charge(event.voltage_v, loaded=loaded)
+            message.level = battery.level(event.voltage_v)
+            self._reading("sensor/battery", message, stamp_ns, published)
+        if "grayscale" in measured and event.grayscale is not None:
+            message = self._cleared("sensor/grayscale")
+            message.raw = event.grayscale
+            self._reading("sensor/grayscale", message, stamp_ns, published)
+        if "line" in measured and event.line is not None:
+            message = self._cleared("sensor/line")
+            message.left_outer, message.left_inner, message.right_inner, message.right_outer = event.line
+            self._reading("sensor/line", message, stamp_ns, published)
+        obstacle = self._profile.obstacle(event, confirmed)
+        if obstacle is not None:
+            message = self._cleared("sensor/obstacle")
+            message.left, message.right = obstacle
+            self._reading("sensor/obstacle", message, stamp_ns, published)
+        if "light" in measured and event.light is not None:
+            message = self._cleared("sensor/light")
+            message.left, message.right = event.light
+            self._reading("sensor/light", message, stamp_ns, published)
+
+    def _reading(self, name: str, message: Any, stamp_ns: int, published: list[str]) -> None:
+        self._rings[name].add(stamp_ns, self._publishers[name].put(message, stamp_ns))
+        published.append(name)
+
+    def _cleared(self, name: str) -> Any:
+        message = self._scratch[name]
+        message.Clear()
+        return message
+
+    # ------------------------------------------------------------------ frames out, records
+
+    def written(self, write: Write, stamp_ns: int, *, whole: bool) -> None:
+        """Publish a frame that was written, or was not."""
+        frame = self._cleared("frame/tx")
+        frame.data = write.data
+        frame.command_id = write.command_id
+        frame.why = write.why
+        frame.written = whole
+        self._publishers["frame/tx"].put(frame, stamp_ns)
+
+    def command(self, record: CommandRecord, request: tuple[bytes, str] | None) -> None:
+        """Publish one transition of a command; the first carries the request as it came."""
+        event = self._cleared("event/command")
+        command = record.command
+        event.id = command.id
+        event.verb = command.verb
+        event.sender = command.sender.name
+        event.kind = command.sender.kind
+        event.phase = record.phase
+        event.reason = record.reason or ""
+        event.words = record.words
+        event.age_s = command.age_s
+        event.worst_case_s = record.worst_case_s
+        event.took_s = record.took_s
+        event.count = record.count
+        event.evidence.extend(record.evidence)
+        if request is not None:
+            event.request, event.request_encoding = request
+        self._publishers["event/command"].put(event, wall_ns(record.at))
+
+    def log(self, record: LogRecord) -> None:
+        """Publish a notable event as foxglove.Log."""
+        stamp_ns = wall_ns(record.at)
+        message: Any = messages.message_class("foxglove.Log")()
+        message.timestamp.seconds, message.timestamp.nanos = divmod(stamp_ns, 1_000_000_000)
+        message.level = _LEVELS[record.level]
+        message.name = f"{self._car} {record.code}"
+        message.message = record.words
+        self._publishers["event/log"].put(message, stamp_ns)
+
+    # ------------------------------------------------------------------ states
+
+    def states(self, control: Controller, health: LinkHealth, now: float, *, force: bool = False) -> None:
+        """Publish each state that changed, and all of them once a second."""
+        mode, hold = control.mode, control.hold
+        changes: dict[str, tuple[object, ...]] = {
+            "state/link": (health.state, health.reconnects, health.state == "lost" and health.reason),
+            "state/mode": (mode.asked, mode.inferred, mode.verdict),
+            "state/motion": (control.motion, control.owner, control.fan, control.servo_deg, control.speed),
+            "state/safety": (hold, control.motors),
+        }
+        for name, told in changes.items():
+            late = now - self._told_at.get(name, float("-inf")) >= STATE_EVERY_S
+            if force or late or self._told.get(name) != told:
+                self._told[name] = told
+                self._state(name, control, health, now)
+
+    def _state(self, name: str, control: Controller, health: LinkHealth, now: float) -> None:
+        message = self._cleared(name)
+        match name:
+            case "state/link":
+                _fill_link(message, health, self._url, now)
+            case "state/mode":
+                _fill_mode(message, control, now)
+            case "state/motion":
+                _fill_motion(message, control, now)
+            case _:
+                _fill_safety(message, control, now)
+        self._put_state(name, message, now)
+
+    def health(self, now: float, *, loop_lag_s: float, bus_drops: int) -> None:
+        """Publish what the gateway's process does."""
+        message = self._cleared("state/health")
+        self._process.fill(message, now)
+        message.host = socket.gethostname()
+        message.link = self._url
+        message.version = VERSION
+        message.platform = self._profile.name
+        message.platform_evidence.extend(self._profile.not_observed)
+        message.capabilities.extend(sorted(self._profile.capabilities))
+        message.loop_lag_s = loop_lag_s
+        message.bus_drops = bus_drops
+        self._put_state("state/health", message, now)
+
+    def _put_state(self, name: str, message: Any, now: float) -> None:
+        self._told_at[name] = now
+        stamp_ns = wall_ns(now)
+        self._rings[name].add(stamp_ns, self._publishers[name].put(message, stamp_ns))
+
+    # ------------------------------------------------------------------ queries
+
+    def answer(self, query: zenoh.Query) -> None:
+        """Answer a query on `sensor/*` or `state/*`: the latest value, or the history that it asks for."""
+        with query:
+            parameters = query.parameters
+            form = parameters.get("format") or "protobuf"
+            if form not in ("protobuf", "json"):
+                query.reply_err(f"format={form}: allowed are json and protobuf", encoding="text/plain")
+                return
+            for name, ring in self._rings.items():
+                publisher = self._publishers[name]
+                if not query.key_expr.intersects(publisher.key):
+                    continue
+                try:
+                    values = ring.select(
+                        time_range=parameters.get("_time"), last=parameters.get("last"), now_ns=time.time_ns()
+                    )
+                except BadRange as error:
+                    query.reply_err(str(error), encoding="text/plain")
+                    return
+                encoding = messages.encoding_of(publisher.topic.message)
+                for value in values:
+                    if form == "json":
+                        text = messages.to_json(messages.parse(publisher.topic.message, value.payload, encoding))
+                        bus.reply(query, publisher.key, text.encode(), messages.JSON)
+                    else:
+                        bus.reply(query, publisher.key, value.payload, encoding)
+
+
+def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> None:
+    message.state = health.state
+    message.reason = health.reason
+    message.url = url
+    message.rx_bytes = health.rx_bytes
+    message.tx_bytes = health.tx_bytes
+    message.rx_frames = health.rx_frames
+    message.tx_frames = health.tx_frames
+    message.rejects.update(health.rejects)
+    message.reconnects = health.reconnects
+    message.tx_airtime = health.airtime(now)
+    message.since_s = now - health.since
+    message.last_rx_s = -1.0 if health.last_rx_at is None else now - health.last_rx_at
+
+
+def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
+    mode = control.mode
+    message.asked = mode.asked or "unknown"
+    message.inferred = mode.inferred or "unknown"
+    message.verdict = mode.verdict
+    message.evidence = mode.evidence
+    message.evidence_age_s = 0.0 if mode.evidence_at is None else max(0.0, now - mode.evidence_at)
+    message.candidates.extend(mode.candidates)
+
+
+def _fill_motion(message: pb.Motion, control: Controller, now: float) -> None:
+    message.motion = control.motion or "unknown"
+    message.source = "unknown" if control.motion is None else "commanded" if control.owner else "assumed"
+    message.speed = control.profile.speed.fraction(control.speed)
+    message.owner = control.owner
+    message.expires_in_s = control.expires_in_s(now)
+    message.fan = bool(control.fan)
+    if control.servo_deg is not None:
+        message.servo_deg = control.servo_deg
+
+
+def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
+    if control.hold is not None:
+        message.hold.by = control.hold.by
+        since_ns = wall_ns(control.hold.since)
+        message.hold.since.seconds, message.hold.since.nanos = divmod(since_ns, 1_000_000_000)
+    message.motors = control.motors
+    message.worst_stop_s = control.worst_stop_s(now)
+
+
+class _Process:
+    """CPU, memory and age of this process."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+        self._cpu_s = time.process_time()
+        self._at = self._started
+
+    def fill(self, message: pb.Health, now: float) -> None:
+        cpu_s = time.process_time()
+        message.pid = os.getpid()
+        message.uptime_s = now - self._started
+        message.cpu = (cpu_s - self._cpu_s) / max(now - self._at, 1e-3)
+        message.rss_mb = _rss_mb()
+        self._cpu_s, self._at = cpu_s, now
+
+
+def _rss_mb() -> float:
+    statm = Path("/proc/self/statm")
+    if statm.exists():
+        pages = int(statm.read_text(encoding="ascii").split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3

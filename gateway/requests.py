@@ -1,0 +1,235 @@
+"""From a payload on a command key to a command that control understands, or words that say what is wrong with it.
+
+Ranges are checked here, at the edge; whether the car may do it now is the arbiter's.
+"""
+
+import math
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from gateway.control.records import (
+    Act,
+    ChangeSpeed,
+    Command,
+    Drive,
+    Fan,
+    Find,
+    Kind,
+    Reason,
+    Resume,
+    Sender,
+    SetMode,
+    Stop,
+    What,
+)
+from gateway.protocol.encode import ArmSet, ColorLed, EncodeError, General, Ptz, encode
+from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from schemas import messages
+from schemas.topics import COMMANDS
+
+LONGEST_DRIVE_S: Final = 10.0
+"""A drive that holds longer is refused: whoever drives is there to say so again."""
+_DRIVE_TTL_S: Final = 0.5
+_TTL_S: Final = 2.0  # messages.md: greatest age at arrival, default 0.5 for drive, 2 for the rest
+_WITHOUT_PAYLOAD: Final = ("stop", "estop")
+BY_WILDCARD: Final = ("stop", "estop", "resume")
+"""Verbs that may be asked of several cars with one query (design.md, "Keys")."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What came: the verb, the payload, and how old it is."""
+
+    verb: str
+    payload: bytes | None
+    encoding: str
+    now_ns: int
+    """Wall clock, ns since the epoch."""
+    sampled_ns: int | None = None
+    """Zenoh timestamp of a publication; None for a query."""
+    by_wildcard: bool = False
+    """It was asked of several cars with one key expression."""
+
+    @property
+    def streamed(self) -> bool:
+        """It came as a publication: nobody waits for an answer."""
+        return self.sampled_ns is not None
+
+
+class BadRequest(ValueError):
+    """A request that is no command. Carries what is known of it, so that the refusal can be recorded under its id."""
+
+    def __init__(self, reason: Reason, words: str, command: Command) -> None:
+        super().__init__(words)
+        self.reason = reason
+        self.words = words
+        self.command = command
+
+
+def parse(request: Request) -> Command:
+    """The command in a request; raises BadRequest."""
+    verb = request.verb
+    blank = Command(uuid.uuid4().hex, verb, Sender(), Stop())
+    if verb not in COMMANDS:
+        words = f"{verb!r} is no command; there are: {', '.join(COMMANDS)}"
+        raise BadRequest(Reason.UNSUPPORTED, words, blank)
+    if request.by_wildcard and verb not in BY_WILDCARD:
+        words = f"{verb} cannot be asked by wildcard: name one car (only {', '.join(BY_WILDCARD)} can)"
+        raise BadRequest(Reason.BAD_VALUE, words, blank)
+    if request.payload is None and verb not in _WITHOUT_PAYLOAD:
+        words = f"{verb} without a payload: give {COMMANDS[verb]} or its JSON (only stop and estop need none)"
+        raise BadRequest(Reason.BAD_VALUE, words, blank)
+    try:
+        message: Any = messages.parse(COMMANDS[verb], request.payload or b"", _encoding(request))
+    except messages.BadPayload as error:
+        raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", blank) from None
+    command = Command(message.id or blank.id, verb, Sender(message.sender or "anonymous"), Stop())
+    try:
+        sender = Sender(_sender(message.sender), _word("kind", message.kind or Kind.SCRIPT, Kind))
+        command = Command(command.id, verb, sender, Stop())
+        ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
+        what = _WHAT[verb](message)
+    except NotImplementedError as error:
+        raise BadRequest(Reason.UNSUPPORTED, f"{verb}: {error}", command) from None
+    except (ValueError, EncodeError) as error:
+        raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", command) from None
+    if message.take:
+        words = f"{verb}: take is not supported yet: ask without it"
+        raise BadRequest(Reason.UNSUPPORTED, words, command)
+    return Command(
+        command.id,
+        verb,
+        sender,
+        what,
+        age_s=_age_s(message, request),
+        ttl_s=ttl_s if ttl_s is not None else _DRIVE_TTL_S if verb == "drive" else _TTL_S,
+        streamed=request.streamed,
+    )
+
+
+def _encoding(request: Request) -> str:
+    if request.payload:
+        return request.encoding
+    return messages.PROTOBUF  # zero bytes are a message without fields
+
+
+def _age_s(message: Any, request: Request) -> float:
+    """Seconds since it was asked; a clock that is ahead of ours gives 0, not a bonus."""
+    if message.HasField("asked"):
+        asked_ns = message.asked.seconds * 1_000_000_000 + message.asked.nanos
+    elif request.sampled_ns is not None:
+        asked_ns = request.sampled_ns
+    else:
+        return 0.0
+    age_ns: int = request.now_ns - asked_ns
+    return max(0.0, age_ns / 1e9)
+
+
+def _sender(name: str) -> str:
+    if set(name) & set("/*$#?"):
+        raise ValueError(f"sender {name!r} is not allowed: no /, *, $, # or ?")
+    return name or "anonymous"
+
+
+def _word(field: str, value: str, kind: Any) -> Any:
+    try:
+        return kind(value)
+    except ValueError:
+        given = f"{field} {value!r}" if value else f"no {field} given"
+        raise ValueError(f"{given}: allowed are {', '.join(kind)}") from None
+
+
+def _seconds(field: str, value: float, top: float) -> float:
+    if not (math.isfinite(value) and 0 < value <= top):
+        raise ValueError(f"{field} {value:g}: allowed are more than 0 and at most {top:g} s")
+    return value
+
+
+def _drive(message: Any) -> What:
+    duration_s = 0.5
+    if message.HasField("duration_s"):
+        duration_s = _seconds("duration_s", message.duration_s, LONGEST_DRIVE_S)
+    return Drive(_word("motion", message.motion, Motion), duration_s)
+
+
+def _mode(message: Any) -> What:
+    return SetMode(_word("mode", message.mode, Mode))
+
+
+def _led(message: Any) -> What:
+    missing = [name for name in "rgb" if not message.HasField(name)]
+    if missing:
+        raise ValueError(f"no {', '.join(missing)} given: r, g and b are needed, 0..255 each")
+    return _checked(ColorLed(message.r, message.g, message.b))
+
+
+def _light(message: Any) -> What:
+    return Act(General(Motion.STOP, light=_word("light", message.light, Light)))
+
+
+_SERVO_ACTIONS: Final = {
+    "front": ("left", "right", "reset"),
+    "vertical": ("up", "down", "reset"),
+    "horizontal": ("left", "right", "reset"),
+}
+
+
+def _servo(message: Any) -> What:
+    servo = message.servo or "front"
+    if servo not in _SERVO_ACTIONS:
+        raise ValueError(f"servo {servo!r}: allowed are {', '.join(_SERVO_ACTIONS)}")
+    if message.HasField("deg"):
+        if servo != "front" or message.action:
+            raise ValueError("deg: only the front servo takes degrees, and no action beside them")
+        return _checked(Ptz(message.deg))
+    if message.action not in _SERVO_ACTIONS[servo]:
+        raise ValueError(
+            f"action {message.action!r} of servo {servo}: allowed are {', '.join(_SERVO_ACTIONS[servo])}"
+            + (", or deg 0..180" if servo == "front" else "")
+        )
+    return Act(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
+
+
+def _arm(message: Any) -> What:
+    return _checked(ArmSet(tuple(message.joint_deg)))
+
+
+def _fan(message: Any) -> What:
+    if message.state not in ("", "on", "off"):
+        raise ValueError(f"state {message.state!r}: allowed are on, off, or none to toggle")
+    return Fan(None if not message.state else message.state == "on")
+
+
+def _lease(_: Any) -> What:
+    raise NotImplementedError("leases are not supported yet")
+
+
+def _resume(message: Any) -> What:
+    if message.ids:
+        raise NotImplementedError("no e-stop is latched yet, so there are no ids to end: leave them out to end a hold")
+    return Resume()
+
+
+def _checked(frame: ColorLed | Ptz | ArmSet) -> Act:
+    encode(frame)  # raises EncodeError with the field and its range
+    return Act(frame)
+
+
+_WHAT: Final[dict[str, Callable[[Any], What]]] = {
+    "drive": _drive,
+    "mode": _mode,
+    "led": _led,
+    "light": _light,
+    "servo": _servo,
+    "arm": _arm,
+    "whistle": lambda _: Act(General(Motion.STOP, whistle=True)),
+    "speed": lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
+    "fan": _fan,
+    "stop": lambda _: Stop(),
+    "estop": lambda _: Stop(emergency=True),
+    "resume": _resume,
+    "lease": _lease,
+    "find": lambda _: Find(),
+}
