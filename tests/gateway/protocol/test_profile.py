@@ -1,0 +1,139 @@
+"""The table of platforms, the times, and what of a frame is measured."""
+
+import pytest
+
+from gateway.protocol.decode import Decoder, Sensors
+from gateway.protocol.encode import ArmSet, parse_sent
+from gateway.protocol.profile import Platform, StopStyle, parse_platform
+from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, mode_open_s
+from gateway.protocol.values import Mode, SpeedStep
+from tests.support.vectors import ids, rows, wire
+
+PLATFORMS, PLACEHOLDERS, BLOCKS, TURNS = rows("platforms"), rows("placeholders"), rows("blocks"), rows("turns")
+SPEED, CONTRADICTIONS = rows("speed"), rows("contradictions")
+ALL = "range battery grayscale line obstacle light"
+
+
+def sensors(raw: bytes, ended: str) -> Sensors:
+    decoder = Decoder()
+    event = (decoder.feed(raw + (b"$" if ended == "$" else b""), 1.0) + decoder.tick(2.0))[0]
+    assert isinstance(event, Sensors)
+    assert (event.terminated, event.by_silence) == (ended == "#", ended == "silence")
+    return event
+
+
+@pytest.mark.parametrize("platform", Platform)
+@pytest.mark.parametrize("row", PLATFORMS, ids=ids(PLATFORMS))
+def test_what_a_platform_knows(row: dict[str, str], platform: Platform) -> None:
+    frame = parse_sent(wire(row["bytes"]))
+    assert frame is not None
+    known, option = row[platform] == "yes", row[platform].startswith("+")
+    words = parse_platform(platform).refusal(frame)
+    assert (words is None) is known
+    assert words is None or str(platform) in words or platform is Platform.UNKNOWN or "any car" in words
+    assert (parse_platform(f"{platform}+arm").refusal(frame) is None) is (known or option)
+
+
+@pytest.mark.parametrize("row", BLOCKS, ids=ids(BLOCKS))
+def test_how_long_a_frame_blocks(row: dict[str, str]) -> None:
+    frame = parse_sent(wire(row["bytes"]))
+    assert frame is not None
+    assert parse_platform(row["platform"]).block_s(frame) == pytest.approx(float(row["seconds"]))
+
+
+def test_the_longest_block_outside_avoidance() -> None:
+    profile = parse_platform("unknown+arm")
+    frames = [parse_sent(wire(row["bytes"])) for row in PLATFORMS]
+    assert max(profile.block_s(frame) for frame in frames if frame) == pytest.approx(LONGEST_BLOCK_S)
+    assert mode_open_s(Mode.FOLLOWING) == pytest.approx(LONGEST_BLOCK_S)
+    assert profile.block_s(ArmSet((0,) * 6)) > FRAME_S
+
+
+@pytest.mark.parametrize("row", TURNS, ids=ids(TURNS))
+def test_the_turn_and_rate_of_each_mode(row: dict[str, str]) -> None:
+    profile, mode = parse_platform("arduino"), Mode(row["mode"])
+    assert profile.mode_turn_s(mode) == float(row["seconds"])
+    assert profile.rate_hz(mode) == float(row["hz"])
+    assert (mode in profile.silent_modes) is (float(row["hz"]) == 0)
+
+
+def test_every_mode_has_a_turn() -> None:
+    assert {row["mode"] for row in TURNS} == set(Mode)
+
+
+@pytest.mark.parametrize("platform", Platform)
+@pytest.mark.parametrize("row", PLACEHOLDERS, ids=ids(PLACEHOLDERS))
+def test_what_is_measured(row: dict[str, str], platform: Platform) -> None:
+    event, profile = sensors(wire(row["bytes"]), row["ended"]), parse_platform(platform)
+    assert event.candidates == tuple(map(Mode, row["candidates"].split()))
+    assert event.signature == (event.candidates[0] if len(event.candidates) == 1 else None)
+    assert profile.measured(event) == set((ALL if row[platform] == "all" else row[platform]).split())
+    obstacle = None if row["obstacle"] == "-" else tuple(bit == "1" for bit in row["obstacle"])
+    assert profile.obstacle(event) == obstacle
+
+
+def test_a_confirmed_mode_chooses_among_candidates_and_decides_nothing_else() -> None:
+    profile = parse_platform("arduino")
+    either = sensors(b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM00", "silence")
+    assert profile.measured(either, Mode.FOLLOWING) == {"obstacle"}
+    assert profile.obstacle(either, Mode.FOLLOWING) == (True, True)
+    assert profile.measured(either, Mode.LIGHT_SEEKING) == {"light"}
+    assert profile.obstacle(either, Mode.LIGHT_SEEKING) is None
+    assert profile.measured(either, Mode.MANUAL) == set()
+    tracking = sensors(b"$4WD,CSB0,PV8,GS0,LF0110,HW00,GM00#", "#")
+    assert profile.measured(tracking, Mode.MANUAL) == {"line"}, "the frame's text is the evidence"
+
+
+@pytest.mark.parametrize("platform", ["arduino", "stm32", "raspberry_pi"])
+@pytest.mark.parametrize("row", CONTRADICTIONS, ids=ids(CONTRADICTIONS))
+def test_what_speaks_against_a_platform(row: dict[str, str], platform: str) -> None:
+    event = sensors(wire(row["bytes"]), "#")
+    expected = [words for words in row[platform].split(", ") if words]
+    found = parse_platform(platform).contradictions(event)
+    assert len(found) == len(expected)
+    assert all(words in text for words, text in zip(expected, found, strict=True))
+    assert parse_platform("unknown").contradictions(event) == ()
+
+
+@pytest.mark.parametrize("row", SPEED, ids=ids(SPEED))
+def test_speed_is_counted_in_steps(row: dict[str, str]) -> None:
+    model = parse_platform(row["platform"]).speed
+    value, values = model.start, []
+    for word in row["steps"].split():
+        value = model.step(value, SpeedStep(word))
+        values.append(value)
+    assert values == [float(text) for text in row["values"].split()]
+    assert model.fraction(value) == pytest.approx(float(row["fraction"]), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("platform", "modes", "stop", "observed", "capabilities"),
+    [
+        ("arduino", 7, StopStyle.MODE_FRAME, True, "drive whistle speed servo fan light servo_deg led mode"),
+        ("stm32", 7, StopStyle.MODE_FRAME, False, "drive whistle speed servo fan light servo_deg led mode"),
+        (
+            "raspberry_pi",
+            1,
+            StopStyle.RASPBERRY_PI,
+            False,
+            "drive whistle speed servo fan light servo_vertical servo_horizontal",
+        ),
+        ("unknown", 1, StopStyle.UNKNOWN, False, "drive whistle speed servo fan light"),
+    ],
+)
+def test_a_platform_at_a_glance(platform: str, modes: int, stop: StopStyle, observed: bool, capabilities: str) -> None:
+    profile = parse_platform(platform)
+    assert profile.name == platform
+    assert len(profile.modes) == modes
+    assert profile.stop_style is stop
+    assert profile.observed is observed
+    assert profile.capabilities == set(capabilities.split())
+    both = parse_platform(f"{platform}+imu+arm")
+    assert both.name == f"{platform}+arm+imu"
+    assert both.capabilities == profile.capabilities | {"arm", "imu"}
+
+
+@pytest.mark.parametrize("text", ["", "esp32", "Arduino", "arduino+", "arduino+wings", "+arm", "arduino imu"])
+def test_a_platform_that_is_none_is_refused_with_the_words_allowed(text: str) -> None:
+    with pytest.raises(ValueError, match=r"platform .* allowed are arduino, stm32, raspberry_pi, unknown, each with"):
+        parse_platform(text)

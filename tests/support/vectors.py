@@ -1,0 +1,25 @@
+"""Reads tests/vectors/*.tsv: one row per line of protocol.md's tables, its `source` naming the section and row."""
+
+from pathlib import Path
+
+_VECTORS = Path(__file__).resolve().parents[1] / "vectors"
+
+
+def rows(name: str) -> list[dict[str, str]]:
+    """The rows of one file as dicts by column; every row has as many columns as the header, and a source."""
+    lines = (_VECTORS / f"{name}.tsv").read_text(encoding="utf-8").splitlines()
+    header, *table = [line.split("\t") for line in lines if line and not line.startswith("// ")]
+    assert "source" in header, name
+    found = [dict(zip(header, row, strict=True)) for row in table]
+    assert all(row["source"] for row in found), name
+    return found
+
+
+def ids(table: list[dict[str, str]]) -> list[str]:
+    """Test ids: the source and the first column."""
+    return [f"{row['source']}: {next(iter(row.values()))}" for row in table]
+
+
+def wire(text: str) -> bytes:
+    """The bytes of a cell; Python escapes such as \\r and \\xff are allowed."""
+    return text.encode("latin-1").decode("unicode_escape").encode("latin-1")
