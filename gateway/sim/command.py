@@ -109,6 +109,7 @@ async def _serve(
     specs: Sequence[CarSpec], faults: Sequence[Scheduled], args: argparse.Namespace, endpoint: str | None
 ) -> None:
     loop = asyncio.get_running_loop()
+    parent = os.getppid()
     ended = asyncio.Event()
     _on_signals(loop, ended)
     simulation = Simulation(specs, seed=args.seed, world=WORLDS[args.world]())
@@ -119,7 +120,7 @@ async def _serve(
 
         tasks.append(loop.create_task(TruthPublisher(simulation, endpoint, args.fleet).run()))
     if args.with_parent:
-        tasks.append(loop.create_task(_watch_parent(ended)))
+        tasks.append(loop.create_task(_watch_parent(parent, ended)))
     lines: asyncio.Queue[bytes] = asyncio.Queue()
     tasks.append(loop.create_task(_obey(simulation, lines)))
     for task in tasks:
@@ -155,8 +156,7 @@ async def _strike(simulation: Simulation, scheduled: Scheduled) -> None:
         _fail(str(error), 1)
 
 
-async def _watch_parent(ended: asyncio.Event) -> None:
-    parent = os.getppid()
+async def _watch_parent(parent: int, ended: asyncio.Event) -> None:
     while os.getppid() == parent:  # noqa: ASYNC110 - the system tells of a dead parent in no other portable way
         await asyncio.sleep(PARENT_EVERY_S)
     ended.set()

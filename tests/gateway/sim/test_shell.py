@@ -1,0 +1,375 @@
+"""The running simulator: its links, faults that come and go, and the process around it."""
+
+import asyncio
+import contextlib
+import itertools
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from gateway.sim.links import LinkError
+from gateway.sim.shell import Simulation
+from gateway.sim.spec import Fault, FaultKind, parse_cars
+from schemas.bus import Bus, Sample
+from tests.gateway.sim.strangers import MODE00, RUN, STOP, opening
+
+PATIENCE = 20.0
+
+
+async def until(so: Any, what: str) -> None:
+    end = time.monotonic() + PATIENCE
+    while not so():
+        assert time.monotonic() < end, f"never: {what}"
+        await asyncio.sleep(0.005)
+
+
+@pytest.fixture
+async def pair(tmp_path: Path) -> AsyncIterator[Simulation]:
+    specs = parse_cars([f"red:arduino:pty:{tmp_path / 'red'}", "blue:raspberry_pi:tcp", "green:arduino:tcp"])
+    simulation = Simulation(specs, seed=1)
+    await simulation.start()
+    yield simulation
+    await simulation.stop()
+
+
+def where(simulation: Simulation, name: str) -> tuple[str, int]:
+    host, _, port = simulation.cars[name].url.removeprefix("tcp://").rpartition(":")
+    return host, int(port)
+
+
+async def test_a_pty_is_paced_at_9600_baud_both_ways(pair: Simulation) -> None:
+    car = pair.cars["red"]
+    with serial.Serial(car.url.removeprefix("serial://"), timeout=0) as port:
+        begun = time.monotonic()
+        for _ in range(4):
+            port.write(RUN + STOP)
+        port.write(b"$1,0,0,0,0,0,0,0,0#")
+        await until(lambda: len(car.firmware.motor_log) == 10, "all nine frames obeyed, each by itself")
+        assert time.monotonic() - begun >= 9 * 19 / 960 - 0.005
+        log = list(car.firmware.motor_log)
+        assert all(b[0] - a[0] >= 19 / 960 - 1e-6 for a, b in itertools.pairwise(log[1:]))
+        port.write(opening(2))
+        data = bytearray()
+        await until(
+            lambda: data.extend(port.read(4096)) or (b"LF" in data[-40:] and car.truth.mode == "tracking"), "tracks"
+        )
+        data.clear()
+        begun = time.monotonic()
+        await until(lambda: data.extend(port.read(4096)) or len(data) > 1500, "talks")
+        assert time.monotonic() - begun >= 1500 / 960 - 0.2
+
+
+async def test_a_firehose_is_held_back_not_hoarded(pair: Simulation) -> None:
+    car = pair.cars["red"]
+    with serial.Serial(car.url.removeprefix("serial://"), write_timeout=0.2) as port:
+        with pytest.raises(serial.SerialTimeoutException):
+            await asyncio.to_thread(port.write, b"$4WD,nonsense#" * 20_000)
+        assert car.firmware.backlog(asyncio.get_running_loop().time()) < 1000
+
+
+async def test_a_dropped_pty_is_gone_and_comes_back_under_its_name(pair: Simulation, tmp_path: Path) -> None:
+    path = tmp_path / "red"
+    first = path.readlink()
+    with serial.Serial(str(path), timeout=5) as port:
+        port.write(opening(2))
+        await until(lambda: pair.cars["red"].truth.mode == "tracking", "opened")
+
+        def read_on() -> None:
+            while True:
+                port.read(4096)
+
+        reading = asyncio.create_task(asyncio.to_thread(read_on))
+        await pair.inflict(Fault(FaultKind.LINK_DROP, "red"))
+        with pytest.raises(serial.SerialException):
+            await asyncio.wait_for(reading, PATIENCE)
+        assert not path.is_symlink()
+    await pair.inflict(Fault(FaultKind.LINK_DROP, "red", for_s=0))
+    assert path.readlink() == first or str(path.readlink()).startswith("/dev/")
+    with serial.Serial(str(path), timeout=0) as port:
+        data = bytearray()
+        await until(lambda: data.extend(port.read(4096)) or b"CSB0,PV8" in data, "still tracking")
+        port.write(MODE00)
+        await until(lambda: pair.cars["red"].truth.mode == "manual", "hears again")
+
+
+async def test_a_dropped_tcp_link_resets_refuses_and_comes_back_by_itself(pair: Simulation) -> None:
+    host, port = where(pair, "green")
+    reader, writer = await asyncio.open_connection(host, port)
+    writer.write(RUN)
+    await until(lambda: pair.cars["green"].truth.driving, "drives")
+    await pair.inflict(Fault(FaultKind.LINK_DROP, "green", for_s=1.0))
+    with pytest.raises(ConnectionResetError):
+        await asyncio.wait_for(_drain(reader), PATIENCE)
+    writer.close()
+    with pytest.raises(ConnectionRefusedError):
+        await asyncio.open_connection(host, port)
+    assert pair.cars["green"].truth.driving
+
+    async def answers() -> bool:
+        try:
+            _, again = await asyncio.open_connection(host, port)
+        except ConnectionRefusedError:
+            return False
+        again.write(STOP)
+        await again.drain()
+        again.close()
+        return True
+
+    end = time.monotonic() + PATIENCE
+    while not await answers():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.05)
+    await until(lambda: not pair.cars["green"].truth.driving, "stops")
+
+
+async def _drain(reader: asyncio.StreamReader) -> None:
+    while await reader.read(4096):
+        pass
+    raise AssertionError("closed, not reset")
+
+
+async def test_a_raspberry_pi_never_survives_a_lost_link(pair: Simulation) -> None:
+    host, port = where(pair, "blue")
+    _, writer = await asyncio.open_connection(host, port)
+    writer.write(RUN)
+    await until(lambda: pair.cars["blue"].truth.driving, "drives")
+    await pair.inflict(Fault(FaultKind.LINK_DROP, "blue", for_s=0.1))
+    await until(lambda: not pair.cars["blue"].truth.alive, "dies")
+    await pair.inflict(Fault(FaultKind.LINK_DROP, "blue", for_s=0))
+    with pytest.raises(ConnectionRefusedError):
+        await asyncio.open_connection(host, port)
+    assert pair.cars["blue"].truth.driving
+    await pair.inflict(Fault(FaultKind.BROWNOUT, "blue"))
+    assert not pair.cars["blue"].truth.driving
+
+    async def back() -> bool:
+        try:
+            _, again = await asyncio.open_connection(host, port)
+        except ConnectionRefusedError:
+            return False
+        again.close()
+        return True
+
+    end = time.monotonic() + PATIENCE
+    while not await back():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.05)
+    writer.close()
+
+
+async def test_a_second_host_is_sent_away(pair: Simulation) -> None:
+    host, port = where(pair, "green")
+    _, first = await asyncio.open_connection(host, port)
+    reader, second = await asyncio.open_connection(host, port)
+    with contextlib.suppress(ConnectionResetError):
+        assert await asyncio.wait_for(reader.read(), PATIENCE) == b""
+    first.write(RUN)
+    await until(lambda: pair.cars["green"].truth.driving, "the first one drives")
+    first.close()
+    second.close()
+
+
+async def test_garbage_reaches_the_host_and_the_car(pair: Simulation) -> None:
+    with serial.Serial(pair.cars["red"].url.removeprefix("serial://"), timeout=0) as port:
+        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=300))
+        data = bytearray()
+        await until(lambda: data.extend(port.read(4096)) or len(data) >= 300, "noise")
+        assert len(set(data)) > 50
+        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=50, to_car=True))
+
+
+async def test_a_port_in_use_and_a_path_in_use(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(LinkError, match=rf"car red: cannot listen on 127.0.0.1:{port}"):
+            await Simulation(parse_cars(["ok:arduino:pty", f"red:arduino:tcp://127.0.0.1:{port}"])).start()
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(LinkError, match="no symlink to a device"):
+        await Simulation(parse_cars([f"red:arduino:pty:{tmp_path / 'file'}"])).start()
+    assert (tmp_path / "file").read_text() == "precious"
+    with pytest.raises(LinkError, match="No such file"):
+        await Simulation(parse_cars([f"red:arduino:pty:{tmp_path / 'nowhere' / 'x'}"])).start()
+
+
+async def test_a_symlink_that_a_killed_simulator_left_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "red"
+    path.symlink_to("/dev/pts/99999")
+    simulation = Simulation(parse_cars([f"red:arduino:pty:{path}"]))
+    await simulation.start()
+    serial.Serial(str(path)).close()
+    await simulation.stop()
+    assert not path.is_symlink()
+
+
+# The process.
+
+
+class Process:
+    def __init__(self, *arguments: str, **more: Any) -> None:
+        command = [sys.executable, "-m", "gateway.sim", *arguments]
+        more = {"stdin": subprocess.PIPE, **more}
+        self.popen = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1, **more
+        )
+
+    def line(self) -> dict[str, Any]:
+        assert self.popen.stdout is not None
+        return json.loads(self.popen.stdout.readline())
+
+    def ask(self, **fields: object) -> dict[str, Any]:
+        assert self.popen.stdin is not None
+        self.popen.stdin.write(json.dumps(fields) + "\n")
+        self.popen.stdin.flush()
+        return self.line()
+
+    def end(self) -> None:
+        if self.popen.poll() is None:
+            self.popen.kill()
+        self.popen.wait()
+        for stream in (self.popen.stdin, self.popen.stdout, self.popen.stderr):
+            if stream is not None:
+                stream.close()
+
+
+@pytest.fixture
+def started() -> Iterator[list[Process]]:
+    processes: list[Process] = []
+    yield processes
+    for process in processes:
+        process.end()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_it_says_what_it_hosts_takes_faults_and_ends_clean(
+    number: signal.Signals, started: list[Process], tmp_path: Path
+) -> None:
+    path = tmp_path / "red"
+    sim = Process("--car", f"red:arduino:pty:{path}", "--car", "blue:raspberry_pi+arm:tcp", "--no-truth", "--seed", "7")
+    started.append(sim)
+    assert sim.line() == {"car": "red", "platform": "arduino", "link": f"serial://{path}"}
+    blue = sim.line()
+    assert (blue["car"], blue["platform"]) == ("blue", "raspberry_pi+arm")
+    assert blue["link"].startswith("tcp://127.0.0.1:")
+    assert sim.ask(car="red", ask="truth")["mode"] == "manual"
+    assert sim.ask(fault="garbage", bytes=10) == {"ok": True, "fault": "garbage", "cars": ["red", "blue"]}
+    assert sim.ask(fault="garbage", car="nobody") == {
+        "ok": False,
+        "error": "car 'nobody' is not simulated here: use red, blue",
+    }
+    assert not sim.ask(fault="melt")["ok"]
+    assert sim.popen.stdin is not None
+    sim.popen.stdin.write("no json\n")
+    assert "no JSON" in sim.line()["error"]
+    assert sim.ask(car="red", fault="link_drop")["ok"]
+    assert not path.is_symlink()
+    assert sim.ask(car="red", fault="link_drop", for_s=0)["ok"]
+    sim.popen.stdin.close()  # the end of stdin ends nothing
+    with serial.Serial(str(path), timeout=PATIENCE) as port:
+        assert port.read_until(b"#").endswith(b"#")
+    sim.popen.send_signal(number)
+    assert sim.popen.wait(PATIENCE) == 0
+    assert not path.is_symlink()
+    assert sim.popen.stderr is not None
+    assert sim.popen.stderr.read() == ""
+
+
+def test_faults_of_the_command_line_come_at_their_time(started: list[Process], tmp_path: Path) -> None:
+    path = tmp_path / "red"
+    sim = Process("--car", f"red:arduino:pty:{path}", "--no-truth", "--fault", "red:link_drop@0.2+0.3")
+    started.append(sim)
+    sim.line()
+    end = time.monotonic() + PATIENCE
+    gone = False
+    while not (gone and path.exists()):
+        gone = gone or not path.exists()
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def test_it_ends_with_its_parent(started: list[Process], tmp_path: Path) -> None:
+    path = tmp_path / "red"
+    child = [sys.executable, "-m", "gateway.sim", "--car", f"red:arduino:pty:{path}", "--no-truth", "--with-parent"]
+    script = f"import subprocess, sys; subprocess.Popen({child!r}); sys.stdin.read()"
+    parent = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        assert parent.stdout is not None
+        assert parent.stdout.readline()
+        assert path.exists()
+    finally:
+        parent.kill()
+        parent.wait()
+        assert parent.stdin is not None
+        parent.stdin.close()
+    end = time.monotonic() + PATIENCE
+    while path.is_symlink():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    parent.stdout.close()
+
+
+BAD = [
+    ([], 2, "--car"),
+    (["--car", "Red:arduino:pty"], 2, "a-z"),
+    (["--car", "red:arduino:pty", "--car", "red:arduino:pty"], 2, "two cars have the name red"),
+    (["--car", "red:arduino:pty", "--fault", "melt@1"], 2, "link_drop, garbage, brownout"),
+    (["--car", "red:arduino:pty", "--fault", "blue:brownout@1"], 2, "'blue' is not simulated here"),
+    (["--car", "red:arduino:pty", "--fleet", "No"], 2, "fleet name"),
+    (["--car", "red:arduino:pty", "--connect", "nonsense"], 2, "endpoint 'nonsense'"),
+    (["--car", "red:arduino:pty", "--world", "moon"], 2, "room"),
+    (["--car", "red:arduino:pty:/nowhere/at/all", "--no-truth"], 1, "car red: no symlink can be made"),
+    (["--car", "red:arduino:tcp://127.0.0.1:PORT", "--no-truth"], 1, "car red: cannot listen on 127.0.0.1:"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "code", "words"), BAD)
+def test_bad_arguments(arguments: list[str], code: int, words: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        command = [sys.executable, "-m", "gateway.sim", *(word.replace("PORT", port) for word in arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert done.returncode == code
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert (code == 2 and "usage" in done.stderr) or done.stderr.count("\n") == 1
+
+
+def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Process]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    sim = Process("--car", "red:arduino:pty", "--connect", endpoint, "--fleet", "mine")
+    started.append(sim)
+    link = sim.line()["link"]
+    hub = subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", endpoint])
+    seen: list[Sample] = []
+    try:
+        end = time.monotonic() + PATIENCE
+        with Bus.open(endpoint, start_hub=True) as bus:
+            bus.subscribe("mine/*/sim/truth", seen.append)
+            while not seen:
+                assert time.monotonic() < end
+                time.sleep(0.01)
+            with serial.Serial(link.removeprefix("serial://")) as port:
+                port.write(RUN)
+                while not any(sample.message().motor_left == 150 for sample in list(seen)):
+                    assert time.monotonic() < end
+                    time.sleep(0.01)
+        assert seen[0].key == "mine/red/sim/truth"
+        truth = seen[0].message()
+        assert (truth.car, truth.mode, truth.led) == ("red", "manual", "off")
+        assert truth.y_m == pytest.approx(-1.05)
+        sequences = [sample.sequence for sample in seen]
+        assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+    finally:
+        sim.popen.terminate()
+        assert sim.popen.wait(PATIENCE) == 0
+        hub.terminate()
+        hub.wait(PATIENCE)
