@@ -102,7 +102,7 @@ class Car:
         self._lag_s = 0.0
 
     async def run(self) -> None:
-        """Serve the car until `stop`, and until its stop is written; raises AlreadyServed, or LinkError at the start."""
+        """Serve the car until `stop` and until its stop is written; raises AlreadyServed, or LinkError at the start."""
         self._refuse(self._others())
         self._declare()
         work = (self._connect(), self._write_frames(), self._tick(), self._keep_hub(), self._look_again())
@@ -403,7 +403,7 @@ class Car:
                 worst = 0.0
 
     async def _keep_hub(self) -> None:
-        """Bring a hub back that has been gone for half a second; jitter keeps a hundred gateways from trying at once."""
+        """Bring a hub back that is gone for half a second; jitter keeps a hundred gateways from trying at once."""
         gone_since: float | None = None
         while True:
             await asyncio.sleep(HUB_GONE_S / 2)

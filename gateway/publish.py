@@ -68,6 +68,7 @@ class Publications:
     def event(self, event: Event, stamp_ns: int, confirmed: Mode | None, *, loaded: bool) -> None:
         """Publish what was measured in an event, then the event itself. `loaded`: motors may pull the battery down."""
         published: list[str] = []
+        verdict = ""
         match event:
             case Sensors():
                 verdict = "sensors"
@@ -86,8 +87,8 @@ class Publications:
                 self._reading("sensor/imu", message, stamp_ns, published)
             case Echo():
                 verdict = "echo"
-            case Rejected():
-                verdict = str(event.cause)
+            case Rejected(cause=cause):
+                verdict = str(cause)
         frame = self._cleared("frame/rx")
         frame.data = event.raw
         frame.verdict = verdict

@@ -84,7 +84,7 @@ def _hold(command: Command, situation: Situation) -> Refusal | None:
         return None
     return (
         Reason.HELD,
-        f"{situation.car} is held since {situation.held_by} stopped it: a person's or script's drive, mode or resume ends that",
+        f"{situation.car} is on hold ({situation.held_by} stopped it): a drive, mode or resume by a person or script ends it",
     )
 
 

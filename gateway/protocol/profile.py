@@ -242,7 +242,7 @@ def parse_platform(text: str) -> Profile:
 # protocol.md, the table of platforms
 _EVERY_CAR: Final = frozenset({"drive", "whistle", "speed", "servo", "fan", "light"})
 _MODE_CAR: Final = _EVERY_CAR | {"servo_deg", "led", "mode"}
-_PI_CAR: Final = _EVERY_CAR | {"servo_vertical", "servo_horizontal"}
+_PI_CAR: Final = _EVERY_CAR | {"servo_deg", "led", "servo_vertical", "servo_horizontal"}
 _ALL_MODES: Final = frozenset(Mode)
 _MODE_0: Final = frozenset({Mode.MANUAL})
 _ALL_LIGHTS: Final = frozenset(Light)

@@ -13,7 +13,7 @@ from typing import Final
 
 from gateway.sim.core.world import World
 from gateway.sim.links import LinkError
-from gateway.sim.shell import Simulation
+from gateway.sim.shell import SimCar, Simulation
 from gateway.sim.spec import BadSpec, CarSpec, Scheduled, check_hit, fault_of, parse_cars, parse_fault
 from schemas import keys
 
@@ -22,7 +22,8 @@ PARENT_EVERY_S: Final = 0.1
 LINE_LIMIT: Final = 65536
 
 EPILOG: Final = """\
-Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gateway run --link`.
+Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gateway run --link`. A plain pty that comes
+back after a link_drop has another name, so its line is printed again; pty:PATH keeps its name.
 Faults, one JSON object a line on stdin, each answered by one line on stdout:
   {"car": "red", "fault": "link_drop", "for_s": 2}   gone for 2 s; without for_s until one with for_s 0
   {"car": "red", "fault": "garbage", "bytes": 200}   noise to the host; "to": "car" for the other way
@@ -127,7 +128,8 @@ async def _serve(
         task.add_done_callback(lambda done: None if done.cancelled() or done.exception() is None else ended.set())
     try:
         for spec in specs:
-            _say({"car": spec.name, "platform": spec.platform_words, "link": simulation.cars[spec.name].url})
+            _introduce(simulation.cars[spec.name])
+            simulation.cars[spec.name].moved = _introduce
         threading.Thread(target=_read_lines, args=(loop, lines), daemon=True).start()
         await ended.wait()
     finally:
@@ -138,6 +140,10 @@ async def _serve(
     for failure in results:
         if isinstance(failure, Exception):
             raise failure
+
+
+def _introduce(car: SimCar) -> None:
+    _say({"car": car.spec.name, "platform": car.spec.platform_words, "link": car.url})
 
 
 def _on_signals(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:

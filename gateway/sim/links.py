@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-READ_SIZE = 64
+READ_SIZE = 128
 
 
 class LinkError(Exception):
@@ -241,11 +241,12 @@ class TcpSimLink:
         await self.down()
 
 
-class _Client(asyncio.Protocol):
-    """One TCP connection."""
+class _Client(asyncio.BufferedProtocol):
+    """One TCP connection, read in small pieces so that a firehose can be held back early."""
 
     def __init__(self, link: TcpSimLink) -> None:
         self._link = link
+        self._piece = bytearray(READ_SIZE)
         self._transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -255,9 +256,12 @@ class _Client(asyncio.Protocol):
         else:
             transport.abort()
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002 - asyncio's signature
+        return self._piece
+
+    def buffer_updated(self, nbytes: int) -> None:
         if self._transport is not None:
-            self._link.received(data)
+            self._link.received(bytes(self._piece[:nbytes]))
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's signature
         if self._transport is not None:

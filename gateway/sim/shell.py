@@ -37,6 +37,8 @@ class SimCar:
         self._truth = firmware.truth
         self.watchers: list[Watcher] = []
         """Called after every change of the truth."""
+        self.moved: Watcher = lambda _: None
+        """Called when the link has come back under another name."""
         self._link: SimLink
         if isinstance(spec.link, PtyLink):
             self._link = PtySimLink(self, spec.link.path)
@@ -66,13 +68,13 @@ class SimCar:
 
     async def stop(self) -> None:
         """Close the link and stand still."""
+        self._dropped = True
+        for task in list(self._closing):
+            await task
+        await self._link.close()
         for timer in (self._timer, self._restore):
             if timer is not None:
                 timer.cancel()
-        self._dropped = True
-        await self._link.close()
-        for task in list(self._closing):
-            await task
 
     # The link's side.
 
@@ -177,7 +179,10 @@ class SimCar:
             self._restore.cancel()
             self._restore = None
         if self.firmware.alive:
+            before = self.url
             await self._link.up()
+            if self.url != before:
+                self.moved(self)
 
 
 class Simulation:

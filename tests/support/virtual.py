@@ -1,4 +1,4 @@
-"""One gateway's control and one simulated car on virtual time, joined by a link without delay: as fast as the CPU allows."""
+"""One gateway's control and one simulated car on virtual time, joined by a link without delay."""
 
 import random
 from collections.abc import Callable

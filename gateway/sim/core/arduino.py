@@ -81,10 +81,8 @@ class ArduinoCar(Firmware):
     def _main(self) -> Program:
         while True:
             self._serial_event()
-            if self._complete:
-                yield from self._parse()
-                if not self._complete:
-                    continue  # what came during an opening is obeyed when its block is over, not a turn later
+            if self._complete and (yield from self._parse()):
+                continue  # what came during an opening is obeyed when its block is over, not a turn later
             match self._mode:
                 case 0:
                     yield from self._manual()
@@ -117,23 +115,20 @@ class ArduinoCar(Firmware):
                 self._started = False
         self._buffer.clear()
 
-    def _clear(self) -> None:
-        self._string = ""
-        self._complete = False
-
-    def _parse(self) -> Program:
+    def _parse(self) -> Generator[Wait, None, bool]:
+        """Whether the string was cleared."""
         text = self._string
         if text.find("MODE") > 0 and text.find("4WD") > 0:
             yield from self._mode_frame(text)
-            self._clear()
         elif self._mode != 0:
-            self._clear()  # row "a general stop in a mode other than 0"
-        elif (yield from self._named_frame(text)):
-            self._clear()
-        elif "4WD" not in text:
+            pass  # row "a general stop in a mode other than 0"
+        elif not (yield from self._named_frame(text)):
+            if "4WD" in text:
+                return False  # row "a named frame it does not know": neither obeyed nor cleared
             yield from self._general_frame(text)
-            self._clear()
-        # Else row "a named frame it does not know": neither obeyed nor cleared.
+        self._string = ""
+        self._complete = False
+        return True
 
     def _mode_frame(self, text: str) -> Program:
         """The digits are read at places 9 and 10 of the string, whatever stands there."""

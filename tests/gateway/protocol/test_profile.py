@@ -116,7 +116,7 @@ def test_speed_is_counted_in_steps(row: dict[str, str]) -> None:
             1,
             StopStyle.RASPBERRY_PI,
             False,
-            "drive whistle speed servo fan light servo_vertical servo_horizontal",
+            "drive whistle speed servo fan light servo_deg led servo_vertical servo_horizontal",
         ),
         ("unknown", 1, StopStyle.UNKNOWN, False, "drive whistle speed servo fan light"),
     ],
