@@ -101,6 +101,32 @@ async def test_a_dropped_pty_is_gone_and_comes_back_under_its_name(pair: Simulat
         await until(lambda: pair.cars["red"].truth.mode == "manual", "hears again")
 
 
+async def test_a_plain_pty_says_its_new_name() -> None:
+    simulation = Simulation(parse_cars(["red:arduino:pty"]))
+    await simulation.start()
+    car = simulation.cars["red"]
+    named: list[str] = []
+    car.moved = lambda moved: named.append(moved.url)
+    first = car.url
+    with serial.Serial(first.removeprefix("serial://")):  # held open, the old name cannot be given again
+        await simulation.inflict(Fault(FaultKind.LINK_DROP, for_s=0.05))
+        await until(lambda: named, "back")
+    assert named == [car.url]
+    assert car.url != first
+    await simulation.stop()
+
+
+async def test_a_tcp_firehose_is_held_back_too(pair: Simulation) -> None:
+    _, writer = await asyncio.open_connection(*where(pair, "green"))
+    car = pair.cars["green"]
+    writer.write(b"$4WD,nonsense#" * 200_000)
+    await until(lambda: car.firmware.backlog(asyncio.get_running_loop().time()) > 128, "arrives")
+    for _ in range(20):
+        await asyncio.sleep(0.01)
+        assert car.firmware.backlog(asyncio.get_running_loop().time()) < 1000
+    writer.transport.abort()
+
+
 async def test_a_dropped_tcp_link_resets_refuses_and_comes_back_by_itself(pair: Simulation) -> None:
     host, port = where(pair, "green")
     reader, writer = await asyncio.open_connection(host, port)
