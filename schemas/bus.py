@@ -376,4 +376,4 @@ class Bus:
 
 def reply(query: zenoh.Query, key: str, payload: bytes, encoding: str) -> None:
     """Answer a query with one value under a concrete key."""
-    query.reply(key, payload, encoding=encoding, **_QOS[Qos.COMMAND])
+    query.reply(key, payload, encoding=encoding, express=True)

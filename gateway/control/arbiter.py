@@ -82,10 +82,8 @@ def _hold(command: Command, situation: Situation) -> Refusal | None:
         return Reason.HELD, "a coordinator may not resume a car: a person or a script does"
     if situation.held_by is None:
         return None
-    return (
-        Reason.HELD,
-        f"{situation.car} is on hold ({situation.held_by} stopped it): a drive, mode or resume by a person or script ends it",
-    )
+    ends = "a drive, mode or resume by a person or script ends it"
+    return Reason.HELD, f"{situation.car} is on hold ({situation.held_by} stopped it): {ends}"
 
 
 def _link(command: Command, situation: Situation) -> Refusal | None:

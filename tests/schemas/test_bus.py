@@ -1,0 +1,182 @@
+"""The bus on real Zenoh sessions: hub, publications, queries, tokens, and what happens without a hub."""
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from schemas import bus, messages, topics
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.support.ports import free_endpoint
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 15.0) -> None:
+    """Poll until it holds; Zenoh's callbacks come when they come."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    where = free_endpoint()
+    hub = subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", where])
+    wait_for(lambda: bus.accepts(where))
+    yield where
+    hub.terminate()
+    assert hub.wait(10) == 0
+
+
+def test_a_publication_carries_header_number_encoding_and_time(endpoint: str) -> None:
+    with bus.Bus.open(endpoint) as sender, bus.Bus.open(endpoint) as receiver:
+        got: list[bus.Sample] = []
+        receiver.subscribe("fleet/**", got.append)
+        publisher = sender.publisher("fleet/red/sensor/range", topics.TOPICS["sensor/range"], "red")
+        before = time.time_ns()
+
+        def put() -> bool:
+            publisher.put(pb.Range(range_m=1.25), stamp_ns=1_500_000_000)
+            return bool(got)
+
+        wait_for(put)
+        sample = got[-1]
+        message = sample.message()
+        assert isinstance(message, pb.Range)
+        assert (message.car, message.boot_id, message.range_m) == ("red", sender.boot_id, 1.25)
+        assert (message.stamp.seconds, message.stamp.nanos) == (1, 500_000_000)
+        assert message.seq == sample.sequence
+        assert sample.encoding == "application/protobuf;fleet.v1.Range"
+        assert before <= sample.time_ns <= time.time_ns() + 1_000_000_000
+
+
+def test_a_query_reaches_everyone_and_commands_are_never_matched_by_wildcards(endpoint: str) -> None:
+    with bus.Bus.open(endpoint) as one, bus.Bus.open(endpoint) as two, bus.Bus.open(endpoint) as asker:
+        asked: list[str] = []
+
+        def answer(name: str) -> Callable[..., None]:
+            def take(query: object) -> None:
+                with query:  # type: ignore[attr-defined]
+                    bus.reply(query, f"fleet/{name}/state/link", name.encode(), "text/plain")  # type: ignore[arg-type]
+
+            return take
+
+        one.queryable("fleet/red/state/*", answer("red"))
+        two.queryable("fleet/blue/state/*", answer("blue"))
+        one.queryable("fleet/red/@cmd/*", lambda query: asked.append(str(query)))
+
+        def both() -> bool:
+            found = list(asker.query("fleet/*/state/*"))
+            return sorted(each.payload for each in found if isinstance(each, bus.Sample)) == [b"blue", b"red"]
+
+        wait_for(both)
+        assert len(list(asker.query("fleet/**"))) == 2
+        assert asked == []
+
+
+def test_tokens_come_and_go(endpoint: str) -> None:
+    with bus.Bus.open(endpoint) as watcher:
+        seen: list[tuple[str, bool]] = []
+        watcher.watch_tokens("fleet/*", lambda key, alive: seen.append((key, alive)))
+        with bus.Bus.open(endpoint) as car:
+            car.token("fleet/red")
+            wait_for(lambda: seen == [("fleet/red", True)])
+            assert watcher.tokens("fleet/*") == ["fleet/red"]
+        wait_for(lambda: seen == [("fleet/red", True), ("fleet/red", False)])
+        assert watcher.tokens("fleet/*") == []
+
+
+def test_a_hub_is_started_once_and_ends_by_itself() -> None:
+    where = free_endpoint()
+    idle = subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", where, "--idle-s", "0.5"])
+    wait_for(lambda: bus.accepts(where))
+    second = subprocess.run(
+        [sys.executable, "-m", "schemas.hub", "--endpoint", where],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert second.returncode == 1
+    assert "cannot listen" in second.stderr
+    with bus.Bus.open(where, start_hub=True) as opened:
+        assert opened.connected
+    assert idle.wait(15) == 0
+
+
+def test_a_killed_hub_comes_back_and_everything_with_it() -> None:
+    where = free_endpoint()
+    with bus.Bus.open(where, start_hub=True) as car, bus.Bus.open(where) as watcher:
+        car.token("fleet/red")
+        wait_for(lambda: watcher.tokens("fleet/*") == ["fleet/red"])
+        found = subprocess.run(
+            ["pgrep", "-f", f"schemas.hub --endpoint {where}"], capture_output=True, text=True, check=True
+        )
+        os.kill(int(found.stdout), signal.SIGKILL)
+        wait_for(lambda: not car.connected)
+        bus.ensure_hub(where)
+        wait_for(lambda: watcher.tokens("fleet/*") == ["fleet/red"])
+        found = subprocess.run(
+            ["pgrep", "-f", f"schemas.hub --endpoint {where}"], capture_output=True, text=True, check=True
+        )
+    os.kill(int(found.stdout), signal.SIGTERM)
+
+
+def test_without_a_hub_whoever_only_asks_is_told_so() -> None:
+    where = free_endpoint()
+    with pytest.raises(bus.NoFleet, match=f"no fleet is running at {where}"):
+        bus.Bus.open(where)
+
+
+def test_a_listener_that_is_no_zenoh_router_is_named() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        where = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(bus.BusError, match="is no Zenoh router"):
+            bus.Bus.open(where, timeout_s=1.0)
+
+
+@pytest.mark.parametrize(
+    "bad", ["127.0.0.1:7447", "tcp/127.0.0.1", "tcp/host:0", "tcp/host:65536", "http/host:80", "tcp/:7447", "tcp/a b:c"]
+)
+def test_bad_endpoints_are_wrong_use(bad: str) -> None:
+    with pytest.raises(bus.BadEndpoint, match="write it as tcp/HOST:PORT"):
+        bus.resolve_endpoint(bad)
+
+
+def test_the_endpoint_is_the_argument_then_the_variable_then_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FLEET_ENDPOINT", raising=False)
+    assert bus.resolve_endpoint() == "tcp/127.0.0.1:7447"
+    monkeypatch.setenv("FLEET_ENDPOINT", "tcp/[::1]:7000")
+    assert bus.resolve_endpoint() == "tcp/[::1]:7000"
+    assert bus.resolve_endpoint("tls/box:7447") == "tls/box:7447"
+
+
+async def test_a_handover_keeps_order_is_bounded_and_counts_what_it_drops() -> None:
+    taken: list[int] = []
+    handover = bus.Handover(asyncio.get_running_loop(), taken.append, limit=10)
+    thread = threading.Thread(target=lambda: [handover(number) for number in range(25)])
+    thread.start()
+    thread.join()  # the loop cannot run meanwhile: the queue fills
+    assert handover.dropped == 15
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert taken == list(range(10))
+    assert handover(99)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert taken == [*range(10), 99]
+
+
+def test_a_reply_in_json_is_protobufs_mapping() -> None:
+    text = messages.to_json(pb.Line(car="red", left_inner=True, seq=7))
+    assert '"left_inner":true' in text
+    assert '"seq":"7"' in text

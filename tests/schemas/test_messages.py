@@ -1,0 +1,62 @@
+"""Every topic and command has a message; payloads are read as protobuf or JSON."""
+
+import json
+
+import pytest
+from google.protobuf import descriptor_pb2
+
+from schemas import messages, topics
+from schemas.gen import fleet_v1_pb2 as pb
+
+NAMES = sorted({topic.message for topic in topics.TOPICS.values()} | set(topics.COMMANDS.values()) | {topics.RESULT})
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_of_the_table_is_a_message(name: str) -> None:
+    message = messages.message_class(name)()
+    assert message.DESCRIPTOR.full_name == name
+    assert messages.parse(name, message.SerializeToString(), messages.encoding_of(name)) == message
+    assert messages.parse(name, messages.to_json(message).encode(), messages.JSON) == message
+    files = descriptor_pb2.FileDescriptorSet.FromString(messages.descriptor_set(name)).file
+    known: set[str] = set()
+    for file in files:
+        assert set(file.dependency) <= known, "dependencies come first"
+        known.add(file.name)
+
+
+@pytest.mark.parametrize("topic", topics.TOPICS.values(), ids=str)
+def test_units_name_fields_of_the_message(topic: topics.Topic) -> None:
+    fields = messages.message_class(topic.message).DESCRIPTOR.fields_by_name
+    assert set(topic.units) <= set(fields)
+    if topic.message.startswith("fleet.v1."):
+        assert [fields[name].number for name in ("stamp", "car", "seq", "boot_id")] == [1, 2, 3, 4]
+
+
+def test_no_enum_is_on_the_wire() -> None:
+    """An enum number that a schema lacks makes Rerun's MCAP importer die."""
+    assert not [name for name, kind in pb.DESCRIPTOR.enum_types_by_name.items() if kind]
+    for message in pb.DESCRIPTOR.message_types_by_name.values():
+        assert not [field.name for field in message.fields if field.enum_type]
+
+
+def test_what_was_not_measured_is_not_in_the_json() -> None:
+    known = json.loads(messages.to_json(pb.Range(no_echo=True)))
+    assert "range_m" not in known
+    assert known["no_echo"] is True
+
+
+@pytest.mark.parametrize(
+    ("payload", "encoding", "words"),
+    [
+        (b"{", messages.JSON, "is not the JSON of fleet.v1.DriveCommand"),
+        (b'{"motoin": "forward"}', messages.JSON, "motoin"),
+        (b'{"duration_s": "soon"}', messages.JSON, "duration_s"),
+        (b"\xff\xfe", messages.JSON, "is not the JSON"),
+        (b"\xff\xff", messages.PROTOBUF, "does not parse as fleet.v1.DriveCommand"),
+        (b"", "application/protobuf;fleet.v1.ModeCommand", "this key takes fleet.v1.DriveCommand"),
+    ],
+)
+def test_bad_payloads_say_why_in_one_line(payload: bytes, encoding: str, words: str) -> None:
+    with pytest.raises(messages.BadPayload, match=words) as caught:
+        messages.parse("fleet.v1.DriveCommand", payload, encoding)
+    assert "\n" not in str(caught.value)
