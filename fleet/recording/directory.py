@@ -1,0 +1,89 @@
+"""A session's directory: its name, what lies in it, and `session.json`, which describes it. No MCAP and no bus here.
+
+`sessions/20260314T151617Z-fleet/` holds `session.json` and the segments `0001.mcap`, `0002.mcap`, ...
+"""
+
+import json
+import platform
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, Self
+
+DESCRIPTION: Final = "session.json"
+SEGMENTS: Final = "[0-9][0-9][0-9][0-9].mcap"
+FORMAT: Final = 1
+"""Raised when a reader of the old layout could misread a session."""
+
+_PACKAGES: Final = ("zenoh-car-fleet", "eclipse-zenoh", "mcap", "protobuf")
+
+
+def versions() -> dict[str, str]:
+    """What wrote a session: our version, Python's and those of the packages that shape it."""
+    return {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
+
+
+@dataclass(slots=True)
+class Description:
+    """What `session.json` says."""
+
+    fleet: str
+    started: str
+    """ISO 8601, UTC."""
+    host: str
+    versions: Mapping[str, str]
+    ended: str | None = None
+    closed: bool = False
+    """Whether the recorder ended the session itself; False also while it is still recording."""
+    messages: int = 0
+    drops: Mapping[str, int] = field(default_factory=dict)
+    missed: Mapping[str, int] = field(default_factory=dict)
+    error: str = ""
+    format: int = FORMAT
+
+    @classmethod
+    def read(cls, directory: Path) -> Self | None:
+        """The description in a directory; None if there is none that can be read. Unknown fields are left out."""
+        try:
+            values: Any = json.loads((directory / DESCRIPTION).read_text(encoding="utf-8"))
+            return cls(**{name: values[name] for name in cls.__slots__ if name in values})
+        except (OSError, ValueError, TypeError):
+            return None
+
+    def write(self, directory: Path) -> None:
+        """Replace the description in a directory, whole or not at all; raises OSError."""
+        text = json.dumps({name: getattr(self, name) for name in self.__slots__}, indent=2) + "\n"
+        new = directory / (DESCRIPTION + ".new")
+        new.write_text(text, encoding="utf-8")
+        new.replace(directory / DESCRIPTION)
+
+
+def iso(now: datetime) -> str:
+    """A time as `session.json` has it."""
+    return now.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def create(root: Path, fleet: str, now: datetime) -> tuple[Path, Description]:
+    """Make the directory of a new session below `root`, described as not closed; raises OSError."""
+    stem = f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{fleet}"
+    directory = root / stem
+    root.mkdir(parents=True, exist_ok=True)
+    number = 2
+    while True:
+        try:
+            directory.mkdir()
+            break
+        except FileExistsError:
+            directory = root / f"{stem}-{number}"
+            number += 1
+    description = Description(fleet, iso(now), socket.gethostname(), versions())
+    description.write(directory)
+    return directory, description
+
+
+def segment(directory: Path, number: int) -> Path:
+    """The path of a segment, counted from 1."""
+    return directory / f"{number:04d}.mcap"

@@ -1,0 +1,256 @@
+"""The recorder: everything of one fleet that comes over the bus, into one session. One more subscriber, no policy.
+
+Zenoh's receive thread copies and appends; one writer thread does the rest: file, flush and status each second, answers.
+"""
+
+import contextlib
+import shutil
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import zenoh
+
+from fleet.recording import directory
+from fleet.recording.segment import Segment
+from schemas import keys, messages
+from schemas.bus import Bus, Sample, reply
+from schemas.gen import fleet_v1_pb2
+from schemas.topics import TOPICS
+
+LIMIT_MESSAGES: Final = 100_000
+LIMIT_BYTES: Final = 64 << 20
+"""What may wait for the writer: some seconds of a hundred cars, and little beside the memory of a small computer."""
+PERIOD_S: Final = 1.0
+"""Flush and status; what a crash loses at most."""
+TICK_S: Final = 0.02
+"""How long messages gather. Short: while the writer works on a long batch it holds up the receive thread."""
+LINGER_S: Final = 0.1
+"""What was published before we were told to end is still under way."""
+QUESTIONS: Final = 64
+
+STATUS: Final = TOPICS["@recorder/status"]
+
+
+class AnotherRecorder(Exception):
+    """This fleet is being recorded already; its text says where."""
+
+
+class RecordingFailed(Exception):
+    """The session could not be written to its end; its text says why, and what is there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a recording holds; numbers by key only where something was lost."""
+
+    session: Path
+    messages: int
+    bytes: int
+    drops: Mapping[str, int]
+    missed: Mapping[str, int]
+
+
+_Item = tuple[str, bytes, zenoh.Encoding, "zenoh.Timestamp | None", "zenoh.SourceInfo | None", int]
+
+
+class Recorder:
+    """Records from `start` to `close`. If the disk fails, `ended` is set and `close` raises RecordingFailed."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        fleet: str,
+        root: Path,
+        *,
+        limit_messages: int = LIMIT_MESSAGES,
+        limit_bytes: int = LIMIT_BYTES,
+        wall_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._bus = bus
+        self._fleet = keys.check_name(fleet, "fleet name")
+        self._root = root
+        self._limit_messages = limit_messages
+        self._limit_bytes = limit_bytes
+        self._now = wall_ns
+        self._lock = threading.Lock()
+        self._waiting: list[_Item] = []
+        self._held_messages = 0
+        self._held_bytes = 0
+        self._drops: dict[str, int] = {}
+        self._questions: list[zenoh.Query] = []
+        self._closing = threading.Event()
+        self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._error = ""
+        self.ended = threading.Event()
+        """The writer has ended: closed, or failed."""
+
+    def start(self) -> Path:
+        """Return the session's directory once every subscription is declared.
+
+        Raises AnotherRecorder, and OSError if the session cannot be made.
+        """
+        self._refuse_a_second()
+        self.session, self._description = directory.create(self._root, self._fleet, self._wall())
+        about = {"fleet": self._fleet, "started": self._description.started, "host": self._description.host}
+        self._segment = Segment(
+            directory.segment(self.session, 1), {**about, **self._description.versions, "format": str(directory.FORMAT)}
+        )
+        key = keys.topic_key(self._fleet, keys.RECORDER, STATUS.name.partition("/")[2])
+        self._publisher = self._bus.publisher(key, STATUS, keys.RECORDER)
+        self._last = self._status("recording")
+        self._writer = threading.Thread(target=self._write, name="mcap-writer")
+        self._writer.start()
+        for expression in keys.recorded(self._fleet):
+            self._subscribers.append(self._bus.subscribe_raw(expression, self._receive))
+        self._bus.queryable(key, self._ask)
+        token = keys.car_token(self._fleet, keys.RECORDER)
+        self._bus.token(token)
+        # Declaring does not wait for the hub. Its answer comes after it has passed our subscriptions on to all.
+        self._bus.tokens(token)
+        return self.session
+
+    def close(self) -> Outcome:
+        """Write what has come until now, and close the session whole; raises RecordingFailed."""
+        if not self.ended.is_set():
+            time.sleep(LINGER_S)
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+        self._subscribers.clear()
+        self._closing.set()
+        self._writer.join()
+        if self._error:
+            raise RecordingFailed(self._error)
+        with self._lock:
+            drops = dict(self._drops)
+        return Outcome(self.session, self._segment.messages, self._size, drops, dict(self._segment.missed))
+
+    def _refuse_a_second(self) -> None:
+        if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
+            return
+        where = "it does not say where to"
+        for answer in self._bus.query(f"{self._fleet}/{STATUS.name}"):
+            if isinstance(answer, Sample):
+                message: Any = answer.message()
+                where = f"to {message.session}"
+        raise AnotherRecorder(f"fleet {self._fleet!r} is being recorded already, {where}: one recorder is enough")
+
+    def _wall(self) -> datetime:
+        return datetime.fromtimestamp(self._now() / 1e9, UTC)
+
+    # ------------------------------------------------------------------ Zenoh's threads
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        # Copied here: a payload that is kept keeps the whole network batch it came in, and the byte limit would lie.
+        payload = sample.payload.to_bytes()
+        key = str(sample.key_expr)
+        item = (key, payload, sample.encoding, sample.timestamp, sample.source_info, self._now())
+        with self._lock:
+            size = self._held_bytes + len(payload)
+            if self._held_messages >= self._limit_messages or size > self._limit_bytes:
+                self._drops[key] = self._drops.get(key, 0) + 1
+                return
+            self._held_messages += 1
+            self._held_bytes = size
+            self._waiting.append(item)
+
+    def _ask(self, query: zenoh.Query) -> None:
+        with self._lock:
+            if len(self._questions) < QUESTIONS and not self.ended.is_set():
+                self._questions.append(query)
+
+    # ------------------------------------------------------------------ the writer's thread
+
+    def _write(self) -> None:
+        try:
+            due = time.monotonic()
+            while not self._closing.wait(TICK_S):
+                self._drain()
+                if time.monotonic() >= due:
+                    due = max(due + PERIOD_S, time.monotonic())
+                    self._segment.flush()
+                    self._publish("recording")
+                self._answer()
+            self._drain()
+            with self._lock:
+                drops = dict(self._drops)
+            self._segment.finish(drops)
+            self._describe(closed=True)
+            self._publish("closed")
+        except OSError as error:
+            self._fail(f"{error.filename or self._segment.path}: {error.strerror or error}")
+        except Exception as error:  # noqa: BLE001 - a recorder that stops must never do so silently, whatever the cause
+            self._fail(f"{type(error).__name__}: {error}")
+        finally:
+            self._answer()
+            self.ended.set()
+
+    def _drain(self) -> None:
+        with self._lock:
+            batch, self._waiting = self._waiting, []
+        add = self._segment.add
+        size = 0
+        for item in batch:
+            add(*item)
+            size += len(item[1])
+        # Only now: what is being written is still held.
+        with self._lock:
+            self._held_messages -= len(batch)
+            self._held_bytes -= size
+
+    def _fail(self, words: str) -> None:
+        self._error = f"recording to {self.session} failed: {words}. What was written until then is whole"
+        with self._lock:
+            self._limit_messages = 0
+        self._segment.abandon()
+        # From the last status: asking the disk again may fail again.
+        self._last.state, self._last.error, self._last.messages = "failed", self._error, self._segment.messages
+        self._publisher.put(self._last, self._now())
+        with contextlib.suppress(OSError):  # the disk that failed; said already
+            self._describe(closed=False)
+
+    def _describe(self, *, closed: bool) -> None:
+        description = self._description
+        description.ended, description.closed = directory.iso(self._wall()), closed
+        description.messages, description.error = self._segment.messages, self._error
+        with self._lock:
+            description.drops = dict(self._drops)
+        description.missed = dict(self._segment.missed)
+        description.write(self.session)
+
+    @property
+    def _size(self) -> int:
+        return self._segment.path.stat().st_size
+
+    def _status(self, state: str) -> fleet_v1_pb2.Recording:
+        with self._lock:
+            drops = dict(self._drops)
+        return fleet_v1_pb2.Recording(
+            session=str(self.session),
+            state=state,
+            bytes=self._size,
+            messages=self._segment.messages,
+            drops=drops,
+            free_bytes=shutil.disk_usage(self.session).free,
+            error=self._error,
+            missed=self._segment.missed,
+        )
+
+    def _publish(self, state: str) -> None:
+        self._last = self._status(state)
+        self._publisher.put(self._last, self._now())
+
+    def _answer(self) -> None:
+        with self._lock:
+            questions, self._questions = self._questions, []
+        for query in questions:
+            with query:
+                if query.parameters.get("format") == "json":
+                    payload, encoding = messages.to_json(self._last).encode(), messages.JSON
+                else:
+                    payload, encoding = self._last.SerializeToString(), messages.encoding_of(STATUS.message)
+                reply(query, self._publisher.key, payload, encoding)
