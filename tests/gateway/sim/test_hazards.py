@@ -15,7 +15,32 @@ async def test_on_virtual_time(hazard: Hazard) -> None:
     await hazard.play(virtual(hazard.platform, world=hazard.world(), tcp=hazard.tcp))
 
 
-async def _play(hazard: Hazard) -> BaseException | None:
+class Stalls:
+    """How long this process was kept from running: a machine that stalls for longer than a block proves nothing."""
+
+    def __init__(self) -> None:
+        self.worst = 0.0
+
+    async def watch(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            due = loop.time() + 0.01
+            await asyncio.sleep(0.01)
+            self.worst = max(self.worst, loop.time() - due)
+
+
+async def play(hazard: Hazard) -> BaseException | None:
+    for _ in range(5):
+        stalls = Stalls()
+        watching = asyncio.create_task(stalls.watch())
+        failure = await play_once(hazard)
+        watching.cancel()
+        if failure is None or stalls.worst < 0.1:
+            return failure
+    return failure
+
+
+async def play_once(hazard: Hazard) -> BaseException | None:
     try:
         car = await WireStranger.at(hazard.platform, world=hazard.world(), tcp=hazard.tcp)
         try:
@@ -32,7 +57,7 @@ def outcomes() -> dict[str, BaseException | None]:
     """All rows at once, each on a simulator of its own: they wait far more than they work."""
 
     async def everything() -> list[BaseException | None]:
-        return await asyncio.gather(*(_play(hazard) for hazard in HAZARDS))
+        return await asyncio.gather(*(play(hazard) for hazard in HAZARDS))
 
     return dict(zip(map(str, HAZARDS), asyncio.run(everything()), strict=True))
 
