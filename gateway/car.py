@@ -23,7 +23,7 @@ from gateway.control.controller import Controller, Hold
 from gateway.control.link_health import LinkHealth
 from gateway.control.mode import Verdict
 from gateway.control.records import Answer, Level, LogRecord, Phase
-from gateway.link import Link, LinkError, LinkLost, open_link
+from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Event, Rejected
@@ -52,7 +52,7 @@ class Settings:
     """What `gateway run` was told."""
 
     car: str
-    url: str
+    url: LinkUrl
     profile: Profile
     fleet: str
     state_dir: Path
@@ -87,7 +87,7 @@ class Car:
         self._health = LinkHealth(since=now)
         self._decoder = Decoder()
         self._link: Link | None = None
-        self._out = Publications(opened, settings.fleet, settings.car, settings.profile, settings.url)
+        self._out = Publications(opened, settings.fleet, settings.car, settings.profile, str(settings.url))
         self._commands = bus.Handover(self._loop, self._query, limit=256)
         self._stream = bus.Handover(self._loop, self._streamed, limit=256)
         self._queries = bus.Handover(self._loop, self._out.answer, limit=1024)

@@ -67,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         settings = Settings(
             car=check_name(arguments.car),
-            url=str(parse_url(arguments.link)),
+            url=parse_url(arguments.link),
             profile=parse_platform(arguments.platform),
             fleet=check_name(arguments.fleet, "fleet name"),
             state_dir=arguments.state_dir or default_directory(),

@@ -1,0 +1,35 @@
+"""What every link is: read, write and close, and the errors that they raise."""
+
+from abc import ABC, abstractmethod
+
+
+class LinkError(Exception):
+    """A link cannot be had, or is gone. The text is one line for a person: what, where, what to do."""
+
+
+class BadUrl(LinkError):
+    """A URL that names no link: wrong use."""
+
+
+class CannotOpen(LinkError):
+    """The link was not opened; nothing was sent."""
+
+
+class LinkLost(LinkError):
+    """The link is gone. A write that raises this may have sent all, some or none of its bytes."""
+
+
+class Link(ABC):
+    """Bytes to and from one car."""
+
+    @abstractmethod
+    async def read(self) -> bytes:
+        """The next bytes as they came, at least one; raises LinkLost when there will be no more."""
+
+    @abstractmethod
+    async def write(self, data: bytes) -> None:
+        """Hand over these bytes whole, in one write of their own; raises LinkLost."""
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Let go of the port; a pending read raises LinkLost. Never raises; may be called again."""

@@ -1,0 +1,205 @@
+"""A serial port through pyserial: one thread opens and reads it, the loop writes.
+
+A write does not block in practice: the port is non-blocking, a frame 26 bytes at most. A device that does not take
+them within `WRITE_TIMEOUT_S` is as good as gone.
+"""
+
+import asyncio
+import contextlib
+import errno
+import os
+import threading
+from typing import Final
+
+import serial
+
+from gateway.link.base import CannotOpen, Link, LinkLost
+from gateway.link.url import SerialUrl
+
+WRITE_TIMEOUT_S: Final = 0.25
+WAITING_CHUNKS: Final = 256
+"""Chunks that may wait for a loop that does not read; then the thread stops reading, the port fills."""
+
+try:
+    import termios
+
+    # tcflush and tcsetattr of a port that is gone raise termios.error, which is no OSError.
+    _GONE: tuple[type[Exception], ...] = (OSError, termios.error)
+except ImportError:  # Windows
+    _GONE = (OSError,)
+
+
+class SerialLink(Link):
+    """One open port. Made by `open_serial`."""
+
+    def __init__(self, url: SerialUrl, loop: asyncio.AbstractEventLoop) -> None:
+        self._url = url
+        self._loop = loop
+        self._port: serial.Serial | None = None
+        self._chunks: list[bytes] = []
+        self._came = asyncio.Event()
+        self._room = threading.Semaphore(WAITING_CHUNKS)
+        self._closing = False
+        self._lost: str | None = None
+        self._opened: asyncio.Future[None] = loop.create_future()
+        self._ended: asyncio.Future[None] = loop.create_future()
+        # A daemon: opening a port can block for ever (a Bluetooth tty does), and must not keep the process.
+        self._thread = threading.Thread(target=self._run, name=f"read {url}", daemon=True)
+
+    async def open(self, timeout_s: float) -> None:
+        """Start the thread and wait until the port is open; raises CannotOpen."""
+        self._thread.start()
+        try:
+            await asyncio.wait_for(asyncio.shield(self._opened), timeout_s)
+        except TimeoutError:
+            self._closing = True
+            raise CannotOpen(
+                f"{self._url}: the port did not open within {timeout_s:g} s: is the device there?"
+            ) from None
+        except _GONE as error:
+            raise CannotOpen(why_not_open(self._url, error)) from None
+
+    async def read(self) -> bytes:
+        """The next bytes as they came; raises LinkLost."""
+        while not self._chunks:
+            if self._lost is not None:
+                raise LinkLost(self._lost)
+            self._came.clear()
+            await self._came.wait()
+        chunks, self._chunks = self._chunks, []
+        self._room.release(len(chunks))
+        return chunks[0] if len(chunks) == 1 else b"".join(chunks)
+
+    async def write(self, data: bytes) -> None:
+        """Write these bytes whole; raises LinkLost, after which some of them may be out."""
+        port = self._port
+        if port is None or self._lost is not None:
+            raise LinkLost(self._lost or f"{self._url} is closed")
+        try:
+            written = port.write(data)
+        except serial.SerialTimeoutException:
+            raise LinkLost(f"{self._url} takes no bytes: unplugged, or stuck?") from None
+        except _GONE as error:
+            raise LinkLost(f"{self._url} is gone: {_cause(error)}") from None
+        if written != len(data):
+            raise LinkLost(f"{self._url} took {written} of {len(data)} bytes")
+
+    async def close(self) -> None:
+        """Let go of the port and wait until the thread has ended."""
+        self._closing = True
+        self._room.release()
+        if self._port is not None:
+            with contextlib.suppress(*_GONE):
+                self._port.cancel_read()
+        if self._opened.done() and not self._opened.cancelled() and self._opened.exception() is None:
+            await asyncio.shield(self._ended)
+            self._thread.join()
+
+    # ------------------------------------------------------------------ in the thread
+
+    def _run(self) -> None:
+        try:
+            # Not given to the constructor's open: `exclusive` locks it against a second gateway.
+            port = serial.Serial(
+                self._url.path, self._url.baud, timeout=None, write_timeout=WRITE_TIMEOUT_S, exclusive=_exclusive()
+            )
+        except _GONE as error:
+            self._tell(self._failed_to_open, error)
+            return
+        self._port = port
+        self._tell(self._succeeded)
+        reason = f"{self._url} was closed"
+        try:
+            while not self._closing:
+                data = port.read(1)
+                if waiting := port.in_waiting:
+                    data += port.read(waiting)
+                if data:
+                    self._room.acquire()
+                    self._tell(self._received, data)
+        except _GONE as error:
+            reason = f"{self._url} is gone: {_cause(error)}"
+        except TypeError:
+            # pyserial reads from a descriptor that `close` has just set to None
+            pass
+        finally:
+            with contextlib.suppress(*_GONE):
+                port.close()
+            self._tell(self._over, reason)
+
+    def _tell(self, what: object, *arguments: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to tell
+            self._loop.call_soon_threadsafe(what, *arguments)  # type: ignore[arg-type]  # a method of this class
+
+    # ------------------------------------------------------------------ told by the thread, on the loop
+
+    def _failed_to_open(self, error: Exception) -> None:
+        if not self._opened.done():
+            self._opened.set_exception(error)
+            self._opened.exception()  # looked at even if `open` has timed out meanwhile
+
+    def _succeeded(self) -> None:
+        if not self._opened.done():
+            self._opened.set_result(None)
+
+    def _received(self, data: bytes) -> None:
+        self._chunks.append(data)
+        self._came.set()
+
+    def _over(self, reason: str) -> None:
+        self._lost = reason
+        self._came.set()
+        if not self._ended.done():
+            self._ended.set_result(None)
+
+
+async def open_serial(url: SerialUrl, timeout_s: float) -> Link:
+    """Open a serial port; raises CannotOpen."""
+    link = SerialLink(url, asyncio.get_running_loop())
+    await link.open(timeout_s)
+    return link
+
+
+def why_not_open(url: SerialUrl, error: Exception) -> str:
+    """One line: what is wrong with the port, and what to do."""
+    code = getattr(error, "errno", None)
+    if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        return f"{url}: there is no such port; {_ports()}"
+    if code in (errno.EACCES, errno.EPERM):
+        return f"{url}: no permission; {_group(url.path)}"
+    if code in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
+        return f"{url}: the port is in use by another program (a second gateway?): end that one first"
+    if code == errno.EISDIR or os.path.isdir(url.path):  # noqa: PTH112 - a device path, not a file to work with
+        return f"{url}: this is a directory, not a serial port; {_ports()}"
+    if os.path.exists(url.path):  # noqa: PTH110 - likewise
+        return f"{url}: this is not a serial port ({_cause(error)}); {_ports()}"
+    return f"{url}: the port cannot be opened ({_cause(error)}); {_ports()}"
+
+
+def _cause(error: Exception) -> str:
+    code = getattr(error, "errno", None)
+    if isinstance(code, int):
+        return os.strerror(code).lower()
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _ports() -> str:
+    from serial.tools import list_ports
+
+    found = sorted(port.device for port in list_ports.comports())
+    return f"there are: {', '.join(found)}" if found else "no serial port is plugged in"
+
+
+def _group(path: str) -> str:
+    try:
+        import grp
+
+        group = grp.getgrgid(os.stat(path).st_gid).gr_name  # noqa: PTH116 - a device path, not a file to work with
+    except (ImportError, OSError, KeyError):
+        return "ask for access to the port"
+    return f"it belongs to group {group}: `sudo usermod -aG {group} $USER`, then log in again"
+
+
+def _exclusive() -> bool | None:
+    """A lock between programs is a matter of POSIX; Windows ports are exclusive anyway, and refuse the argument."""
+    return True if os.name == "posix" else None
