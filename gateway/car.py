@@ -110,9 +110,10 @@ class Car:
         stopped = asyncio.ensure_future(self._stopped.wait())
         try:
             done, _ = await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
-            failed = [task for task in done if task is not stopped]
+            failed = [task for task in done if task is not stopped and task.exception() is not None]
             if failed:
-                self.stop()
+                if not self._ending:
+                    self.stop()
                 await asyncio.wait([stopped, tasks[1]], return_when=asyncio.FIRST_COMPLETED)
                 failed[0].result()
         finally:
