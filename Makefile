@@ -50,5 +50,8 @@ bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in 
 proto: .venv/.ready ## generate schemas/gen from schemas/proto
 	$(BIN)/python -m schemas.generate
 
+readme: .venv/.ready ## generate the tables and help texts of the README
+	$(BIN)/python -m tests.readme
+
 clean: ## remove everything that is not tracked
 	rm -rf .venv .cache .tmp .state .hypothesis .pytest_cache .mypy_cache .ruff_cache sessions
