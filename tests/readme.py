@@ -1,6 +1,5 @@
 """The generated parts of README.md: `python -m tests.readme` writes them, tests/test_readme.py compares them."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -83,9 +82,11 @@ def generated(text: str) -> str:
     """`text` with every generated part made anew."""
     for name, make in PARTS.items():
         begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
-        pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
-        text, count = pattern.subn(lambda _, made=make(): f"{begin}\n{made}\n{end}", text)
-        assert count == 1, f"README.md has {count} parts named {name}"
+        before, found, rest = text.partition(begin)
+        _, closed, after = rest.partition(end)
+        assert found, f"README.md has no {begin}"
+        assert closed, f"README.md has no {end}"
+        text = f"{before}{begin}\n{make()}\n{end}{after}"
     return text
 
 

@@ -353,10 +353,12 @@ class Controller:
     def worst_stop_s(self, now: float) -> float:
         """The longest that a stop asked now takes until the motors are off (protocol.md, "Worst case of a stop")."""
         running, style = self._running, self.profile.stop_style
-        if style is StopStyle.UNKNOWN or (style is StopStyle.MODE_FRAME and not self.known):
+        if style is not StopStyle.RASPBERRY_PI and not self.known:
             began = running.first_at if running is not None and running.first_at is not None else now
             avoiding = self.profile.mode_turn_s(Mode.OBSTACLE_AVOIDANCE)
             return max(0.0, began + RECOVERY_WORST_S - now) + avoiding
+        if style is StopStyle.UNKNOWN:
+            return RECOVERY_WORST_S
         gate = Gate.FLIGHT if style is StopStyle.RASPBERRY_PI else Gate.ALONE
         wait = max(0.0, self.pacing.ready_at(gate) - now)
         if running is not None and running.recipe.rank >= recipes.FULL.rank and running.first_at is not None:
