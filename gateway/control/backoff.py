@@ -3,7 +3,8 @@
 from typing import Final
 
 FIRST_S: Final = 0.25
-LONGEST_S: Final = 5.0
+LONGEST_S: Final = 1.0
+"""A car may be driving while its link is away: whatever a try costs, it is tried again within a second."""
 
 
 def delay_s(failures: int, jitter: float) -> float:

@@ -180,6 +180,8 @@ def _cause(error: Exception) -> str:
     code = getattr(error, "errno", None)
     if isinstance(code, int):
         return os.strerror(code).lower()
+    if "readiness to read" in str(error):  # pyserial's words for an end of file, which is what an unplug looks like
+        return "unplugged"
     return " ".join(str(error).split()) or type(error).__name__
 
 
