@@ -1,6 +1,7 @@
 """The recorder: everything of one fleet that comes over the bus, into one session. One more subscriber, no policy.
 
-Zenoh's receive thread copies and appends; one writer thread does the rest: file, flush and status each second, answers.
+Two threads. One takes what comes off Zenoh's channels and never touches a disk: a disk that hangs must show as drops
+here, not as a session that stalls its senders. The other writes: file, flush and status each second, answers.
 """
 
 import contextlib
@@ -27,8 +28,14 @@ LIMIT_BYTES: Final = 64 << 20
 """What may wait for the writer: some seconds of a hundred cars, and little beside the memory of a small computer."""
 PERIOD_S: Final = 1.0
 """Flush and status; what a crash loses at most."""
-TICK_S: Final = 0.02
-"""How long messages gather. Short: while the writer works on a long batch it holds up the receive thread."""
+TICK_S: Final = 0.01
+"""How long messages gather before they are taken. Their log_time is that moment; their publish_time is exact."""
+WRITE_S: Final = 0.05
+"""How long they gather again before they are written."""
+CHANNEL: Final = 16_384
+"""What a channel holds until it is taken: three seconds of a hundred cars."""
+ROUND: Final = 4_096
+"""Taken from one channel before the others have their turn."""
 LINGER_S: Final = 0.1
 """What was published before we were told to end is still under way."""
 QUESTIONS: Final = 64
@@ -84,7 +91,9 @@ class Recorder:
         self._drops: dict[str, int] = {}
         self._questions: list[zenoh.Query] = []
         self._closing = threading.Event()
-        self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._taken = threading.Event()
+        self._reader_error: Exception | None = None
+        self._subscribers: list[zenoh.Subscriber[Any]] = []
         self._error = ""
         self.ended = threading.Event()
         """The writer has ended: closed, or failed."""
@@ -103,10 +112,12 @@ class Recorder:
         key = keys.topic_key(self._fleet, keys.RECORDER, STATUS.name.partition("/")[2])
         self._publisher = self._bus.publisher(key, STATUS, keys.RECORDER)
         self._last = self._status("recording")
-        self._writer = threading.Thread(target=self._write, name="mcap-writer")
-        self._writer.start()
         for expression in keys.recorded(self._fleet):
-            self._subscribers.append(self._bus.subscribe_raw(expression, self._receive))
+            self._subscribers.append(self._bus.subscribe_channel(expression, CHANNEL))
+        self._reader = threading.Thread(target=self._read, name="bus-reader")
+        self._writer = threading.Thread(target=self._write, name="mcap-writer")
+        self._reader.start()
+        self._writer.start()
         self._bus.queryable(key, self._ask)
         token = keys.car_token(self._fleet, keys.RECORDER)
         self._bus.token(token)
@@ -118,16 +129,15 @@ class Recorder:
         """Write what has come until now, and close the session whole; raises RecordingFailed."""
         if not self.ended.is_set():
             time.sleep(LINGER_S)
+        self._closing.set()
+        self._reader.join()
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
         self._subscribers.clear()
-        self._closing.set()
         self._writer.join()
         if self._error:
             raise RecordingFailed(self._error)
-        with self._lock:
-            drops = dict(self._drops)
-        return Outcome(self.session, self._segment.messages, self._size, drops, dict(self._segment.missed))
+        return Outcome(self.session, self._segment.messages, self._size, dict(self._drops), dict(self._segment.missed))
 
     def _refuse_a_second(self) -> None:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
@@ -142,33 +152,62 @@ class Recorder:
     def _wall(self) -> datetime:
         return datetime.fromtimestamp(self._now() / 1e9, UTC)
 
-    # ------------------------------------------------------------------ Zenoh's threads
-
-    def _receive(self, sample: zenoh.Sample) -> None:
-        # Copied here: a payload that is kept keeps the whole network batch it came in, and the byte limit would lie.
-        payload = sample.payload.to_bytes()
-        key = str(sample.key_expr)
-        item = (key, payload, sample.encoding, sample.timestamp, sample.source_info, self._now())
-        with self._lock:
-            size = self._held_bytes + len(payload)
-            if self._held_messages >= self._limit_messages or size > self._limit_bytes:
-                self._drops[key] = self._drops.get(key, 0) + 1
-                return
-            self._held_messages += 1
-            self._held_bytes = size
-            self._waiting.append(item)
-
     def _ask(self, query: zenoh.Query) -> None:
         with self._lock:
             if len(self._questions) < QUESTIONS and not self.ended.is_set():
                 self._questions.append(query)
+
+    # ------------------------------------------------------------------ the reader's thread
+
+    def _read(self) -> None:
+        try:
+            while not self._closing.is_set():
+                if not self._take():
+                    time.sleep(TICK_S)  # an Event's wait costs several times as much
+            while self._take():
+                pass
+        except Exception as error:  # noqa: BLE001 - handed to the writer, which says it: never silently
+            self._reader_error = error
+        finally:
+            self._taken.set()
+
+    def _take(self) -> bool:
+        """Take what has come; whether there may be more."""
+        with self._lock:
+            messages, size = self._held_messages, self._held_bytes
+        batch: list[_Item] = []
+        more = False
+        for subscriber in self._subscribers:
+            receive = subscriber.try_recv
+            for _ in range(ROUND):
+                sample = receive()
+                if sample is None:
+                    break
+                # Copied here: a payload that is kept keeps the network batch it came in, and the byte limit would lie.
+                payload = sample.payload.to_bytes()
+                key = str(sample.key_expr)
+                if messages >= self._limit_messages or size + len(payload) > self._limit_bytes:
+                    self._drops[key] = self._drops.get(key, 0) + 1
+                    continue
+                messages += 1
+                size += len(payload)
+                batch.append((key, payload, sample.encoding, sample.timestamp, sample.source_info, self._now()))
+            else:
+                more = True
+        if batch:
+            taken = sum(len(item[1]) for item in batch)
+            with self._lock:
+                self._held_messages += len(batch)
+                self._held_bytes += taken
+                self._waiting += batch
+        return more
 
     # ------------------------------------------------------------------ the writer's thread
 
     def _write(self) -> None:
         try:
             due = time.monotonic()
-            while not self._closing.wait(TICK_S):
+            while not self._taken.wait(WRITE_S):
                 self._drain()
                 if time.monotonic() >= due:
                     due = max(due + PERIOD_S, time.monotonic())
@@ -176,9 +215,10 @@ class Recorder:
                     self._publish("recording")
                 self._answer()
             self._drain()
-            with self._lock:
-                drops = dict(self._drops)
-            self._segment.finish(drops)
+            if self._reader_error is not None:
+                self._fail(f"{type(self._reader_error).__name__}: {self._reader_error}")
+                return
+            self._segment.finish(dict(self._drops))
             self._describe(closed=True)
             self._publish("closed")
         except OSError as error:
@@ -204,8 +244,7 @@ class Recorder:
 
     def _fail(self, words: str) -> None:
         self._error = f"recording to {self.session} failed: {words}. What was written until then is whole"
-        with self._lock:
-            self._limit_messages = 0
+        self._limit_messages = 0
         self._segment.abandon()
         # From the last status: asking the disk again may fail again.
         self._last.state, self._last.error, self._last.messages = "failed", self._error, self._segment.messages
@@ -217,8 +256,7 @@ class Recorder:
         description = self._description
         description.ended, description.closed = directory.iso(self._wall()), closed
         description.messages, description.error = self._segment.messages, self._error
-        with self._lock:
-            description.drops = dict(self._drops)
+        description.drops = dict(self._drops)
         description.missed = dict(self._segment.missed)
         description.write(self.session)
 
@@ -227,14 +265,12 @@ class Recorder:
         return self._segment.path.stat().st_size
 
     def _status(self, state: str) -> fleet_v1_pb2.Recording:
-        with self._lock:
-            drops = dict(self._drops)
         return fleet_v1_pb2.Recording(
             session=str(self.session),
             state=state,
             bytes=self._size,
             messages=self._segment.messages,
-            drops=drops,
+            drops=dict(self._drops),
             free_bytes=shutil.disk_usage(self.session).free,
             error=self._error,
             missed=self._segment.missed,
