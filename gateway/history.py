@@ -1,12 +1,14 @@
 """The values of one key, the latest and a ring of earlier ones, and the time ranges that a query may ask for. No bus.
 
-A time range is written as Zenoh writes it: `[now(-30s)..]`, `[now(-1m)..now(-30s)[`, `[2026-11-21T04:00:00Z;10s]`.
+A time range is written as Zenoh writes it: `[now(-30s)..]`, `[now(-1m)..now(-30s)[`. Zenoh's other form,
+`[start;duration]`, never arrives whole: `;` separates the parameters of a query.
 """
 
+import math
 import re
 from collections import deque
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Final
 
 RING: Final = 1500  # design.md, "Keys": one minute of the fastest readings
@@ -22,8 +24,10 @@ _UNITS_NS: Final = {
 }
 _DURATION: Final = re.compile(r"(-?\d+(?:\.\d+)?)(u|us|ms|s|m|h|d|w)?")
 _NOW: Final = re.compile(r"now\((.*)\)")
-_RANGE: Final = re.compile(r"([\[\]])(.*?)(\.\.|;)(.*)([\[\]])")
+_RANGE: Final = re.compile(r"([\[\]])(.*?)\.\.(.*)([\[\]])")
 _FOREVER_NS: Final = 1 << 63
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_COUNT: Final = re.compile(r"0*([1-9][0-9]*)")
 
 
 class BadRange(ValueError):
@@ -57,9 +61,11 @@ class Ring:
             begin, end = parse_range(time_range, now_ns)
             values = [value for value in values if begin <= value.time_ns < end]
         if last is not None:
-            if not last.isdecimal() or not last.isascii() or int(last) < 1:
+            found = _COUNT.fullmatch(last)
+            if found is None:
                 raise BadRange(f"last={last}: give a whole number from 1 on, at most {RING} are kept")
-            values = values[-int(last) :]
+            if len(found[1]) <= len(str(RING)):
+                values = values[-int(found[1]) :]
         return values
 
 
@@ -68,14 +74,9 @@ def parse_range(text: str, now_ns: int) -> tuple[int, int]:
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         raise _bad(text)
-    opening, first, between, second, closing = match.groups()
+    opening, first, second, closing = match.groups()
     begin = _instant(first, now_ns, text) if first else 0
-    if between == ";":
-        if not first or not second:
-            raise _bad(text)
-        end = begin + _duration_ns(second, text)
-    else:
-        end = _instant(second, now_ns, text) if second else _FOREVER_NS
+    end = _instant(second, now_ns, text) if second else _FOREVER_NS
     return begin + (opening == "]"), end + (closing == "]")
 
 
@@ -89,18 +90,21 @@ def _instant(text: str, now_ns: int, whole: str) -> int:
         raise _bad(whole) from None
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
-    return int(moment.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
+    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000
 
 
 def _duration_ns(text: str, whole: str) -> int:
     found = _DURATION.fullmatch(text)
     if found is None:
         raise _bad(whole)
-    return round(float(found[1]) * _UNITS_NS[found[2] or "s"])
+    duration_ns = float(found[1]) * _UNITS_NS[found[2] or "s"]
+    if not math.isfinite(duration_ns):
+        raise _bad(whole)
+    return round(duration_ns)
 
 
 def _bad(text: str) -> BadRange:
     return BadRange(
-        f"_time={text} cannot be read: write [now(-30s)..], [now(-1m)..now(-30s)] or [2026-11-21T04:00:00Z;10s] "
+        f"_time={text} cannot be read: write [now(-30s)..], [now(-1m)..now(-30s)] or [2026-11-21T04:00:00Z..] "
         "(units u, ms, s, m, h, d, w)"
     )

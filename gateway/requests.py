@@ -6,7 +6,7 @@ Ranges are checked here, at the edge; whether the car may do it now is the arbit
 import math
 import uuid
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from gateway.control.records import (
@@ -71,7 +71,7 @@ class BadRequest(ValueError):
 def parse(request: Request) -> Command:
     """The command in a request; raises BadRequest."""
     verb = request.verb
-    blank = Command(uuid.uuid4().hex, verb, Sender(), Stop())
+    blank = Command(uuid.uuid4().hex, verb, Sender(), Stop(), streamed=request.streamed)
     if verb not in COMMANDS:
         words = f"{verb!r} is no command; there are: {', '.join(COMMANDS)}"
         raise BadRequest(Reason.UNSUPPORTED, words, blank)
@@ -85,10 +85,10 @@ def parse(request: Request) -> Command:
         message: Any = messages.parse(COMMANDS[verb], request.payload or b"", _encoding(request))
     except messages.BadPayload as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", blank) from None
-    command = Command(message.id or blank.id, verb, Sender(message.sender or "anonymous"), Stop())
+    command = replace(blank, id=message.id or blank.id, sender=Sender(message.sender or "anonymous"))
     try:
         sender = Sender(_sender(message.sender), _word("kind", message.kind or Kind.SCRIPT, Kind))
-        command = Command(command.id, verb, sender, Stop())
+        command = replace(command, sender=sender)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
         what = _WHAT[verb](message)
     except NotImplementedError as error:
@@ -98,14 +98,11 @@ def parse(request: Request) -> Command:
     if message.take:
         words = f"{verb}: take is not supported yet: ask without it"
         raise BadRequest(Reason.UNSUPPORTED, words, command)
-    return Command(
-        command.id,
-        verb,
-        sender,
-        what,
+    return replace(
+        command,
+        what=what,
         age_s=_age_s(message, request),
         ttl_s=ttl_s if ttl_s is not None else _DRIVE_TTL_S if verb == "drive" else _TTL_S,
-        streamed=request.streamed,
     )
 
 

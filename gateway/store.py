@@ -44,8 +44,12 @@ class Store:
             return StoredHold(f"unreadable {self.path.name}: {error}", now_ns)
         try:
             hold = json.loads(text)["hold"]
-            return None if hold is None else StoredHold(str(hold["by"]), int(hold["since_ns"]))
-        except (ValueError, TypeError, KeyError):
+            if hold is None:
+                return None
+            by = str(hold["by"])
+            by.encode()  # JSON can say half a surrogate pair, a message cannot
+            return StoredHold(by, min(max(0, int(hold["since_ns"])), now_ns))
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
             return StoredHold(f"unreadable {self.path.name}", now_ns)
 
     def save(self, hold: StoredHold | None) -> None:

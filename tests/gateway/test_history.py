@@ -1,0 +1,119 @@
+"""Rings of values, and the time ranges that a query may ask for: tables, and any text is a range or a BadRange."""
+
+import contextlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.history import RING, BadRange, Ring, parse_range
+
+S = 1_000_000_000
+NOW = 1_800_000_000 * S
+EARLY = 0
+FOREVER = 1 << 63
+
+
+@pytest.mark.parametrize(
+    ("text", "begin", "end"),
+    [
+        ("[now(-30s)..]", NOW - 30 * S, FOREVER + 1),
+        ("[now(-30s)..[", NOW - 30 * S, FOREVER),
+        ("[..now()]", EARLY, NOW + 1),
+        ("[..]", EARLY, FOREVER + 1),
+        ("[now(-1m)..now(-30s)]", NOW - 60 * S, NOW - 30 * S + 1),
+        ("]now(-1m)..now(-30s)[", NOW - 60 * S + 1, NOW - 30 * S),
+        ("[now(-2h)..now(1h)]", NOW - 7200 * S, NOW + 3600 * S + 1),
+        ("[now(-1.5)..]", NOW - S * 3 // 2, FOREVER + 1),
+        ("[now(-250ms)..now(-10us)]", NOW - S // 4, NOW - 10_000 + 1),
+        ("[now(-3u)..now()]", NOW - 3000, NOW + 1),
+        ("[now(-1d)..now(-1w)]", NOW - 86_400 * S, NOW - 604_800 * S + 1),
+        ("[2026-11-21T04:00:00Z..]", 1_795_233_600 * S, FOREVER + 1),
+        ("[2026-11-21T04:00:00.000001+00:00..]", 1_795_233_600 * S + 1000, FOREVER + 1),
+        ("[2026-11-21T05:00:00+01:00..2026-11-21T04:00:01]", 1_795_233_600 * S, 1_795_233_601 * S + 1),
+        ("[1969-12-31T23:59:59.500000Z..]", -S // 2, FOREVER + 1),
+        (" [now()..] ", NOW, FOREVER + 1),
+    ],
+)
+def test_a_range_is_half_open_in_nanoseconds(text: str, begin: int, end: int) -> None:
+    assert parse_range(text, NOW) == (begin, end)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "now(-30s)",
+        "[now(-30s)]",
+        "[now(-30s..]",
+        "[now(-30x)..]",
+        "[now(nan)..]",
+        "[now(inf)..]",
+        "[now(-1e3s)..]",
+        f"[now({'9' * 400}s)..]",
+        f"[now({'9' * 5000}s)..]",
+        "[yesterday..]",
+        "[2026-13-01T00:00:00Z..]",
+        "[2026-11-21T04:00:00Z",  # Zenoh cuts parameters at `;`, so `[start;duration]` arrives like this
+        "[2026-11-21T04:00:00Z;10s]",
+        "(now()..)",
+    ],
+)
+def test_what_is_no_range_is_refused_with_how_to_write_one(text: str) -> None:
+    with pytest.raises(BadRange, match=r"cannot be read: write \[now\(-30s\)\.\.\]"):
+        parse_range(text, NOW)
+
+
+def filled(count: int, size: int = 5) -> Ring:
+    ring = Ring(size)
+    for number in range(count):
+        ring.add(NOW - (count - number) * S, str(number).encode())
+    return ring
+
+
+@pytest.mark.parametrize(
+    ("time_range", "last", "found"),
+    [
+        (None, None, "7"),
+        (None, "1", "7"),
+        (None, "3", "567"),
+        (None, "03", "567"),
+        (None, "99999999999", "34567"),
+        ("[now(-2s)..]", None, "67"),
+        ("]now(-2s)..]", None, "7"),
+        ("[now(-4s)..now(-2s)]", None, "456"),
+        ("[now(-4s)..now(-2s)[", None, "45"),
+        ("[now(-4s)..]", "2", "67"),
+        ("[now(-1h)..]", None, "34567"),
+        ("[now()..]", None, ""),
+    ],
+)
+def test_the_ring_gives_the_latest_the_last_or_a_range_oldest_first(
+    time_range: str | None, last: str | None, found: str
+) -> None:
+    values = filled(8).select(time_range=time_range, last=last, now_ns=NOW)
+    assert b"".join(value.payload for value in values).decode() == found
+
+
+@pytest.mark.parametrize("last", ["", "0", "-1", "1.5", "three", "³", "٣", "1_0", " 3", "inf", "0" * 5000])
+def test_a_last_that_is_no_count_is_refused(last: str) -> None:
+    with pytest.raises(BadRange, match=f"whole number from 1 on, at most {RING} are kept"):
+        filled(3).select(time_range=None, last=last, now_ns=NOW)
+
+
+def test_a_count_of_thousands_of_digits_is_all_there_is() -> None:
+    assert len(filled(3).select(time_range=None, last="9" * 5000, now_ns=NOW)) == 3
+
+
+def test_an_empty_ring_has_nothing_to_give() -> None:
+    for time_range, last in [(None, None), ("[..]", None), (None, "3")]:
+        assert Ring(3).select(time_range=time_range, last=last, now_ns=NOW) == []
+
+
+PIECES = st.sampled_from(["[", "]", "..", "now(", ")", "-", "1", "9" * 30, "s", "ms", "w", "Z", "T", ":", ";", "2026"])
+
+
+@given(st.one_of(st.text(), st.lists(PIECES, max_size=12).map("".join)), st.one_of(st.none(), st.text()))
+def test_any_text_is_a_selection_or_a_bad_range(time_range: str, last: str | None) -> None:
+    with contextlib.suppress(BadRange):
+        filled(3).select(time_range=time_range, last=last, now_ns=NOW)

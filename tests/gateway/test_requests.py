@@ -1,0 +1,260 @@
+"""From a payload to a command: the table of verbs, what is refused and with which words, and any bytes at all."""
+
+import json
+import time
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.control.records import (
+    Act,
+    ChangeSpeed,
+    Command,
+    Drive,
+    Fan,
+    Find,
+    Kind,
+    Reason,
+    Resume,
+    Sender,
+    SetMode,
+    Stop,
+    What,
+)
+from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz
+from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.requests import BadRequest, Request, parse
+from schemas import messages
+from schemas.gen import fleet_v1_pb2 as pb
+from schemas.topics import COMMANDS
+
+NOW = 1_800_000_000_000_000_000
+
+
+def ask(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any) -> Command:
+    data = payload if isinstance(payload, bytes | None) else json.dumps(payload).encode()
+    return parse(Request(verb, data, encoding, NOW, **more))
+
+
+def refused(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any) -> BadRequest:
+    with pytest.raises(BadRequest) as caught:
+        ask(verb, payload, encoding, **more)
+    assert "\n" not in caught.value.words
+    return caught.value
+
+
+def parsed(request: Request) -> tuple[Command, str]:
+    """The command, or what is known of it and why it is refused."""
+    try:
+        return parse(request), ""
+    except BadRequest as error:
+        return error.command, error.words or "no words"
+
+
+def general(**fields: Any) -> Act:
+    return Act(General(Motion.STOP, **fields))
+
+
+@pytest.mark.parametrize(
+    ("verb", "payload", "what"),
+    [
+        *(("drive", {"motion": motion}, Drive(motion, 0.5)) for motion in Motion),
+        ("drive", {"motion": "forward", "duration_s": 10}, Drive(Motion.FORWARD, 10.0)),
+        ("drive", {"motion": "forward", "duration_s": 1e-3}, Drive(Motion.FORWARD, 1e-3)),
+        *(("mode", {"mode": mode}, SetMode(mode)) for mode in Mode),
+        ("led", {"r": 0, "g": 0, "b": 0}, Act(ColorLed(0, 0, 0))),
+        ("led", {"r": 255, "g": 16, "b": 1}, Act(ColorLed(255, 16, 1))),
+        *(("light", {"light": light}, general(light=light)) for light in Light),
+        ("servo", {"deg": 0}, Act(Ptz(0))),
+        ("servo", {"servo": "front", "deg": 180}, Act(Ptz(180))),
+        ("servo", {"action": "left"}, general(servo=ServoAction.FRONT_LEFT)),
+        ("servo", {"servo": "front", "action": "reset"}, general(servo=ServoAction.FRONT_RESET)),
+        ("servo", {"servo": "vertical", "action": "up"}, general(servo=ServoAction.VERTICAL_UP)),
+        ("servo", {"servo": "horizontal", "action": "right"}, general(servo=ServoAction.HORIZONTAL_RIGHT)),
+        ("arm", {"joint_deg": [0, 180, 1, 2, 3, 4]}, Act(ArmSet((0, 180, 1, 2, 3, 4)))),
+        ("whistle", {}, general(whistle=True)),
+        ("speed", {"step": "up"}, ChangeSpeed(SpeedStep.UP)),
+        ("speed", {"step": "down"}, ChangeSpeed(SpeedStep.DOWN)),
+        ("fan", {}, Fan(None)),
+        ("fan", {"state": "on"}, Fan(on=True)),
+        ("fan", {"state": "off"}, Fan(on=False)),
+        ("stop", {}, Stop()),
+        ("stop", None, Stop()),
+        ("estop", {"why": "smoke", "scope": "fleet"}, Stop(emergency=True)),
+        ("estop", None, Stop(emergency=True)),
+        ("resume", {}, Resume()),
+        ("find", {}, Find()),
+    ],
+)
+def test_a_payload_becomes_a_command(verb: str, payload: Any, what: What) -> None:
+    command = ask(verb, payload)
+    assert command.what == what
+    assert (command.verb, command.sender, command.streamed) == (verb, Sender("anonymous", Kind.SCRIPT), False)
+    assert (command.age_s, command.ttl_s) == (0.0, 0.5 if verb == "drive" else 2.0)
+    assert len(command.id) == 32
+    if payload is not None:
+        message: Any = messages.message_class(COMMANDS[verb])(**payload)
+        for encoding in (messages.PROTOBUF, messages.encoding_of(COMMANDS[verb])):
+            assert ask(verb, message.SerializeToString(), encoding).what == what
+
+
+def test_every_verb_of_the_table_is_known_here() -> None:
+    for verb in COMMANDS:
+        assert (verb, parsed(Request(verb, b"{}", messages.JSON, NOW))[0].verb) == (verb, verb)
+
+
+@pytest.mark.parametrize(
+    ("verb", "payload", "reason", "words"),
+    [
+        ("jump", {}, Reason.UNSUPPORTED, "'jump' is no command; there are: drive, "),
+        ("", {}, Reason.UNSUPPORTED, "'' is no command"),
+        ("drive", None, Reason.BAD_VALUE, "drive without a payload: give fleet.v1.DriveCommand or its JSON"),
+        ("resume", None, Reason.BAD_VALUE, "only stop and estop need none"),
+        ("drive", {}, Reason.BAD_VALUE, "no motion given: allowed are stop, forward, "),
+        ("drive", {"motion": "Forward"}, Reason.BAD_VALUE, "motion 'Forward': allowed are "),
+        ("drive", {"motion": "forward", "duration_s": 0}, Reason.BAD_VALUE, "duration_s 0: allowed are more than 0"),
+        ("drive", {"motion": "forward", "duration_s": -1}, Reason.BAD_VALUE, "duration_s -1"),
+        ("drive", {"motion": "forward", "duration_s": 10.1}, Reason.BAD_VALUE, "at most 10 s"),
+        ("drive", {"motion": "forward", "duration_s": "NaN"}, Reason.BAD_VALUE, "duration_s nan"),
+        ("drive", {"motion": "forward", "duration_s": "Infinity"}, Reason.BAD_VALUE, "duration_s inf"),
+        ("drive", {"motion": "forward", "ttl_s": 0}, Reason.BAD_VALUE, "ttl_s 0"),
+        ("drive", {"motion": "forward", "ttl_s": "NaN"}, Reason.BAD_VALUE, "ttl_s nan"),
+        ("drive", {"motion": "forward", "ttl_s": 3601}, Reason.BAD_VALUE, "at most 3600 s"),
+        ("drive", {"motion": "forward", "speed": 3}, Reason.BAD_VALUE, "speed"),
+        ("drive", {"motion": 1}, Reason.BAD_VALUE, "the payload is not the JSON of fleet.v1.DriveCommand"),
+        ("drive", {"motion": "forward", "kind": "boss"}, Reason.BAD_VALUE, "person, script, coordinator"),
+        ("drive", {"motion": "forward", "sender": "a/b"}, Reason.BAD_VALUE, "sender 'a/b' is not allowed"),
+        ("drive", {"motion": "forward", "take": True}, Reason.UNSUPPORTED, "take is not supported yet"),
+        ("mode", {"mode": "parking"}, Reason.BAD_VALUE, "mode 'parking': allowed are manual, "),
+        ("led", {"r": 1, "b": 1}, Reason.BAD_VALUE, "no g given: r, g and b are needed, 0..255 each"),
+        ("led", {"r": 1, "g": 256, "b": 1}, Reason.BAD_VALUE, "g: 256, allowed are whole numbers 0..255"),
+        ("light", {"light": "pink"}, Reason.BAD_VALUE, "light 'pink'"),
+        ("servo", {}, Reason.BAD_VALUE, "allowed are left, right, reset, or deg 0..180"),
+        ("servo", {"deg": 181}, Reason.BAD_VALUE, "deg: 181, allowed are whole numbers 0..180"),
+        ("servo", {"deg": -1}, Reason.BAD_VALUE, "deg"),
+        ("servo", {"deg": 9, "action": "left"}, Reason.BAD_VALUE, "no action beside them"),
+        ("servo", {"servo": "vertical", "deg": 9}, Reason.BAD_VALUE, "only the front servo takes degrees"),
+        ("servo", {"servo": "vertical", "action": "left"}, Reason.BAD_VALUE, "allowed are up, down, reset"),
+        ("servo", {"servo": "rear", "action": "left"}, Reason.BAD_VALUE, "servo 'rear'"),
+        ("arm", {"joint_deg": [1, 2]}, Reason.BAD_VALUE, "joint_deg: 2 values, allowed are 6"),
+        ("arm", {"joint_deg": [1, 2, 3, 4, 5, 999]}, Reason.BAD_VALUE, "joint_deg[5]: 999"),
+        ("speed", {}, Reason.BAD_VALUE, "no step given: allowed are up, down"),
+        ("fan", {"state": "fast"}, Reason.BAD_VALUE, "allowed are on, off, or none to toggle"),
+        ("resume", {"ids": ["x"]}, Reason.UNSUPPORTED, "no e-stop is latched yet"),
+        ("lease", {}, Reason.UNSUPPORTED, "leases are not supported yet"),
+        ("stop", [1], Reason.BAD_VALUE, "the payload is not the JSON of fleet.v1.StopCommand"),
+        ("stop", {"sender": "\ud800"}, Reason.BAD_VALUE, "the payload is not the JSON"),
+    ],
+)
+def test_what_is_no_command_is_refused_with_words(verb: str, payload: Any, reason: Reason, words: str) -> None:
+    error = refused(verb, payload)
+    assert error.reason is reason
+    assert words in error.words
+
+
+def test_a_refusal_is_recorded_under_the_id_and_the_sender_that_were_given() -> None:
+    error = refused("drive", {"motion": "up", "id": "abc", "sender": "mia", "kind": "person"})
+    assert (error.command.id, error.command.sender) == ("abc", Sender("mia", Kind.PERSON))
+
+
+def test_a_refused_stream_is_still_a_stream() -> None:
+    for payload in ({"motion": "up"}, {}, b"\xff", None):
+        error = refused("drive", payload, sampled_ns=NOW)
+        assert error.command.streamed, "or each of 25 a second is recorded"
+
+
+@pytest.mark.parametrize("encoding", ["", "zenoh/bytes", "text/plain", "application/json", "application/json;x"])
+def test_whatever_is_not_called_protobuf_is_read_as_json(encoding: str) -> None:
+    assert ask("drive", {"motion": "back"}, encoding).what == Drive(Motion.BACK)
+
+
+def test_another_verbs_message_is_refused() -> None:
+    words = refused("drive", pb.LedCommand(r=1).SerializeToString(), messages.encoding_of("fleet.v1.LedCommand")).words
+    assert words == "drive: the payload is a fleet.v1.LedCommand, this key takes fleet.v1.DriveCommand"
+
+
+@pytest.mark.parametrize("encoding", ["", messages.JSON, messages.PROTOBUF])
+def test_zero_bytes_are_a_message_without_fields(encoding: str) -> None:
+    assert ask("whistle", b"", encoding).what == general(whistle=True)
+    assert ask("stop", b"", encoding).what == Stop()
+    assert "no motion given" in refused("drive", b"", encoding).words
+
+
+@pytest.mark.parametrize("verb", COMMANDS)
+def test_only_stop_estop_and_resume_may_be_asked_by_wildcard(verb: str) -> None:
+    if verb in ("stop", "estop", "resume"):
+        assert ask(verb, {}, by_wildcard=True).verb == verb
+    else:
+        assert "cannot be asked by wildcard: name one car" in refused(verb, {}, by_wildcard=True).words
+
+
+@pytest.mark.parametrize(
+    ("asked_ns", "sampled_ns", "age_s"),
+    [
+        (None, None, 0.0),
+        (NOW - 1_500_000_000, None, 1.5),
+        (NOW + 1_500_000_000, None, 0.0),
+        (None, NOW - 2_000_000_000, 2.0),
+        (NOW - 250_000_000, NOW - 9_000_000_000, 0.25),
+        (0, None, NOW / 1e9),
+    ],
+)
+def test_age_is_from_asked_else_from_the_sample_else_fresh(
+    asked_ns: int | None, sampled_ns: int | None, age_s: float
+) -> None:
+    message = pb.DriveCommand(motion="forward", ttl_s=7)
+    if asked_ns is not None:
+        message.asked.seconds, message.asked.nanos = divmod(asked_ns, 1_000_000_000)
+    command = ask("drive", message.SerializeToString(), messages.PROTOBUF, sampled_ns=sampled_ns)
+    assert command.age_s == pytest.approx(age_s)
+    assert command.ttl_s == 7
+    assert command.streamed is (sampled_ns is not None)
+
+
+VALUES = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(),
+        st.floats(),
+        st.text(),
+        st.sampled_from(["forward", "NaN", "-Infinity", "up", "front"]),
+    ),
+    lambda inner: st.one_of(st.lists(inner, max_size=6), st.dictionaries(st.text(), inner, max_size=3)),
+    max_leaves=6,
+)
+FIELDS = sorted(
+    {field for name in COMMANDS.values() for field in messages.message_class(name).DESCRIPTOR.fields_by_name}
+)
+JSONS = st.one_of(VALUES, st.dictionaries(st.sampled_from(FIELDS), VALUES)).map(
+    lambda value: json.dumps(value).encode()
+)
+WIRE = st.binary(max_size=40).map(lambda tail: pb.DriveCommand(motion="forward", id="x").SerializeToString() + tail)
+
+
+@settings(max_examples=400)
+@given(
+    st.sampled_from([*COMMANDS, "jump"]),
+    st.one_of(st.none(), st.binary(), st.text().map(lambda text: text.encode(errors="replace")), JSONS, WIRE),
+    st.one_of(st.sampled_from([messages.JSON, messages.PROTOBUF, ""]), st.text()),
+    st.one_of(st.none(), st.integers(0, 1 << 63)),
+    st.booleans(),
+)
+def test_any_bytes_on_any_verb_are_a_command_or_a_bad_request(
+    verb: str, payload: bytes | None, encoding: str, sampled_ns: int | None, by_wildcard: bool
+) -> None:
+    request = Request(verb, payload, encoding, NOW, sampled_ns=sampled_ns, by_wildcard=by_wildcard)
+    command, words = parsed(request)
+    assert words != "no words"
+    assert command.verb == verb
+    assert command.streamed is request.streamed
+    assert command.age_s >= 0
+    assert 0 < command.ttl_s <= 3600
+
+
+def test_deep_json_is_refused_in_no_time() -> None:
+    began = time.monotonic()
+    assert "not the JSON" in refused("drive", b"[" * 100_000).words
+    assert time.monotonic() - began < 10

@@ -1,0 +1,105 @@
+"""What survives a restart: written whole, read back, and a file that cannot be read counts as a hold."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gateway.store import Store, StoredHold, default_directory
+
+NOW = 1_800_000_000_000_000_000
+
+
+def test_a_hold_is_read_back_by_the_next_process(tmp_path: Path) -> None:
+    directory = tmp_path / "not" / "yet" / "there"
+    hold = StoredHold("mia", NOW - 5)
+    Store(directory, "fleet", "red").save(hold)
+    assert Store(directory, "fleet", "red").load(NOW) == hold
+    assert Store(directory, "fleet", "blue").load(NOW) is None
+    assert Store(directory, "other", "red").load(NOW) is None
+    Store(directory, "fleet", "red").save(None)
+    assert Store(directory, "fleet", "red").load(NOW) is None
+    assert [path.name for path in directory.iterdir()] == ["fleet.red.json"]
+
+
+def test_a_hold_from_the_future_began_now(tmp_path: Path) -> None:
+    store = Store(tmp_path, "fleet", "red")
+    store.save(StoredHold("mia", NOW + 10**30))
+    assert store.load(NOW) == StoredHold("mia", NOW)
+
+
+def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        Store(tmp_path / "file", "fleet", "red").save(None)
+    assert Store(tmp_path / "file", "fleet", "red").load(NOW) is not None
+    store = Store(tmp_path, "fleet", "red")
+    store.save(StoredHold("mia", 1))
+    (tmp_path / "fleet.red.new").mkdir()
+    with pytest.raises(OSError, match="fleet"):
+        store.save(None)
+    assert store.load(NOW) == StoredHold("mia", 1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "null",
+        "3",
+        "{}",
+        '{"hold": 3}',
+        '{"hold": {"by": "mia"}}',
+        '{"hold": {"since_ns": 3}}',
+        '{"hold": {"by": "mia", "since_ns": "soon"}}',
+        '{"hold": {"by": "mia", "since_ns": Infinity}}',
+        '{"hold": {"by": "mia", "since_ns": NaN}}',
+        '{"hold": {"by": "\\ud800", "since_ns": 3}}',
+        "[" * 100_000,
+        '{"hold": {"by": "mia", "since_ns": ' + "9" * 5000 + "}}",
+    ],
+)
+def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
+    store = Store(tmp_path, "fleet", "red")
+    store.path.write_text(text)
+    held = store.load(NOW)
+    assert held is not None
+    assert (held.since_ns, held.by[:10]) == (NOW, "unreadable")
+    held.by.encode()
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.one_of(st.binary(), st.text().map(str.encode), st.integers(0, 80).map(lambda cut: SAVED[:cut])))
+def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: bytes) -> None:
+    store = Store(tmp_path, "fleet", "red")
+    store.path.write_bytes(content)
+    held = store.load(NOW)
+    if held is None:
+        assert json.loads(content)["hold"] is None
+    else:
+        assert 0 <= held.since_ns <= NOW
+
+
+SAVED = json.dumps({"hold": {"by": "mia", "since_ns": NOW}}).encode()
+
+
+def test_the_directory_is_the_variables_or_the_platforms(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path / "chosen"))
+    assert default_directory() == tmp_path / "chosen"
+    monkeypatch.delenv("FLEET_STATE_DIR")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("XDG_STATE_HOME", "")
+    assert default_directory() == tmp_path / ".local" / "state" / "zenoh-car-fleet"
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    assert default_directory() == tmp_path / "state" / "zenoh-car-fleet"
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert default_directory() == tmp_path / "Library" / "Application Support" / "zenoh-car-fleet"
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "local"))
+    assert default_directory() == tmp_path / "local" / "zenoh-car-fleet"
