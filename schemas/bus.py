@@ -24,6 +24,7 @@ import zenoh
 from google.protobuf.message import Message
 
 from schemas import messages
+from schemas.keys import BadKey
 from schemas.topics import Qos, Topic
 
 T = TypeVar("T")
@@ -139,6 +140,15 @@ def ensure_hub(endpoint: str, timeout_s: float = 10.0) -> None:
             time.sleep(0.02)
     # The hub is nobody's child to wait for; without this the interpreter warns that it still runs.
     hub.returncode = 0 if hub.returncode is None else hub.returncode
+
+
+def canon(expression: str) -> str:
+    """A key expression as Zenoh writes it; raises BadKey for one that Zenoh does not take."""
+    try:
+        return str(zenoh.KeyExpr.autocanonize(expression))
+    except zenoh.ZError as error:
+        words = str(error).partition(" at /")[0]  # what follows is a place in Zenoh's source
+        raise BadKey(f"key expression {expression!r} is not allowed: {words}") from None
 
 
 class Handover(Generic[T]):

@@ -1,0 +1,131 @@
+"""AsyncFleetClient and AsyncCar: the client of client.py for asyncio, with the same names.
+
+The blocking calls run in threads; a watch is an asynchronous iterator fed through a bounded hand-over.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Coroutine, Iterable, Sequence
+from contextlib import asynccontextmanager
+from typing import Any, Self
+
+from fleet.client import FleetClient
+from fleet.outcome import Outcome
+from fleet.readings import QUEUE_LIMIT, Reading, reading_of
+from fleet.verbs import Request, Verbs
+from schemas import keys, messages
+from schemas.bus import Handover, Sample
+
+
+class AsyncFleetClient:
+    """`async with AsyncFleetClient() as client`; see FleetClient for what each does and raises."""
+
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        fleet: str = keys.DEFAULT_FLEET,
+        *,
+        sender: str | None = None,
+        kind: str = "script",
+        start_hub: bool = False,
+    ) -> None:
+        self._open = lambda: FleetClient(endpoint, fleet, sender=sender, kind=kind, start_hub=start_hub)
+        self._client: FleetClient | None = None
+
+    async def __aenter__(self) -> Self:
+        self._client = await asyncio.to_thread(self._open)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await asyncio.to_thread(self.sync.close)
+
+    @property
+    def sync(self) -> FleetClient:
+        """The client underneath."""
+        if self._client is None:
+            raise RuntimeError("use the client inside `async with`")
+        return self._client
+
+    async def cars(self) -> list[str]:
+        """The cars whose gateway is on the bus."""
+        return await asyncio.to_thread(self.sync.cars)
+
+    def car(self, name: str) -> "AsyncCar":
+        """One car, there or not."""
+        return AsyncCar(self, keys.check_name(name))
+
+    async def get(self, expression: str) -> list[Reading]:
+        """The latest value under every key that matches."""
+        return await asyncio.to_thread(self.sync.get, expression)
+
+    @asynccontextmanager
+    async def watch(self, expression: str) -> AsyncIterator["AsyncWatch"]:
+        """Readings as they are published: `async with client.watch("red") as stream: async for reading in stream`."""
+        stream = AsyncWatch()
+        subscriber = self.sync.bus.subscribe(self.sync.expression(expression), stream.hand_over)
+        try:
+            yield stream
+        finally:
+            await asyncio.to_thread(subscriber.undeclare)
+
+    async def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
+        """Stop these cars, or every car."""
+        return await asyncio.to_thread(self.sync.stop, cars)
+
+    async def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
+        """Emergency stop of these cars, or of the fleet."""
+        return await asyncio.to_thread(self.sync.estop, cars, why)
+
+    async def resume(self, cars: Iterable[str], ids: Sequence[str] = ()) -> list[Outcome]:
+        """End the e-stops of these ids; without ids, the hold."""
+        return await asyncio.to_thread(self.sync.resume, cars, ids)
+
+    async def ask(self, request: Request, cars: Iterable[str] | None = None) -> list[Outcome]:
+        """Ask the cars and wait for what becomes of it."""
+        return await asyncio.to_thread(self.sync.ask, request, cars)
+
+
+class AsyncCar(Verbs[Coroutine[Any, Any, Outcome]]):
+    """One car of an AsyncFleetClient: `await client.car("red").drive("forward", 2.0)`."""
+
+    def __init__(self, client: AsyncFleetClient, name: str) -> None:
+        super().__init__(name)
+        self._client = client
+
+    async def get(self, topic: str = "sensor/*") -> list[Reading]:
+        """The latest readings of this car."""
+        return await self._client.get(f"{self.name}/{topic}")
+
+    async def _do(self, request: Request) -> Outcome:
+        return (await self._client.ask(request, [self.name]))[0]
+
+
+class AsyncWatch:
+    """Readings as they come; what the reader is too slow for is counted."""
+
+    def __init__(self) -> None:
+        self._waiting: asyncio.Queue[Sample] = asyncio.Queue(QUEUE_LIMIT)
+        self.hand_over: Handover[Sample] = Handover(asyncio.get_running_loop(), self._take, limit=QUEUE_LIMIT)
+        self._full = 0
+        self.unreadable = 0
+        """Samples that are no message of ours."""
+
+    @property
+    def dropped(self) -> int:
+        """Samples that found the queue full."""
+        return self._full + self.hand_over.dropped
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Reading:
+        while True:
+            try:
+                return reading_of(await self._waiting.get())
+            except (messages.BadPayload, KeyError):
+                self.unreadable += 1
+
+    def _take(self, sample: Sample) -> None:
+        try:
+            self._waiting.put_nowait(sample)
+        except asyncio.QueueFull:
+            self._full += 1

@@ -1,0 +1,282 @@
+"""FleetClient and Car: the operator's side of the bus, for scripts, the command line, the console and the coordinator.
+
+Asks and waits. What a command is lies in verbs.py, what became of it in outcome.py; the same for asyncio is aio.py.
+"""
+
+import getpass
+import logging
+import os
+import queue
+import re
+import socket
+import time
+import uuid
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Final, Self
+
+from fleet.outcome import Outcome, Progress
+from fleet.readings import Reading, Watch, reading_of
+from fleet.verbs import Request, Verbs, estop_request, resume_request, stop_request
+from schemas import keys, messages, topics
+from schemas.bus import Bus, Failure, Sample, canon
+from schemas.topics import Qos
+
+ANSWER_S: Final = 2.0
+"""How long a gateway may take to answer; it answers at once, whatever its car does."""
+_QUEUE: Final = 4096  # answers and events of one command: a few for each of some hundred cars
+
+log = logging.getLogger("fleet")
+
+
+def default_sender() -> str:
+    """Who asks, in one key chunk: user@host-pid."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # no entry for this user id, as in some containers
+        user = "user"
+    return re.sub(r"[^A-Za-z0-9_.@-]", "-", f"{user}@{socket.gethostname()}-{os.getpid()}").lstrip("@")
+
+
+class FleetClient:
+    """One operator on the bus; use it with `with`. Its methods may be called from several threads.
+
+    While it is open it holds the token `<fleet>/@operator/<sender>`: when that is lost, gateways stop what it drives.
+    Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
+    """
+
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        fleet: str = keys.DEFAULT_FLEET,
+        *,
+        sender: str | None = None,
+        kind: str = "script",
+        start_hub: bool = False,
+    ) -> None:
+        self.fleet = keys.check_name(fleet, "fleet name")
+        self.sender = sender or default_sender()
+        self.kind = kind
+        token = keys.operator_token(self.fleet, self.sender)
+        self.bus = Bus.open(endpoint, start_hub=start_hub)
+        self._inboxes: dict[str, queue.Queue[_Item]] = {}
+        self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
+        self.dropped = 0
+        """Command events that were lost because nobody took them in time."""
+        try:
+            self.bus.token(token)
+            self.bus.subscribe(keys.topic_key(self.fleet, "*", "event/command"), self._event)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._pool.shutdown(cancel_futures=True)
+        self.bus.close()
+
+    # ------------------------------------------------------------------ reading
+
+    def cars(self) -> list[str]:
+        """The cars whose gateway is on the bus, by name."""
+        return [token.rpartition("/")[2] for token in self.bus.tokens(keys.car_token(self.fleet, "*"))]
+
+    def car(self, name: str) -> "Car":
+        """One car, there or not; raises keys.BadKey for a bad name."""
+        return Car(self, keys.check_name(name))
+
+    def expression(self, expression: str) -> str:
+        """A short form (`red`, `*/sensor/battery`) written out; raises keys.BadKey."""
+        return canon(keys.expand(expression, self.fleet))
+
+    def get(self, expression: str) -> list[Reading]:
+        """The latest value under every key that matches, sorted by key; short forms as on the command line."""
+        found = []
+        for answer in self.bus.query(self.expression(expression), timeout_s=ANSWER_S, qos=Qos.STATE):
+            if isinstance(answer, Failure):
+                log.warning("not every gateway answered: %s", answer.words)
+                continue
+            try:
+                found.append(reading_of(answer))
+            except (messages.BadPayload, KeyError) as error:
+                log.warning("%s: an answer that is no message of this fleet: %s", answer.key, error)
+        return sorted(found, key=lambda reading: reading.key)
+
+    def watch(self, expression: str) -> Watch:
+        """Readings as they are published under matching keys, until closed."""
+        written = self.expression(expression)
+
+        def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
+            return self.bus.subscribe(written, take).undeclare
+
+        return Watch().begin(subscribe)
+
+    # ------------------------------------------------------------------ commands
+
+    def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
+        """Stop these cars; without an argument every car, with one query."""
+        return self.ask(stop_request(), cars)
+
+    def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
+        """Emergency stop of these cars; without an argument of the whole fleet."""
+        return self.ask(estop_request(why, "fleet" if cars is None else "car"), cars)
+
+    def resume(self, cars: Iterable[str], ids: Sequence[str] = ()) -> list[Outcome]:
+        """End the e-stops of these ids; without ids, the hold."""
+        return self.ask(resume_request(ids), cars)
+
+    def ask(self, request: Request, cars: Iterable[str] | None = None) -> list[Outcome]:
+        """Ask the cars (None: all, with one wildcard query), wait, and say for each what became of it.
+
+        A car that is missing or silent has an outcome of its own and keeps none of the others waiting to be asked.
+        """
+        named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
+        message, command_id = self._filled(request)
+        asking = _Asking(request, self.cars(), named)
+        self._inboxes[command_id] = asking.inbox
+        try:
+            payload = message.SerializeToString()
+            futures = [self._pool.submit(self._query, target, asking, payload) for target in asking.targets]
+            asking.wait()
+            for future in futures:
+                if future.done():
+                    future.result()
+        finally:
+            del self._inboxes[command_id]
+        return asking.outcomes()
+
+    def _filled(self, request: Request) -> tuple[Any, str]:
+        message = type(request.message)()
+        message.CopyFrom(request.message)
+        message.id = uuid.uuid4().hex
+        message.sender = self.sender
+        message.kind = self.kind
+        message.asked.seconds, message.asked.nanos = divmod(time.time_ns(), 1_000_000_000)
+        return message, message.id
+
+    def _query(self, target: str, asking: "_Asking", payload: bytes) -> None:
+        """Ask one car, or all; on a thread of the pool."""
+        verb = asking.request.verb
+        words = f"{target} did not answer within {ANSWER_S:g} s: its gateway hangs"
+        try:
+            answers = self.bus.query(
+                keys.command_key(self.fleet, target, verb),
+                payload=payload,
+                encoding=messages.encoding_of(topics.COMMANDS[verb]),
+                timeout_s=ANSWER_S,
+            )
+            for answer in answers:
+                if isinstance(answer, Sample):
+                    asking.inbox.put((time.monotonic(), answer))
+                elif answer.words != "Timeout":
+                    words = answer.words
+        finally:
+            asking.inbox.put((time.monotonic(), _Over(target, words)))
+
+    def _event(self, sample: Sample) -> None:
+        """A record of some command of somebody; on a Zenoh thread."""
+        try:
+            event: Any = sample.message()
+        except (messages.BadPayload, KeyError) as error:
+            log.warning("%s: not a command event: %s", sample.key, error)
+            return
+        inbox = self._inboxes.get(event.id)
+        if inbox is None:
+            return
+        try:
+            inbox.put_nowait((time.monotonic(), event))
+        except queue.Full:
+            self.dropped += 1
+
+
+class Car(Verbs[Outcome]):
+    """One car of a FleetClient: `client.car("red").drive("forward", 2.0)`."""
+
+    def __init__(self, client: FleetClient, name: str) -> None:
+        super().__init__(name)
+        self._client = client
+
+    def get(self, topic: str = "sensor/*") -> list[Reading]:
+        """The latest readings of this car."""
+        return self._client.get(f"{self.name}/{topic}")
+
+    def _do(self, request: Request) -> Outcome:
+        return self._client.ask(request, [self.name])[0]
+
+
+class _Over:
+    """The query to a car, or to all, is over."""
+
+    def __init__(self, target: str, words: str) -> None:
+        self.target = target
+        self.words = words
+
+
+_Item = tuple[float, Any]
+"""When it came (monotonic s), and a Sample (an answer), a CommandEvent, or _Over."""
+
+
+class _Asking:
+    """One command on its way to some cars; `wait` runs on the thread that asked and takes what others put in."""
+
+    def __init__(self, request: Request, present: list[str], named: list[str] | None) -> None:
+        self.request = request
+        self.inbox: queue.Queue[_Item] = queue.Queue(_QUEUE)
+        self._asked_at = time.monotonic()
+        self._open = 0
+        self._progress: dict[str, Progress] = {}
+        for car in present if named is None else named:
+            self._of(car)
+            if car not in present:
+                self._progress[car].missing(present, self._asked_at)
+        self.targets = ["*"] if named is None else [car for car in named if car in present]
+        self._open = len(self.targets)
+
+    def outcomes(self) -> list[Outcome]:
+        """What became of it, sorted by car."""
+        ended = [progress.outcome for _, progress in sorted(self._progress.items())]
+        return [outcome for outcome in ended if outcome is not None]
+
+    def wait(self) -> None:
+        """Until every car's outcome is known, or its deadline is over."""
+        while True:
+            waiting = [progress for progress in self._progress.values() if progress.outcome is None]
+            # By wildcard a car may answer that showed no token yet: it counts as well, so the query must be over.
+            if not waiting and not self._open:
+                return
+            now = time.monotonic()
+            for progress in waiting:
+                if now >= progress.deadline:
+                    progress.give_up(now)
+            until = min((each.deadline for each in waiting), default=now + ANSWER_S)
+            try:
+                at, item = self.inbox.get(timeout=max(0.0, until - now))
+            except queue.Empty:
+                continue
+            self._take(item, at)
+
+    def _take(self, item: Any, at: float) -> None:
+        if isinstance(item, _Over):
+            self._open -= 1
+            for progress in self._progress.values():
+                if item.target in ("*", progress.car):
+                    words = item.words.replace("*", progress.car, 1)
+                    progress.silent(words, at)
+        elif isinstance(item, Sample):
+            key = keys.parse(item.key)
+            answer: Any = messages.parse(topics.RESULT, item.payload, item.encoding)
+            if key is not None:
+                self._of(key.car).answered(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
+        else:
+            self._of(item.car).event(item.phase, item.reason, item.words, item.worst_case_s, at)
+
+    def _of(self, car: str) -> Progress:
+        if car not in self._progress:
+            self._progress[car] = Progress(car, self.request.until, self._asked_at, self.request.lasts_s)
+        return self._progress[car]

@@ -1,0 +1,130 @@
+"""What becomes of one command on one car, from its answer and its events. Pure: time is an argument."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+QUEUED: Final = "queued"
+SENT: Final = "sent"
+COMPLETE: Final = "complete"
+NO_ANSWER: Final = "no_answer"
+_ENDED: Final = frozenset({"superseded", "expired", "failed", "rejected"})
+
+MARGIN_S: Final = 5.0
+"""What is waited beyond the time in which the gateway said, or must say, what became of a command.
+
+A stop's worst case ends when the motors are off; its last frame follows 1.1 s later (protocol.md, "full")."""
+PATIENCE_S: Final = 10.0  # gateway.control: the longest that a command waits there for a busy car
+
+
+class Until(StrEnum):
+    """What is waited for."""
+
+    SENT = "sent"
+    """The frame was written."""
+    STOPPED = "stopped"
+    """The whole stop was written."""
+    OVER = "over"
+    """The drive has ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a command on one car."""
+
+    car: str
+    ok: bool
+    """It was carried out: `sent`, or `complete` where that was waited for."""
+    phase: str
+    """The last phase heard (`sent, complete, superseded, expired, failed, rejected, queued`), or `no_answer`."""
+    reason: str = ""
+    """Of the gateway's closed set (`held, wrong_mode, link_down, ...`); empty if there is none."""
+    words: str = ""
+    """For a person: why, and what to do."""
+    worst_case_s: float = 0.0
+    """A stop's: the longest it could take until the motors are off, as announced."""
+    took_s: float = 0.0
+    """From asking until this was known, here."""
+
+
+class Progress:
+    """One command on one car; `outcome` is None until it is known what became of it."""
+
+    def __init__(self, car: str, until: Until, asked_at: float, lasts_s: float = 0.0) -> None:
+        self.car = car
+        self.outcome: Outcome | None = None
+        self._until = until
+        self._asked_at = asked_at
+        self._lasts_s = lasts_s
+        self._phase = NO_ANSWER
+        self._heard_at = asked_at
+        self._worst_case_s = 0.0
+        self._queued = False
+
+    @property
+    def _joined(self) -> bool:
+        """It only prolongs a drive that its sender holds already: the end is recorded under the earlier id."""
+        return self._until is Until.OVER and self._phase == SENT and not self._queued
+
+    @property
+    def deadline(self) -> float:
+        """When to give up, on the clock of `asked_at`."""
+        if self._joined:
+            return self._asked_at + self._lasts_s
+        wait_s = {Until.SENT: PATIENCE_S, Until.STOPPED: self._worst_case_s, Until.OVER: self._lasts_s}[self._until]
+        return self._asked_at + wait_s + MARGIN_S
+
+    @property
+    def heard(self) -> bool:
+        """Whether the car's gateway said anything about the command."""
+        return self._phase != NO_ANSWER
+
+    def answered(self, status: str, reason: str, words: str, worst_case_s: float, at: float) -> None:
+        """Take the answer to the query."""
+        self._worst_case_s = max(self._worst_case_s, worst_case_s)
+        self._note(status, reason, words, at)
+        # Nothing had to be stopped, so nothing will be complete: `sent` without a worst case is the last word.
+        if status == SENT and self._until is Until.STOPPED and worst_case_s == 0:
+            self._end(SENT, reason, words, at, ok=True)
+
+    def event(self, phase: str, reason: str, words: str, worst_case_s: float, at: float) -> None:
+        """Take one record of `event/command`."""
+        self._worst_case_s = max(self._worst_case_s, worst_case_s)
+        self._note(phase, reason, words, at)
+
+    def missing(self, present: Sequence[str], at: float) -> None:
+        """The car has no token."""
+        there = f"there are: {', '.join(present)}" if present else "there is none"
+        self._end(NO_ANSWER, "", f"no car {self.car} on the bus; {there}", at, ok=False)
+
+    def silent(self, words: str, at: float) -> None:
+        """Its query is over; a car that has not said anything did not answer."""
+        if not self.heard:
+            self._end(NO_ANSWER, "", words, at, ok=False)
+
+    def give_up(self, at: float) -> None:
+        """The deadline is over."""
+        if self._joined:
+            self._end(SENT, "", "it prolonged a drive", at, ok=True)
+            return
+        words = (
+            f"not known what became of it after {at - self._asked_at:.1f} s: "
+            f"last heard was {self._phase!r}, {at - self._heard_at:.1f} s ago"
+        )
+        self._end(self._phase, "", words, at, ok=False)
+
+    def _note(self, phase: str, reason: str, words: str, at: float) -> None:
+        self._heard_at = at
+        self._queued = self._queued or phase == QUEUED
+        if self._phase not in (SENT, COMPLETE) or phase not in ("asked", QUEUED):
+            self._phase = phase
+        if phase in _ENDED:
+            self._end(phase, reason, words, at, ok=False)
+        elif phase == COMPLETE or (phase == SENT and self._until is Until.SENT):
+            self._end(phase, reason, words, at, ok=True)
+
+    def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
+        if self.outcome is None:
+            took_s = at - self._asked_at
+            self.outcome = Outcome(self.car, ok, phase, reason, words, self._worst_case_s, took_s)

@@ -1,0 +1,88 @@
+"""Readings as an operator sees them: key, time, value; and a stream of them with a bounded queue. No Zenoh here."""
+
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final, Self
+
+from schemas import messages
+from schemas.bus import Sample
+
+QUEUE_LIMIT: Final = 1024
+_LOOK_S: Final = 0.2
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One message under one key."""
+
+    key: str
+    time: datetime
+    """When its publisher had it, UTC: the message's own stamp, else the time Zenoh put on it."""
+    value: Any
+    """The protobuf message, e.g. `fleet.v1.Range`; optional fields that were not measured are not set."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The message in protobuf's JSON mapping, with the field names of the .proto."""
+        return messages.to_dict(self.value)
+
+
+def reading_of(sample: Sample) -> Reading:
+    """The reading in a sample; raises messages.BadPayload or KeyError for what is no message of ours."""
+    value: Any = sample.message()
+    stamp = getattr(value, "stamp", None) or getattr(value, "timestamp", None)
+    time_ns = stamp.seconds * 1_000_000_000 + stamp.nanos if stamp is not None and stamp.seconds else sample.time_ns
+    return Reading(sample.key, _EPOCH + timedelta(microseconds=time_ns // 1000), value)
+
+
+class Watch:
+    """Readings as they come. Iterate; `close` (or `with`) ends it. What the reader is too slow for is counted."""
+
+    def __init__(self, limit: int = QUEUE_LIMIT) -> None:
+        self._waiting: queue.Queue[Sample] = queue.Queue(limit)
+        self._closed = threading.Event()
+        self._undeclare: Callable[[], object] = lambda: None
+        self.dropped = 0
+        """Samples that found the queue full."""
+        self.unreadable = 0
+        """Samples that are no message of ours."""
+
+    def begin(self, subscribe: Callable[[Callable[[Sample], None]], Callable[[], object]]) -> Self:
+        """Subscribe; what `subscribe` returns is called at the end."""
+        self._undeclare = subscribe(self._take)
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Reading:
+        while not self._closed.is_set():
+            try:
+                return reading_of(self._waiting.get(timeout=_LOOK_S))
+            except queue.Empty:
+                continue
+            except (messages.BadPayload, KeyError):
+                self.unreadable += 1
+        raise StopIteration
+
+    def close(self) -> None:
+        """End the stream; the iteration stops."""
+        if not self._closed.is_set():
+            self._closed.set()
+            self._undeclare()
+
+    def _take(self, sample: Sample) -> None:
+        """On a Zenoh thread."""
+        try:
+            self._waiting.put_nowait(sample)
+        except queue.Full:
+            self.dropped += 1
