@@ -152,9 +152,10 @@ def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
         out = publisher(bus, "red", "sensor/range")
         sent = 0
         while not dropping.is_set():
-            for _ in range(500):
+            for _ in range(50):
                 out.put(pb.Range(range_m=1.0), time.time_ns())
-            sent += 500
+            sent += 50
+            time.sleep(0.01)  # a pace that the hub carries whole: what is lost is lost in the queue
         outcome = recorder.close()
     held = Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))[out.key]
     dropped, missed = outcome.drops[out.key], outcome.missed.get(out.key, 0)

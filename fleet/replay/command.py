@@ -1,0 +1,75 @@
+"""`fleet replay`: a session in Rerun, in its viewer or as a file that carries its layout."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("session", type=click.Path(path_type=Path))
+@click.option(
+    "--save",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="OUT.rrd",
+    help="Write a file that carries its layout instead of opening the viewer: `rerun OUT.rrd` shows it.",
+)
+def replay(session: Path, save: Path | None) -> None:  # fmt: skip
+    """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun."""
+    from fleet.recording.session import NoSession, Session
+
+    if save is None and not has_display():
+        raise click.ClickException(
+            f"there is no display here to open Rerun on: write a file, fleet replay {session} --save out.rrd"
+        )
+    try:
+        found = Session.open(session)
+        if found.cut:
+            click.echo(f"{found.cut_words}; showing what is whole", err=True)
+        if save is not None:
+            _export(found, save)
+            return
+        with tempfile.TemporaryDirectory() as scratch:
+            out = Path(scratch) / f"{found.name}.rrd"
+            _export(found, out)
+            sys.exit(_view(out))
+    except NoSession as error:
+        raise click.ClickException(str(error)) from None
+
+
+def has_display() -> bool:
+    """Whether a window can be opened, as far as one can tell without opening one."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _export(session: object, out: Path) -> None:
+    from fleet.recording.session import Session
+    from fleet.replay.to_rerun import ExportFailed, export
+
+    assert isinstance(session, Session)
+    try:
+        held = export(session, out)
+    except ExportFailed as error:
+        raise click.ClickException(str(error)) from None
+    except OSError as error:
+        raise click.ClickException(f"{out} cannot be written: {error.strerror}") from None
+    click.echo(f"{out}: {held.total()} messages on {len(held)} keys")
+
+
+def _view(rrd: Path) -> int:
+    """Rerun's viewer until its window is closed; it listens on loopback only."""
+    from fleet.replay.to_rerun import environment, program
+
+    viewer = subprocess.Popen([str(program()), "--bind", "127.0.0.1", "--port", "auto", str(rrd)], env=environment())
+    try:
+        return viewer.wait()
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        viewer.terminate()
+        viewer.wait()

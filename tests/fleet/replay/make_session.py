@@ -1,0 +1,148 @@
+"""A session of three cars and every message type, by the stock mcap writer: `python make_session.py FILE.mcap`."""
+
+import math
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.message import Message
+from mcap.writer import Writer
+
+from schemas import messages
+from schemas.gen import fleet_v1_pb2 as pb
+
+START_NS = 1_790_000_000_000_000_000
+CARS = ("blue", "green", "red")
+MODES = ("manual", "tracking", "obstacle_avoidance")
+COMMANDS = (
+    (3.0, "drive", "asked", "forward for 3 s"),
+    (3.02, "drive", "sent", ""),
+    (6.1, "stop", "complete", "motors off"),
+    (6.5, "mode", "sent", "tracking"),
+    (13.0, "mode", "rejected", "the link is down"),
+)
+
+
+class Made:
+    """Writes messages and counts them by key."""
+
+    def __init__(self, path: Path, writer: type[Writer]) -> None:
+        self._file = path.open("wb")
+        self._writer: Any = writer(self._file)
+        self._writer.start()
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()
+
+    def put(self, key: str, message: Message, at_s: float) -> None:
+        at_ns = START_NS + int(at_s * 1e9)
+        name = message.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, "protobuf", messages.descriptor_set(name))
+        if key not in self._channels:
+            self._channels[key] = self._writer.register_channel(key, "protobuf", self._schemas[name])
+        self.counts[key] += 1
+        given: Any = message
+        if name.startswith("fleet.v1."):
+            given.stamp.FromNanoseconds(at_ns)
+            given.car, given.seq, given.boot_id = key.split("/")[1], self.counts[key], "b"
+        payload = message.SerializeToString()
+        self._writer.add_message(self._channels[key], at_ns + 1_000_000, payload, at_ns, self.counts[key])
+
+    def close(self) -> None:
+        self._writer.finish()
+        self._file.close()
+
+
+def log(car: str, at_s: float, level: int, words: str) -> Log:
+    made = Log(level=level, message=words, name=f"{car} demo")  # type: ignore[arg-type]  # an enum is a number here
+    made.timestamp.FromNanoseconds(START_NS + int(at_s * 1e9))
+    return made
+
+
+def drive_about(made: Made, car: str, index: int, seconds: int) -> None:
+    """One car: manual, then tracking, then avoidance; its own circle in the world."""
+    base = f"fleet/{car}"
+    for tenth in range(seconds * 10):
+        at = tenth / 10
+        angle = at * 0.35 + index * 2.1
+        radius = 0.8 + 0.35 * index
+        truth = pb.Truth(mode=mode(at, seconds), motor_left=120, motor_right=150, led="off")
+        truth.x_m, truth.y_m = radius * math.cos(angle), radius * math.sin(angle)
+        truth.heading_rad = angle + math.pi / 2
+        made.put(f"{base}/sim/truth", truth, at)
+        if mode(at, seconds) == "tracking":
+            made.put(f"{base}/sensor/line", pb.Line(left_inner=tenth % 7 < 5, right_inner=tenth % 5 < 3), at)
+            frame = pb.RxFrame(
+                data=b"$4WD,CSB0,PV8,GS0,LF0110,HW00,GM00#", verdict="sensors", published=["sensor/line"]
+            )
+            made.put(f"{base}/frame/rx", frame, at)
+    for second in range(seconds):
+        at = second + 0.03 * index
+        now = mode(at, seconds)
+        if now == "manual":
+            distance = (
+                pb.Range(no_echo=True) if second % 7 == 6 else pb.Range(range_m=1 + 0.6 * math.sin(at / 2 + index))
+            )
+            made.put(f"{base}/sensor/range", distance, at)
+            voltage = 8.2 - 0.02 * second - 0.2 * index
+            made.put(f"{base}/sensor/battery", pb.Battery(voltage_v=voltage, charge=0.8, level="ok"), at)
+            made.put(f"{base}/sensor/grayscale", pb.Grayscale(raw=200 + second), at)
+            made.put(f"{base}/sensor/line", pb.Line(left_outer=second % 3 == 0), at)
+            made.put(f"{base}/sensor/obstacle", pb.Obstacle(left=second % 4 == 0, right=second % 5 == 0), at)
+            made.put(f"{base}/sensor/light", pb.Light(left=second % 2 == 0), at)
+            made.put(f"{base}/sensor/imu", pb.Imu(gyro_x_raw=second * 3, accel_z_raw=16384), at)
+            made.put(f"{base}/sensor/arm", pb.Arm(joint_deg=[90, 45, 30, 20, 10, second]), at)
+        inferred = "tracking" if now == "tracking" else "manual" if now == "manual" else "unknown"
+        verdict = "confirmed" if inferred == now else "assumed"
+        made.put(
+            f"{base}/state/mode",
+            pb.Mode(asked=now, inferred=inferred, verdict=verdict, evidence="shape of 3 frames"),
+            at,
+        )
+        motion = "forward" if 3 <= second < 6 else "stop"
+        made.put(f"{base}/state/motion", pb.Motion(motion=motion, source="commanded", speed=0.6), at)
+        quiet = "lost" if index == 1 and 8 <= second < 11 else "quiet" if now == "obstacle_avoidance" else "online"
+        made.put(f"{base}/state/link", pb.Link(state=quiet, rx_bytes=second * 35, rejects={"truncated": 1}), at)
+        made.put(f"{base}/state/safety", pb.Safety(motors="on" if motion == "forward" else "off", worst_stop_s=1.2), at)
+        made.put(f"{base}/state/health", pb.Health(platform="arduino", loop_lag_s=0.002, cpu=0.01, rss_mb=38), at)
+    for number, (at, verb, phase, words) in enumerate(COMMANDS):
+        event = pb.CommandEvent(id=f"c{number}", verb=verb, sender="ann", kind="person", phase=phase, words=words)
+        made.put(f"{base}/event/command", event, at + 0.1 * index)
+        made.put(f"{base}/frame/tx", pb.TxFrame(data=b"$1,0,0,0,0,0,0,0,0#", why="command", written=True), at)
+    made.put(f"{base}/event/log", log(car, 0.1, 2, "connected to /dev/pts/3"), 0.1)
+    made.put(f"{base}/event/log", log(car, 8.0, 3, "link lost: the port is gone"), 8.0)
+    made.put(f"{base}/event/log", log(car, 11.0, 2, "link back; recovery begun"), 11.0)
+
+
+def mode(at_s: float, seconds: int) -> str:
+    return MODES[min(int(at_s / seconds * 3), 2)]
+
+
+def make(path: Path, seconds: int = 20, writer: type[Writer] = Writer) -> Counter[str]:
+    """Write the session; how many messages each key has."""
+    made = Made(path, writer)
+    for index, car in enumerate(CARS):
+        drive_about(made, car, index, seconds)
+    made.put("fleet/@coordinator/plan", pb.Plan(text="red: tracking\nblue: obstacle_avoidance\n", version="1"), 0.5)
+    roles = [pb.Role(name="patrol", cars=["blue"]), pb.Role(name="track", cars=["red", "green"])]
+    made.put("fleet/@coordinator/assignment", pb.Assignment(roles=roles), 0.6)
+    for at, car, decided, why in (
+        (0.7, "red", "mode tracking", "its role is track"),
+        (8.5, "green", "none", "link lost"),
+    ):
+        made.put("fleet/@coordinator/decision", pb.Decision(subject=car, decided=decided, why=why), at)
+    for second in range(seconds):
+        made.put(
+            "fleet/@recorder/status",
+            pb.Recording(state="recording", bytes=second * 30_000, messages=second * 100),
+            second,
+        )
+    made.close()
+    return made.counts
+
+
+if __name__ == "__main__":
+    make(Path(sys.argv[1]))

@@ -1,0 +1,166 @@
+"""A session becomes an .rrd with its layout; what is in it is counted by Rerun's own reader."""
+
+import os
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import rerun.chunk as rrc
+from click.testing import CliRunner
+
+from fleet.recording.session import NoSession, Session
+from fleet.replay import mapping, to_rerun
+from fleet.replay.command import replay
+from schemas.topics import TOPICS
+
+from .make_session import CARS, make
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Counter[str]]:
+    path = tmp_path_factory.mktemp("session") / "0001.mcap"
+    return path, make(path)
+
+
+def test_the_made_session_has_every_message_type(made: tuple[Path, Counter[str]]) -> None:
+    topics = {key.split("/", 2)[2] if "@" not in key else key.split("/", 1)[1] for key in made[1]}
+    assert topics == set(TOPICS)
+
+
+def test_the_rrd_holds_every_message_and_its_layout(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    path, counts = made
+    out = tmp_path / "out.rrd"
+    assert to_rerun.export(Session.open(path), out) == counts
+    assert to_rerun.rows(out) == counts
+    reader = rrc.RrdReader(out)
+    (recording,), (layout,) = reader.recordings(), reader.blueprints()
+    assert recording.application_id == layout.application_id == to_rerun.APPLICATION
+    assert recording.recording_id == Session.open(path).name
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    to_rerun.export(Session.open(made[0]), out)
+    texts: list[str] = []
+    lanes: dict[str, list[object]] = {}
+    for chunk in rrc.RrdReader(out).store().stream():
+        batch = chunk.to_record_batch()
+        if mapping.key_of(chunk.entity_path) == "fleet/red/event/command" and to_rerun.TEXT in batch.schema.names:
+            texts += [row[0] for row in batch.column(to_rerun.TEXT).to_pylist()]
+        if mapping.key_of(chunk.entity_path) == "fleet/red/state/mode":
+            for name in ("mode asked", "mode inferred"):
+                if name in batch.schema.names:
+                    lanes.setdefault(name, []).extend(row[0] for row in batch.column(name).to_pylist())
+    assert "red  drive  asked  forward for 3 s" in texts
+    assert "red  drive  sent" in texts
+    messages = [m for m in Session.open(made[0]).messages() if m.key == "fleet/red/state/mode"]
+    assert len(lanes["mode asked"]) == len(lanes["mode inferred"]) == len(messages)
+    assert set(lanes["mode inferred"]) == {"manual", "tracking", "unknown"}
+
+
+def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
+    from schemas.messages import message_class
+
+    for panel in mapping.CAR_PANELS:
+        for part in (*panel.curves, *panel.lanes):
+            fields = message_class(TOPICS[part.topic].message).DESCRIPTOR.fields_by_name
+            name = part.field.rstrip("!").partition("[")[0]
+            assert name in fields, part
+            # What may be missing must not be drawn as the zero that stands for it.
+            assert not isinstance(part, mapping.Curve) or fields[name].has_presence == part.field.endswith("!"), part
+        assert panel.topics <= set(TOPICS)
+    for words in mapping.WORDS:
+        assert set(words.fields) <= set(message_class(TOPICS[words.topic].message).DESCRIPTOR.fields_by_name)
+
+
+@pytest.mark.parametrize("key", ["fleet/red/sensor/range", "fleet/@recorder/status", "my-fleet/car_1/state/mode"])
+def test_entities_are_named_as_reruns_reader_names_them(key: str) -> None:
+    assert mapping.key_of(mapping.entity(key)) == key
+
+
+def test_rerun_names_entities_as_we_do(made: tuple[Path, Counter[str]]) -> None:
+    found = {chunk.entity_path for chunk in rrc.McapReader(made[0]).stream() if not chunk.is_static}
+    assert found == {mapping.entity(key) for key in made[1]}
+
+
+def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    class Flushing(Writer):
+        """A chunk for every hundred messages."""
+
+        def add_message(self, *arguments: object, **named: object) -> None:
+            super().add_message(*arguments, **named)  # type: ignore[arg-type]
+            self.count = getattr(self, "count", 0) + 1
+            if self.count % 100 == 0:
+                self.flush()
+
+    path = tmp_path / "0001.mcap"
+    make(path, writer=Flushing)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    session = Session.open(tmp_path)
+    whole = Counter(message.key for message in session.messages())
+    assert sum(whole.values()) > 100
+    out = tmp_path / "out.rrd"
+    result = CliRunner().invoke(replay, [str(tmp_path), "--save", str(out)])
+    assert result.exit_code == 0
+    assert "is cut" in result.stderr
+    assert to_rerun.rows(out) == whole
+
+
+def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    foreign = tmp_path / "foreign.mcap"
+    foreign.write_bytes(b"something else")
+    out = str(tmp_path / "out.rrd")
+    for arguments, words in (
+        ([str(tmp_path / "none"), "--save", out], "there is no session at"),
+        ([str(tmp_path), "--save", out], "no 0001.mcap in it"),
+        ([str(foreign), "--save", out], "is not an MCAP file"),
+    ):
+        result = CliRunner().invoke(replay, arguments)
+        assert (result.exit_code, len(result.stderr.splitlines())) == (1, 1), result.stderr
+        assert words in result.stderr
+    if sys.platform == "linux":
+        result = CliRunner().invoke(replay, [str(foreign)])
+        assert result.exit_code == 1
+        assert "--save" in result.stderr
+
+
+def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "0001.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(NoSession, match="holds no message"):
+        to_rerun.export(Session.open(tmp_path), tmp_path / "out.rrd")
+
+
+def test_nothing_is_written_outside(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    home, work = tmp_path / "home", tmp_path / "work"
+    home.mkdir()
+    work.mkdir()
+    names = ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME", "TMPDIR")
+    environment = {**os.environ, **dict.fromkeys(names, str(home))}
+    environment.pop("CI", None)
+    code = "from fleet.replay.command import replay; replay()"
+    command = [sys.executable, "-c", code, str(made[0]), "--save", str(work / "out.rrd")]
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    assert list(home.rglob("*")) == []
+    assert list(work.iterdir()) == [work / "out.rrd"]
+
+
+def test_cars_come_from_the_keys_and_foreign_keys_do_no_harm() -> None:
+    keys = frozenset(
+        {"fleet/red/sensor/range", "fleet/@recorder/status", "fleet/red/@cmd/drive", "x", "fleet/blue/other"}
+    )
+    found = mapping.contents(keys)
+    assert dict(found.cars) == {"red": frozenset({"sensor/range"})}
+    assert found.services == {"@recorder/status"}
+    assert tuple(sorted(CARS)) == CARS
