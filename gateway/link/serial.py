@@ -51,8 +51,11 @@ class SerialLink(Link):
         self._thread.start()
         try:
             await asyncio.wait_for(asyncio.shield(self._opened), timeout_s)
+        except asyncio.CancelledError:
+            self._end()
+            raise
         except TimeoutError:
-            self._closing = True
+            self._end()
             raise CannotOpen(
                 f"{self._url}: the port did not open within {timeout_s:g} s: is the device there?"
             ) from None
@@ -86,14 +89,18 @@ class SerialLink(Link):
 
     async def close(self) -> None:
         """Let go of the port and wait until the thread has ended."""
+        self._end()
+        if self._opened.done() and not self._opened.cancelled() and self._opened.exception() is None:
+            await asyncio.shield(self._ended)
+            self._thread.join()
+
+    def _end(self) -> None:
+        """Tell the thread to end, whatever it waits for; one that still opens the port closes it again."""
         self._closing = True
         self._room.release()
         if self._port is not None:
             with contextlib.suppress(*_GONE):
                 self._port.cancel_read()
-        if self._opened.done() and not self._opened.cancelled() and self._opened.exception() is None:
-            await asyncio.shield(self._ended)
-            self._thread.join()
 
     # ------------------------------------------------------------------ in the thread
 

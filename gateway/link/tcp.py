@@ -102,7 +102,7 @@ async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
             _, link = await loop.create_connection(lambda: TcpLink(url), url.host, url.port)
     except TimeoutError:
         raise CannotOpen(f"{url}: no answer within {timeout_s:g} s: is the car on, and in this network?") from None
-    except socket.gaierror:
+    except (socket.gaierror, UnicodeError):  # UnicodeError: a label too long for a host name
         raise CannotOpen(f"{url}: there is no host {url.host!r}: check the name, or give its address") from None
     except ConnectionRefusedError:
         words = (

@@ -47,7 +47,7 @@ def parse_url(text: str) -> LinkUrl:
         return SerialUrl(text)
     try:
         parts = urlsplit(text)
-        port = parts.port
+        port = parts.port if parts.scheme == "tcp" else None
     except ValueError as error:
         raise _bad(text, str(error)) from None
     if parts.scheme == "serial":
@@ -73,7 +73,7 @@ def _baud(text: str, query: str) -> int:
     if unknown:
         raise _bad(text, f"{', '.join(unknown)} is no option of a serial link")
     given = fields.get("baud", [str(BAUD)])[-1]
-    if not (given.isascii() and given.isdecimal()) or int(given) not in _BAUDS:
+    if not (given.isascii() and given.isdecimal() and len(given) < 10) or int(given) not in _BAUDS:
         raise _bad(text, f"baud={given} is not from {_BAUDS.start} to {_BAUDS.stop - 1}")
     return int(given)
 

@@ -1,0 +1,137 @@
+"""The other ends of links, real ones: the master of a PTY, and a TCP server. Each does what a car's end can do."""
+
+import contextlib
+import os
+import pty
+import socket
+import struct
+import threading
+import tty
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from gateway.link import LinkUrl
+from gateway.link.url import SerialUrl, TcpUrl
+
+
+class Peer(ABC):
+    """A car's end of a link."""
+
+    url: LinkUrl
+
+    @abstractmethod
+    def send(self, data: bytes) -> None:
+        """Send all of it; blocks while nobody takes it."""
+
+    @abstractmethod
+    def receive(self, size: int) -> bytes:
+        """Exactly so many bytes."""
+
+    @abstractmethod
+    def die(self) -> None:
+        """Hang up; a PTY as an unplugged port does."""
+
+    @abstractmethod
+    def revive(self) -> None:
+        """Be there again, under the same URL."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of everything."""
+
+
+class PtyPeer(Peer):
+    """The master of a PTY, behind a symlink that outlives it, as /dev/serial/by-id does."""
+
+    def __init__(self, directory: Path) -> None:
+        self._path = directory / "tty"
+        self.url = SerialUrl(str(self._path))
+        self._master: int | None = None
+        self.revive()
+
+    def send(self, data: bytes) -> None:
+        assert self._master is not None
+        while data:
+            data = data[os.write(self._master, data) :]
+
+    def receive(self, size: int) -> bytes:
+        assert self._master is not None
+        data = b""
+        while len(data) < size:
+            data += os.read(self._master, size - len(data))
+        return data
+
+    def die(self) -> None:
+        if self._master is not None:
+            os.close(self._master)
+            self._master = None
+            self._path.unlink()
+
+    def revive(self) -> None:
+        self._master, slave = pty.openpty()
+        tty.setraw(slave)
+        self._path.symlink_to(os.ttyname(slave))
+        os.close(slave)
+
+    def close(self) -> None:
+        self.die()
+
+
+class TcpPeer(Peer):
+    """A server that takes one connection at a time."""
+
+    def __init__(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = TcpUrl("127.0.0.1", self._listener.getsockname()[1])
+        self._peer: socket.socket | None = None
+
+    @property
+    def peer(self) -> socket.socket:
+        """The connection; waits for one."""
+        if self._peer is None:
+            self._peer, _ = self._listener.accept()
+            self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return self._peer
+
+    def send(self, data: bytes) -> None:
+        self.peer.sendall(data)
+
+    def receive(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            piece = self.peer.recv(size - len(data))
+            assert piece, "hung up"
+            data += piece
+        return data
+
+    def die(self) -> None:
+        self.peer.close()
+        self._peer = None
+
+    def reset(self) -> None:
+        """Die with a real RST."""
+        self.peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.die()
+
+    def revive(self) -> None:
+        pass  # it listens all the time
+
+    def close(self) -> None:
+        if self._peer is not None:
+            self._peer.close()
+        self._listener.close()
+
+
+def open_descriptors() -> dict[str, str]:
+    """What this process has open; where the system does not tell, nothing."""
+    found = {}
+    with contextlib.suppress(FileNotFoundError):
+        for each in Path("/proc/self/fd").iterdir():
+            with contextlib.suppress(FileNotFoundError):
+                found[each.name] = str(each.readlink())
+    return found
+
+
+def link_threads() -> list[threading.Thread]:
+    """Threads of links."""
+    return [thread for thread in threading.enumerate() if thread.name.startswith("read ")]

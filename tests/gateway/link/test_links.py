@@ -1,0 +1,289 @@
+"""One suite over every kind of link: a real PTY and a real TCP server at the other end."""
+
+import asyncio
+import gc
+import threading
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.link import Link, LinkLost, open_link
+from gateway.link.serial import WRITE_TIMEOUT_S
+from tests.gateway.link.peers import Peer, PtyPeer, TcpPeer, link_threads, open_descriptors
+
+FRAME = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
+STOP = b"$0,0,0,0,0,0,0,0,0#"
+PATIENCE_S = 20.0
+
+
+@pytest.fixture(params=["serial", "tcp"])
+def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
+    made: Peer = PtyPeer(tmp_path) if request.param == "serial" else TcpPeer()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+async def link(peer: Peer) -> AsyncIterator[Link]:
+    opened = await open_link(peer.url)
+    if isinstance(peer, TcpPeer):
+        assert peer.peer, "taken"
+    yield opened
+    await opened.close()
+
+
+async def read(link: Link, size: int) -> bytes:
+    """Exactly so many bytes, as they come."""
+    data = b""
+    async with asyncio.timeout(PATIENCE_S):
+        while len(data) < size:
+            piece = await link.read()
+            assert piece, "a read gives at least one byte"
+            data += piece
+    assert len(data) == size
+    return data
+
+
+async def until_lost(again: Callable[[], Awaitable[object]]) -> str:
+    """Do it until the link is lost; the words."""
+    async with asyncio.timeout(PATIENCE_S):
+        words = ""
+        while not words:
+            try:
+                await again()
+                await asyncio.sleep(0)
+            except LinkLost as error:
+                words = str(error)
+    assert "\n" not in words
+    return words
+
+
+async def lost(link: Link) -> str:
+    """Read until the link is lost; the words."""
+    return await until_lost(link.read)
+
+
+async def test_bytes_go_both_ways_unchanged(link: Link, peer: Peer) -> None:
+    every = bytes(range(256)) * 4
+    peer.send(every)
+    assert await read(link, len(every)) == every
+    for frame in (STOP, FRAME, b"#", bytes(range(256))):
+        await link.write(frame)
+        assert peer.receive(len(frame)) == frame
+
+
+async def test_byte_by_byte_and_slowly(link: Link, peer: Peer) -> None:
+    for index in range(len(FRAME)):
+        peer.send(FRAME[index : index + 1])
+        assert await read(link, 1) == FRAME[index : index + 1], "each byte is handed on when it comes"
+    sender = asyncio.create_task(asyncio.to_thread(lambda: [(time.sleep(0.002), peer.send(b"%c" % c)) for c in FRAME]))
+    assert await read(link, len(FRAME)) == FRAME
+    await sender
+
+
+async def test_dying_in_the_middle_of_a_frame(link: Link, peer: Peer) -> None:
+    peer.send(FRAME[:17])
+    assert await read(link, 17) == FRAME[:17]
+    peer.die()
+    words = await lost(link)
+    assert words.startswith(str(peer.url))
+    assert " is gone: " in words
+    assert await lost(link) == words, "asked again it says the same"
+    with pytest.raises(LinkLost):
+        await link.write(STOP)
+    await link.close()
+
+
+async def test_what_came_before_the_end_is_still_read(peer: Peer) -> None:
+    """Not so on a PTY: the system throws away what nobody had read when the port went."""
+    link = await open_link(peer.url)
+    if isinstance(peer, TcpPeer):
+        peer.send(FRAME)
+        peer.die()
+        assert await read(link, len(FRAME)) == FRAME
+    else:
+        peer.die()
+    await lost(link)
+    await link.close()
+
+
+async def test_a_write_after_death_is_lost_at_the_latest_when_that_is_known(link: Link, peer: Peer) -> None:
+    peer.die()
+    assert (await until_lost(lambda: link.write(STOP))).startswith(str(peer.url))
+
+
+async def test_close_again_and_then_nothing_works(link: Link, peer: Peer) -> None:
+    await link.close()
+    await link.close()
+    assert await lost(link) == f"{peer.url} was closed"
+    with pytest.raises(LinkLost, match="closed"):
+        await link.write(STOP)
+
+
+async def test_closed_at_the_same_time_from_two_sides(link: Link, peer: Peer) -> None:
+    await asyncio.gather(link.close(), link.close())
+    await lost(link)
+
+
+async def test_close_while_a_read_is_pending(link: Link, peer: Peer) -> None:
+    pending = asyncio.create_task(lost(link))
+    await asyncio.sleep(0)
+    await link.close()
+    assert await pending == f"{peer.url} was closed"
+
+
+async def test_a_read_that_is_cancelled_loses_nothing(link: Link, peer: Peer) -> None:
+    pending = asyncio.create_task(link.read())
+    await asyncio.sleep(0)
+    pending.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await pending
+    peer.send(FRAME)
+    assert await read(link, len(FRAME)) == FRAME
+
+
+async def test_it_opens_again_after_every_kind_of_end(peer: Peer) -> None:
+    for number in range(6):
+        link = await open_link(peer.url)
+        peer.send(FRAME) if isinstance(peer, TcpPeer) else None
+        await link.write(STOP)
+        assert peer.receive(len(STOP)) == STOP
+        if number % 2:
+            peer.die()
+            await lost(link)
+            peer.revive()
+        await link.close()
+        if isinstance(peer, TcpPeer) and not number % 2:
+            peer.die()
+
+
+async def test_a_firehose_into_a_loop_that_does_not_read_is_held_back(link: Link, peer: Peer) -> None:
+    """Whoever sends more than fits waits; what was taken is read in order, and then the rest."""
+    total = 24 * 1024 * 1024 if isinstance(peer, TcpPeer) else 8 * 1024 * 1024
+    block = bytes(range(256)) * 256
+    sent = 0
+    ended = threading.Event()
+
+    def pour() -> None:
+        nonlocal sent
+        try:
+            while sent < total:
+                peer.send(block)
+                sent += len(block)
+        except OSError:
+            pass
+        ended.set()
+
+    thread = threading.Thread(target=pour)
+    thread.start()
+    async with asyncio.timeout(PATIENCE_S):
+        before = -1
+        while before != sent or not sent:  # it stands still
+            before = sent
+            for _ in range(10):
+                await asyncio.sleep(0.01)
+    assert sent < total, "held back"
+    assert not ended.is_set()
+    got = 0
+    async with asyncio.timeout(60):
+        while got < total:
+            data = await link.read()
+            assert data[:1] == bytes([got % 256]), "in order"
+            got += len(data)
+    assert got == total
+    await asyncio.to_thread(thread.join)
+
+
+async def test_a_car_that_stops_reading_costs_the_link_not_the_loop(link: Link, peer: Peer) -> None:
+    writes: list[float] = []
+
+    async def write() -> None:
+        writes.append(time.monotonic())
+        await link.write(FRAME * 20)
+
+    assert "takes no bytes" in await until_lost(write)
+    if isinstance(peer, PtyPeer):
+        assert time.monotonic() - writes[-1] < WRITE_TIMEOUT_S + 5
+    await link.close()
+
+
+async def test_nothing_is_left_behind(peer: Peer) -> None:
+    gc.collect()
+    before = open_descriptors()
+    for ending in ("close", "die", "die unread", "cancelled"):
+        link = await open_link(peer.url)
+        pending = asyncio.create_task(link.read())
+        await asyncio.sleep(0)
+        if ending.startswith("die"):
+            peer.send(FRAME)
+            peer.die()
+        if ending == "die":
+            await asyncio.gather(pending, return_exceptions=True)
+            await lost(link)
+        pending.cancel()
+        await asyncio.gather(pending, return_exceptions=True)
+        await link.close()
+        if ending.startswith("die"):
+            peer.revive()
+        elif isinstance(peer, TcpPeer):
+            peer.die()
+        assert not any(thread.is_alive() for thread in link_threads())
+    del link, pending
+    async with asyncio.timeout(PATIENCE_S):
+        while len(open_descriptors()) > len(before):
+            gc.collect()
+            await asyncio.sleep(0.01)
+
+
+async def test_a_real_reset(tmp_path: Path) -> None:
+    peer = TcpPeer()
+    link = await open_link(peer.url)
+    peer.send(FRAME[:5])
+    assert await read(link, 5) == FRAME[:5]
+    peer.reset()
+    assert "connection reset by peer" in await lost(link)
+    with pytest.raises(LinkLost):
+        await link.write(STOP)
+    await link.close()
+    peer.close()
+
+
+async def test_each_write_is_a_segment_of_its_own() -> None:
+    """TCP_NODELAY: a frame does not wait for the acknowledgement of the one before it."""
+    peer = TcpPeer()
+    link = await open_link(peer.url)
+    for _ in range(20):
+        await link.write(STOP)
+        assert peer.peer.recv(4096) == STOP
+    await link.close()
+    peer.close()
+
+
+async def test_a_serial_port_belongs_to_one_program(tmp_path: Path) -> None:
+    peer = PtyPeer(tmp_path)
+    link = await open_link(peer.url)
+    with pytest.raises(Exception, match="the port is in use by another program"):
+        await open_link(peer.url)
+    await link.write(STOP)
+    assert peer.receive(len(STOP)) == STOP
+    await link.close()
+    again = await open_link(peer.url)
+    await again.close()
+    peer.close()
+
+
+async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:
+    """Reading blocks a thread, never the loop; and that thread is the only one."""
+    peer = PtyPeer(tmp_path)
+    link = await open_link(peer.url)
+    assert [thread.name for thread in link_threads()] == [f"read {peer.url}"]
+    pending = asyncio.create_task(link.read())
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert not pending.done()
+    peer.send(b"$")
+    assert await pending == b"$"
+    await link.close()
+    peer.close()

@@ -1,0 +1,191 @@
+"""URLs, and links that cannot be opened: one line that says what, where and what to do."""
+
+import asyncio
+import grp
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import serial
+
+from gateway.link import BadUrl, CannotOpen, open_link, parse_url
+from gateway.link.url import LinkUrl, SerialUrl, TcpUrl
+from tests.gateway.link.peers import PtyPeer, link_threads
+
+
+@pytest.mark.parametrize(
+    ("text", "url", "written"),
+    [
+        ("/dev/ttyUSB0", SerialUrl("/dev/ttyUSB0"), "serial:///dev/ttyUSB0"),
+        ("/dev/serial/by-id/usb-1a86_USB", SerialUrl("/dev/serial/by-id/usb-1a86_USB"), None),
+        ("serial:///dev/ttyUSB0", SerialUrl("/dev/ttyUSB0"), "serial:///dev/ttyUSB0"),
+        ("serial:///dev/ttyUSB0?baud=115200", SerialUrl("/dev/ttyUSB0", 115200), "serial:///dev/ttyUSB0?baud=115200"),
+        ("serial:///dev/ttyUSB0?baud=9600", SerialUrl("/dev/ttyUSB0"), "serial:///dev/ttyUSB0"),
+        ("COM3", SerialUrl("COM3"), "serial://COM3"),
+        ("serial://COM12", SerialUrl("COM12"), "serial://COM12"),
+        ("tcp://192.168.1.7:8888", TcpUrl("192.168.1.7", 8888), "tcp://192.168.1.7:8888"),
+        ("tcp://car.local:1", TcpUrl("car.local", 1), "tcp://car.local:1"),
+        ("tcp://[::1]:65535", TcpUrl("::1", 65535), "tcp://[::1]:65535"),
+    ],
+)
+def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written: str | None) -> None:
+    assert parse_url(text) == url
+    assert parse_url(str(url)) == url
+    assert written is None or str(url) == written
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "it is neither a URL nor a device path"),
+        ("ttyUSB0", "it is neither a URL nor a device path"),
+        ("COM", "it is neither a URL nor a device path"),
+        ("serial://", "it names no device"),
+        ("serial:///", "it names no device"),
+        ("serial://dev/ttyUSB0", "three slashes come before a device path"),
+        ("serial:///dev/ttyUSB0#x", "it names no device"),
+        ("serial:///dev/ttyUSB0?baud=fast", "baud=fast is not from 300 to 4000000"),
+        ("serial:///dev/ttyUSB0?baud=", "baud= is not from"),
+        ("serial:///dev/ttyUSB0?baud=0", "baud=0 is not from"),
+        ("serial:///dev/ttyUSB0?baud=9600.0", "baud=9600.0 is not from"),
+        ("serial:///dev/ttyUSB0?baud=" + "9" * 5000, "is not from 300 to 4000000"),
+        ("serial:///dev/ttyUSB0?parity=odd", "parity is no option of a serial link"),
+        ("tcp://", "a host and a port from 1 to 65535 are needed"),
+        ("tcp://host", "a host and a port"),
+        ("tcp://:8888", "a host and a port"),
+        ("tcp://host:0", "a host and a port"),
+        ("tcp://host:65536", "Port out of range"),
+        ("tcp://host:x", "Port could not be cast"),
+        ("tcp://host:8888/path", "nothing may follow the port"),
+        ("tcp://host:8888?x=1", "nothing may follow the port"),
+        ("tcp://me@host:8888", "nothing may follow the port"),
+        ("tcp://[::1:8888", "Invalid IPv6 URL"),
+        ("http://host:80", "http:// is no kind of link"),
+        ("ble://00:11:22:33:44:55", "ble:// is no kind of link"),
+    ],
+)
+def test_what_is_no_url_is_refused_with_what_is(text: str, why: str) -> None:
+    with pytest.raises(BadUrl) as caught:
+        parse_url(text)
+    words = str(caught.value)
+    assert why in words
+    assert words.endswith(
+        "give serial:///dev/ttyUSB0 (?baud=9600), a bare device path such as /dev/ttyUSB0 or COM3, or tcp://host:8888"
+    )
+    assert "\n" not in words
+
+
+async def no_threads() -> None:
+    """Wait until the threads of links have ended."""
+    for thread in link_threads():
+        await asyncio.to_thread(thread.join, 20.0)
+        assert not thread.is_alive()
+
+
+async def refused(url: LinkUrl, timeout_s: float = 20.0) -> str:
+    with pytest.raises(CannotOpen) as caught:
+        await open_link(url, timeout_s=timeout_s)
+    words = str(caught.value)
+    assert words.startswith(f"{url}: ")
+    assert "\n" not in words
+    return words
+
+
+async def test_a_serial_port_that_cannot_be_opened(tmp_path: Path) -> None:
+    assert "there is no such port; " in await refused(SerialUrl(str(tmp_path / "ttyUSB9")))
+    assert "there is no such port; " in await refused(SerialUrl(str(tmp_path / "no" / "ttyUSB9")))
+    assert "this is a directory, not a serial port; " in await refused(SerialUrl(str(tmp_path)))
+    regular = tmp_path / "file"
+    regular.write_text("not a port")
+    assert "this is not a serial port (" in await refused(SerialUrl(str(regular)))
+    assert "this is not a serial port (" in await refused(SerialUrl("/dev/null"))
+    assert "there is no such port; " in await refused(SerialUrl("COM99"))
+    await no_threads()
+
+
+async def test_a_port_that_another_program_has(tmp_path: Path) -> None:
+    peer = PtyPeer(tmp_path)
+    with serial.Serial(str(tmp_path / "tty"), exclusive=True):
+        assert "in use by another program (a second gateway?): end that one first" in await refused(peer.url)
+    link = await open_link(peer.url)
+    await link.close()
+    peer.close()
+
+
+WITHOUT_PERMISSION = """
+import asyncio, grp, os, sys  # all of it now: nobody may not even read the library
+from gateway.link import CannotOpen, open_link
+from gateway.link.url import SerialUrl
+import gateway.link.serial, serial.tools.list_ports
+os.setgroups([]); os.setgid(65534); os.setuid(65534)
+try:
+    asyncio.run(open_link(SerialUrl(sys.argv[1])))
+except CannotOpen as error:
+    print(error)
+"""
+
+
+def test_a_port_that_we_may_not_open_names_its_group(tmp_path: Path) -> None:
+    """Root may open anything, so a process that is nobody tries; whoever is not root tries itself."""
+    peer = PtyPeer(tmp_path)
+    port = (tmp_path / "tty").resolve()
+    port.chmod(0)
+    script = WITHOUT_PERMISSION
+    if os.getuid() == 0:
+        os.chown(port, -1, 0)
+    else:
+        script = script.replace("os.setgroups([]); os.setgid(65534); os.setuid(65534)", "")
+    group = grp.getgrgid(port.stat().st_gid).gr_name
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(port)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stderr == ""
+    assert done.stdout == (
+        f"serial://{port}: no permission; it belongs to group {group}: "
+        f"`sudo usermod -aG {group} $USER`, then log in again\n"
+    )
+    peer.close()
+
+
+async def test_a_tcp_car_that_cannot_be_reached() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # bound, not listening: refused, and nobody else gets the port
+        words = await refused(TcpUrl("127.0.0.1", taken.getsockname()[1]))
+        assert "nothing listens on that port (a Raspberry Pi car's program dies with its last client" in words
+    assert "there is no host 'no.such.car.invalid': check the name" in await refused(TcpUrl("no.such.car.invalid", 1))
+    assert "there is no host" in await refused(TcpUrl("a" * 64, 8888))
+    assert "there is no host" in await refused(TcpUrl("a..b", 8888))
+
+
+async def test_a_tcp_car_that_does_not_answer() -> None:
+    """A listener whose queue is full drops what asks: as silent as a car that is off."""
+    with socket.socket() as full:
+        full.bind(("127.0.0.1", 0))
+        full.listen(0)
+        where = full.getsockname()
+        waiting = []
+        for _ in range(4):
+            each = socket.socket()
+            each.setblocking(False)
+            each.connect_ex(where)
+            waiting.append(each)
+        words = await refused(TcpUrl(*where), timeout_s=0.5)
+        assert words.endswith("no answer within 0.5 s: is the car on, and in this network?")
+        for each in waiting:
+            each.close()
+
+
+async def test_opening_that_is_given_up_leaves_no_port_open(tmp_path: Path) -> None:
+    peer = PtyPeer(tmp_path)
+    opening = asyncio.create_task(open_link(peer.url))
+    await asyncio.sleep(0)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    await no_threads()
+    again = await open_link(peer.url)
+    await again.close()
+    peer.close()
