@@ -72,6 +72,31 @@ def arm_request(joint_deg: Sequence[int]) -> Request:
     return Request("arm", pb.ArmCommand(joint_deg=joint_deg))
 
 
+def light_request(light: str) -> Request:
+    """The light's colour, or off."""
+    return Request("light", pb.LightCommand(light=light))
+
+
+def whistle_request() -> Request:
+    """Sound once."""
+    return Request("whistle", pb.WhistleCommand())
+
+
+def speed_request(step: str) -> Request:
+    """One step up or down."""
+    return Request("speed", pb.SpeedCommand(step=step))
+
+
+def fan_request(state: str | None = None) -> Request:
+    """Toggle the fan, or bring it to a state."""
+    return Request("fan", pb.FanCommand(state=state or ""))
+
+
+def find_request() -> Request:
+    """Blink and beep."""
+    return Request("find", pb.FindCommand())
+
+
 def stop_request() -> Request:
     """Stop, and hold against the coordinator."""
     return Request("stop", pb.StopCommand(), Until.STOPPED)
@@ -122,10 +147,10 @@ class Verbs(ABC, Generic[R]):
 
     def light(self, light: str) -> R:
         """`white, red, green, blue, cyan, magenta, yellow` or `off`."""
-        return self._do(Request("light", pb.LightCommand(light=light)))
+        return self._do(light_request(light))
 
     def servo(self, servo: str, action: str = "", deg: int | None = None) -> R:
-        """`front` left, right, reset, or to `deg` (0..180); `horizontal` left, right, reset; `vertical` up, down, reset."""
+        """`front`, `horizontal`: left, right, reset; `vertical`: up, down, reset; `front` instead to `deg` (0..180)."""
         return self._do(servo_request(servo, action, deg))
 
     def arm(self, joint_deg: Sequence[int]) -> R:
@@ -134,15 +159,15 @@ class Verbs(ABC, Generic[R]):
 
     def whistle(self) -> R:
         """Sound once."""
-        return self._do(Request("whistle", pb.WhistleCommand()))
+        return self._do(whistle_request())
 
     def speed(self, step: str) -> R:
         """One step `up` or `down`: the car knows no absolute speed."""
-        return self._do(Request("speed", pb.SpeedCommand(step=step)))
+        return self._do(speed_request(step))
 
     def fan(self, state: str | None = None) -> R:
         """Toggle the fan; `on` or `off` only while the gateway knows its state."""
-        return self._do(Request("fan", pb.FanCommand(state=state or "")))
+        return self._do(fan_request(state))
 
     def stop(self) -> R:
         """Stop, and hold against the coordinator; waits until the stop is complete."""
@@ -158,4 +183,4 @@ class Verbs(ABC, Generic[R]):
 
     def find(self) -> R:
         """Blink and beep, without moving."""
-        return self._do(Request("find", pb.FindCommand()))
+        return self._do(find_request())

@@ -1,0 +1,96 @@
+"""The `fleet` command: the table of its subcommands, and what every one of them does with a mistake.
+
+A subcommand is imported when it is called, so that `fleet --help` takes no longer than click does.
+"""
+
+import importlib
+import os
+import sys
+from typing import Final
+
+import click
+
+COMMANDS: Final = {
+    "list": ("fleet.commands.reading:list_cars", "The cars on the bus, and how each is."),
+    "get": ("fleet.commands.reading:get", "The latest value of every matching reading."),
+    "watch": ("fleet.commands.reading:watch", "Readings as they come, until Ctrl-C."),
+    "drive": ("fleet.commands.driving:drive", "Hold a motion for a time, then stop."),
+    "mode": ("fleet.commands.driving:mode", "Bring cars into a mode."),
+    "stop": ("fleet.commands.driving:stop", "Stop cars (all, if none is named) and hold them against the coordinator."),
+    "estop": ("fleet.commands.driving:estop", "Emergency stop of cars, or of the fleet."),
+    "resume": ("fleet.commands.driving:resume", "End the hold of cars."),
+    "led": ("fleet.commands.acting:led", "Set the colour LED."),
+    "light": ("fleet.commands.acting:light", "Set the light."),
+    "servo": ("fleet.commands.acting:servo", "Move a servo."),
+    "arm": ("fleet.commands.acting:arm", "Move the arm's six joints."),
+    "whistle": ("fleet.commands.acting:whistle", "Sound once."),
+    "speed": ("fleet.commands.acting:speed", "One step faster or slower."),
+    "fan": ("fleet.commands.acting:fan", "Toggle the fan."),
+    "find": ("fleet.commands.acting:find", "Make cars blink and beep, without moving."),
+    "coordinate": ("fleet.commands.coordinate:coordinate", "Keep cars in the modes of a plan, until Ctrl-C."),
+    "record": ("fleet.recording.command:record", "Record everything of the fleet to MCAP, until Ctrl-C."),
+    "replay": ("fleet.replay.command:replay", "Open a recorded session in Rerun."),
+    "demo": ("fleet.demo:demo", "Three simulated cars do a job, recorded and checked."),
+}
+"""Subcommand: where it lives, and its line in `fleet --help`."""
+
+
+class _Lazy(click.Group):
+    """A group whose commands are imported when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, name = COMMANDS[cmd_name][0].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's signature
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, words) for name, (_, words) in COMMANDS.items()])
+
+
+@click.group(
+    cls=_Lazy,
+    epilog="""\b
+examples:
+  fleet list
+  fleet get red/sensor/range
+  fleet drive red,blue forward --for 2s
+  fleet stop
+
+Exit codes: 0 carried out, 1 not carried out, 2 wrong use, 130 Ctrl-C.""",
+)
+def cli() -> None:
+    """Drive, watch, record and replay a fleet of small robot cars."""
+
+
+def main() -> None:
+    """Entry point."""
+    try:
+        code = cli.main(prog_name="fleet", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        code = 2
+    except click.UsageError as error:
+        where = error.ctx.command_path if error.ctx is not None else "fleet"
+        sys.stderr.write(f"fleet: {error.format_message()} (see {where} --help)\n")
+        code = error.exit_code
+    except click.ClickException as error:
+        sys.stderr.write(f"fleet: {error.format_message()}\n")
+        code = error.exit_code
+    except click.Abort:
+        code = 130
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read it has seen enough; say nothing at the interpreter's end either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The subcommands of `fleet`, in files by what they are for."""

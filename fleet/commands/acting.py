@@ -1,0 +1,111 @@
+"""`fleet led, light, servo, arm, whistle, speed, fan, find`: what a car does once."""
+
+import re
+
+import click
+
+from fleet.client import FleetClient
+from fleet.commands.common import carry_out, cars_argument, json_option, with_client
+from fleet.verbs import (
+    arm_request,
+    fan_request,
+    find_request,
+    led_request,
+    light_request,
+    servo_request,
+    speed_request,
+    whistle_request,
+)
+from gateway.protocol.values import Light, SpeedStep
+
+
+@click.command(epilog="\b\nexample:\n  fleet led red '#ff0010'")
+@cars_argument
+@click.argument("colour", metavar="'#RRGGBB'")
+@json_option
+@with_client
+def led(client: FleetClient, cars: tuple[str, ...], colour: str, *, as_json: bool) -> None:
+    """Set the colour LED."""
+    match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", colour)
+    if match is None:
+        raise click.UsageError(f"colour {colour!r} is not allowed: '#RRGGBB', six hexadecimal digits, as '#ff0010'")
+    r, g, b = (int(part, 16) for part in match.groups())
+    carry_out(client, led_request(r, g, b), cars, as_json=as_json)
+
+
+@click.command(epilog="\b\nexample:\n  fleet light red,blue cyan")
+@cars_argument
+@click.argument("light", type=click.Choice([str(light) for light in Light]))
+@json_option
+@with_client
+def light(client: FleetClient, cars: tuple[str, ...], light: str, *, as_json: bool) -> None:
+    """Set the light."""
+    carry_out(client, light_request(light), cars, as_json=as_json)
+
+
+@click.command(epilog="\b\nexamples:\n  fleet servo red front 90\n  fleet servo blue vertical up")
+@cars_argument
+@click.argument("servo", type=click.Choice(["front", "vertical", "horizontal"]))
+@click.argument("action", metavar="left|right|up|down|reset|DEG")
+@json_option
+@with_client
+def servo(client: FleetClient, cars: tuple[str, ...], servo: str, action: str, *, as_json: bool) -> None:
+    """Move a servo: left, right or reset (vertical: up, down or reset); the front one also to 0..180 degrees.
+
+    The number is sent unchanged; the front servo goes to 180 minus it.
+    """
+    if action.isascii() and action.isdigit():
+        if servo != "front":
+            raise click.UsageError(f"the {servo} servo takes no degrees: only the front one does")
+        request = servo_request(servo, deg=int(action))
+    else:
+        request = servo_request(servo, action)
+    carry_out(client, request, cars, as_json=as_json)
+
+
+@click.command(epilog="\b\nexample:\n  fleet arm red 90 90 45 120 90 30")
+@cars_argument
+@click.argument("joints", type=click.IntRange(0, 180), nargs=6, metavar="J1 J2 J3 J4 J5 J6")
+@json_option
+@with_client
+def arm(client: FleetClient, cars: tuple[str, ...], joints: tuple[int, ...], *, as_json: bool) -> None:
+    """Move the arm's six joints to 0..180 degrees each."""
+    carry_out(client, arm_request(joints), cars, as_json=as_json)
+
+
+@click.command(epilog="\b\nexample:\n  fleet whistle red")
+@cars_argument
+@json_option
+@with_client
+def whistle(client: FleetClient, cars: tuple[str, ...], *, as_json: bool) -> None:
+    """Sound once."""
+    carry_out(client, whistle_request(), cars, as_json=as_json)
+
+
+@click.command(epilog="\b\nexample:\n  fleet speed red up")
+@cars_argument
+@click.argument("step", type=click.Choice([str(step) for step in SpeedStep]))
+@json_option
+@with_client
+def speed(client: FleetClient, cars: tuple[str, ...], step: str, *, as_json: bool) -> None:
+    """One step faster or slower: cars know no absolute speed."""
+    carry_out(client, speed_request(step), cars, as_json=as_json)
+
+
+@click.command(epilog="\b\nexamples:\n  fleet fan red\n  fleet fan red off")
+@cars_argument
+@click.argument("state", type=click.Choice(["on", "off"]), required=False)
+@json_option
+@with_client
+def fan(client: FleetClient, cars: tuple[str, ...], state: str | None, *, as_json: bool) -> None:
+    """Toggle the fan; `on` and `off` only while the gateway knows its state."""
+    carry_out(client, fan_request(state), cars, as_json=as_json)
+
+
+@click.command(epilog="\b\nexample:\n  fleet find red")
+@cars_argument
+@json_option
+@with_client
+def find(client: FleetClient, cars: tuple[str, ...], *, as_json: bool) -> None:
+    """Make cars blink and beep, without moving."""
+    carry_out(client, find_request(), cars, as_json=as_json)

@@ -1,0 +1,112 @@
+"""`fleet drive, mode, stop, estop, resume`: what moves cars, and what keeps them from moving."""
+
+import click
+
+from fleet.client import FleetClient
+from fleet.commands.common import (
+    INTERRUPTED,
+    Cars,
+    Seconds,
+    carry_out,
+    cars_argument,
+    end_with,
+    json_option,
+    say,
+    sigterm_interrupts,
+    with_client,
+)
+from fleet.outcome import Outcome
+from fleet.verbs import drive_request, estop_request, mode_request, resume_request, stop_request
+from gateway.protocol.values import Mode, Motion
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet drive red forward --for 2s
+  fleet drive red,blue spin_left --for 500ms"""
+)
+@cars_argument
+@click.argument("motion", type=click.Choice([str(motion) for motion in Motion]))
+@click.option("--for", "duration_s", type=Seconds(), default="500ms", show_default=True, help="How long; at most 10s.")
+@json_option
+@with_client
+def drive(client: FleetClient, cars: tuple[str, ...], motion: str, duration_s: float, *, as_json: bool) -> None:
+    """Hold a motion for a time, then stop; stays until the drive is over. Ctrl-C stops the car."""
+    with sigterm_interrupts():
+        try:
+            outcomes = client.ask(drive_request(motion, duration_s, wait=True), cars)
+        except KeyboardInterrupt:
+            say(client.ask(drive_request("stop"), cars), as_json=as_json)
+            raise SystemExit(INTERRUPTED) from None
+    end_with(outcomes, as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+example:
+  fleet mode red tracking
+  fleet mode red,blue manual"""
+)
+@cars_argument
+@click.argument("mode", type=click.Choice([str(mode) for mode in Mode]))
+@json_option
+@with_client
+def mode(client: FleetClient, cars: tuple[str, ...], mode: str, *, as_json: bool) -> None:
+    """Bring cars into a mode; `manual` ends whatever they do by themselves."""
+    carry_out(client, mode_request(mode), cars, as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet stop
+  fleet stop red blue"""
+)
+@click.argument("cars", type=Cars(), nargs=-1, metavar="[CAR...]")
+@json_option
+@with_client
+def stop(client: FleetClient, cars: tuple[tuple[str, ...], ...], *, as_json: bool) -> None:
+    """Stop these cars, or all, and hold them against the coordinator until someone drives or resumes them."""
+    _some(client, client.ask(stop_request(), _flat(cars)), as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet estop
+  fleet estop red --why 'someone is on the track'"""
+)
+@click.argument("cars", type=Cars(), nargs=-1, metavar="[CAR...]")
+@click.option("--why", default="", help="What happened, for the record.")
+@json_option
+@with_client
+def estop(client: FleetClient, cars: tuple[tuple[str, ...], ...], why: str, *, as_json: bool) -> None:
+    """Emergency stop of these cars, or of the whole fleet."""
+    request = estop_request(why, "car" if cars else "fleet")
+    _some(client, client.ask(request, _flat(cars)), as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet resume red
+  fleet resume red blue"""
+)
+@click.argument("cars", type=Cars(), nargs=-1, required=True, metavar="CAR...")
+@click.option("--id", "ids", multiple=True, metavar="ID", help="An e-stop to end; may be given several times.")
+@json_option
+@with_client
+def resume(client: FleetClient, cars: tuple[tuple[str, ...], ...], ids: tuple[str, ...], *, as_json: bool) -> None:
+    """End the hold of cars: the coordinator may use them again."""
+    carry_out(client, resume_request(ids), _flat(cars) or (), as_json=as_json)
+
+
+def _flat(cars: tuple[tuple[str, ...], ...]) -> list[str] | None:
+    return [car for some in cars for car in some] or None
+
+
+def _some(client: FleetClient, outcomes: list[Outcome], *, as_json: bool) -> None:
+    if not outcomes:
+        raise click.ClickException(f"no car of fleet {client.fleet} is on the bus at {client.bus.endpoint}")
+    end_with(outcomes, as_json=as_json)

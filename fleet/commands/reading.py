@@ -1,0 +1,137 @@
+"""`fleet list, get, watch`: what cars say. Nothing here makes a car do anything."""
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import click
+
+from fleet.client import FleetClient
+from fleet.commands.common import json_option, with_client
+from fleet.readings import Reading
+from schemas import keys, topics
+
+_HEADER: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
+_COLUMNS: Final = ("car", "link", "mode", "verdict", "motion", "hold", "battery")
+
+
+@click.command("list", epilog="\b\nexample:\n  fleet list --json")
+@json_option
+@with_client
+def list_cars(client: FleetClient, *, as_json: bool) -> None:
+    """The cars on the bus: link, mode and how sure that is, motion, who holds the car, battery."""
+    cars = client.cars()
+    said: dict[str, dict[str, Any]] = {car: {} for car in cars}
+    for expression in ("*/state/*", "*/sensor/battery"):
+        for reading in client.get(expression):
+            key = keys.parse(reading.key)
+            if key is not None:
+                said.setdefault(key.car, {})[key.topic] = reading.value
+    if not said:
+        raise click.ClickException(f"no car of fleet {client.fleet} is on the bus at {client.bus.endpoint}")
+    rows = [_row(car, values) for car, values in sorted(said.items())]
+    if as_json:
+        for row in rows:
+            click.echo(json.dumps(row))
+        return
+    table = [{name: name.upper() for name in _COLUMNS}] + [
+        {name: _cell(row[name]) for name in _COLUMNS} for row in rows
+    ]
+    widths = {name: max(len(row[name]) for row in table) for name in _COLUMNS}
+    for cells in table:
+        click.echo("  ".join(cells[name].ljust(widths[name]) for name in _COLUMNS).rstrip())
+
+
+def _row(car: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    link, mode, motion = (values.get(f"state/{name}") for name in ("link", "mode", "motion"))
+    safety, battery = values.get("state/safety"), values.get("sensor/battery")
+    return {
+        "car": car,
+        "link": link.state if link else "no answer",
+        "reason": link.reason if link else "",
+        "mode": mode.asked if mode else None,
+        "verdict": mode.verdict if mode else None,
+        "motion": motion.motion if motion else None,
+        "hold": safety.hold.by if safety and safety.HasField("hold") else None,
+        "motors": safety.motors if safety else None,
+        "battery": f"{battery.voltage_v:.2f} V {battery.level}" if battery else None,
+    }
+
+
+def _cell(value: object) -> str:
+    return str(value) if value else "-"
+
+
+@click.command(
+    epilog="\b\nexamples:\n  fleet get red\n  fleet get red/sensor/range\n  fleet get '*/sensor/battery' --json"
+)
+@click.argument("keyexpr")
+@json_option
+@with_client
+def get(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:
+    """The latest value of every reading that matches KEYEXPR; `red` is every sensor of red, * is any one part."""
+    readings = client.get(keyexpr)
+    if not readings:
+        cars = client.cars()
+        there = f"the cars on the bus are: {', '.join(cars)}" if cars else "there is no car on the bus"
+        raise click.ClickException(f"nothing under {client.expression(keyexpr)}; {there}")
+    width = max(len(reading.key) for reading in readings)
+    for reading in readings:
+        click.echo(_json(reading) if as_json else _line(reading, width))
+
+
+@click.command(
+    epilog="\b\nexamples:\n  fleet watch red\n  fleet watch '*/state/*' --json\n  fleet watch red/event/command"
+)
+@click.argument("keyexpr")
+@json_option
+@with_client
+def watch(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:
+    """Readings that match KEYEXPR as they are published, until Ctrl-C."""
+    _warn_if_missing(client.expression(keyexpr), client.cars())
+    told = 0
+    with client.watch(keyexpr) as readings:
+        for reading in readings:
+            click.echo(_json(reading) if as_json else _line(reading))
+            if readings.dropped > told:
+                told = readings.dropped
+                click.echo(f"fleet: {told} readings dropped so far: what reads this is too slow", err=True)
+
+
+def _warn_if_missing(expression: str, cars: Sequence[str]) -> None:
+    """A watch of a car that is not there waits for it; a misspelt name should not go unnoticed."""
+    key = keys.parse(expression)
+    if key is not None and not set(key.car) & set("*$@") and key.car not in cars:
+        there = f"there are: {', '.join(cars)}" if cars else "there is none"
+        click.echo(f"fleet: no car {key.car} on the bus yet ({there}); waiting", err=True)
+
+
+def _json(reading: Reading) -> str:
+    time = reading.time.isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return json.dumps({"key": reading.key, "time": time, "value": reading.as_dict()})
+
+
+def _line(reading: Reading, width: int = 0) -> str:
+    topic = topics.of_key(reading.key)
+    units = topic.units if topic is not None else {}
+    fields = [
+        f"{name}={_value(value)}{_unit(units.get(name, ''))}"
+        for name, value in reading.as_dict().items()
+        if name not in _HEADER and value not in ("", [], {})
+    ]
+    age_s = max(0.0, (datetime.now(UTC) - reading.time).total_seconds())
+    stale = topic is not None and topic.stale_after_s is not None and age_s > topic.stale_after_s
+    return f"{reading.key:<{width}}  {'  '.join(fields)}  {age_s:.1f} s ago{' (stale)' if stale else ''}"
+
+
+def _value(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _unit(unit: str) -> str:
+    return f" {unit}" if unit not in ("", "1") else ""
