@@ -1,0 +1,383 @@
+"""`fleet demo`: three simulated cars do a job as real processes; everything is recorded, checked and ready for Rerun.
+
+Each check compares what was believed with what was so: the simulator publishes the true mode, motors and LED of a car.
+"""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import IO, Any, Final
+
+import click
+
+from fleet.client import FleetClient
+from schemas import bus, keys, messages
+from schemas.gen import fleet_v1_pb2 as pb
+
+CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
+PLAN: Final = """\
+# Red follows the line, green keeps clear of walls, blue is driven by hand.
+cars:
+  red: tracking
+  green: obstacle_avoidance
+"""
+LED: Final = {"red": (255, 0, 16), "green": (0, 255, 64), "blue": (0, 64, 255)}
+PATIENCE_S: Final = 30.0
+END_S: Final = 15.0
+"""How long a process may take to end: the longest stop recipe, its worst case, and a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One line of the summary."""
+
+    name: str
+    ok: bool
+    words: str
+
+
+@dataclass(slots=True)
+class Demo:
+    """The processes of one run, and what was seen."""
+
+    folder: Path
+    endpoint: str
+    say: Callable[[str], None]
+    checks: list[Check] = field(default_factory=list)
+    truth: dict[str, pb.Truth] = field(default_factory=dict)
+    published: dict[str, set[int]] = field(default_factory=dict)
+    """Sequence numbers that this process saw, by key: a second witness to the recording."""
+
+    def check(self, name: str, words: str, *, ok: bool) -> None:
+        """Note a check and say how it went."""
+        self.checks.append(Check(name, ok, words))
+        mark = click.style("ok  ", fg="green") if ok else click.style("FAIL", fg="red", bold=True)
+        self.say(f"{mark} {name}: {words}")
+
+    def witness(self, sample: bus.Sample) -> None:
+        """See every publication; on a Zenoh thread."""
+        key = keys.parse(sample.key)
+        if key is None or key.car not in CARS:
+            return
+        if key.topic == "sim/truth":
+            truth = sample.message()
+            assert isinstance(truth, pb.Truth)
+            self.truth[key.car] = truth
+        else:
+            self.published.setdefault(sample.key, set()).add(sample.sequence)
+
+    def until(self, condition: Callable[[], object], seconds: float = PATIENCE_S) -> bool:
+        """Wait until it holds; False if it did not in time."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.02)
+        return True
+
+    def truly(self, car: str, field_name: str, value: object) -> bool:
+        """Wait until the simulated car's truth says so; False if it did not in ten seconds."""
+        return self.until(lambda: getattr(self.truth[car], field_name) == value, 10.0)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet demo
+  fleet demo --json --out sessions"""
+)
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("sessions"), help="where the session goes"
+)
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object: checks, session, rrd")
+@click.option(
+    "--view/--no-view", default=None, help="open Rerun's viewer afterwards (default: ask, if there is a display)"
+)
+def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
+    """Three simulated cars of two platforms do a job: modes, driving, LEDs, a cut link, a stop; recorded, checked."""
+
+    def say(text: str) -> None:
+        click.echo(text, err=as_json)
+
+    out.mkdir(parents=True, exist_ok=True)
+    run = Demo(out.resolve(), _free_endpoint(), say)
+    session, rrd = _run(run)
+    failed = [check for check in run.checks if not check.ok]
+    if as_json:
+        result = {
+            "ok": not failed,
+            "session": str(session),
+            "rrd": str(rrd),
+            "checks": [asdict(check) for check in run.checks],
+        }
+        click.echo(json.dumps(result))
+    else:
+        click.echo(f"\n{len(run.checks) - len(failed)} of {len(run.checks)} checks passed. Session: {session}")
+        if rrd is not None:
+            click.echo(f"Look at it: rerun {rrd}")
+    if failed:
+        raise SystemExit(1)
+    if rrd is not None and (
+        view or (view is None and not as_json and _can_view() and click.confirm("Open it in Rerun?"))
+    ):
+        subprocess.run([sys.executable, "-m", "fleet.cli", "replay", str(session)], check=False)
+
+
+def _run(run: Demo) -> tuple[Path | None, Path | None]:
+    began = time.monotonic()
+    with ExitStack() as stack:
+        stack.enter_context(_process(run, "hub", "schemas.hub", "--endpoint", run.endpoint))
+        run.until(lambda: bus.accepts(run.endpoint))
+        recorder = stack.enter_context(
+            _process(
+                run, "recorder", "fleet.cli", "record", "--connect", run.endpoint, "--out", str(run.folder), "--json"
+            )
+        )
+        session = Path(_line(recorder, "recorder")["session"])
+        client = stack.enter_context(FleetClient(run.endpoint, sender="demo", kind="person"))
+        watcher = stack.enter_context(bus.Bus.open(run.endpoint))
+        watcher.subscribe(f"{keys.DEFAULT_FLEET}/**", run.witness)
+        simulator, links = _simulator(run, stack, session)
+        gateways = {car: stack.enter_context(_gateway(run, car, link)) for car, link in links.items()}
+        _act(run, stack, client, simulator, session)
+        run.say("ending the gateways, the simulated cars and the recorder")
+        for process in gateways.values():
+            process.send_signal(signal.SIGTERM)
+        codes = {car: process.wait(END_S) for car, process in gateways.items()}
+        run.check("gateways end", f"exit codes {codes}", ok=set(codes.values()) == {0})
+        simulator.terminate()
+        simulator.wait(END_S)
+        recorder.send_signal(signal.SIGTERM)
+        code = recorder.wait(END_S)
+        run.check("recording closed", f"{session.name}, exit code {code}", ok=code == 0)
+    took = time.monotonic() - began
+    recorded = _check_recording(run, session)
+    rrd = _replay(run, session, recorded)
+    run.say(f"the cars were up for {took:.0f} s")
+    return session, rrd
+
+
+# ---------------------------------------------------------------- the job
+
+
+def _act(run: Demo, stack: ExitStack, client: FleetClient, simulator: "subprocess.Popen[str]", session: Path) -> None:
+    run.say("three gateways bring their cars to a known state")
+    ready = run.until(lambda: _motors(client) == dict.fromkeys(CARS, "off"))
+    run.check("cars ready", f"motors {_motors(client)}", ok=ready)
+
+    for car, (r, g, b) in LED.items():
+        outcome = client.car(car).led(r, g, b)
+        colour = f"#{r:02x}{g:02x}{b:02x}"
+        seen = outcome.ok and run.truly(car, "led", colour)
+        run.check(f"{car} LED", f"asked {colour}, truly {run.truth[car].led}", ok=seen)
+
+    readings = client.get("*/sensor/range")
+    told = ", ".join(f"{reading.key} {reading.value.range_m:.2f} m" for reading in readings)
+    run.check("sensors by key", told, ok=len(readings) == len(CARS))
+
+    run.say("the coordinator assigns modes")
+    plan = session / "plan.yaml"
+    plan.write_text(PLAN, encoding="utf-8")
+    coordinator = stack.enter_context(
+        _process(run, "coordinator", "fleet.cli", "coordinate", "--connect", run.endpoint, "--plan", str(plan))
+    )
+    for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):
+        seen = run.truly(car, "mode", mode)
+        run.check(f"{car} mode", f"asked {mode}, truly {run.truth[car].mode}", ok=seen)
+    seen = run.until(lambda: _state(client, "red", "mode").verdict == "confirmed", 5.0)
+    run.check("red mode known", _state(client, "red", "mode").evidence, ok=seen)
+
+    run.say("red's link is cut for two seconds; meanwhile blue is driven by hand")
+    _ask(simulator, {"car": "red", "fault": "link_drop", "for_s": 2})
+    start = (run.truth["blue"].x_m, run.truth["blue"].y_m)
+    outcome = client.car("blue").drive("forward", 0.5)
+    moved = run.until(lambda: (run.truth["blue"].x_m, run.truth["blue"].y_m) != start, 3.0)
+    stood = run.until(lambda: run.truth["blue"].motor_left == 0 == run.truth["blue"].motor_right, 5.0)
+    run.check(
+        "blue driven",
+        f"{outcome.words or outcome.phase}; moved {moved}, stopped by itself {stood}",
+        ok=outcome.ok and moved and stood,
+    )
+    lost = run.until(lambda: _state(client, "red", "link").state == "lost", 2.0)
+    run.check(
+        "red cut",
+        f"link {_state(client, 'red', 'link').state}, motors {_state(client, 'red', 'safety').motors}",
+        ok=lost,
+    )
+    back = run.until(
+        lambda: _state(client, "red", "mode").verdict == "confirmed" and run.truth["red"].mode == "tracking"
+    )
+    run.check("red back", f"link {_state(client, 'red', 'link').state}, truly {run.truth['red'].mode} again", ok=back)
+
+    run.say("a person stops all cars; the coordinator leaves them alone")
+    outcomes = client.stop()
+    run.check(
+        "stop",
+        ", ".join(f"{each.car} {each.phase} in {each.took_s:.2f} s" for each in outcomes),
+        ok=all(each.ok for each in outcomes),
+    )
+    off = run.until(lambda: all(truth.motor_left == 0 == truth.motor_right for truth in run.truth.values()), 3.0)
+    run.check(
+        "all motors off",
+        str({car: (truth.motor_left, truth.motor_right) for car, truth in sorted(run.truth.items())}),
+        ok=off,
+    )
+    moved = run.until(lambda: any(truth.mode != "manual" for truth in run.truth.values()), 1.5)
+    holds = {car: _state(client, car, "safety").hold.by for car in CARS}
+    run.check(
+        "held", f"on hold by {sorted(set(holds.values()))}, none moved again", ok=not moved and all(holds.values())
+    )
+    coordinator.send_signal(signal.SIGTERM)
+    code = coordinator.wait(END_S)
+    run.check("coordinator ends", f"exit code {code}", ok=code == 0)
+
+
+def _state(client: FleetClient, car: str, name: str) -> Any:
+    found = client.get(f"{car}/state/{name}")
+    return found[0].value if found else messages.message_class(f"fleet.v1.{name.capitalize()}")()
+
+
+def _motors(client: FleetClient) -> dict[str, str]:
+    return {reading.key.split("/")[1]: reading.value.motors for reading in client.get("*/state/safety")}
+
+
+# ---------------------------------------------------------------- the recording
+
+
+def _check_recording(run: Demo, session: Path) -> Counter[str]:
+    """Read with the stock reader alone: every message that was published is there, each key's numbers without a gap."""
+    from mcap.reader import make_reader
+
+    recorded: dict[str, set[int]] = {}
+    for path in sorted(session.glob("*.mcap")):
+        with path.open("rb") as file:
+            for _, channel, message in make_reader(file).iter_messages():
+                recorded.setdefault(channel.topic, set()).add(message.sequence)
+    missing = {key: sorted(numbers - recorded.get(key, set())) for key, numbers in run.published.items()}
+    gaps = [key for key in run.published if recorded.get(key, set()) != set(range(1, max(recorded.get(key, {0})) + 1))]
+    lost = {key: numbers for key, numbers in missing.items() if numbers}
+    counted = Counter({key: len(numbers) for key, numbers in recorded.items()})
+    words = (
+        f"{counted.total()} messages on {len(counted)} keys, none missing"
+        if not lost and not gaps
+        else f"missing {lost}, gaps in {gaps}"
+    )
+    run.check("recording complete", words, ok=not lost and not gaps and bool(run.published))
+    return counted
+
+
+def _replay(run: Demo, session: Path, recorded: Counter[str]) -> Path | None:
+    """Make the .rrd, and read it back with Rerun: each key has as many messages in it as in the recording."""
+    from fleet.replay.to_rerun import rows
+
+    rrd = session / "session.rrd"
+    command = [sys.executable, "-m", "fleet.cli", "replay", str(session), "--save", str(rrd)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0 or not rrd.exists():
+        run.check("rrd made", (done.stderr or done.stdout).strip(), ok=False)
+        return None
+    shown = rows(rrd)
+    differing = {key: (count, shown[key]) for key, count in recorded.items() if shown[key] != count}
+    words = f"{shown.total()} messages read back with Rerun, as many as recorded"
+    run.check("rrd complete", words if not differing else f"recorded and shown differ: {differing}", ok=not differing)
+    return rrd
+
+
+# ---------------------------------------------------------------- processes
+
+
+@contextmanager
+def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[subprocess.Popen[str]]":
+    """A process of its own group, so that Ctrl-C at the terminal comes to it from here, and in order."""
+    environment = os.environ | {"FLEET_STATE_DIR": str(run.folder / ".state")}
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        process_group=0 if os.name == "posix" else None,
+    )
+    said: list[str] = []
+    assert process.stderr is not None
+    reader = threading.Thread(target=_drain, args=(process.stderr, said), name=f"log of {name}")
+    reader.start()
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            run.check(f"{name} ends", f"it did not within {END_S:g} s and was killed", ok=False)
+        reader.join()
+        for pipe in (process.stdin, process.stdout, process.stderr):
+            assert pipe is not None
+            pipe.close()
+        if process.returncode not in (0, -signal.SIGTERM):
+            run.say(f"{name} ended with {process.returncode}: {''.join(said[-3:]).strip()}")
+
+
+def _drain(pipe: IO[str], said: list[str]) -> None:
+    for line in pipe:
+        said.append(line)
+        del said[:-20]
+
+
+def _simulator(run: Demo, stack: ExitStack, session: Path) -> "tuple[subprocess.Popen[str], dict[str, str]]":
+    links = {"red": f"pty:{session / 'red.tty'}", "green": "pty", "blue": "tcp://127.0.0.1:0"}
+    cars = [part for car, platform in CARS.items() for part in ("--car", f"{car}:{platform}:{links[car]}")]
+    process = stack.enter_context(
+        _process(
+            run, "simulator", "gateway.cli", "sim", *cars, "--seed", "7", "--connect", run.endpoint, "--with-parent"
+        )
+    )
+    told = [_line(process, "simulator") for _ in CARS]
+    return process, {each["car"]: each["link"] for each in told}
+
+
+def _gateway(run: Demo, car: str, link: str) -> Any:
+    arguments = ("run", "--car", car, "--link", link, "--platform", CARS[car], "--connect", run.endpoint)
+    return _process(run, f"gateway of {car}", "gateway.cli", *arguments)
+
+
+def _line(process: "subprocess.Popen[str]", name: str) -> dict[str, Any]:
+    """The next JSON line of a process."""
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if not line:
+        raise click.ClickException(f"the {name} ended before it was ready (exit code {process.wait(END_S)})")
+    answer: dict[str, Any] = json.loads(line)
+    return answer
+
+
+def _ask(process: "subprocess.Popen[str]", request: dict[str, object]) -> dict[str, Any]:
+    assert process.stdin is not None
+    process.stdin.write(json.dumps(request) + "\n")
+    process.stdin.flush()
+    return _line(process, "simulator")
+
+
+def _free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _can_view() -> bool:
+    from fleet.replay.command import has_display
+
+    return sys.stdin.isatty() and has_display()
