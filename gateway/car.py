@@ -12,6 +12,7 @@ import random
 import signal
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -90,7 +91,9 @@ class Car:
         self._out = Publications(opened, settings.fleet, settings.car, settings.profile, str(settings.url))
         self._commands = bus.Handover(self._loop, self._query, limit=256)
         self._stream = bus.Handover(self._loop, self._streamed, limit=256)
-        self._queries = bus.Handover(self._loop, self._out.answer, limit=1024)
+        self._queries: bus.Handover[tuple[str, zenoh.Query]] = bus.Handover(
+            self._loop, lambda asked: self._out.answer(*asked), limit=1024
+        )
         self._senders = bus.Handover(self._loop, self._sender, limit=1024)
         self._asked: list[_Asked] = []
         self._sent: set[str] = set()
@@ -168,13 +171,19 @@ class Car:
         self._out.health(now, loop_lag_s=0.0, bus_drops=0)
         self._out.states(self._control, self._health, now)
         for family in ("sensor", "state"):
-            self._bus.queryable(f"{fleet}/{car}/{family}/*", self._queries)
+            # A query on `fleet/**` reaches both: each answers for its own family only.
+            take = partial(self._hand_over, family)
+            self._bus.queryable(f"{fleet}/{car}/{family}/*", take)
         self._bus.queryable(keys.command_key(fleet, car, "*"), self._commands)
         self._bus.subscribe(keys.command_key(fleet, car, "drive"), self._stream)
         self._bus.watch_tokens(
             f"{fleet}/{keys.OPERATOR}/*", lambda key, alive: self._senders((key.rpartition("/")[2], alive))
         )
         self._bus.token(keys.car_token(fleet, car))
+
+    def _hand_over(self, family: str, query: zenoh.Query) -> None:
+        """On a Zenoh thread."""
+        self._queries((family, query))
 
     # ------------------------------------------------------------------ the link
 

@@ -73,9 +73,12 @@ def _run(arguments: argparse.Namespace) -> int:
             state_dir=arguments.state_dir or default_directory(),
             retry=arguments.retry,
         )
+    except (BadKey, BadUrl, ValueError) as error:
+        return _failed(str(error), 2)
+    try:
         with Bus.open(arguments.connect, start_hub=True) as opened:
             asyncio.run(serve(settings, opened))
-    except (BadKey, BadUrl, BadEndpoint, ValueError) as error:
+    except BadEndpoint as error:
         return _failed(str(error), 2)
     except (AlreadyServed, LinkError, BusError) as error:
         return _failed(str(error), 1)

@@ -230,8 +230,8 @@ class Publications:
 
     # ------------------------------------------------------------------ queries
 
-    def answer(self, query: zenoh.Query) -> None:
-        """Answer a query on `sensor/*` or `state/*`: the latest value, or the history that it asks for."""
+    def answer(self, family: str, query: zenoh.Query) -> None:
+        """Answer a query for one family, `sensor` or `state`: the latest values, or the history that it asks for."""
         with query:
             parameters = query.parameters
             form = parameters.get("format") or "protobuf"
@@ -240,7 +240,7 @@ class Publications:
                 return
             for name, ring in self._rings.items():
                 publisher = self._publishers[name]
-                if not query.key_expr.intersects(publisher.key):
+                if publisher.topic.family != family or not query.key_expr.intersects(publisher.key):
                     continue
                 try:
                     values = ring.select(

@@ -1,0 +1,23 @@
+"""Fixtures of the tests on real processes."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.ports import free_endpoint
+from tests.support.processes import Fleet, TcpCar
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[Fleet]:
+    started = Fleet(free_endpoint(), tmp_path)
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def tcp_car() -> Iterator[TcpCar]:
+    car = TcpCar()
+    yield car
+    car.close()

@@ -1,0 +1,432 @@
+"""`gateway run` as a real process: what it publishes, writes, survives, refuses and leaves behind."""
+
+import json
+import random
+import signal
+import socket
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from schemas import bus
+from tests.support.processes import Fleet, TcpCar, driving, wait_for
+
+ANY_CLIENT = Path(__file__).parent / "any_client.py"
+
+STOP = b"$0,0,0,0,0,0,0,0,0#"
+RUN = b"$1,0,0,0,0,0,0,0,0#"
+MODE00 = b"$4WD,MODE00#"
+
+TAKEN = ("sent", "queued")
+"""Queued: another frame was in flight."""
+
+# What a car sent, and what of it are readings: protocol.md, "From the car: readings".
+LAST = b"$4WD,CSB33.00,PV7.25,GS7,LF0000,HW00,GM00#"
+RECORDED: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
+    (b"BT-04 ready\r\n", {}),
+    (
+        b"$4WD,CSB125.50,PV8.3,GS214,LF1011,HW01,GM10#\r\n",
+        {
+            "range": {"range_m": 1.255},
+            "battery": {"voltage_v": 8.3, "level": "ok"},
+            "grayscale": {"raw": 214},
+            "line": {"left_outer": True, "left_inner": False, "right_inner": True, "right_outer": True},
+            "obstacle": {"left": False, "right": True},
+            "light": {"left": True, "right": False},
+        },
+    ),
+    (b"$4WD,CSB12", {}),  # cut by a reset
+    (
+        b"$4WD,CSB0.00,PV6.5,GS1023,LF0000,HW10,GM01#",
+        {
+            "range": {"no_echo": True, "range_m": 0.0},
+            "battery": {"voltage_v": 6.5, "level": "critical"},
+            "grayscale": {"raw": 1023},
+            "line": {"left_outer": False},
+            "obstacle": {"left": True, "right": False},
+            "light": {"left": False, "right": True},
+        },
+    ),
+    (b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#", {"line": {"left_outer": True, "left_inner": False}}),  # tracking
+    (b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM10#", {"light": {"left": True, "right": False}}),  # light seeking
+    (b"$4WD,CSB120,PV8.3,GS000,LF0000,HW01,GM00", {"obstacle": {"left": True, "right": False}}),  # following
+    (
+        b"$4WD,CSB2000,PV7.91,GS5,LF0201,HW00,GM11#",  # two of its fields are out of range
+        {
+            "battery": {"voltage_v": 7.91},
+            "grayscale": {"raw": 5},
+            "obstacle": {"left": False, "right": False},
+            "light": {"left": True, "right": True},
+        },
+    ),
+    (b"$4WD,J190,J280,J370,J460,J50,J6180#", {"arm": {"joint_deg": [90, 80, 70, 60, 0, 180]}}),
+    (
+        b"$4WD,MPUgx-1,MPUgy2,MPUgz3.5,MPUax4,MPUay5,MPUaz-16384#",
+        {"imu": {"gyro_x_raw": -1.0, "gyro_z_raw": 3.5, "accel_z_raw": -16384.0}},
+    ),
+    (b"$4WD,XYZ1#\xff\x00$" + b"9" * 300 + b"#", {}),
+    (
+        LAST,
+        {
+            "range": {"range_m": 0.33},
+            "battery": {"voltage_v": 7.25},
+            "grayscale": {"raw": 7},
+            "line": {"left_outer": False},
+            "obstacle": {"left": False},
+            "light": {"left": False},
+        },
+    ),
+]
+OF_A_RASPBERRY_PI: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
+    (
+        b"$4WD,CSB125,PV8.4,GS0,LF1011,HW01,GM10#",  # its voltage and its grayscale are constants
+        {
+            "range": {"range_m": 1.25},
+            "line": {"left_outer": True},
+            "obstacle": {"right": True},
+            "light": {"left": True},
+        },
+    ),
+    (b"hello\r\n", {}),
+    (
+        b"$4WD,CSB0,PV8.4,GS0,LF0000,HW00,GM00#",
+        {"range": {"no_echo": True}, "line": {}, "obstacle": {}, "light": {}},
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("platform", "recording", "known", "connected", "stopped"),
+    [
+        ("arduino+arm+imu", RECORDED, LAST, [b"#", MODE00, MODE00, STOP], [MODE00, STOP]),
+        ("raspberry_pi", OF_A_RASPBERRY_PI, b"", [STOP, STOP, STOP], [STOP, STOP, STOP]),
+    ],
+    ids=["arduino", "raspberry_pi"],
+)
+def test_a_tcp_server_that_knows_nothing_of_us(
+    fleet: Fleet,
+    tcp_car: TcpCar,
+    platform: str,
+    recording: list[tuple[bytes, dict[str, dict[str, Any]]]],
+    known: bytes,
+    connected: list[bytes],
+    stopped: list[bytes],
+) -> None:
+    published: defaultdict[str, list[Any]] = defaultdict(list)
+    fleet.bus.subscribe("fleet/red/sensor/*", lambda sample: published[sample.key[17:]].append(sample.message()))
+    raw = bytearray()
+    fleet.bus.subscribe("fleet/red/frame/rx", lambda sample: raw.extend(sample.message().data))  # type: ignore[attr-defined]
+    fleet.gateway(tcp_car.link, platform=platform)
+    wait_for(lambda: len(tcp_car.received) == len(connected), "what it is sent on connecting")
+    assert tcp_car.received == connected
+
+    whole = b"".join(data for data, _ in recording)
+    cuts = random.Random(5)
+    sent = 0
+    while sent < len(whole):
+        size = cuts.choice([1, 1, 2, 5, 20, 20, 60])
+        tcp_car.send(whole[sent : sent + size])
+        sent += size
+        time.sleep(0.005)  # so that pieces arrive as pieces
+    expected: defaultdict[str, list[dict[str, Any]]] = defaultdict(list)
+    for _, readings in recording:
+        for name, fields in readings.items():
+            expected[name].append(fields)
+    wait_for(lambda: recording[-1][0] in raw, "the last frame is published")
+    assert published.keys() == expected.keys()
+    for name, readings_of in expected.items():
+        got = [
+            {field: plain(getattr(one, field)) for field in fields}
+            for one, fields in zip(published[name], readings_of, strict=True)
+        ]
+        assert got == readings_of, name
+        assert [one.seq for one in published[name]] == list(range(1, len(got) + 1))
+    assert strip(raw) == strip(whole), "every byte is in one raw frame"
+
+    fleet.ready()
+    assert fleet.ask("drive", motion="forward", duration_s=10)["status"] in TAKEN
+    wait_for(lambda: len(tcp_car.received) == len(connected) + 2, "the drive, and its repetition")
+    assert fleet.ask("stop")["status"] in TAKEN
+    whole_life = [*connected, RUN, RUN, *stopped]
+    wait_for(lambda: len(tcp_car.received) >= len(whole_life), "the stop")
+    fleet.ready()
+    assert tcp_car.received == whole_life, "one write per frame, and no other"
+    assert tcp_car.connections == 1
+
+
+def plain(value: Any) -> Any:
+    return list(value) if hasattr(value, "append") else value
+
+
+def strip(data: bytes | bytearray) -> bytes:
+    """Without the separators, which are in no frame."""
+    return bytes(data).translate(None, b"\r\n \t")
+
+
+def test_any_zenoh_client_reads_and_drives(fleet: Fleet) -> None:
+    assert len([line for line in ANY_CLIENT.read_text().splitlines() if line]) <= 10
+    sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
+    fleet.gateway(link, platform="raspberry_pi")
+    fleet.ready()
+    wait_for(lambda: fleet.get("fleet/red/sensor/range"), "a reading")
+    before = sim.say({"car": "red", "ask": "truth"})
+    client = fleet.start(str(ANY_CLIENT))
+    reading, answer = client.line(), client.line()
+    assert client.wait() == 0, client.stderr
+    assert (reading["car"], 0 < reading["range_m"] < 12) == ("red", True)
+    assert (answer["car"], answer["status"] in TAKEN, answer["reason"]) == ("red", True, "")
+    wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["x_m"] != before["x_m"], "it moves")
+    wait_for(lambda: not driving(sim), "and stops by itself")
+
+
+def test_history(fleet: Fleet, tcp_car: TcpCar) -> None:
+    fleet.gateway(tcp_car.link, platform="raspberry_pi")
+    fleet.ready()
+    for number in range(1, 6):
+        tcp_car.send(b"$4WD,CSB%d,PV8.4,GS0,LF0000,HW00,GM00#" % number)
+    wait_for(lambda: len(fleet.get("fleet/red/sensor/range?last=9")) == 5, "five readings")
+
+    def ranges(parameters: str) -> list[int]:
+        return [round(message.range_m * 100) for message in fleet.get(f"fleet/red/sensor/range?{parameters}")]
+
+    assert ranges("") == [5]
+    assert ranges("last=3") == [3, 4, 5]
+    assert ranges("_time=[now(-10m)..]") == [1, 2, 3, 4, 5]
+    assert ranges("_time=[now(-10m)..];last=2") == [4, 5]
+    assert ranges("_time=[..now(-10m)]") == []
+    third = fleet.get("fleet/red/sensor/range?last=3")[0].stamp.ToJsonString()
+    assert ranges(f"_time=[{third}..];last=9")[-2:] == [4, 5]
+    assert len(fleet.get("fleet/red/sensor/*?last=2")) == 2 * 4
+    assert len(fleet.get("fleet/**")) == 4 + 5, "four readings and five states, and no command was asked"
+    for bad in ("last=0", "last=x", "last=-1", "_time=now", "_time=[2026-11-21T04:00:00Z;10s]", "format=xml"):
+        (words,) = fleet.get(f"fleet/red/sensor/range?{bad}")
+        assert isinstance(words, str), bad
+        assert bad.partition("=")[0] in words
+    assert fleet.get("fleet/red/sensor/nonsense") == []
+
+
+def test_bad_commands_are_answered_and_nothing_dies(fleet: Fleet, tcp_car: TcpCar) -> None:
+    gateway = fleet.gateway(tcp_car.link, platform="raspberry_pi")
+    fleet.ready()
+    quiet = len(tcp_car.received)
+    for verb, fields, reason in [
+        ("drive", {}, "bad_value"),
+        ("drive", {"motion": "forward", "duration_s": "NaN"}, "bad_value"),
+        ("mode", {"mode": "tracking"}, "unsupported"),
+        ("jump", {}, "unsupported"),
+        ("lease", {}, "unsupported"),
+        ("led", {"r": 1, "g": 2, "b": 300}, "bad_value"),
+        ("light", {"light": "yellow"}, "unsupported"),
+    ]:
+        answer = fleet.ask(verb, **fields)
+        assert (answer["status"], answer["reason"]) == ("rejected", reason), verb
+        assert answer["words"]
+    for selector in ("fleet/*/@cmd/drive", "fleet/red/@cmd/*"):
+        (answer,) = list(fleet.bus.query(selector, payload=b'{"motion": "forward"}', timeout_s=5.0))
+        words = answer.words if isinstance(answer, bus.Failure) else json.loads(answer.payload)["words"]
+        assert "name" in words
+    for data in (b"", b"{", b"\xff" * 100, b"[" * 100_000):
+        for encoding in ("application/json", "application/protobuf", "application/protobuf;fleet.v1.DriveCommand"):
+            assert len(list(fleet.bus.query("fleet/red/@cmd/drive", payload=data, encoding=encoding))) == 1
+            fleet.bus.put_command("fleet/red/@cmd/drive", data, encoding)
+    answers = list(fleet.bus.query("fleet/*/@cmd/stop", timeout_s=5.0))
+    assert [json.loads(one.payload)["status"] in TAKEN for one in answers if isinstance(one, bus.Sample)] == [True]
+    wait_for(lambda: len(tcp_car.received) == quiet + 3, "the stop, and nothing else")
+    assert set(tcp_car.received) == {STOP}
+    assert gateway.end() == 0
+    assert "Traceback" not in gateway.stderr
+
+
+def test_a_second_gateway_refuses_and_names_the_first(fleet: Fleet, tcp_car: TcpCar) -> None:
+    first = fleet.gateway(tcp_car.link, platform="raspberry_pi")
+    fleet.ready()
+    second = fleet.gateway("/dev/ttyNOWHERE", platform="raspberry_pi")
+    assert second.wait() == 1
+    (line,) = second.stderr.splitlines()
+    assert line == (
+        f"gateway: car red is served already, by process {first.pid} on {socket.gethostname()} (link {tcp_car.link}): "
+        "stop that one first, or give this car another name"
+    )
+    assert fleet.ask("drive", motion="forward", duration_s=0.1)["status"] in TAKEN
+
+
+@pytest.mark.parametrize("link", ["tcp", "pty"])
+def test_of_two_that_start_at_the_same_moment_one_remains(fleet: Fleet, tcp_car: TcpCar, link: str) -> None:
+    where = tcp_car.link if link == "tcp" else fleet.simulate("red:raspberry_pi:pty")[1][0]
+    both = [fleet.gateway(where, platform="raspberry_pi") for _ in range(2)]
+    wait_for(lambda: any(one.popen.poll() is not None for one in both), "one yields")
+    (stays,) = [one for one in both if one.popen.poll() is None]
+    (yields,) = [one for one in both if one is not stays]
+    assert yields.wait() == 1
+    assert "is served already" in yields.stderr or "in use" in yields.stderr
+    wait_for(lambda: (health := fleet.state("health")) and health.uptime_s > 2.5, "the other has looked again")
+    assert stays.popen.poll() is None
+    fleet.ready()
+    assert [health.pid for health in fleet.get("fleet/red/state/health")] == [stays.pid]
+
+
+@pytest.mark.parametrize(
+    ("number", "car"),
+    [(signal.SIGINT, "red:arduino:pty"), (signal.SIGTERM, "red:arduino:tcp"), (signal.SIGTERM, "red:raspberry_pi:tcp")],
+    ids=["SIGINT-arduino", "SIGTERM-arduino", "SIGTERM-raspberry_pi"],
+)
+def test_a_signal_stops_the_car_first(fleet: Fleet, number: int, car: str) -> None:
+    sim, (link,) = fleet.simulate(car)
+    gateway = fleet.gateway(link, platform=car.split(":")[1])
+    fleet.ready()
+    assert fleet.ask("drive", motion="forward", duration_s=10)["status"] in TAKEN
+    wait_for(lambda: driving(sim), "it drives")
+    began = time.monotonic()
+    assert gateway.end(number) == 0, gateway.stderr
+    took = time.monotonic() - began
+    assert not driving(sim)
+    assert took < 1.2 + 1.0 + 2.0, "its recipe, one second, and two for a machine that is busy"
+    assert "Traceback" not in gateway.stderr
+    assert fleet.left() == []
+    assert wait_for(lambda: not fleet.get("fleet/red/**"), "nobody answers for it")
+
+
+def test_a_killed_gateway_leaves_a_car_that_drives_and_its_successor_stops_it(fleet: Fleet) -> None:
+    sim, (link,) = fleet.simulate("red:arduino:pty")
+    gateway = fleet.gateway(link)
+    fleet.ready()
+    assert fleet.ask("stop", sender="mia", kind="person")["status"] in TAKEN
+    wait_for(lambda: fleet.state("safety").hold.by == "mia", "held")
+    assert fleet.ask("drive", motion="forward", kind="coordinator")["reason"] == "held"
+    gateway.end(signal.SIGKILL)
+    wait_for(lambda: not fleet.get("fleet/red/**"), "it is gone")
+
+    gateway = fleet.gateway(link)
+    wait_for(lambda: fleet.state("safety"), "a successor")
+    assert fleet.state("safety").hold.by == "mia", "a hold survives"
+    assert fleet.state("safety").motors == "unknown"
+    fleet.ready()
+    assert fleet.ask("drive", motion="forward", duration_s=10)["status"] in TAKEN
+    assert not fleet.state("safety").HasField("hold"), "a script's drive ends it"
+    wait_for(lambda: driving(sim), "it drives")
+    gateway.end(signal.SIGKILL)
+    assert driving(sim), "the car has no dead-man"
+
+    fleet.gateway(link)
+    wait_for(lambda: not driving(sim), "recovery stops it")
+    fleet.ready()
+    assert not fleet.state("safety").HasField("hold"), "its end survives too"
+
+
+def test_a_link_that_drops_comes_back_by_itself(fleet: Fleet, tmp_path: Path) -> None:
+    sim, (link,) = fleet.simulate(f"red:arduino:pty:{tmp_path / 'tty'}")
+    gateway = fleet.gateway(link)
+    fleet.ready()
+    assert fleet.ask("drive", motion="forward", duration_s=10, id="long")["status"] in TAKEN
+    ends: list[Any] = []
+    fleet.bus.subscribe("fleet/red/event/command", lambda sample: ends.append(sample.message()))
+    wait_for(lambda: driving(sim), "it drives")
+    sim.say({"car": "red", "fault": "link_drop"})
+    wait_for(lambda: fleet.state("link").state == "lost", "lost")
+    assert driving(sim)
+    assert fleet.state("safety").motors == "unknown"
+    answer = fleet.ask("drive", motion="forward")
+    assert (answer["status"], answer["reason"]) == ("rejected", "link_down")
+    sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
+    wait_for(lambda: not driving(sim), "recovery stops it")
+    fleet.ready()
+    wait_for(lambda: fleet.state("link").state == "online", "online")
+    assert fleet.state("link").reconnects == 1
+    assert [(end.phase, end.reason) for end in ends if end.id == "long"] == [("failed", "link_down")]
+    assert fleet.ask("drive", motion="forward", duration_s=0.3)["status"] in TAKEN
+    assert gateway.end() == 0
+
+
+def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: Fleet) -> None:
+    sim, links = fleet.simulate("red:raspberry_pi:tcp", "blue:raspberry_pi:tcp")
+    fleet.gateway(links[0], platform="raspberry_pi")
+    fleet.gateway(links[1], platform="raspberry_pi", car="blue")
+    fleet.ready("red")
+    fleet.ready("blue")
+    fleet.hub.end(signal.SIGKILL)
+    wait_for(lambda: fleet.left() and bus.accepts(fleet.endpoint), "another hub")
+    assert wait_for(lambda: fleet.bus.tokens("fleet/*") == ["fleet/blue", "fleet/red"], "both are back")
+    for car in ("red", "blue"):
+        assert fleet.ask("drive", car, motion="forward", duration_s=5)["status"] in TAKEN
+        wait_for(lambda car=car: driving(sim, car), f"{car} drives")
+        assert fleet.ask("stop", car)["status"] in TAKEN
+        wait_for(lambda car=car: not driving(sim, car), f"{car} stands")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--car", "Red"], 2, "car name 'Red' is not allowed: use 1 to 32 of a-z"),
+        (["--car", ""], 2, "car name '' is not allowed"),
+        (["--fleet", "a/b"], 2, "fleet name 'a/b' is not allowed"),
+        (["--platform", "esp32"], 2, "'esp32' is not known, allowed are arduino, stm32, raspberry_pi, unknown"),
+        (["--platform", "arduino+wings"], 2, "option 'wings' is not known"),
+        (["--link", "usb://x"], 2, "usb:// is no kind of link: give serial:///dev/ttyUSB0"),
+        (["--link", "tcp://host"], 2, "a host and a port from 1 to 65535 are needed"),
+        (["--link", "ttyUSB0"], 2, "it is neither a URL nor a device path"),
+        (["--connect", "127.0.0.1:7447"], 2, "write it as tcp/HOST:PORT"),
+        (["--connect", "tcp/127.0.0.1:0"], 2, "port 1 to 65535"),
+        (["--connect", "tcp/192.0.2.1:7447"], 1, "nothing listens at tcp/192.0.2.1:7447"),
+        (["--link", "/dev/ttyNOWHERE"], 1, "serial:///dev/ttyNOWHERE: there is no such port"),
+        (["--link", "/dev"], 1, "serial:///dev: this is a directory, not a serial port"),
+        (["--link", "tcp://127.0.0.1:1"], 1, "nothing listens on that port"),
+        (["--link", f"tcp://{'a' * 64}:8888"], 1, "there is no host"),
+    ],
+    ids=lambda value: " ".join(value)[:40] if isinstance(value, list) else "",
+)
+def test_bad_input_is_one_line(fleet: Fleet, arguments: list[str], code: int, words: str) -> None:
+    given = {"--car": "red", "--link": "/dev/null", "--platform": "arduino"}
+    given |= dict(zip(arguments[::2], arguments[1::2], strict=True))
+    process = fleet.start("-m", "gateway.cli", "run", *(word for pair in given.items() for word in pair))
+    assert process.wait() == code, process.stderr
+    (line,) = process.stderr.splitlines()
+    assert line.startswith("gateway: ")
+    assert words in line
+
+
+def test_a_port_in_use_is_said(fleet: Fleet) -> None:
+    _, (link,) = fleet.simulate("red:arduino:pty")
+    with serial.Serial(link.removeprefix("serial://"), exclusive=True):
+        process = fleet.gateway(link)
+        assert process.wait() == 1
+    (line,) = process.stderr.splitlines()
+    assert "the port is in use by another program (a second gateway?): end that one first" in line
+
+
+def test_what_listens_there_is_no_router(tmp_path: Path, fleet: Fleet, tcp_car: TcpCar) -> None:
+    process = fleet.gateway("/dev/null", "--connect", tcp_car.link.replace("tcp://", "tcp/"))
+    assert process.wait() == 1
+    (line,) = process.stderr.splitlines()
+    assert "is no Zenoh router" in line
+
+
+def test_a_link_that_is_not_there_yet_is_waited_for(fleet: Fleet, tmp_path: Path) -> None:
+    gateway = fleet.gateway(str(tmp_path / "tty"), "--retry", platform="raspberry_pi")
+    wait_for(lambda: (link := fleet.state("link")) and "no such port" in link.reason, "it says what is missing")
+    fleet.simulate(f"red:raspberry_pi:pty:{tmp_path / 'tty'}")
+    fleet.ready()
+    assert gateway.end() == 0
+
+
+def test_a_signal_while_nothing_is_connected_ends_at_once(fleet: Fleet, tmp_path: Path) -> None:
+    gateway = fleet.gateway(str(tmp_path / "tty"), "--retry")
+    wait_for(lambda: fleet.state("link"), "it runs")
+    assert gateway.end(signal.SIGINT) == 0, gateway.stderr
+
+
+def test_it_imports_nothing_that_it_does_not_need(fleet: Fleet, tcp_car: TcpCar) -> None:
+    code = (
+        "import sys\nfrom gateway.cli import main\n"
+        "try:\n    main()\nfinally:\n    import json\n"
+        "    print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+    )
+    process = fleet.start("-c", code, "run", "--car", "red", "--link", tcp_car.link, "--platform", "raspberry_pi")
+    fleet.ready()
+    assert process.end() == 0
+    loaded = set(process.line())
+    assert {"gateway", "zenoh", "google"} <= loaded
+    assert not loaded & {"click", "pydantic", "rich", "mcap", "rerun", "yaml", "fleet", "serial", "numpy", "pyarrow"}

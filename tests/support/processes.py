@@ -1,0 +1,227 @@
+"""A fleet of real processes for one test: hub, simulated cars, gateways; everything that was started is ended."""
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from schemas import bus, messages
+
+PATIENCE_S = 40.0
+"""The machine may be busy with other tests; nothing here is waited for longer than it takes."""
+
+
+def wait_for(so: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> Any:
+    """Ask until it is so; returns what was so."""
+    deadline = time.monotonic() + seconds
+    while not (found := so()):
+        assert time.monotonic() < deadline, f"never: {what}"
+        time.sleep(0.01)
+    return found
+
+
+class Process:
+    """One `gateway` process."""
+
+    def __init__(self, arguments: list[str], log: Path, environment: dict[str, str]) -> None:
+        self.log = log
+        with log.open("w") as stderr:
+            self.popen = subprocess.Popen(
+                [sys.executable, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=stderr,
+                env=os.environ | environment,
+                text=True,
+            )
+        self.pid = self.popen.pid
+        self._lines: queue.Queue[str] = queue.Queue()
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    @property
+    def stderr(self) -> str:
+        """What it has said so far."""
+        return self.log.read_text()
+
+    def line(self) -> Any:
+        """Its next line of JSON."""
+        return json.loads(self._lines.get(timeout=PATIENCE_S))
+
+    def say(self, fields: dict[str, Any]) -> Any:
+        """Give it a line of JSON, get its answer."""
+        assert self.popen.stdin is not None
+        self.popen.stdin.write(json.dumps(fields) + "\n")
+        self.popen.stdin.flush()
+        while "ok" not in (answer := self.line()):
+            pass
+        assert answer["ok"], answer
+        return answer
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        """Send a signal and wait; the exit code."""
+        if self.popen.poll() is None:
+            self.popen.send_signal(number)
+        return self.wait()
+
+    def wait(self) -> int:
+        """Wait until it has ended; the exit code."""
+        code = self.popen.wait(PATIENCE_S)
+        self._reader.join()
+        for stream in (self.popen.stdin, self.popen.stdout):
+            assert stream is not None
+            with contextlib.suppress(BrokenPipeError):
+                stream.close()
+        return code
+
+    def _read(self) -> None:
+        assert self.popen.stdout is not None
+        for line in self.popen.stdout:
+            self._lines.put(line)
+
+
+class Fleet:
+    """Processes at one endpoint, and a client of their bus."""
+
+    def __init__(self, endpoint: str, directory: Path) -> None:
+        self.endpoint = endpoint
+        self.directory = directory
+        self.environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(directory / "state")}
+        self._started: list[Process] = []
+        self._bus: bus.Bus | None = None
+        self.hub = self.start("-m", "schemas.hub", "--endpoint", endpoint)
+        wait_for(lambda: bus.accepts(endpoint), "the hub listens")
+
+    def start(self, *arguments: str) -> Process:
+        """Start Python with these arguments."""
+        started = Process(list(arguments), self.directory / f"{len(self._started)}.log", self.environment)
+        self._started.append(started)
+        return started
+
+    def simulate(self, *cars: str) -> tuple[Process, list[str]]:
+        """Simulated cars that publish no truth (they are asked), and their links."""
+        described = [word for car in cars for word in ("--car", car)]
+        sim = self.start("-m", "gateway.cli", "sim", "--no-truth", "--seed", "3", *described)
+        return sim, [sim.line()["link"] for _ in cars]
+
+    def gateway(self, link: str, *more: str, car: str = "red", platform: str = "arduino") -> Process:
+        """Start `gateway run`."""
+        return self.start("-m", "gateway.cli", "run", "--car", car, "--link", link, "--platform", platform, *more)
+
+    @property
+    def bus(self) -> bus.Bus:
+        """A client of the fleet's bus."""
+        if self._bus is None:
+            self._bus = bus.Bus.open(self.endpoint)
+        return self._bus
+
+    def get(self, selector: str) -> list[Any]:
+        """The answers to a query, as messages; an error reply is its words."""
+        found: list[Any] = []
+        for answer in self.bus.query(selector, timeout_s=5.0):
+            found.append(answer.words if isinstance(answer, bus.Failure) else answer.message())
+        return found
+
+    def state(self, name: str, car: str = "red") -> Any:
+        """One state of one car; None while nobody answers."""
+        return next(iter(self.get(f"fleet/{car}/state/{name}")), None)
+
+    def ready(self, car: str = "red") -> None:
+        """Wait until the car is in a known state."""
+
+        def known() -> bool:
+            safety = self.state("safety", car)
+            return safety is not None and safety.motors == "off"
+
+        wait_for(known, f"{car} is in a known state")
+
+    def ask(self, verb: str, car: str = "red", **fields: Any) -> Any:
+        """Give a command as JSON; the answer as a dict."""
+        answers = list(
+            self.bus.query(
+                f"fleet/{car}/@cmd/{verb}",
+                payload=json.dumps(fields).encode(),
+                encoding=messages.JSON,
+                timeout_s=5.0,
+            )
+        )
+        assert len(answers) == 1, answers
+        assert isinstance(answers[0], bus.Sample), answers
+        return json.loads(answers[0].payload)
+
+    def left(self) -> list[str]:
+        """Processes that still run at this endpoint, by the system's own list."""
+        listed = subprocess.run(["ps", "-axwwo", "pid=,args="], capture_output=True, text=True, check=True).stdout
+        mine = {str(process.pid) for process in self._started}
+        found = [line.split(None, 1) for line in listed.splitlines()]
+        return [pid for pid, args in found if self.endpoint in args and pid not in mine]
+
+    def close(self) -> None:
+        """End everything that was started, and the hubs that gateways have started at this endpoint."""
+        if self._bus is not None:
+            self._bus.close()
+        for process in self._started:
+            if process.popen.poll() is None:
+                process.popen.kill()
+            process.wait()
+        for pid in self.left():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(pid), signal.SIGTERM)
+
+
+def driving(sim: Process, car: str = "red") -> bool:
+    """Whether the motors of a simulated car are on, says the car."""
+    truth = sim.say({"car": car, "ask": "truth"})
+    return bool(truth["motor_left"] or truth["motor_right"])
+
+
+class TcpCar:
+    """A TCP server that knows nothing of us: it keeps what each receive brought, and sends what it is told to."""
+
+    def __init__(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.link = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+        self.received: list[bytes] = []
+        self.connections = 0
+        self._peers: list[socket.socket] = []
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def send(self, data: bytes) -> None:
+        """Send to the last that connected."""
+        self._peers[-1].sendall(data)
+
+    def close(self) -> None:
+        """Hang up and end."""
+        for each in (self._listener, *self._peers):
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
+        self._thread.join()
+
+    def _serve(self) -> None:
+        readers = []
+        with contextlib.suppress(OSError):
+            while True:
+                peer, _ = self._listener.accept()
+                peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._peers.append(peer)
+                self.connections += 1
+                readers.append(threading.Thread(target=self._read, args=(peer,)))
+                readers[-1].start()
+        for reader in readers:
+            reader.join()
+
+    def _read(self, peer: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := peer.recv(4096):
+                self.received.append(data)
