@@ -4,7 +4,6 @@ Every message goes into the .rrd as it was; lenses add what the viewer draws. No
 """
 
 import os
-import subprocess
 import sys
 import tempfile
 from collections import Counter
@@ -65,18 +64,18 @@ def export(session: Session, out: Path) -> Counter[str]:
     ways = _ways(session)
     stream = rrc.LazyChunkStream.merge(stream, rrc.LazyChunkStream.from_iter(_drawn(ways, contents)))
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".replay-") as scratch:
-        data, layout, whole = (Path(scratch) / name for name in ("data.rrd", "layout.rbl", "whole.rrd"))
-        stream.write_rrd(data, application_id=APPLICATION, recording_id=session.name)
-        blueprint.layout(contents, _ground(ways)).save(APPLICATION, layout)
-        done = subprocess.run(
-            [program(), "rrd", "merge", data, layout, "-o", whole],
-            env=environment(),
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode != 0:
-            raise ExportFailed(f"Rerun could not put the layout into {out}: {done.stderr.strip()}")
+        whole = Path(scratch) / "whole.rrd"
+        # A recording stream, because only its file carries a layout; the chunks go through it unseen by Python.
+        recording = rr.RecordingStream(APPLICATION, recording_id=session.name)
+        recording.save(whole, default_blueprint=blueprint.layout(contents, _ground(ways)))
+        recording.send_chunks(stream)
+        recording.disconnect()
+        try:
+            rrc.RrdReader(
+                whole
+            ).store()  # its writer tells nobody of a full disk; a cut file has no index
+        except RuntimeError as error:
+            raise ExportFailed(f"{out} could not be written: {error}") from None
         whole.replace(out)
     return held
 
