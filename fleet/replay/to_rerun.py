@@ -71,9 +71,7 @@ def export(session: Session, out: Path) -> Counter[str]:
         recording.send_chunks(stream)
         recording.disconnect()
         try:
-            rrc.RrdReader(
-                whole
-            ).store()  # its writer tells nobody of a full disk; a cut file has no index
+            rrc.RrdReader(whole).store()  # its writer tells nobody of a full disk; a cut file has no index
         except RuntimeError as error:
             raise ExportFailed(f"{out} could not be written: {error}") from None
         whole.replace(out)
