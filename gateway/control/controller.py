@@ -292,9 +292,9 @@ class Controller:
         held = self._held
         if held is not None and not held.pending.sent:
             return self._write(General(held.motion), Why.COMMAND, held, held.pending)
-        if self._opening is not None:
+        if self._opening is not None and not (self._acts and self.at_rest):
             return self._open_mode(self._opening, now)
-        if self._acts:
+        if self._acts:  # asked before the mode, in which the car would ignore them
             pending = self._acts[0]
             return self._write(self._with_motion(pending.frames[0]), Why.COMMAND, pending, pending)
         if self._repeat and now >= self.pacing.repeat_at:
@@ -398,6 +398,9 @@ class Controller:
         words = f"{drive.motion} by {sender.name}"
         self._close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._held = _Held(drive.motion, pending, now + drive.duration_s, watched)
+        if held is not None and held.motion is drive.motion and held.pending.sent:
+            self._ledger.sent(pending, now, "the motion is held on")
+            return Answer(Phase.SENT, words="the motion is held on")
         running = self._running
         if running is not None and running.recipe.rank == recipes.SOFT.rank:
             # The car is wanted to move again: the rest of a soft stop would only jerk it.

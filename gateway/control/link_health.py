@@ -74,7 +74,8 @@ class LinkHealth:
         if self.state is LinkState.LOST:
             return False
         before = self.state
-        heard = self.last_rx_at if self.last_rx_at is not None else self._up_at or now
+        up_at = self._up_at if self._up_at is not None else now
+        heard = self.last_rx_at if self.last_rx_at is not None else up_at
         silence = now - max(heard, min(blocked_until, now))
         if self.last_rx_at is not None and now - self.last_rx_at <= (limit_s if limit_s is not None else STALE_S):
             self._set(LinkState.ONLINE, "heard", now)

@@ -85,7 +85,7 @@ UNKNOWN: Final = Recipe(
     "unknown_platform",
     3,
     (
-        Step(_STOP),
+        Step(_STOP, Gate.FLIGHT),
         Step(_MANUAL, after_s=0.06),
         Step(_STOP, after_s=REPEAT_S),
         Step(_MANUAL, from_start_s=3.7),

@@ -1,0 +1,621 @@
+"""Commands through control: their lives, what merges and what queues, hold, refusals, recovery, the end."""
+
+import random
+
+import pytest
+
+from gateway.control.controller import PATIENCE_S, Hold
+from gateway.control.records import (
+    Act,
+    ChangeSpeed,
+    Drive,
+    Fan,
+    Find,
+    Phase,
+    Reason,
+    Resume,
+    Sender,
+    SetMode,
+    Stop,
+    What,
+    Why,
+)
+from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz, parse_sent
+from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from tests.gateway.control.desk import BACK, COORDINATOR, MODE00, PERSON, RUN, SCRIPT, STOP, TRACKING, Desk
+from tests.support.virtual import Pair
+
+ASKED, QUEUED, SENT, COMPLETE = Phase.ASKED, Phase.QUEUED, Phase.SENT, Phase.COMPLETE
+WHISTLE = Act(General(Motion.STOP, whistle=True))
+LIGHT = Act(General(Motion.STOP, light=Light.RED))
+FORWARD = Drive(Motion.FORWARD, 5.0)
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk().ready()
+
+
+# ---------------------------------------------------------------------- the life of each command
+
+
+@pytest.mark.parametrize(
+    ("what", "frames", "life"),
+    [
+        (Drive(Motion.FORWARD, 0.3), [RUN, STOP, STOP], [ASKED, QUEUED, SENT, COMPLETE]),
+        (Drive(Motion.SPIN_LEFT, 0.3), [b"$0,1,0,0,0,0,0,0,0#", STOP, STOP], [ASKED, QUEUED, SENT, COMPLETE]),
+        (Drive(Motion.STOP), [], [ASKED, SENT]),
+        (SetMode(Mode.TRACKING), [b"$4WD,MODE21#"], [ASKED, QUEUED, SENT]),
+        (SetMode(Mode.MANUAL), [MODE00, STOP], [ASKED, QUEUED, SENT]),
+        (Act(ColorLed(1, 2, 3)), [b"$4WD,CLR1,CLG2,CLB3#"], [ASKED, QUEUED, SENT]),
+        (Act(Ptz(30)), [b"$4WD,PTZ30#"], [ASKED, QUEUED, SENT]),
+        (LIGHT, [b"$0,0,0,0,0,0,2,0,0#"], [ASKED, QUEUED, SENT]),
+        (WHISTLE, [b"$0,0,1,0,0,0,0,0,0#"], [ASKED, QUEUED, SENT]),
+        (Act(General(Motion.STOP, servo=ServoAction.FRONT_RESET)), [b"$0,0,0,0,0,0,0,0,1#"], [ASKED, QUEUED, SENT]),
+        (ChangeSpeed(SpeedStep.UP), [b"$0,0,0,1,0,0,0,0,0#"], [ASKED, QUEUED, SENT]),
+        (Fan(), [b"$0,0,0,0,0,0,0,1,0#"], [ASKED, QUEUED, SENT]),
+        (Fan(on=True), [b"$0,0,0,0,0,0,0,1,0#"], [ASKED, QUEUED, SENT]),
+        (Fan(on=False), [], [ASKED, SENT]),
+        (
+            Find(),
+            [b"$0,0,1,0,0,0,0,0,0#", b"$4WD,CLR255,CLG255,CLB255#", b"$0,0,1,0,0,0,0,0,0#", b"$4WD,CLR0,CLG0,CLB0#"],
+            [ASKED, QUEUED, SENT],
+        ),
+        (Stop(), [MODE00, STOP], [ASKED, QUEUED, SENT, COMPLETE]),
+        (Stop(emergency=True), [MODE00, STOP], [ASKED, QUEUED, SENT, COMPLETE]),
+        (Resume(), [], [ASKED, SENT]),
+    ],
+    ids=str,
+)
+def test_the_life_of_a_command(desk: Desk, what: What, frames: list[bytes], life: list[Phase]) -> None:
+    answer = desk.ask(what, identity="it")
+    assert answer.status in (QUEUED, SENT)
+    desk.run(4.0)
+    assert desk.frames == frames
+    assert desk.life("it") == life
+    assert all(b.at >= a.at for a, b in zip(desk.records, desk.records[1:], strict=False))
+
+
+def test_an_opened_mode_is_seen_when_its_reading_comes(desk: Desk) -> None:
+    desk.ask(SetMode(Mode.TRACKING), identity="it")
+    desk.run(3.5, reports=False)
+    assert desk.life("it")[-1] is SENT
+    desk.hear(TRACKING)
+    record = desk.records[-1]
+    assert (record.phase, record.evidence) == (Phase.EFFECT_SEEN, ("a reading with the shape of tracking",))
+    again = desk.ask(SetMode(Mode.TRACKING))
+    assert (again.status, again.words) == (SENT, "red is in tracking already (confirmed)")
+
+
+# ---------------------------------------------------------------------- motion is a state
+
+
+def test_a_changed_motion_is_sent_again_once_alone_and_never_more(desk: Desk) -> None:
+    began = desk.now
+    desk.ask(FORWARD)
+    desk.run(4.9)
+    assert [(round(at - began, 3), data, why) for at, data, why in desk.sent] == [
+        (0.0, RUN, Why.COMMAND),
+        (1.1, RUN, Why.REPEAT),
+    ]
+
+
+def test_the_same_motion_held_on_is_not_written_again(desk: Desk) -> None:
+    desk.ask(Drive(Motion.FORWARD), identity="first")
+    for number in range(20):
+        desk.run(0.25)
+        assert desk.ask(Drive(Motion.FORWARD), identity=f"more{number}").status is SENT
+        assert desk.life(f"more{number}") == [ASKED, SENT]
+    assert desk.frames == [RUN, RUN]
+    desk.ask(Drive(Motion.FORWARD, 0.2), PERSON, identity="hers")
+    assert desk.end("first") == (Phase.SUPERSEDED, Reason.SUPERSEDED)
+    assert desk.control.owner == "mia"
+    desk.run(0.1)
+    assert desk.frames == [RUN, RUN]
+    desk.run(3.0)
+    assert desk.frames == [RUN, RUN, STOP, STOP]
+    assert desk.end("hers") == (COMPLETE, None)
+
+
+def test_the_newest_motion_wins_and_only_it_is_written(desk: Desk) -> None:
+    desk.ask(WHISTLE)  # blocks for 0.3 s: what comes now waits
+    for number, motion in enumerate([Motion.FORWARD, Motion.LEFT, Motion.RIGHT, Motion.BACK]):
+        assert desk.ask(Drive(motion, 2.0), identity=f"m{number}").status is QUEUED
+    desk.run(1.0)
+    assert desk.frames[1:] == [BACK]
+    for number in range(3):
+        assert desk.life(f"m{number}") == [ASKED, QUEUED, Phase.SUPERSEDED]
+    assert desk.life("m3") == [ASKED, QUEUED, SENT]
+
+
+def test_motion_overtakes_what_queues(desk: Desk) -> None:
+    for _ in range(3):
+        desk.ask(WHISTLE)
+    desk.ask(Drive(Motion.FORWARD, 3.0))
+    desk.run(1.5)
+    assert desk.frames[:4] == [b"$0,0,1,0,0,0,0,0,0#", RUN, b"$1,0,1,0,0,0,0,0,0#", b"$1,0,1,0,0,0,0,0,0#"]
+
+
+@pytest.mark.parametrize(
+    ("what", "frame"),
+    [
+        (LIGHT, b"$1,0,0,0,0,0,2,0,0#"),
+        (WHISTLE, b"$1,0,1,0,0,0,0,0,0#"),
+        (ChangeSpeed(SpeedStep.DOWN), b"$1,0,0,2,0,0,0,0,0#"),
+        (Fan(), b"$1,0,0,0,0,0,0,1,0#"),
+    ],
+    ids=str,
+)
+def test_a_one_shot_while_driving_carries_the_motion(desk: Desk, what: What, frame: bytes) -> None:
+    desk.ask(FORWARD)
+    desk.run(2.0)
+    desk.ask(what)
+    desk.run(1.0)
+    assert desk.frames == [RUN, RUN, frame]
+
+
+def test_the_repetition_after_a_one_shot_repeats_the_motion_alone(desk: Desk) -> None:
+    desk.ask(FORWARD)
+    desk.run(0.5)
+    desk.ask(Fan())
+    desk.run(3.0)
+    assert desk.frames == [RUN, b"$1,0,0,0,0,0,0,1,0#", RUN], "a toggle is never repeated"
+
+
+def test_a_drive_expires_and_stops_softly(desk: Desk) -> None:
+    began = desk.now
+    desk.ask(Drive(Motion.BACK, 0.7), identity="it")
+    desk.run(3.0)
+    assert [(round(at - began, 3), data) for at, data, _ in desk.sent] == [(0.0, BACK), (0.7, STOP), (1.8, STOP)]
+    assert desk.records[-1].words == "its time is over"
+    assert desk.control.motors == "off"
+
+
+def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Desk) -> None:
+    desk.ask(Drive(Motion.FORWARD, 0.3))
+    desk.run(0.6)
+    desk.ask(Drive(Motion.FORWARD, 1.0), identity="on")
+    assert desk.frames == [RUN, STOP, RUN]
+    desk.run(0.9)
+    assert desk.life("on") == [ASKED, QUEUED, SENT]
+    desk.run(3.0)
+    assert desk.frames[3:] == [STOP, STOP]
+
+
+def test_a_drive_within_a_full_stop_waits_for_its_end_or_is_refused(desk: Desk) -> None:
+    desk.ask(FORWARD)
+    desk.run(1.0)
+    desk.ask(Stop())
+    short = desk.ask(Drive(Motion.BACK, 0.5))
+    assert (short.status, short.reason) == (Phase.REJECTED, Reason.EXPIRED)
+    assert short.words == "red is busy for 1.1 s more, longer than this drive's 0.5 s"
+    assert desk.ask(Drive(Motion.BACK, 2.0)).status is QUEUED
+    desk.run(1.5)
+    assert desk.frames == [RUN, MODE00, STOP, BACK]
+
+
+def test_a_drive_released_by_hand(desk: Desk) -> None:
+    desk.ask(FORWARD, identity="it")
+    desk.run(0.5)
+    assert desk.ask(Drive(Motion.STOP), identity="off").status is QUEUED
+    desk.run(2.0)
+    assert desk.frames == [RUN, STOP, STOP]
+    assert desk.end("it") == (COMPLETE, None)
+    assert desk.life("off") == [ASKED, QUEUED, SENT, COMPLETE]
+    assert desk.control.hold is None, "a release is no stop"
+
+
+# ---------------------------------------------------------------------- senders, stalls
+
+
+def test_a_sender_that_is_away_for_a_second_is_lost(desk: Desk) -> None:
+    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
+    desk.run(2.0)
+    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    desk.run(0.5)
+    desk.control.sender_alive("mia", alive=True, now=desk.now)  # the hub was restarted
+    desk.run(2.0)
+    assert desk.frames == [RUN, RUN]
+    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    gone = desk.now
+    desk.run(3.0)
+    assert [(round(at - gone, 3), data) for at, data, _ in desk.sent[2:]] == [(1.0, STOP), (2.1, STOP)]
+    assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
+    assert desk.records[-1].words == "its sender mia is gone"
+
+
+def test_a_sender_without_a_token_is_not_watched(desk: Desk) -> None:
+    desk.ask(Drive(Motion.FORWARD, 5.0), PERSON)
+    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    desk.run(4.0)
+    assert desk.frames == [RUN, RUN]
+
+
+def test_a_stalled_loop_stops_the_car_first(desk: Desk) -> None:
+    desk.ask(FORWARD, identity="it")
+    desk.run(2.0)
+    desk.control.stalled(0.4, desk.now)
+    desk.pump()
+    assert desk.frames == [RUN, RUN]
+    desk.control.stalled(0.6, desk.now)
+    desk.pump()
+    assert desk.frames == [RUN, RUN, STOP]
+    assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
+    assert [entry.code for entry in desk.logs] == ["stalled"]
+    desk.run(2.0)
+    desk.control.stalled(9.0, desk.now)
+    assert len(desk.logs) == 1, "nothing is held now"
+
+
+# ---------------------------------------------------------------------- one-shots
+
+
+def test_one_shots_queue_so_many_and_no_more_each_once(desk: Desk) -> None:
+    answers = [desk.ask(Fan() if number % 2 else ChangeSpeed(SpeedStep.UP)) for number in range(12)]
+    accepted = [answer for answer in answers if answer.status is not Phase.REJECTED]
+    assert len(accepted) == 9, "one was written, eight wait"
+    assert {answer.reason for answer in answers[9:]} == {Reason.QUEUE_FULL}
+    desk.run(5.0)
+    assert [data[15:16] + data[7:8] for data in desk.frames] == [b"01", b"10"] * 4 + [b"01"]
+
+
+@pytest.mark.parametrize("what", [WHISTLE, SetMode(Mode.TRACKING), Drive(Motion.FORWARD, 8.0)], ids=str)
+def test_what_waits_too_long_for_a_busy_car_expires(what: What) -> None:
+    desk = Desk()
+    desk.control.link_up(desk.now)
+    desk.pump()
+    desk.ask(what, identity="it")
+    desk.run(PATIENCE_S + 0.1, reports=False)
+    assert desk.life("it") == [ASKED, QUEUED, Phase.EXPIRED]
+    assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
+
+
+def test_one_shots_asked_before_a_mode_are_sent_before_it(desk: Desk) -> None:
+    desk.ask(WHISTLE)
+    desk.ask(Act(Ptz(30)))
+    desk.ask(SetMode(Mode.TRACKING))
+    assert desk.ask(Act(Ptz(60))).reason is Reason.WRONG_MODE
+    desk.run(3.0)
+    assert desk.frames == [b"$0,0,1,0,0,0,0,0,0#", b"$4WD,PTZ30#", b"$4WD,MODE21#"]
+
+
+def test_a_mode_asked_while_driving_stops_first_then_what_waits_then_opens(desk: Desk) -> None:
+    desk.ask(FORWARD)
+    desk.run(2.0)
+    desk.ask(WHISTLE)
+    desk.ask(WHISTLE)
+    desk.ask(SetMode(Mode.TRACKING))
+    desk.run(4.0)
+    whistle = b"$0,0,1,0,0,0,0,0,0#"
+    assert desk.frames == [RUN, RUN, b"$1,0,1,0,0,0,0,0,0#", MODE00, STOP, whistle, b"$4WD,MODE21#"]
+
+
+# ---------------------------------------------------------------------- hold
+
+
+def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Desk) -> None:
+    assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
+    desk.ask(Stop(), PERSON)
+    assert desk.control.hold == Hold("mia", desk.now)
+    desk.run(600.0)
+    everything: list[What] = [FORWARD, Drive(Motion.STOP), SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), LIGHT, Fan()]
+    for what in [*everything, ChangeSpeed(SpeedStep.UP), Find(), Resume()]:
+        answer = desk.ask(what, COORDINATOR)
+        assert (answer.status, answer.reason) == (Phase.REJECTED, Reason.HELD), what
+    for what in (Stop(), Stop(emergency=True)):
+        assert desk.ask(what, COORDINATOR).status is QUEUED
+    assert desk.control.hold is not None
+    assert desk.control.hold.by == "mia", "the first keeps it"
+    for what in (LIGHT, WHISTLE, Find()):
+        assert desk.ask(what, PERSON).status is QUEUED
+    assert desk.control.hold is not None, "only a drive, a mode or resume end it"
+
+
+@pytest.mark.parametrize("what", [FORWARD, Drive(Motion.STOP), SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), Resume()])
+@pytest.mark.parametrize("sender", [PERSON, SCRIPT], ids=["person", "script"])
+def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Desk, what: What, sender: Sender) -> None:
+    desk.ask(Stop(), PERSON)
+    desk.run(2.0)
+    assert desk.ask(what, sender).status is not Phase.REJECTED
+    assert desk.control.hold is None
+    assert desk.logs[-1].code == "hold_ended"
+
+
+def test_a_refused_command_does_not_end_the_hold(desk: Desk) -> None:
+    desk.ask(Stop(), PERSON)
+    assert desk.ask(FORWARD, age_s=9.0).reason is Reason.STALE
+    desk.control.link_down("unplugged", desk.now)
+    assert desk.ask(FORWARD).reason is Reason.LINK_DOWN
+    assert desk.control.hold is not None
+    assert desk.ask(Resume()).status is SENT, "resume needs no car"
+    assert desk.control.hold is None
+
+
+def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Desk) -> None:
+    desk.ask(Stop(), COORDINATOR)
+    assert desk.control.hold is None
+    desk.run(2.0)
+    assert desk.ask(Resume(), COORDINATOR).reason is Reason.HELD
+    assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
+
+
+def test_a_hold_from_before_a_restart_counts() -> None:
+    desk = Desk(hold=Hold("mia", 1.0)).ready()
+    assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
+    assert desk.ask(FORWARD, PERSON).status is QUEUED
+
+
+# ---------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize("what", [FORWARD, LIGHT, Act(Ptz(1)), Fan(), ChangeSpeed(SpeedStep.UP), Find()], ids=str)
+def test_in_another_mode_the_car_would_ignore_it(desk: Desk, what: What) -> None:
+    desk.ask(SetMode(Mode.TRACKING))
+    desk.run(3.0, reports=False)
+    answer = desk.ask(what)
+    assert (answer.reason, answer.words) == (
+        Reason.WRONG_MODE,
+        "red is in mode tracking, where it ignores this: bring it to mode manual first",
+    )
+    assert desk.ask(Drive(Motion.STOP)).status is QUEUED
+    desk.run(2.0, reports=False)
+    assert desk.frames == [b"$4WD,MODE21#", MODE00, STOP], "where a soft stop is not safe it is a full one"
+
+
+@pytest.mark.parametrize(
+    ("platform", "what"),
+    [
+        ("raspberry_pi", SetMode(Mode.TRACKING)),
+        ("raspberry_pi", Act(General(Motion.STOP, light=Light.YELLOW))),
+        ("raspberry_pi", Fan(on=True)),
+        ("unknown", SetMode(Mode.FOLLOWING)),
+        ("unknown", Act(Ptz(3))),
+        ("arduino", Act(ArmSet((1, 2, 3, 4, 5, 6)))),
+        ("arduino", Act(General(Motion.STOP, servo=ServoAction.VERTICAL_UP))),
+    ],
+    ids=str,
+)
+def test_what_the_platform_does_not_know_is_never_sent(platform: str, what: What) -> None:
+    desk = Desk(platform).ready()
+    assert desk.ask(what, identity="it").reason is Reason.UNSUPPORTED
+    desk.run(2.0)
+    assert desk.frames == []
+    assert desk.life("it") == [ASKED, Phase.REJECTED]
+
+
+def test_duplicate_and_stale(desk: Desk) -> None:
+    assert desk.ask(Fan(), identity="x").status is QUEUED
+    assert desk.ask(Fan(), identity="x").reason is Reason.DUPLICATE
+    assert desk.ask(Fan(), identity="y", age_s=2.1).reason is Reason.STALE
+    assert desk.ask(Fan(), identity="y").status is QUEUED, "a refused id is not used up"
+    assert desk.ask(Stop(), identity="x", age_s=99.0).status is QUEUED, "a stop never is"
+
+
+# ---------------------------------------------------------------------- streams
+
+
+def test_a_stream_is_recorded_at_its_start_its_changes_and_its_end(desk: Desk) -> None:
+    for motion in [Motion.FORWARD] * 10 + [Motion.LEFT] * 5:
+        desk.ask(Drive(motion, 0.5), PERSON, streamed=True)
+        desk.run(0.05)
+    desk.run(3.0)
+    assert [(record.phase, record.count) for record in desk.records] == [
+        (QUEUED, 1),
+        (SENT, 1),
+        (Phase.SUPERSEDED, 10),
+        (QUEUED, 1),
+        (SENT, 1),
+        (COMPLETE, 5),
+    ]
+
+
+def test_a_refused_stream_is_recorded_once_per_cause(desk: Desk) -> None:
+    desk.ask(Stop(), PERSON)
+    before = len(desk.records)
+    for _ in range(50):
+        desk.ask(FORWARD, COORDINATOR, streamed=True)
+    assert [record.reason for record in desk.records[before:] if record.phase is Phase.REJECTED] == [Reason.HELD]
+
+
+# ---------------------------------------------------------------------- link and recovery
+
+
+def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Desk) -> None:
+    desk.ask(FORWARD, identity="held")
+    desk.ask(WHISTLE, identity="act")
+    desk.control.link_down("unplugged", desk.now)
+    desk.take()
+    for identity in ("held", "act"):
+        assert desk.end(identity) == (Phase.FAILED, Reason.LINK_DOWN), identity
+    assert (desk.control.motors, desk.control.motion, desk.control.fan) == ("unknown", None, None)
+    stop = desk.ask(Stop(), PERSON)
+    assert (stop.status, stop.reason) == (Phase.REJECTED, Reason.LINK_DOWN)
+    assert desk.control.hold is not None, "a stop by hand holds, reached or not"
+    desk.run(60.0)
+    assert desk.frames == [RUN]
+
+
+def test_a_failed_write_fails_its_command_and_what_waits(desk: Desk) -> None:
+    desk.ask(FORWARD, identity="it", pump=False)
+    desk.ask(WHISTLE, identity="act", pump=False)
+    write = desk.control.poll(desk.now)
+    assert write is not None
+    desk.control.write_failed("a write failed: gone", desk.now)
+    desk.take()
+    for identity in ("it", "act"):
+        assert desk.end(identity) == (Phase.FAILED, Reason.WRITE_FAILED)
+    assert desk.ask(FORWARD).reason is Reason.LINK_DOWN
+    desk.control.link_up(desk.now)
+    desk.pump()
+    assert desk.frames == [b"#"], "recovery"
+
+
+def test_a_stop_under_way_fails_with_its_link(desk: Desk) -> None:
+    desk.ask(Stop(), identity="it")
+    desk.control.link_down("unplugged", desk.now)
+    desk.take()
+    assert desk.end("it") == (Phase.FAILED, Reason.LINK_DOWN)
+
+
+def test_recovery_gives_up_after_three_more_and_begins_again_when_a_reading_comes() -> None:
+    desk = Desk()
+    began = desk.now
+    desk.control.link_up(began)
+    desk.pump()
+    desk.ask(Stop(), PERSON, identity="it")
+    desk.run(60.0, reports=False)
+    again = [(MODE00, STOP)] * 3
+    assert desk.frames == [b"#", MODE00, MODE00, STOP, *(frame for pair in again for frame in pair)]
+    times = [round(at - began, 2) for at, _, _ in desk.sent]
+    assert times == [0.0, 0.05, 3.7, 4.8, 9.3, 10.4, 14.9, 16.0, 20.5, 21.6]
+    assert desk.logs[-1].code == "no_answer"
+    assert desk.control.motors == "unknown"
+    assert desk.end("it") == (Phase.FAILED, Reason.LINK_DOWN)
+    assert "does not answer" in desk.ask(FORWARD).words
+    assert desk.ask(Stop()).status is QUEUED, "a stop is always tried"
+    desk.run(60.0, reports=False)
+    desk.sent.clear()
+    desk.hear()
+    assert desk.frames == [b"#"]
+    desk.run(6.0)
+    assert desk.control.motors == "off"
+
+
+def test_a_reading_before_the_last_frame_confirms_nothing() -> None:
+    desk = Desk()
+    desk.control.link_up(desk.now)
+    desk.pump()
+    desk.run(4.7)  # a reading each second
+    assert not desk.control.known
+    desk.run(1.5)
+    assert desk.control.known
+    assert desk.logs[-1].code == "recovered"
+
+
+# ---------------------------------------------------------------------- the end
+
+
+def idle(desk: Desk) -> None:
+    pass
+
+
+def driving(desk: Desk) -> None:
+    desk.ask(FORWARD, identity="it")
+
+
+def acting(desk: Desk) -> None:
+    desk.ask(Find(), identity="it")
+    desk.ask(Act(Ptz(1)))
+
+
+def opening(desk: Desk) -> None:
+    desk.ask(SetMode(Mode.TRACKING), identity="it")
+
+
+def stopping(desk: Desk) -> None:
+    desk.ask(Stop())
+    desk.run(0.3)
+
+
+def recovering(desk: Desk) -> None:
+    desk.control.link_down("gone", desk.now)
+    desk.control.link_up(desk.now)
+    desk.run(1.0, reports=False)
+
+
+@pytest.mark.parametrize("state", [idle, driving, acting, opening, stopping, recovering])
+@pytest.mark.parametrize("platform", ["arduino", "raspberry_pi", "unknown"])
+def test_a_shutdown_ends_within_the_length_of_its_recipe_and_what_it_waits_for(platform: str, state: object) -> None:
+    desk = Desk(platform).ready()
+    if platform != "arduino" and state is opening:
+        state = acting
+    state(desk)  # type: ignore[operator]  # one of the functions above
+    began = desk.now
+    wait = desk.control.pacing.buffer_until - began
+    desk.control.shutdown(desk.now)
+    desk.control.shutdown(desk.now)
+    while not desk.control.finished:
+        desk.run(0.01, reports=False)
+    full = {"arduino": 1.1, "raspberry_pi": 1.16, "unknown": 4.8}[platform]
+    longest = 4.8 if state is recovering and platform != "raspberry_pi" else full
+    assert desk.now - began <= longest + max(0.0, wait) + 0.02
+    assert desk.frames[-1] == STOP
+    if desk.life("it"):
+        assert desk.life("it")[-1] in (Phase.SUPERSEDED, SENT)
+    for what in (FORWARD, WHISTLE, Stop()):
+        assert desk.ask(what).reason is Reason.LINK_DOWN
+
+
+def test_a_shutdown_without_a_link_is_over_at_once() -> None:
+    desk = Desk()
+    desk.control.shutdown(desk.now)
+    assert desk.control.finished
+
+
+# ---------------------------------------------------------------------- everything at once
+
+
+def anything(moments: random.Random) -> What:
+    return moments.choice(
+        [
+            *(Drive(motion, moments.choice([0.1, 0.5, 3.0])) for motion in Motion),
+            *(SetMode(mode) for mode in (Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED)),
+            *(WHISTLE, LIGHT, Act(Ptz(90)), Act(ColorLed(1, 2, 3)), Find(), Resume()),
+            *(Fan(), ChangeSpeed(SpeedStep.UP), Stop()),
+        ]
+    )
+
+
+@pytest.mark.parametrize("platform", ["arduino", "raspberry_pi", "unknown"])
+def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_wins(platform: str) -> None:
+    stops = {b"#", STOP, MODE00}
+    for seed in range(60):
+        moments = random.Random(seed)
+        desk = Desk(platform).ready()
+        links = {0}
+        for _ in range(moments.randrange(5, 40)):
+            desk.ask(anything(moments), moments.choice([PERSON, SCRIPT, COORDINATOR]), streamed=False)
+            if moments.random() < 0.02:
+                desk.control.link_down("unplugged", desk.now)
+                desk.control.link_up(desk.now)
+                links.add(len(desk.sent))
+            desk.run(moments.choice([0.0, 0.01, 0.05, 0.3, 1.5]), reports=moments.random() < 0.8)
+        before = len(desk.sent)
+        desk.ask(Stop(), identity="the-stop")
+        desk.run(12.0)
+        assert desk.control.motors == "off"
+        assert set(desk.frames[before:]) <= stops, seed
+        assert desk.life("the-stop")[-1] is COMPLETE
+
+        profile = desk.control.profile
+        for index in set(range(1, len(desk.sent))) - links:
+            (earlier, first, _), (later, second, why) = desk.sent[index - 1 : index + 1]
+            frame = parse_sent(first)
+            assert frame is not None
+            gap = later - earlier + 1e-6
+            if first == b"#":
+                assert gap >= 0.05
+            elif why is Why.RECOVERY or (second in stops and platform != "arduino"):
+                assert gap >= 0.06, "recovery, and the stops of these platforms, do not wait for a block's end"
+            else:
+                assert gap >= profile.block_s(frame) >= 0.06, (seed, first, second)
+        sent = [record.command.what for record in desk.records if record.phase is SENT]
+        assert sum(data[15:16] == b"1" for data in desk.frames if data[2:3] == b",") == sent.count(Fan())
+        assert sum(data[7:8] == b"1" for data in desk.frames if data[2:3] == b",") == sent.count(
+            ChangeSpeed(SpeedStep.UP)
+        )
+        ended = {record.command.id for record in desk.records if record.phase not in (ASKED, QUEUED)}
+        assert ended == {record.command.id for record in desk.records}, "every command has an end"
+
+
+def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
+    pair = Pair(start_s=2.0).ready()
+    for _ in range(3):
+        pair.ask(Fan())
+        pair.run(2.5)
+        assert pair.car.truth.fan is pair.control.fan
+    for step in (SpeedStep.DOWN, SpeedStep.DOWN, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP):
+        pair.ask(ChangeSpeed(step))
+        pair.run(0.5)
+        assert pair.car.truth.speed == pair.control.speed

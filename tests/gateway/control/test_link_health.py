@@ -1,0 +1,82 @@
+"""Whether the car is heard: each state, its words, and the counters."""
+
+import pytest
+
+from gateway.control.link_health import LinkHealth, LinkState
+
+
+def judged(health: LinkHealth, now: float, *, limit_s: float | None = 3.0, blocked_until: float = 0.0) -> LinkState:
+    health.judge(now=now, limit_s=limit_s, why_quiet="color_led is silent", blocked_until=blocked_until)
+    return health.state
+
+
+@pytest.mark.parametrize("start", [0.0, 50.0])
+def test_from_lost_to_online_to_stale_and_back(start: float) -> None:
+    health = LinkHealth(since=start)
+    assert (judged(health, start + 9), health.reason) == (LinkState.LOST, "not connected yet")
+    health.up(start + 10)
+    assert (judged(health, start + 12), health.reason) == (LinkState.STALE, "open, nothing heard yet")
+    judged(health, start + 14)
+    assert health.reason == "nothing heard for 4.0 s, expected every 3 s"
+    health.received(10, start + 15)
+    assert (judged(health, start + 15), health.since) == (LinkState.ONLINE, start + 15)
+    assert judged(health, start + 18) is LinkState.ONLINE
+    assert judged(health, start + 18.1) is LinkState.STALE
+    assert judged(health, start + 20, blocked_until=start + 19) is LinkState.QUIET
+    assert health.reason == "the car is busy"
+    assert judged(health, start + 30, limit_s=None) is LinkState.QUIET
+    assert health.reason == "color_led is silent"
+    health.received(1, start + 31)
+    assert judged(health, start + 31) is LinkState.ONLINE
+    health.down("unplugged", start + 32)
+    assert (judged(health, start + 99), health.reason, health.since) == (LinkState.LOST, "unplugged", start + 32)
+
+
+def test_opened_at_the_origin_of_the_clock() -> None:
+    health = LinkHealth()
+    health.up(0.0)
+    judged(health, 5.0)
+    assert health.reason == "nothing heard for 5.0 s, expected every 3 s"
+
+
+def test_in_a_silent_mode_what_is_heard_counts_and_silence_is_quiet() -> None:
+    health = LinkHealth()
+    health.up(1.0)
+    assert judged(health, 2.0, limit_s=None) is LinkState.QUIET
+    health.received(1, 3.0)
+    assert judged(health, 5.0, limit_s=None) is LinkState.ONLINE
+    assert judged(health, 6.1, limit_s=None) is LinkState.QUIET
+
+
+def test_a_new_connection_is_not_online_by_what_the_old_one_heard() -> None:
+    health = LinkHealth()
+    health.up(1.0)
+    health.received(1, 2.0)
+    assert judged(health, 2.0) is LinkState.ONLINE
+    health.down("gone", 3.0)
+    health.up(3.5)
+    assert judged(health, 3.6) is LinkState.STALE
+    assert health.reconnects == 1
+
+
+def test_counters() -> None:
+    health = LinkHealth()
+    for cause in ("truncated", "truncated", "overlong"):
+        health.rejected(cause)
+    assert health.rejects == {"truncated": 2, "overlong": 1}
+    for second in range(20):
+        health.wrote(96, float(second))
+    assert (health.tx_frames, health.tx_bytes) == (20, 1920)
+    assert health.airtime(19.0) == pytest.approx(11 * 96 / 9600)
+    assert health.airtime(100.0) == 0.0
+    for _ in range(200):
+        health.wrote(96, 200.0)
+    assert health.airtime(200.0) == 1.0
+
+
+def test_a_change_is_told_once() -> None:
+    health = LinkHealth()
+    health.up(1.0)
+    health.received(1, 2.0)
+    assert health.judge(now=2.0, limit_s=3.0, why_quiet="", blocked_until=0.0)
+    assert not health.judge(now=2.5, limit_s=3.0, why_quiet="", blocked_until=0.0)
