@@ -50,6 +50,9 @@ bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in 
 proto: .venv/.ready ## generate schemas/gen from schemas/proto
 	$(BIN)/python -m schemas.generate
 
+picture: .venv/.ready ## the README's picture, of the newest session (needs a Vulkan driver, which may be software)
+	$(BIN)/python -m fleet.replay.picture "$$(ls -td sessions/*/ | head -n 1)session.rrd" .github/demo.png
+
 readme: .venv/.ready ## generate the tables and help texts of the README
 	$(BIN)/python -m tests.readme
 
