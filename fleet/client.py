@@ -77,7 +77,9 @@ class FleetClient:
         self.close()
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the bus; what is still waited for ends as not known."""
+        for inbox in list(self._inboxes.values()):
+            inbox.put((time.monotonic(), _CLOSED))
         self._pool.shutdown(cancel_futures=True)
         self.bus.close()
 
@@ -218,6 +220,8 @@ class _Over:
         self.words = words
 
 
+_CLOSED: Final = _Over("", "")
+
 _Item = tuple[float, Any]
 """When it came (monotonic s), and a Sample (an answer), a CommandEvent, or _Over."""
 
@@ -262,7 +266,11 @@ class _Asking:
             self._take(item, at)
 
     def _take(self, item: Any, at: float) -> None:
-        if isinstance(item, _Over):
+        if item is _CLOSED:
+            self._open = 0
+            for progress in self._progress.values():
+                progress.give_up(at)
+        elif isinstance(item, _Over):
             self._open -= 1
             for progress in self._progress.values():
                 if item.target in ("*", progress.car):
