@@ -103,7 +103,7 @@ class Publications:
             message = self._cleared("sensor/range")
             message.no_echo = event.range_cm == 0
             if event.range_cm:
-                message.range_m = event.range_cm / 100
+                message.range_m = round(event.range_cm / 100, 4)
             self._reading("sensor/range", message, stamp_ns, published)
         if "battery" in measured and event.voltage_v is not None:
             message = self._cleared("sensor/battery")
