@@ -226,7 +226,7 @@ def _act(run: Demo, stack: ExitStack, client: FleetClient, simulator: "subproces
         ", ".join(f"{each.car} {each.phase} in {each.took_s:.2f} s" for each in outcomes),
         ok=all(each.ok for each in outcomes),
     )
-    off = run.until(lambda: all(truth.motor_left == 0 == truth.motor_right for truth in run.truth.values()), 3.0)
+    off = run.until(lambda: all(truth.motor_left == 0 == truth.motor_right for truth in run.truth.values()), 1.0)
     run.check(
         "all motors off",
         str({car: (truth.motor_left, truth.motor_right) for car, truth in sorted(run.truth.items())}),

@@ -165,6 +165,8 @@ class Controller:
         running, self._running = self._running, None
         for pending in running.commands if running else ():
             self._ledger.record(pending, Phase.FAILED, now, reason=cause, words=reason)
+        if self._closing and running is not None and not running.frames_sent:
+            self._not_stopped(now)
         self._drop(Phase.FAILED, cause, reason, now)
         self.mode.forget()
         self.fan = None
@@ -188,7 +190,7 @@ class Controller:
                 self._gave_up = False
                 self._ledger.log(Level.INFO, "answers_again", "a reading came: recovery begins again", now)
                 self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
-        elif running.recipe.confirmed and running.frames_sent and event.at > running.last_at + UNDER_WAY_S:
+        elif running.frames_sent and event.at > running.last_at + UNDER_WAY_S:
             self._finish(running, now)
 
     def tick(self, now: float) -> None:
@@ -272,6 +274,12 @@ class Controller:
         self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)
         if self._link_open:
             self._begin(stop.full(self.profile, known=self.known), Why.SHUTDOWN, now)
+        else:
+            self._not_stopped(now)
+
+    def _not_stopped(self, now: float) -> None:
+        words = f"ending without a stop, {self.car} cannot be reached ({self._link_reason}): look whether it drives"
+        self._ledger.log(Level.ERROR, "not_stopped", words, now)
 
     @property
     def finished(self) -> bool:
@@ -360,11 +368,11 @@ class Controller:
         if style is StopStyle.UNKNOWN:
             return RECOVERY_WORST_S
         gate = Gate.FLIGHT if style is StopStyle.RASPBERRY_PI else Gate.ALONE
-        wait = max(0.0, self.pacing.ready_at(gate) - now)
         if running is not None and running.recipe.rank >= recipes.FULL.rank and running.first_at is not None:
-            wait = 0.0  # the frame that stops it is on its way
-        mode = self.mode.asked or Mode.MANUAL
-        return wait + self.profile.mode_turn_s(mode) + WIRE_S
+            # The frame that stops it is on its way.
+            return max(running.first_at + running.turn_s - now, 0.0) + WIRE_S
+        wait = max(0.0, self.pacing.ready_at(gate) - now)
+        return wait + self.profile.mode_turn_s(self.mode.asked or Mode.MANUAL) + WIRE_S
 
     # ------------------------------------------------------------------ commands, one by one
 
@@ -504,10 +512,11 @@ class Controller:
         self._repeat = False
         joining = [pending] if pending is not None else []
         running = self._running
+        turn_s = self.profile.mode_turn_s(self.mode.asked) if self.mode.asked is not None else 0.0
         if running is None:
-            self._running = Running(recipe, why, now, joining)
+            self._running = Running(recipe, why, now, joining, turn_s=turn_s)
         elif running.recipe.rank < recipe.rank:
-            self._running = Running(recipe, why, now, running.commands + joining)
+            self._running = Running(recipe, why, now, running.commands + joining, turn_s=turn_s)
         else:
             running.commands.extend(joining)
             if why is Why.SHUTDOWN:
@@ -519,7 +528,7 @@ class Controller:
         running = self._running
         assert running is not None
         if running.frames_sent:
-            self._unconfirmed(running, now)
+            self._overdue(running, now)
             return None
         if now < running.due_at(self.pacing):
             return None
@@ -531,8 +540,8 @@ class Controller:
                 self._ledger.sent(pending, now)
                 if isinstance(pending.command.what, SetMode):
                     self._mode_sent = pending
-        if running is self._running and running.frames_sent and not running.recipe.confirmed:
-            self._finish(running, now)
+        if running is self._running and running.frames_sent:
+            self._overdue(running, now)
 
     def _finish(self, running: Running, now: float) -> None:
         """The stop is complete: the motors are off."""
@@ -546,8 +555,12 @@ class Controller:
             if not isinstance(pending.command.what, SetMode):
                 self._ledger.record(pending, Phase.COMPLETE, now)
 
-    def _unconfirmed(self, running: Running, now: float) -> None:
-        """No mode-0 reading has come since the last frame of a recovery: once more, up to three times."""
+    def _overdue(self, running: Running, now: float) -> None:
+        """No mode-0 reading since the last frame: a stop is over in time; a recovery tries again, three times."""
+        if not running.recipe.confirmed:
+            if now >= running.obeyed_at:
+                self._finish(running, now)
+            return
         if now < running.last_at + recipes.CONFIRM_S:
             return
         if running.retries < recipes.RETRIES:

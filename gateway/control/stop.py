@@ -23,6 +23,8 @@ class Running:
     first_at: float | None = None
     last_at: float = float("-inf")
     retries: int = 0
+    turn_s: float = 0.0
+    """How long the car may be in a turn of its mode, deaf, before it reads the first frame."""
 
     @property
     def frames_sent(self) -> bool:
@@ -42,14 +44,21 @@ class Running:
             due = max(due, self.first_at + step.from_start_s)
         return max(due, pacing.ready_at(step.gate))
 
+    @property
+    def obeyed_at(self) -> float:
+        """When the car has obeyed at the latest, if no reading says so earlier and none has to."""
+        return max(self.last_at, self.began_at if self.first_at is None else self.first_at + self.turn_s)
+
     def wake_at(self, pacing: Pacing) -> float:
-        """When there is something to do: the next step, or the end of the patience for a reading."""
-        return self.last_at + recipes.CONFIRM_S if self.frames_sent else self.due_at(pacing)
+        """When there is something to do: the next step, or the end of the patience."""
+        if not self.frames_sent:
+            return self.due_at(pacing)
+        return self.last_at + recipes.CONFIRM_S if self.recipe.confirmed else self.obeyed_at
 
     def over_at(self, pacing: Pacing, now: float) -> float:
-        """When its last frame will have been written, as far as that is known."""
+        """When it will be over, as far as that is known."""
         began = self.first_at if self.first_at is not None else max(now, self.due_at(pacing))
-        return began + self.recipe.length_s
+        return began + max(self.recipe.length_s, self.turn_s)
 
     def stepped(self, now: float) -> bool:
         """A step's frame was written; True if it was the first."""

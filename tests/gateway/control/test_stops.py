@@ -127,6 +127,8 @@ def test_a_stop_at_any_moment_stops_for_good_within_the_announced_time(case: Cas
         pair.run(9.0)
         took = pair.off_for_good_at() - asked_at
         assert took <= answer.worst_case_s, f"seed {seed}: {took:.3f} s, announced {answer.worst_case_s:.3f} s"
+        complete = [record.took_s for record in pair.records if record.phase is Phase.COMPLETE][-1]
+        assert took <= complete, f"seed {seed}: complete after {complete:.3f} s, the motors ran for {took:.3f} s"
         assert pair.phases("the-stop")[-1] is Phase.COMPLETE
         assert pair.control.motors == "off"
         if "avoidance" not in case.name:
