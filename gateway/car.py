@@ -102,7 +102,6 @@ class Car:
         self._ending = False
         self._stopped = asyncio.Event()
         self._alive_at = now
-        self._lag_s = 0.0
 
     async def run(self) -> None:
         """Serve the car until `stop` and until its stop is written; raises AlreadyServed, or LinkError at the start."""

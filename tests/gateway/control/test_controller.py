@@ -488,7 +488,12 @@ def test_a_reading_before_the_last_frame_confirms_nothing() -> None:
     desk.pump()
     desk.run(4.7)  # a reading each second
     assert not desk.control.known
-    desk.run(1.5)
+    desk.run(0.15, reports=False)
+    assert desk.frames[-1] == STOP
+    desk.hear()
+    assert not desk.control.known, "it was under way when the last frame was written"
+    desk.run(0.05, reports=False)
+    desk.hear()
     assert desk.control.known
     assert desk.logs[-1].code == "recovered"
 
@@ -547,10 +552,28 @@ def test_a_shutdown_ends_within_the_length_of_its_recipe_and_what_it_waits_for(p
         assert desk.ask(what).reason is Reason.LINK_DOWN
 
 
-def test_a_shutdown_without_a_link_is_over_at_once() -> None:
+def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped() -> None:
     desk = Desk()
     desk.control.shutdown(desk.now)
     assert desk.control.finished
+    desk.take()
+    assert [(entry.code, entry.words) for entry in desk.logs] == [
+        (
+            "not_stopped",
+            "ending without a stop, red cannot be reached (not connected yet): look whether it drives",
+        )
+    ]
+
+
+def test_a_link_that_goes_during_the_last_stop_is_said(desk: Desk) -> None:
+    desk.ask(FORWARD)
+    desk.control.shutdown(desk.now)
+    desk.run(0.5)
+    assert desk.frames == [RUN, MODE00]
+    desk.control.link_down("unplugged", desk.now)
+    desk.take()
+    assert desk.control.finished
+    assert [entry.code for entry in desk.logs] == ["not_stopped"]
 
 
 # ---------------------------------------------------------------------- everything at once
