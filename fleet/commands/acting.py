@@ -1,12 +1,14 @@
 """`fleet led, light, servo, arm, whistle, speed, fan, find`: what a car does once."""
 
 import re
+from typing import Any
 
 import click
 
 from fleet.client import FleetClient
 from fleet.commands.common import carry_out, cars_argument, json_option, with_client
 from fleet.verbs import (
+    Request,
     arm_request,
     fan_request,
     find_request,
@@ -19,18 +21,44 @@ from fleet.verbs import (
 from gateway.protocol.values import Light, SpeedStep
 
 
+class _Colour(click.ParamType[tuple[int, int, int]]):
+    """Red, green and blue as `#rrggbb`."""
+
+    name = "'#RRGGBB'"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int, int]:
+        """Three numbers, 0..255."""
+        match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", str(value))
+        if match is None:
+            self.fail(f"{value!r} is not allowed: six hexadecimal digits, as '#ff0010'", param, ctx)
+        return int(match[1], 16), int(match[2], 16), int(match[3], 16)
+
+
+def _servo(ctx: click.Context, _: click.Parameter, action: str) -> Request:
+    """The request for what is asked of the servo named before; wrong use is found before anyone is asked."""
+    servo = ctx.params["servo"]
+    if not re.fullmatch("[0-9]+", action):
+        allowed = ("up", "down", "reset") if servo == "vertical" else ("left", "right", "reset")
+        if action not in allowed:
+            degrees = " or 0 to 180" if servo == "front" else ""
+            raise click.BadParameter(f"{action!r} is not allowed for servo {servo}: {', '.join(allowed)}{degrees}")
+        return servo_request(servo, action)
+    if servo != "front":
+        raise click.BadParameter(f"{action!r} is not allowed: servo {servo} takes no degrees, only front does")
+    try:
+        return servo_request(servo, deg=int(action))
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from None
+
+
 @click.command(epilog="\b\nexample:\n  fleet led red '#ff0010'")
 @cars_argument
-@click.argument("colour", metavar="'#RRGGBB'")
+@click.argument("colour", type=_Colour())
 @json_option
 @with_client
-def led(client: FleetClient, cars: tuple[str, ...], colour: str, *, as_json: bool) -> None:
+def led(client: FleetClient, cars: tuple[str, ...], colour: tuple[int, int, int], *, as_json: bool) -> None:
     """Set the colour LED."""
-    match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", colour)
-    if match is None:
-        raise click.UsageError(f"colour {colour!r} is not allowed: '#RRGGBB', six hexadecimal digits, as '#ff0010'")
-    r, g, b = (int(part, 16) for part in match.groups())
-    carry_out(client, led_request(r, g, b), cars, as_json=as_json)
+    carry_out(client, led_request(*colour), cars, as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet light red,blue cyan")
@@ -46,20 +74,21 @@ def light(client: FleetClient, cars: tuple[str, ...], light: str, *, as_json: bo
 @click.command(epilog="\b\nexamples:\n  fleet servo red front 90\n  fleet servo blue vertical up")
 @cars_argument
 @click.argument("servo", type=click.Choice(["front", "vertical", "horizontal"]))
-@click.argument("action", metavar="left|right|up|down|reset|DEG")
+@click.argument("request", metavar="left|right|up|down|reset|DEG", callback=_servo)
 @json_option
 @with_client
-def servo(client: FleetClient, cars: tuple[str, ...], servo: str, action: str, *, as_json: bool) -> None:
+def servo(
+    client: FleetClient,
+    cars: tuple[str, ...],
+    servo: str,  # noqa: ARG001 - it is in the request already
+    request: Request,
+    *,
+    as_json: bool,
+) -> None:
     """Move a servo: left, right or reset (vertical: up, down or reset); the front one also to 0..180 degrees.
 
     The number is sent unchanged; the front servo goes to 180 minus it.
     """
-    if action.isascii() and action.isdigit():
-        if servo != "front":
-            raise click.UsageError(f"the {servo} servo takes no degrees: only the front one does")
-        request = servo_request(servo, deg=int(action))
-    else:
-        request = servo_request(servo, action)
     carry_out(client, request, cars, as_json=as_json)
 
 

@@ -11,6 +11,17 @@ from fleet.client import FleetClient
 from fleet.commands.common import json_option, with_client
 from fleet.readings import Reading
 from schemas import keys, topics
+from schemas.bus import canon
+
+
+def _checked(_: click.Context, __: click.Parameter, keyexpr: str) -> str:
+    """A key expression that can be asked; wrong use is found before anyone is."""
+    try:
+        canon(keys.expand(keyexpr))
+    except keys.BadKey as error:
+        raise click.UsageError(str(error)) from None
+    return keyexpr
+
 
 _HEADER: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 _COLUMNS: Final = ("car", "link", "mode", "verdict", "motion", "hold", "battery")
@@ -66,7 +77,7 @@ def _cell(value: object) -> str:
 @click.command(
     epilog="\b\nexamples:\n  fleet get red\n  fleet get red/sensor/range\n  fleet get '*/sensor/battery' --json"
 )
-@click.argument("keyexpr")
+@click.argument("keyexpr", callback=_checked)
 @json_option
 @with_client
 def get(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:
@@ -84,7 +95,7 @@ def get(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:
 @click.command(
     epilog="\b\nexamples:\n  fleet watch red\n  fleet watch '*/state/*' --json\n  fleet watch red/event/command"
 )
-@click.argument("keyexpr")
+@click.argument("keyexpr", callback=_checked)
 @json_option
 @with_client
 def watch(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:

@@ -27,7 +27,7 @@ class BadPlan(ValueError):
     """A plan that cannot be followed; its text names the file, the place, the value and what is allowed."""
 
 
-class Test(StrEnum):
+class Comparison(StrEnum):
     """How a field is compared."""
 
     BELOW = "below"
@@ -42,21 +42,21 @@ class Condition:
     car: str
     reading: str
     field: str
-    test: Test
+    test: Comparison
     value: float | str | bool
     for_s: float
 
     def holds(self, value: object) -> bool:
         """Whether a value of the field passes the test."""
-        if self.test is Test.EQUALS:
+        if self.test is Comparison.EQUALS:
             return value == self.value
         assert isinstance(self.value, float)
         if not isinstance(value, int | float):
             return False
-        return value < self.value if self.test is Test.BELOW else value > self.value
+        return value < self.value if self.test is Comparison.BELOW else value > self.value
 
     def __str__(self) -> str:
-        sign = {Test.BELOW: "<", Test.ABOVE: ">", Test.EQUALS: "="}[self.test]
+        sign = {Comparison.BELOW: "<", Comparison.ABOVE: ">", Comparison.EQUALS: "="}[self.test]
         lasting = f" for {self.for_s:g} s" if self.for_s else ""
         return f"{self.car}/{self.reading} {self.field} {sign} {_shown(self.value)}{lasting}"
 
@@ -115,10 +115,10 @@ def _rule(place: "_Place", cars: Sequence[str]) -> Rule:
 
 
 def _condition(place: "_Place") -> Condition:
-    given = place.mapping(required=("car", "reading", "field"), optional=(*Test, "for_s"))
-    tests = [test for test in Test if test in given]
+    given = place.mapping(required=("car", "reading", "field"), optional=(*Comparison, "for_s"))
+    tests = [test for test in Comparison if test in given]
     if len(tests) != 1:
-        place.bad(f"exactly one of {', '.join(Test)}")
+        place.bad(f"exactly one of {', '.join(Comparison)}")
     reading = given["reading"].word(_READINGS)
     fields = {
         field.name: field
@@ -137,11 +137,11 @@ def _condition(place: "_Place") -> Condition:
     )
 
 
-def _value(place: "_Place", field: Any, test: Test) -> float | str | bool:
+def _value(place: "_Place", field: Any, test: Comparison) -> float | str | bool:
     """What the field is compared with, of the field's own type. Any: the stubs know two kinds of descriptor."""
     kind = field.cpp_type
     if kind == FieldDescriptor.CPPTYPE_BOOL or kind == FieldDescriptor.CPPTYPE_STRING:
-        if test is not Test.EQUALS:
+        if test is not Comparison.EQUALS:
             place.bad(f"{field.name} is no number: only equals can be asked of it")
         wanted = bool if kind == FieldDescriptor.CPPTYPE_BOOL else str
         if not isinstance(place.value, wanted):

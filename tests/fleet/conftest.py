@@ -1,0 +1,36 @@
+"""A fleet of real processes for the tests of a module: three simulated cars with their gateways, all at rest."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.ports import free_endpoint
+from tests.support.processes import Fleet, Process
+
+CARS = {"red": "arduino", "green": "raspberry_pi", "blue": "raspberry_pi"}
+
+
+class Cars(Fleet):
+    """Red, green and blue."""
+
+    def __init__(self, endpoint: str, directory: Path) -> None:
+        super().__init__(endpoint, directory)
+        self.sim, links = self.simulate(*(f"{car}:{platform}:pty" for car, platform in CARS.items()))
+        self.links = dict(zip(CARS, links, strict=True))
+        self.gateways: dict[str, Process] = {car: self.serve(car) for car in CARS}
+        for car in CARS:
+            self.ready(car)
+
+    def serve(self, car: str) -> Process:
+        """Start the gateway of a car."""
+        return self.gateway(self.links[car], car=car, platform=CARS[car])
+
+
+@pytest.fixture(scope="module")
+def cars(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cars]:
+    fleet = Cars(free_endpoint(), tmp_path_factory.mktemp("fleet"))
+    try:
+        yield fleet
+    finally:
+        fleet.close()

@@ -1,0 +1,252 @@
+"""FleetClient, sync and async, against real gateways of simulated cars, and against gateways that do not answer."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+
+import pytest
+import zenoh
+
+from fleet.aio import AsyncFleetClient
+from fleet.client import FleetClient
+from fleet.verbs import led_request
+from schemas import keys, messages, topics
+from schemas.bus import BadEndpoint, Bus, NoFleet, reply
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.fleet.conftest import Cars
+from tests.support.ports import free_endpoint
+from tests.support.processes import driving, wait_for
+
+
+@pytest.fixture
+def client(cars: Cars) -> Iterator[FleetClient]:
+    with FleetClient(cars.endpoint, sender="ann", kind="person") as opened:
+        yield opened
+
+
+def test_the_cars_are_those_with_a_token(client: FleetClient) -> None:
+    assert client.cars() == ["blue", "green", "red"]
+
+
+def test_a_command_is_carried_out_and_seen_in_the_car(client: FleetClient, cars: Cars) -> None:
+    outcome = client.car("red").led(255, 0, 16)
+    assert (outcome.ok, outcome.phase) == (True, "sent")
+    wait_for(lambda: cars.sim.say({"car": "red", "ask": "truth"})["led"] == "#ff0010", "the LED is so")
+
+
+def test_a_drive_that_is_waited_for_ends_complete_and_not_before_its_time(client: FleetClient, cars: Cars) -> None:
+    outcome = client.car("green").drive("forward", 0.7, wait=True)
+    assert (outcome.ok, outcome.phase) == (True, "complete")
+    assert outcome.took_s >= 0.7
+    wait_for(lambda: not driving(cars.sim, "green"), "green stands")
+
+
+def test_a_stop_supersedes_a_drive_and_is_waited_for_until_it_is_complete(client: FleetClient, cars: Cars) -> None:
+    ended: list[object] = []
+    drive = threading.Thread(target=lambda: ended.append(client.car("blue").drive("forward", 10, wait=True)))
+    drive.start()
+    wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
+    (outcome,) = client.stop(["blue"])
+    drive.join()
+    assert (outcome.ok, outcome.phase) == (True, "complete")
+    assert outcome.worst_case_s > 0
+    assert not driving(cars.sim, "blue")
+    assert [(each.ok, each.phase) for each in ended] == [(False, "superseded")]  # type: ignore[attr-defined]  # Outcome
+
+
+def test_one_stop_reaches_every_car(client: FleetClient) -> None:
+    outcomes = client.stop()
+    assert [(each.car, each.ok, each.phase) for each in outcomes] == [
+        (car, True, "complete") for car in ("blue", "green", "red")
+    ]
+
+
+def test_a_missing_car_keeps_no_other_from_its_command(client: FleetClient) -> None:
+    outcomes = client.ask(led_request(1, 2, 3), ["red", "purple", "blue"])
+    assert [(each.car, each.ok, each.phase) for each in outcomes] == [
+        ("blue", True, "sent"),
+        ("purple", False, "no_answer"),
+        ("red", True, "sent"),
+    ]
+    assert outcomes[1].words == "no car purple on the bus; there are: blue, green, red"
+
+
+def test_a_refusal_carries_its_reason_and_words(client: FleetClient) -> None:
+    outcome = client.car("green").light("pink")
+    assert (outcome.ok, outcome.phase, outcome.reason) == (False, "rejected", "bad_value")
+    assert "allowed are white, red" in outcome.words
+
+
+def test_a_person_stop_holds_the_car_against_the_coordinator_until_resumed(client: FleetClient, cars: Cars) -> None:
+    client.stop(["green"])
+    with FleetClient(cars.endpoint, sender="c", kind="coordinator") as coordinator:
+        assert coordinator.car("green").mode("manual").reason == "held"
+        assert client.car("green").resume().ok
+        assert coordinator.car("green").mode("manual").ok
+
+
+def test_whoever_goes_while_driving_leaves_no_car_driving(cars: Cars) -> None:
+    with FleetClient(cars.endpoint, sender="gone", kind="script") as client:
+        assert client.car("blue").drive("forward", 10).ok
+        wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
+    began = time.monotonic()
+    wait_for(lambda: not driving(cars.sim, "blue"), "blue stands")
+    assert time.monotonic() - began < 9, "it stopped because the drive's time was over"
+
+
+@pytest.mark.parametrize("duration_s", [0, -1, 10.01, float("nan"), float("inf")])
+def test_a_drive_out_of_range_is_refused_here(client: FleetClient, duration_s: float) -> None:
+    with pytest.raises(ValueError, match="more than 0 and at most 10 s"):
+        client.car("red").drive("forward", duration_s)
+
+
+def test_other_values_that_no_message_can_carry(client: FleetClient) -> None:
+    with pytest.raises(ValueError, match="r 256 is not allowed"):
+        client.car("red").led(256, 0, 0)
+    with pytest.raises(ValueError, match="six joints, 2 given"):
+        client.car("red").arm([1, 2])
+    with pytest.raises(ValueError, match="deg -1 is not allowed"):
+        client.car("red").servo("front", deg=-1)
+    with pytest.raises(keys.BadKey):
+        client.car("Red")
+
+
+def test_readings_have_key_time_and_value(client: FleetClient) -> None:
+    readings = client.get("red")
+    assert "fleet/red/sensor/range" in [reading.key for reading in readings]
+    (battery,) = client.get("red/sensor/battery")
+    assert isinstance(battery.value, pb.Battery)
+    assert battery.as_dict()["voltage_v"] == battery.value.voltage_v > 0
+    assert abs((datetime.now(UTC) - battery.time).total_seconds()) < 60
+    assert {reading.key.split("/")[1] for reading in client.get("*/state/mode")} == {"blue", "green", "red"}
+    assert client.get("red/sensor/sonar") == []
+    with pytest.raises(keys.BadKey):
+        client.get("red//x")
+
+
+def test_a_watch_gives_what_is_published_and_ends_when_closed(client: FleetClient) -> None:
+    with client.watch("*/state/health") as readings:
+        seen = set()
+        for reading in readings:
+            seen.add(reading.key)
+            if len(seen) == 3:
+                break
+    assert list(readings) == []
+    assert (readings.dropped, readings.unreadable) == (0, 0)
+
+
+async def test_the_async_client_does_the_same(cars: Cars) -> None:
+    async with AsyncFleetClient(cars.endpoint, sender="eve") as client:
+        assert await client.cars() == ["blue", "green", "red"]
+        one, other = await asyncio.gather(client.car("red").whistle(), client.car("blue").led(0, 0, 9))
+        assert (one.phase, other.phase) == ("sent", "sent")
+        assert (await client.get("red/state/mode"))[0].value.asked == "manual"
+        async with client.watch("red/state/*") as readings:
+            reading = await anext(readings)
+        assert reading.key.startswith("fleet/red/state/")
+        assert all(outcome.ok for outcome in await client.stop())
+        assert (await client.resume(["red"]))[0].ok
+
+
+# ---------------------------------------------------------------- gateways that do not behave
+
+
+@pytest.fixture
+def gateway(cars: Cars) -> Iterator[Bus]:
+    """A session in a fleet of its own, `odd`, in which a test plays the gateways."""
+    with Bus.open(cars.endpoint) as opened:
+        yield opened
+
+
+def _asked(query: zenoh.Query) -> str:
+    assert query.payload is not None
+    command = pb.StopCommand()
+    command.ParseFromString(query.payload.to_bytes())
+    assert command.sender == "ann"
+    assert command.HasField("asked")
+    return command.id
+
+
+def test_a_gateway_that_hangs_is_told_from_one_that_answers(cars: Cars, gateway: Bus) -> None:
+    events = gateway.publisher("odd/fine/event/command", topics.TOPICS["event/command"], "fine")
+    held: list[zenoh.Query] = []
+    asked = threading.Event()
+    ids: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            ids.append(_asked(query))
+            result = pb.Result(id=ids[0], car="fine", status="queued", worst_case_s=0.5)
+            key = "odd/fine/@cmd/stop"
+            reply(query, key, result.SerializeToString(), messages.encoding_of(topics.RESULT))
+        asked.set()
+
+    gateway.queryable("odd/fine/@cmd/*", answer)
+    gateway.queryable("odd/hung/@cmd/*", held.append)
+    for car in ("fine", "hung"):
+        gateway.token(keys.car_token("odd", car))
+
+    def complete() -> None:
+        asked.wait(20)
+        events.put(pb.CommandEvent(id="another", phase="failed"), time.time_ns())
+        events.put(pb.CommandEvent(id=ids[0], phase="complete"), time.time_ns())
+
+    worker = threading.Thread(target=complete)
+    worker.start()
+    with FleetClient(cars.endpoint, "odd", sender="ann") as client:
+        wait_for(lambda: client.cars() == ["fine", "hung"], "both are there")
+        fine, hung = client.stop()
+    worker.join()
+    assert (fine.car, fine.ok, fine.phase, fine.worst_case_s) == ("fine", True, "complete", 0.5)
+    assert (hung.car, hung.ok, hung.phase) == ("hung", False, "no_answer")
+    assert hung.words == "hung did not answer within 2 s: its gateway hangs"
+
+
+def test_a_command_of_which_nothing_more_is_heard_ends_with_what_was_heard_last(cars: Cars, gateway: Bus) -> None:
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            result = pb.Result(id=_asked(query), car="mute", status="queued", worst_case_s=0.1)
+            reply(query, "odd/mute/@cmd/stop", result.SerializeToString(), messages.encoding_of(topics.RESULT))
+
+    gateway.queryable("odd/mute/@cmd/*", answer)
+    gateway.token(keys.car_token("odd", "mute"))
+    with FleetClient(cars.endpoint, "odd", sender="ann") as client:
+        wait_for(lambda: "mute" in client.cars(), "it is there")
+        outcome = client.car("mute").stop()
+    assert (outcome.ok, outcome.phase) == (False, "queued")
+    assert "last heard was 'queued'" in outcome.words
+
+
+def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
+    asked = threading.Event()
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            result = pb.Result(id=_asked(query), car="slow", status="queued", worst_case_s=600.0)
+            reply(query, "odd/slow/@cmd/stop", result.SerializeToString(), messages.encoding_of(topics.RESULT))
+        asked.set()
+
+    gateway.queryable("odd/slow/@cmd/*", answer)
+    gateway.token(keys.car_token("odd", "slow"))
+    client = FleetClient(cars.endpoint, "odd", sender="ann")
+    wait_for(lambda: "slow" in client.cars(), "it is there")
+    outcomes: list[object] = []
+    waiting = threading.Thread(target=lambda: outcomes.extend(client.stop(["slow"])))
+    waiting.start()
+    assert asked.wait(20)
+    client.close()
+    waiting.join(20)
+    assert len(outcomes) == 1
+
+
+def test_no_fleet_and_bad_names_are_told_apart() -> None:
+    with pytest.raises(NoFleet):
+        FleetClient(free_endpoint())
+    with pytest.raises(BadEndpoint):
+        FleetClient("nowhere")
+    with pytest.raises(keys.BadKey, match="fleet name 'A B'"):
+        FleetClient(fleet="A B")
+    with pytest.raises(keys.BadKey, match="sender 'a/b'"):
+        FleetClient(sender="a/b")

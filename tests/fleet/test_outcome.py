@@ -1,0 +1,78 @@
+"""What a command's answer and events, in any order, say became of it."""
+
+import pytest
+
+from fleet.outcome import Progress, Until
+
+# Each step: ("answer" | "event", phase, worst case); at 1, 2, 3 ... s after asking at 100.
+Steps = list[tuple[str, str, float]]
+
+
+def told(until: Until, steps: Steps, lasts_s: float = 0.0) -> Progress:
+    progress = Progress("red", until, 100.0, lasts_s)
+    for number, (how, phase, worst_s) in enumerate(steps, start=1):
+        take = progress.answered if how == "answer" else progress.event
+        take(phase, "held" if phase == "rejected" else "", "", worst_s, 100.0 + number)
+    return progress
+
+
+@pytest.mark.parametrize(
+    ("until", "steps", "phase", "ok"),
+    [
+        (Until.SENT, [("answer", "sent", 0.0)], "sent", True),
+        (Until.SENT, [("answer", "rejected", 0.0)], "rejected", False),
+        (Until.SENT, [("answer", "queued", 0.0), ("event", "sent", 0.0)], "sent", True),
+        (Until.SENT, [("event", "asked", 0.0), ("event", "queued", 0.0), ("event", "expired", 0.0)], "expired", False),
+        (Until.SENT, [("event", "sent", 0.0), ("answer", "queued", 0.0)], "sent", True),
+        (Until.SENT, [("answer", "queued", 0.0), ("event", "superseded", 0.0)], "superseded", False),
+        (Until.STOPPED, [("answer", "sent", 0.0)], "sent", True),  # it was at rest
+        (Until.STOPPED, [("answer", "sent", 1.0), ("event", "complete", 0.0)], "complete", True),
+        (Until.STOPPED, [("answer", "queued", 1.0), ("event", "sent", 0.0), ("event", "failed", 0.0)], "failed", False),
+        (Until.OVER, [("answer", "queued", 0.0), ("event", "sent", 0.0), ("event", "complete", 0.0)], "complete", True),
+        (Until.OVER, [("answer", "sent", 0.0), ("event", "superseded", 0.0)], "superseded", False),
+    ],
+)
+def test_the_last_word(until: Until, steps: Steps, phase: str, ok: bool) -> None:
+    outcome = told(until, steps, 2.0).outcome
+    assert outcome is not None
+    assert (outcome.phase, outcome.ok) == (phase, ok)
+
+
+@pytest.mark.parametrize(
+    ("until", "steps"),
+    [
+        (Until.SENT, [("answer", "queued", 0.0)]),
+        (Until.STOPPED, [("answer", "sent", 1.0), ("event", "sent", 0.0)]),
+        (Until.OVER, [("answer", "queued", 0.0), ("event", "sent", 0.0)]),
+        (Until.SENT, []),
+    ],
+)
+def test_not_known_yet(until: Until, steps: Steps) -> None:
+    assert told(until, steps, 2.0).outcome is None
+
+
+def test_a_stop_is_waited_for_as_long_as_its_gateway_announced_and_a_margin() -> None:
+    assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(100 + 7.3 + 5.0)
+
+
+def test_giving_up_says_what_was_heard_last() -> None:
+    progress = told(Until.SENT, [("answer", "queued", 0.0)])
+    progress.give_up(115.0)
+    assert progress.outcome is not None
+    assert not progress.outcome.ok
+    assert progress.outcome.words == "not known what became of it after 15.0 s: last heard was 'queued', 14.0 s ago"
+
+
+def test_a_drive_that_only_prolonged_another_is_over_when_its_time_is() -> None:
+    progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
+    assert progress.deadline == 102.0
+    progress.give_up(102.0)
+    assert progress.outcome is not None
+    assert progress.outcome.ok
+
+
+def test_the_first_last_word_stays() -> None:
+    progress = told(Until.SENT, [("answer", "rejected", 0.0), ("event", "sent", 0.0)])
+    progress.silent("nothing", 105.0)
+    assert progress.outcome is not None
+    assert (progress.outcome.phase, progress.outcome.reason) == ("rejected", "held")
