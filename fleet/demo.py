@@ -215,7 +215,11 @@ def _act(run: Demo, stack: ExitStack, client: FleetClient, simulator: "subproces
         ok=lost,
     )
     back = run.until(
-        lambda: _state(client, "red", "mode").verdict == "confirmed" and run.truth["red"].mode == "tracking"
+        lambda: (
+            _state(client, "red", "mode").verdict == "confirmed"
+            and _state(client, "red", "link").state == "online"
+            and run.truth["red"].mode == "tracking"
+        )
     )
     run.check("red back", f"link {_state(client, 'red', 'link').state}, truly {run.truth['red'].mode} again", ok=back)
 
