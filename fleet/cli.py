@@ -77,10 +77,10 @@ def main() -> None:
         code = 2
     except click.UsageError as error:
         where = error.ctx.command_path if error.ctx is not None else "fleet"
-        sys.stderr.write(f"fleet: {error.format_message()} (see {where} --help)\n")
+        sys.stderr.write(f"fleet: {_one_line(error)} (see {where} --help)\n")
         code = error.exit_code
     except click.ClickException as error:
-        sys.stderr.write(f"fleet: {error.format_message()}\n")
+        sys.stderr.write(f"fleet: {_one_line(error)}\n")
         code = error.exit_code
     except click.Abort:
         code = 130
@@ -90,6 +90,10 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     sys.exit(code)
+
+
+def _one_line(error: click.ClickException) -> str:
+    return " ".join(error.format_message().split())
 
 
 if __name__ == "__main__":

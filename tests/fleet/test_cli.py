@@ -1,0 +1,239 @@
+"""The `fleet` command: exit codes, what is said of a mistake, what Ctrl-C does; real processes where it matters."""
+
+import json
+import signal
+import subprocess
+import sys
+from datetime import datetime
+from typing import Any
+
+import pytest
+
+from fleet import cli
+from tests.fleet.conftest import Cars
+from tests.support.ports import free_endpoint
+from tests.support.processes import driving, wait_for
+
+FLEET = [sys.executable, "-m", "fleet.cli"]
+
+
+def run(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    command = [*FLEET, *arguments, "--connect", endpoint]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ("frob", "No such command 'frob'. (see fleet --help)"),
+        ("drive", "Missing argument 'CAR[,CAR...]'. (see fleet drive --help)"),
+        ("drive red", "Missing argument"),
+        ("drive red up", "'up' is not one of 'stop', 'forward'"),
+        ("drive Red forward", "car name 'Red' is not allowed: use 1 to 32 of a-z"),
+        ("drive red,,blue forward", "car name '' is not allowed"),
+        ("drive red forward --for 11s", "'11s' is not allowed: more than 0 and at most 10 s, as 2s or 500ms"),
+        ("drive red forward --for 0", "'0' is not allowed: more than 0 and at most 10 s"),
+        ("drive red forward --for 1m", "'1m' is not allowed: more than 0 and at most 10 s"),
+        ("drive red forward --for nan", "'nan' is not allowed"),
+        ("mode red fast", "'fast' is not one of 'manual', 'remote_control'"),
+        ("led red blue", "'blue' is not allowed: six hexadecimal digits, as '#ff0010'"),
+        ("led red #ff00", "'#ff00' is not allowed: six hexadecimal digits"),
+        ("light red pink", "'pink' is not one of 'white', 'red'"),
+        ("servo red middle left", "'middle' is not one of 'front', 'vertical', 'horizontal'"),
+        ("servo red front 181", "deg 181 is not allowed: a whole number, 0 to 180"),
+        ("servo red front \u0669", "'\u0669' is not allowed for servo front: left, right, reset or 0 to 180"),
+        ("servo red vertical left", "'left' is not allowed for servo vertical: up, down, reset"),
+        ("servo red horizontal 90", "'90' is not allowed: servo horizontal takes no degrees"),
+        ("arm red 1 2 3", "takes 6 values"),
+        ("arm red 1 2 3 4 5 181", "181 is not in the range 0<=x<=180"),
+        ("speed red faster", "'faster' is not one of 'up', 'down'"),
+        ("fan red maybe", "'maybe' is not one of 'on', 'off'"),
+        ("stop Red", "car name 'Red' is not allowed"),
+        ("resume", "Missing argument 'CAR...'"),
+        ("get", "Missing argument 'KEYEXPR'"),
+        ("get red//sensor", "key expression 'red//sensor' is not allowed"),
+        ("get red/a*b", "key expression 'red/a*b' is not allowed"),
+        ("get red?last=3", "key expression 'red?last=3' is not allowed"),
+        ("watch red/$", "key expression 'fleet/red/$' is not allowed"),
+        ("list --connect nowhere", "endpoint 'nowhere' is not allowed: write it as tcp/HOST:PORT"),
+        ("list --connect tcp/localhost", "endpoint 'tcp/localhost' is not allowed"),
+        ("list --fleet A", "fleet name 'A' is not allowed"),
+        ("coordinate", "Missing option '--plan'"),
+        ("coordinate --plan no/such.yaml", "the plan no/such.yaml cannot be read: No such file or directory"),
+    ],
+)
+def test_wrong_use_is_one_line_and_exit_code_2(
+    arguments: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["fleet", *arguments.split(" ")])
+    monkeypatch.setenv("FLEET_ENDPOINT", free_endpoint())  # nobody is there, and nobody is asked
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr()
+    assert ended.value.code == 2
+    assert told in said.err
+    assert said.err.startswith("fleet: ")
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+
+
+@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if name not in ("demo", "replay", "record")])
+def test_every_help_has_an_example(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["fleet", name, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr().out
+    assert ended.value.code == 0
+    assert f"  fleet {name}" in said[said.index("example") :]
+    assert "--connect" in said
+    assert "--fleet" in said
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; import fleet.cli; sys.argv = ['fleet', '--help']\n"
+        "try: fleet.cli.main()\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'zenoh', 'google', 'rerun', 'mcap', 'yaml', 'asyncio'} & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "[]\n"
+    assert all(f"  {name} " in done.stdout for name in cli.COMMANDS)
+
+
+def test_no_fleet_running_is_a_failure_that_says_what_to_do() -> None:
+    endpoint = free_endpoint()
+    done = run(endpoint, "list")
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"fleet: no fleet is running at {endpoint}: start one")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_fleet_without_cars(cars: Cars) -> None:
+    for command in (["list"], ["stop"], ["get", "red"]):
+        done = run(cars.endpoint, *command, "--fleet", "empty")
+        assert done.returncode == 1
+        assert "no car" in done.stderr
+        assert done.stderr.count("\n") == 1
+
+
+def test_list_says_how_each_car_is(cars: Cars) -> None:
+    done = run(cars.endpoint, "list")
+    table = [line.split() for line in done.stdout.splitlines()]
+    assert table[0] == ["CAR", "LINK", "MODE", "VERDICT", "MOTION", "HOLD", "BATTERY"]
+    assert [row[0] for row in table[1:]] == ["blue", "green", "red"]
+    rows = lines(run(cars.endpoint, "list", "--json"))
+    assert [(row["car"], row["mode"], row["motors"]) for row in rows] == [
+        (car, "manual", "off") for car in ("blue", "green", "red")
+    ]
+
+
+def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
+    done = run(cars.endpoint, "get", "red")
+    assert done.returncode == 0
+    battery = next(line for line in done.stdout.splitlines() if line.startswith("fleet/red/sensor/battery "))
+    assert "voltage_v=7." in battery
+    assert " V  " in battery
+    (reading,) = lines(run(cars.endpoint, "get", "red/sensor/range", "--json"))
+    assert list(reading) == ["key", "time", "value"]
+    assert reading["key"] == "fleet/red/sensor/range"
+    assert reading["time"].endswith("Z")
+    assert datetime.fromisoformat(reading["time"]).year > 2000
+    assert reading["value"]["car"] == "red"
+    done = run(cars.endpoint, "get", "red/sensor/sonar")
+    assert done.returncode == 1
+    assert done.stderr == "fleet: nothing under fleet/red/sensor/sonar; the cars on the bus are: blue, green, red\n"
+
+
+def test_each_car_has_a_line_and_a_missing_one_makes_the_exit_code_1(cars: Cars) -> None:
+    done = run(cars.endpoint, "led", "red,purple,blue", "#0000ff")
+    assert done.returncode == 1
+    assert [line.split(" after")[0] for line in done.stdout.splitlines()] == ["blue: sent", "red: sent"]
+    assert done.stderr == "purple: not carried out: no car purple on the bus; there are: blue, green, red\n"
+    outcomes = lines(run(cars.endpoint, "led", "red,purple", "#000000", "--json"))
+    assert [(each["car"], each["ok"], each["phase"]) for each in outcomes] == [
+        ("purple", False, "no_answer"),
+        ("red", True, "sent"),
+    ]
+
+
+def test_a_refusal_says_why(cars: Cars) -> None:
+    done = run(cars.endpoint, "mode", "blue", "tracking")
+    assert done.returncode == 1
+    assert done.stderr.startswith("blue: not carried out: unsupported: a raspberry_pi car does not know mode tracking")
+
+
+def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
+    done = run(cars.endpoint, "drive", "green", "forward", "--for", "700ms")
+    assert done.returncode == 0
+    assert done.stdout.startswith("green: complete after 0.7")
+    wait_for(lambda: not driving(cars.sim, "green"), "green stands")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_drive_stops_its_cars(cars: Cars, number: signal.Signals) -> None:
+    command = [*FLEET, "drive", "green,blue", "forward", "--for", "10s", "--connect", cars.endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drive:
+        for car in ("green", "blue"):
+            wait_for(lambda car=car: driving(cars.sim, car), f"{car} drives")
+        drive.send_signal(number)
+        out, err = drive.communicate(timeout=20)
+    assert drive.returncode == 130
+    assert "Traceback" not in err
+    assert [line.split(" after")[0] for line in out.splitlines()] == ["blue: complete", "green: complete"]
+    assert not driving(cars.sim, "green")
+    assert not driving(cars.sim, "blue")
+
+
+def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
+    command = [*FLEET, "drive", "green", "forward", "--for", "10s", "--connect", cars.endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drive:
+        wait_for(lambda: driving(cars.sim, "green"), "green drives")
+        done = run(cars.endpoint, "stop")
+        _, err = drive.communicate(timeout=20)
+    assert done.returncode == 0
+    assert [line.split(" after")[0] for line in done.stdout.splitlines()] == [
+        "blue: complete",
+        "green: complete",
+        "red: complete",
+    ]
+    assert not driving(cars.sim, "green")
+    assert drive.returncode == 1
+    assert err.startswith("green: not carried out: superseded: stop by ")
+    resumed = run(cars.endpoint, "resume", "red,green", "blue")
+    assert resumed.returncode == 0
+
+
+def test_watch_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
+    command = [*FLEET, "watch", "red/state/health", "--json", "--connect", cars.endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
+        assert watch.stdout is not None
+        assert json.loads(watch.stdout.readline())["key"] == "fleet/red/state/health"
+        watch.send_signal(signal.SIGINT)
+        _, err = watch.communicate(timeout=20)
+    assert watch.returncode == 130
+    assert err.strip() == ""
+
+
+def test_watch_says_that_a_car_is_not_there_and_a_broken_pipe_is_silent(cars: Cars) -> None:
+    command = [*FLEET, "watch", "*/state/*", "--json", "--connect", cars.endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
+        assert watch.stdout is not None
+        watch.stdout.readline()
+        watch.stdout.close()
+        assert watch.stderr is not None
+        assert watch.stderr.read() == ""
+        assert watch.wait(20) == 1
+    command = [*FLEET, "watch", "purple", "--connect", cars.endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
+        assert watch.stderr is not None
+        said = watch.stderr.readline()
+        watch.send_signal(signal.SIGINT)
+        watch.communicate(timeout=20)
+    assert said == "fleet: no car purple on the bus yet (there are: blue, green, red); waiting\n"
