@@ -136,7 +136,7 @@ async def test_a_dropped_tcp_link_resets_refuses_and_comes_back_by_itself(pair: 
     with pytest.raises(ConnectionResetError):
         await asyncio.wait_for(_drain(reader), PATIENCE)
     writer.close()
-    with pytest.raises(ConnectionRefusedError):
+    with pytest.raises(ConnectionError):
         await asyncio.open_connection(host, port)
     assert pair.cars["green"].truth.driving
 
@@ -171,7 +171,7 @@ async def test_a_raspberry_pi_never_survives_a_lost_link(pair: Simulation) -> No
     await pair.inflict(Fault(FaultKind.LINK_DROP, "blue", for_s=0.1))
     await until(lambda: not pair.cars["blue"].truth.alive, "dies")
     await pair.inflict(Fault(FaultKind.LINK_DROP, "blue", for_s=0))
-    with pytest.raises(ConnectionRefusedError):
+    with pytest.raises(ConnectionError):
         await asyncio.open_connection(host, port)
     assert pair.cars["blue"].truth.driving
     await pair.inflict(Fault(FaultKind.BROWNOUT, "blue"))
@@ -180,7 +180,7 @@ async def test_a_raspberry_pi_never_survives_a_lost_link(pair: Simulation) -> No
     async def back() -> bool:
         try:
             _, again = await asyncio.open_connection(host, port)
-        except ConnectionRefusedError:
+        except ConnectionError:
             return False
         again.close()
         return True
