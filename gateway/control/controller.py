@@ -92,6 +92,7 @@ class Controller:
         self.known = False
         """The last recovery is complete and no write has failed since: what is sent will be read as it is meant."""
         self._link_open = False
+        self._was_open = False
         self._link_reason = "not connected yet"
         self._gave_up = False
         self._closing = False
@@ -148,7 +149,7 @@ class Controller:
 
     def link_up(self, now: float) -> None:
         """The link is open: bring the car to a known state."""
-        self._link_open = True
+        self._link_open = self._was_open = True
         self._gave_up = False
         self.known = False
         self.pacing.reset()
@@ -274,7 +275,7 @@ class Controller:
         self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)
         if self._link_open:
             self._begin(stop.full(self.profile, known=self.known), Why.SHUTDOWN, now)
-        else:
+        elif self._was_open:
             self._not_stopped(now)
 
     def _not_stopped(self, now: float) -> None:

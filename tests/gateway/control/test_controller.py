@@ -552,17 +552,22 @@ def test_a_shutdown_ends_within_the_length_of_its_recipe_and_what_it_waits_for(p
         assert desk.ask(what).reason is Reason.LINK_DOWN
 
 
-def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped() -> None:
-    desk = Desk()
+def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped(desk: Desk) -> None:
+    desk.control.link_down("unplugged", desk.now)
     desk.control.shutdown(desk.now)
     assert desk.control.finished
     desk.take()
     assert [(entry.code, entry.words) for entry in desk.logs] == [
-        (
-            "not_stopped",
-            "ending without a stop, red cannot be reached (not connected yet): look whether it drives",
-        )
+        ("not_stopped", "ending without a stop, red cannot be reached (unplugged): look whether it drives")
     ]
+
+
+def test_a_shutdown_before_there_was_a_link_has_nothing_to_say() -> None:
+    desk = Desk()
+    desk.control.shutdown(desk.now)
+    assert desk.control.finished
+    desk.take()
+    assert desk.logs == []
 
 
 def test_a_link_that_goes_during_the_last_stop_is_said(desk: Desk) -> None:
