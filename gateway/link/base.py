@@ -1,6 +1,10 @@
 """What every link is: read, write and close, and the errors that they raise."""
 
 from abc import ABC, abstractmethod
+from typing import Final
+
+CLOSE_S: Final = 1.0
+"""How long `close` waits for a port or a peer; one that is not done then is left to itself, or cut."""
 
 
 class LinkError(Exception):
@@ -28,8 +32,8 @@ class Link(ABC):
 
     @abstractmethod
     async def write(self, data: bytes) -> None:
-        """Hand over these bytes whole, in one write of their own; raises LinkLost."""
+        """Hand over these bytes whole, in one write of their own, without waiting; raises LinkLost."""
 
     @abstractmethod
     async def close(self) -> None:
-        """Let go of the port; a pending read raises LinkLost. Never raises; may be called again."""
+        """Let go of the port within CLOSE_S; a pending read raises LinkLost. Never raises; may be called again."""

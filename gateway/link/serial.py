@@ -1,7 +1,8 @@
-"""A serial port through pyserial: one thread opens and reads it, the loop writes.
+"""A serial port through pyserial: one thread opens, reads and closes it, the loop writes.
 
-A write does not block in practice: the port is non-blocking, a frame 26 bytes at most. A device that does not take
-them within `WRITE_TIMEOUT_S` is as good as gone.
+A write never waits: a port has room for far more than one frame, so a port that does not take a frame whole and at
+once has stopped taking bytes, and the link is lost. Who uses the descriptor holds `_hold`: the thread lets go
+of a port that died at any moment, and the number of a closed descriptor may be another car's a moment later.
 """
 
 import asyncio
@@ -13,10 +14,11 @@ from typing import Final
 
 import serial
 
-from gateway.link.base import CannotOpen, Link, LinkLost
+from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkLost
 from gateway.link.url import SerialUrl
 
 WRITE_TIMEOUT_S: Final = 0.25
+"""Only where the port cannot be written without waiting (Windows)."""
 WAITING_CHUNKS: Final = 256
 """Chunks that may wait for a loop that does not read; then the thread stops reading, the port fills."""
 
@@ -28,6 +30,9 @@ try:
 except ImportError:  # Windows
     _GONE = (OSError,)
 
+# ValueError: a path or a baud rate that the system cannot express.
+_NOT_OPENED: Final[tuple[type[Exception], ...]] = (*_GONE, ValueError)
+
 
 class SerialLink(Link):
     """One open port. Made by `open_serial`."""
@@ -35,6 +40,7 @@ class SerialLink(Link):
     def __init__(self, url: SerialUrl, loop: asyncio.AbstractEventLoop) -> None:
         self._url = url
         self._loop = loop
+        self._hold = threading.Lock()
         self._port: serial.Serial | None = None
         self._chunks: list[bytes] = []
         self._came = asyncio.Event()
@@ -43,7 +49,7 @@ class SerialLink(Link):
         self._lost: str | None = None
         self._opened: asyncio.Future[None] = loop.create_future()
         self._ended: asyncio.Future[None] = loop.create_future()
-        # A daemon: opening a port can block for ever (a Bluetooth tty does), and must not keep the process.
+        # A daemon: opening or closing a port can block (a Bluetooth tty does), and must not keep the process.
         self._thread = threading.Thread(target=self._run, name=f"read {url}", daemon=True)
 
     async def open(self, timeout_s: float) -> None:
@@ -59,7 +65,7 @@ class SerialLink(Link):
             raise CannotOpen(
                 f"{self._url}: the port did not open within {timeout_s:g} s: is the device there?"
             ) from None
-        except _GONE as error:
+        except _NOT_OPENED as error:
             raise CannotOpen(why_not_open(self._url, error)) from None
 
     async def read(self) -> bytes:
@@ -75,31 +81,43 @@ class SerialLink(Link):
 
     async def write(self, data: bytes) -> None:
         """Write these bytes whole; raises LinkLost, after which some of them may be out."""
-        port = self._port
-        if port is None or self._lost is not None:
-            raise LinkLost(self._lost or f"{self._url} is closed")
+        if self._lost is not None:
+            raise LinkLost(self._lost)
         try:
-            written = port.write(data)
+            with self._hold:
+                written = None if self._port is None else _write_now(self._port, data)
         except serial.SerialTimeoutException:
-            raise LinkLost(f"{self._url} takes no bytes: unplugged, or stuck?") from None
+            written = 0
         except _GONE as error:
-            raise LinkLost(f"{self._url} is gone: {_cause(error)}") from None
+            raise self._lose(f"{self._url} is gone: {_cause(error)}") from None
+        if written is None:
+            raise self._lose(f"{self._url} is gone: unplugged")  # the thread knows, and is about to say so
+        if written == 0 and data:
+            raise self._lose(f"{self._url} takes no bytes: unplugged, or stuck?")
         if written != len(data):
-            raise LinkLost(f"{self._url} took {written} of {len(data)} bytes")
+            raise self._lose(f"{self._url} took {written} of {len(data)} bytes: unplugged, or stuck?")
 
     async def close(self) -> None:
-        """Let go of the port and wait until the thread has ended."""
-        self._end()
+        """Let go of the port, and wait for that; one that does not close in time is left to the thread."""
+        self._lose(f"{self._url} was closed")
         if self._opened.done() and not self._opened.cancelled() and self._opened.exception() is None:
-            await asyncio.shield(self._ended)
-            self._thread.join()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(asyncio.shield(self._ended), CLOSE_S)
+                self._thread.join()
+
+    def _lose(self, reason: str) -> LinkLost:
+        """The link is of no more use; the first reason is kept."""
+        self._lost = self._lost or reason
+        self._came.set()
+        self._end()
+        return LinkLost(self._lost)
 
     def _end(self) -> None:
         """Tell the thread to end, whatever it waits for; one that still opens the port closes it again."""
         self._closing = True
         self._room.release()
-        if self._port is not None:
-            with contextlib.suppress(*_GONE):
+        with self._hold, contextlib.suppress(*_GONE):
+            if self._port is not None:
                 self._port.cancel_read()
 
     # ------------------------------------------------------------------ in the thread
@@ -110,10 +128,11 @@ class SerialLink(Link):
             port = serial.Serial(
                 self._url.path, self._url.baud, timeout=None, write_timeout=WRITE_TIMEOUT_S, exclusive=_exclusive()
             )
-        except _GONE as error:
+        except _NOT_OPENED as error:
             self._tell(self._failed_to_open, error)
             return
-        self._port = port
+        with self._hold:
+            self._port = port
         self._tell(self._succeeded)
         reason = f"{self._url} was closed"
         try:
@@ -126,10 +145,9 @@ class SerialLink(Link):
                     self._tell(self._received, data)
         except _GONE as error:
             reason = f"{self._url} is gone: {_cause(error)}"
-        except TypeError:
-            # pyserial reads from a descriptor that `close` has just set to None
-            pass
         finally:
+            with self._hold:
+                self._port = None
             with contextlib.suppress(*_GONE):
                 port.close()
             self._tell(self._over, reason)
@@ -154,7 +172,7 @@ class SerialLink(Link):
         self._came.set()
 
     def _over(self, reason: str) -> None:
-        self._lost = reason
+        self._lost = self._lost or reason
         self._came.set()
         if not self._ended.done():
             self._ended.set_result(None)
@@ -165,6 +183,19 @@ async def open_serial(url: SerialUrl, timeout_s: float) -> Link:
     link = SerialLink(url, asyncio.get_running_loop())
     await link.open(timeout_s)
     return link
+
+
+def _write_now(port: serial.Serial, data: bytes) -> int:
+    """Write what the port takes at once; how much that was.
+
+    Not pyserial's write: without a write_timeout a full port makes it spin for ever, with one it waits in the loop.
+    """
+    if os.name != "posix":
+        return port.write(data) or 0
+    try:
+        return os.write(port.fileno(), data)  # pyserial opens it O_NONBLOCK
+    except BlockingIOError:
+        return 0
 
 
 def why_not_open(url: SerialUrl, error: Exception) -> str:
@@ -178,7 +209,7 @@ def why_not_open(url: SerialUrl, error: Exception) -> str:
         return f"{url}: the port is in use by another program (a second gateway?): end that one first"
     if code == errno.EISDIR or os.path.isdir(url.path):  # noqa: PTH112 - a device path, not a file to work with
         return f"{url}: this is a directory, not a serial port; {_ports()}"
-    if os.path.exists(url.path):  # noqa: PTH110 - likewise
+    if not isinstance(error, ValueError) and os.path.exists(url.path):  # noqa: PTH110 - likewise
         return f"{url}: this is not a serial port ({_cause(error)}); {_ports()}"
     return f"{url}: the port cannot be opened ({_cause(error)}); {_ports()}"
 

@@ -4,14 +4,14 @@ import asyncio
 import contextlib
 import os
 import socket
-from typing import Final
+from collections.abc import Iterable
+from typing import Any, Final
 
-from gateway.link.base import CannotOpen, Link, LinkLost
+from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkLost
 from gateway.link.url import TcpUrl
 
 HELD_BYTES: Final = 64 * 1024
 """Bytes that may wait for a loop that does not read; then the socket is not read, and the car's side waits."""
-CLOSE_S: Final = 1.0
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
 """A peer that has vanished without a word is noticed within about five seconds, where the system allows."""
 
@@ -49,9 +49,14 @@ class TcpLink(asyncio.Protocol, Link):
             raise LinkLost(self._lost or f"{self._url} is closed")
         if transport.get_write_buffer_size():
             # What waits would go out together with this, and a car obeys only the first frame of a segment.
+            self._lost = f"{self._url} takes no bytes: the car or its bridge has stopped reading"
+            self._came.set()
             transport.abort()
-            raise LinkLost(f"{self._url} takes no bytes: the car or its bridge has stopped reading")
+            raise LinkLost(self._lost)
         transport.write(data)
+        if transport.is_closing():  # it met a reset: asyncio does not raise, but tells connection_lost why
+            await self._ended.wait()
+            raise LinkLost(self._lost)
 
     async def close(self) -> None:
         """Close in order; what is not closed after a second is cut."""
@@ -61,9 +66,11 @@ class TcpLink(asyncio.Protocol, Link):
         self._lost = self._lost or f"{self._url} was closed"
         self._came.set()
         transport.close()
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._ended.wait(), CLOSE_S)
-        transport.abort()
+        try:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._ended.wait(), CLOSE_S)
+        finally:
+            transport.abort()
 
     # ------------------------------------------------------------------ asyncio's side
 
@@ -72,12 +79,15 @@ class TcpLink(asyncio.Protocol, Link):
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         peer: socket.socket = transport.get_extra_info("socket")
-        peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _KEEPALIVE:
-            option = getattr(socket, name, None)
-            if option is not None:
-                peer.setsockopt(socket.IPPROTO_TCP, option, value)
+        with contextlib.suppress(
+            OSError
+        ):  # macOS refuses on a connection that is reset already; connection_lost follows
+            peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for name, value in _KEEPALIVE:
+                option = getattr(socket, name, None)
+                if option is not None:
+                    peer.setsockopt(socket.IPPROTO_TCP, option, value)
 
     def data_received(self, data: bytes) -> None:
         """Keep bytes until they are read, so many and no more."""
@@ -99,7 +109,8 @@ async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(timeout_s):
-            _, link = await loop.create_connection(lambda: TcpLink(url), url.host, url.port)
+            found = await loop.getaddrinfo(url.host, url.port, type=socket.SOCK_STREAM)
+            return await connect_first(url, [(family, address) for family, _, _, _, address in found])
     except TimeoutError:
         raise CannotOpen(f"{url}: no answer within {timeout_s:g} s: is the car on, and in this network?") from None
     except (socket.gaierror, UnicodeError):  # UnicodeError: a label too long for a host name
@@ -111,7 +122,31 @@ async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
         raise CannotOpen(f"{url}: {words}") from None
     except OSError as error:
         raise CannotOpen(f"{url}: no connection, {_cause(error)}") from None
-    return link
+
+
+async def connect_first(url: TcpUrl, addresses: Iterable[tuple[int, Any]]) -> Link:
+    """Connect to the first (family, socket address) that accepts; raises the OSError of the first that does not.
+
+    `create_connection` given a name would hide the error numbers of several addresses in one text.
+    """
+    loop = asyncio.get_running_loop()
+    first: OSError | None = None
+    for family, address in addresses:
+        peer = None
+        try:
+            peer = socket.socket(family, socket.SOCK_STREAM)
+            peer.settimeout(0)
+            await loop.sock_connect(peer, address)
+            _, link = await loop.create_connection(lambda: TcpLink(url), sock=peer)
+        except BaseException as error:
+            if peer is not None:
+                peer.close()
+            if not isinstance(error, OSError):
+                raise
+            first = first or error
+        else:
+            return link
+    raise first or OSError("the name has no address")
 
 
 def _cause(error: Exception) -> str:

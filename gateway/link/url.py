@@ -12,6 +12,7 @@ _BAUDS: Final = range(300, 4_000_001)
 _ALLOWED: Final = (
     "serial:///dev/ttyUSB0 (?baud=9600), a bare device path such as /dev/ttyUSB0 or COM3, or tcp://host:8888"
 )
+_LATER: Final = frozenset({"ble"})
 _WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
 
 
@@ -43,6 +44,8 @@ LinkUrl = SerialUrl | TcpUrl
 
 def parse_url(text: str) -> LinkUrl:
     """The link that a URL or a bare device path names; raises BadUrl, which says what is allowed."""
+    if not text.isprintable():  # urlsplit would drop a line feed and say nothing
+        raise _bad(text, "it has characters that cannot be printed")
     if text.startswith("/") or _WINDOWS_PORT.fullmatch(text):
         return SerialUrl(text)
     try:
@@ -62,6 +65,8 @@ def parse_url(text: str) -> LinkUrl:
         if parts.path or parts.query or parts.fragment or parts.username is not None:
             raise _bad(text, "nothing may follow the port")
         return TcpUrl(parts.hostname, port)
+    if parts.scheme in _LATER:
+        raise _bad(text, f"{parts.scheme}:// is not yet supported")
     raise _bad(
         text, f"{parts.scheme}:// is no kind of link" if parts.scheme else "it is neither a URL nor a device path"
     )

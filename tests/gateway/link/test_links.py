@@ -1,7 +1,11 @@
 """One suite over every kind of link: a real PTY and a real TCP server at the other end."""
 
 import asyncio
+import contextlib
 import gc
+import re
+import socket
+import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -10,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from gateway.link import Link, LinkLost, open_link
-from gateway.link.serial import WRITE_TIMEOUT_S
+from gateway.link.tcp import TcpLink
+from gateway.link.url import TcpUrl
 from tests.gateway.link.peers import Peer, PtyPeer, TcpPeer, link_threads, open_descriptors
 
 FRAME = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
@@ -94,6 +99,7 @@ async def test_dying_in_the_middle_of_a_frame(link: Link, peer: Peer) -> None:
     with pytest.raises(LinkLost):
         await link.write(STOP)
     await link.close()
+    assert await lost(link) == words, "closing it does not cover up why it was lost"
 
 
 async def test_what_came_before_the_end_is_still_read(peer: Peer) -> None:
@@ -197,22 +203,22 @@ async def test_a_firehose_into_a_loop_that_does_not_read_is_held_back(link: Link
 
 
 async def test_a_car_that_stops_reading_costs_the_link_not_the_loop(link: Link, peer: Peer) -> None:
-    writes: list[float] = []
 
     async def write() -> None:
-        writes.append(time.monotonic())
         await link.write(FRAME * 20)
 
-    assert "takes no bytes" in await until_lost(write)
-    if isinstance(peer, PtyPeer):
-        assert time.monotonic() - writes[-1] < WRITE_TIMEOUT_S + 5
+    words = await until_lost(write)
+    assert "takes no bytes" in words or "took " in words
+    assert await lost(link) == words, "the first cause is kept, and whoever reads is told it"
+    with pytest.raises(LinkLost, match=re.escape(words)):
+        await link.write(STOP)
     await link.close()
 
 
 async def test_nothing_is_left_behind(peer: Peer) -> None:
     gc.collect()
     before = open_descriptors()
-    for ending in ("close", "die", "die unread", "cancelled"):
+    for ending in ("close", "die", "die unread", "cancelled") * 5:
         link = await open_link(peer.url)
         pending = asyncio.create_task(link.read())
         await asyncio.sleep(0)
@@ -250,10 +256,63 @@ async def test_a_real_reset(tmp_path: Path) -> None:
     peer.close()
 
 
-async def test_each_write_is_a_segment_of_its_own() -> None:
-    """TCP_NODELAY: a frame does not wait for the acknowledgement of the one before it."""
+async def test_a_write_that_meets_a_reset_is_not_called_written() -> None:
+    """Before the loop has heard of the reset, so that only the write itself can tell."""
     peer = TcpPeer()
     link = await open_link(peer.url)
+    assert peer.peer
+    peer.reset()
+    with pytest.raises(LinkLost, match=r"is gone: (connection reset by peer|broken pipe)"):
+        await link.write(STOP)
+    await link.close()
+    peer.close()
+
+
+async def test_a_port_that_takes_nothing_never_holds_up_the_loop(tmp_path: Path) -> None:
+    """pyserial's own write would wait for a write_timeout, or spin; the best of several: machines are busy."""
+    peer = PtyPeer(tmp_path)
+    stood = []
+    for _ in range(5):
+        link = await open_link(peer.url)
+        began = time.monotonic()
+        with contextlib.suppress(LinkLost):
+            while True:
+                began = time.monotonic()
+                await link.write(FRAME)
+        stood.append(time.monotonic() - began)
+        await link.close()
+    assert min(stood) < 0.1
+    peer.close()
+
+
+async def test_a_write_while_the_port_goes_is_lost_and_nothing_worse(tmp_path: Path) -> None:
+    """The reader lets go of a dead port in its thread: never between a write's look at the descriptor and its use."""
+    peer = PtyPeer(tmp_path)
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for _ in range(300):
+            link = await open_link(peer.url)
+            peer.die()
+            for _ in range(20):
+                with contextlib.suppress(LinkLost):
+                    await link.write(STOP)
+            await link.close()
+            peer.revive()
+    finally:
+        sys.setswitchinterval(usual)
+    peer.close()
+
+
+async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it() -> None:
+    """Held back it would go out in one segment with the next, of which a car obeys only the first."""
+    peer = TcpPeer()
+    assert isinstance(peer.url, TcpUrl)
+    ours = socket.create_connection((peer.url.host, peer.url.port))
+    ours.settimeout(0)
+    _, link = await asyncio.get_running_loop().create_connection(lambda: TcpLink(TcpUrl("car", 8888)), sock=ours)
+    assert ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    assert ours.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
     for _ in range(20):
         await link.write(STOP)
         assert peer.peer.recv(4096) == STOP

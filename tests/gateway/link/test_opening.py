@@ -12,6 +12,7 @@ import pytest
 import serial
 
 from gateway.link import BadUrl, CannotOpen, open_link, parse_url
+from gateway.link.tcp import connect_first
 from gateway.link.url import LinkUrl, SerialUrl, TcpUrl
 from tests.gateway.link.peers import PtyPeer, link_threads
 
@@ -64,7 +65,10 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
         ("tcp://me@host:8888", "nothing may follow the port"),
         ("tcp://[::1:8888", "Invalid IPv6 URL"),
         ("http://host:80", "http:// is no kind of link"),
-        ("ble://00:11:22:33:44:55", "ble:// is no kind of link"),
+        ("ble://00:11:22:33:44:55", "ble:// is not yet supported"),
+        ("/dev/tty\nUSB0", "it has characters that cannot be printed"),
+        ("/dev/tty\x00USB0", "it has characters that cannot be printed"),
+        ("tcp://ho\nst:80", "it has characters that cannot be printed"),
     ],
 )
 def test_what_is_no_url_is_refused_with_what_is(text: str, why: str) -> None:
@@ -103,6 +107,7 @@ async def test_a_serial_port_that_cannot_be_opened(tmp_path: Path) -> None:
     assert "this is not a serial port (" in await refused(SerialUrl(str(regular)))
     assert "this is not a serial port (" in await refused(SerialUrl("/dev/null"))
     assert "there is no such port; " in await refused(SerialUrl("COM99"))
+    assert "the port cannot be opened (embedded null byte); " in await refused(SerialUrl("/dev/tty\0"))
     await no_threads()
 
 
@@ -118,6 +123,7 @@ async def test_a_port_that_another_program_has(tmp_path: Path) -> None:
 WITHOUT_PERMISSION = """
 import asyncio, grp, os, sys  # all of it now: nobody may not even read the library
 from gateway.link import CannotOpen, open_link
+from gateway.link.tcp import connect_first
 from gateway.link.url import SerialUrl
 import gateway.link.serial, serial.tools.list_ports
 os.setgroups([]); os.setgid(65534); os.setuid(65534)
@@ -158,6 +164,45 @@ async def test_a_tcp_car_that_cannot_be_reached() -> None:
     assert "there is no host 'no.such.car.invalid': check the name" in await refused(TcpUrl("no.such.car.invalid", 1))
     assert "there is no host" in await refused(TcpUrl("a" * 64, 8888))
     assert "there is no host" in await refused(TcpUrl("a..b", 8888))
+
+
+async def test_a_name_with_several_addresses_is_tried_on_each_and_says_why_in_the_same_words() -> None:
+    """asyncio would say "Multiple exceptions", without the number that tells a refusal from the rest."""
+    with socket.socket() as taken, socket.create_server(("127.0.0.1", 0)) as server:
+        taken.bind(("127.0.0.1", 0))
+        nobody = (socket.AF_INET, taken.getsockname())
+        url = TcpUrl("several", server.getsockname()[1])
+        with pytest.raises(ConnectionRefusedError):
+            await connect_first(url, [nobody, nobody])
+        link = await connect_first(url, [nobody, (socket.AF_INET, server.getsockname())])
+        await link.close()
+
+
+ONLY_WHAT_IS_NEEDED = """
+import asyncio, sys
+from gateway.link import open_link, parse_url
+link = asyncio.run(open_link(parse_url(sys.argv[1])))
+print("serial" in sys.modules, "serial.tools" in sys.modules)
+"""
+
+
+def test_only_what_a_link_needs_is_imported(tmp_path: Path) -> None:
+    """A gateway is started a hundred times."""
+    peer = PtyPeer(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        for url, said in (
+            (TcpUrl("127.0.0.1", server.getsockname()[1]), "False False\n"),
+            (peer.url, "True False\n"),
+        ):
+            done = subprocess.run(
+                [sys.executable, "-c", ONLY_WHAT_IS_NEEDED, str(url)],
+                capture_output=True,
+                text=True,
+                timeout=60,
+                check=False,
+            )
+            assert (done.stdout, done.stderr) == (said, "")
+    peer.close()
 
 
 async def test_a_tcp_car_that_does_not_answer() -> None:
