@@ -187,13 +187,13 @@ class Coordinator:
         mode, motion, safety = states
         if not before.present or mode is None or motion is None or safety is None:
             return
-        hold, owner = safety.fields.get("hold"), str(motion.fields["owner"])
+        hold = safety.fields.get("hold")
         self._cars[car] = replace(
             before,
             mode=str(mode.fields["asked"]),
             verdict=str(mode.fields["verdict"]),
             held_by=hold.by if isinstance(hold, pb.Hold) else None,
-            driven_by=owner if owner not in ("", self.client.sender) else None,
+            driven_by=str(motion.fields["owner"]) or None,
         )
 
     # ------------------------------------------------------------------ there is only one; and the hub

@@ -33,7 +33,7 @@ class CarPicture:
     verdict: str = ""
     held_by: str | None = None
     driven_by: str | None = None
-    """Another sender that holds a motion."""
+    """Who holds a motion; a coordinator never does."""
 
 
 @dataclass(frozen=True, slots=True)
