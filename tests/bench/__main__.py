@@ -1,0 +1,46 @@
+"""`python -m tests.bench [NAME...] [--json]`: run the benchmarks, print a table. Ends 0 unless something broke."""
+
+import argparse
+import importlib
+import json
+import platform
+import sys
+
+from tests.bench.measured import RUNS, Measured
+
+BENCHMARKS = {
+    "decode": "decoding",
+    "readings": "readings",
+    "commands": "commands",
+    "start": "starting",
+    "record": "recording",
+    "replay": "replaying",
+}
+
+
+def _row(one: Measured) -> str:
+    goal = f"{one.goal:g} x" + (f" + {one.slack:g} {one.unit}" if one.slack else "")
+    numbers = f"{one.ours_median:8.2f} {one.floor_median:8.2f} {one.unit:3} {one.ratio:6.2f} x"
+    return f"{one.name:28} {numbers}   {goal:13} {'met' if one.met else 'MISSED'}"
+
+
+def main() -> int:
+    """Run what is named, or all; only a program that broke is a failure."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"which: {', '.join(BENCHMARKS)} (default all)")
+    parser.add_argument("--json", action="store_true", help="one JSON object per line instead of a table")
+    arguments = parser.parse_args()
+    unknown = [name for name in arguments.names if name not in BENCHMARKS]
+    if unknown:
+        parser.error(f"there is no benchmark {', '.join(unknown)}: allowed are {', '.join(BENCHMARKS)}")
+    if not arguments.json:
+        print(f"Python {platform.python_version()}, {platform.machine()}; medians of {RUNS} runs, in turns")
+        print(f"{'':28} {'ours':>8} {'floor':>8} {'':3} {'ratio':>8}   {'goal':13}", flush=True)
+    for name in arguments.names or BENCHMARKS:
+        for one in importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run():
+            print(json.dumps(one.to_dict()) if arguments.json else _row(one), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,57 @@
+"""From a command's query to its bytes on the tty; the floor is a query that a bare process answers at once."""
+
+import json
+from itertools import cycle
+from statistics import median
+from time import monotonic, sleep
+
+from tests.bench.measured import Measured, in_turns
+from tests.bench.stage import Arrival, Stage, Tty, perf_counter, stage
+from tests.support.processes import PATIENCE_S
+
+COMMANDS = 30
+GAP_S = 0.1
+"""More than the 60 ms for which a motion is in flight: what is measured is the way, not the pacing."""
+TURNS = cycle([("left", b"$3,0,0,0,0,0,0,0,0#"), ("right", b"$4,0,0,0,0,0,0,0,0#")])
+
+
+def _command(here: Stage, port: Tty) -> float:
+    times = []
+    for _ in range(COMMANDS):
+        motion, frame = next(TURNS)
+        payload = json.dumps({"motion": motion, "duration_s": 5})
+        sleep(GAP_S)
+        port.drain()
+        began = perf_counter()
+        replies = here.session.get("fleet/red/@cmd/drive", payload=payload, encoding="application/json")
+        seen = b""
+        deadline = monotonic() + PATIENCE_S
+        while frame not in seen:
+            assert monotonic() < deadline, (seen, [str(reply.ok and reply.ok.payload.to_string()) for reply in replies])
+            seen += port.read()
+        times.append((perf_counter() - began) * 1e3)
+        assert all(reply.ok is not None for reply in replies)
+    return median(times[1:])  # the first may have met the stop of what was held before
+
+
+def _query(here: Stage) -> float:
+    times = []
+    for _ in range(COMMANDS):
+        sleep(GAP_S)
+        began = perf_counter()
+        replies = here.session.get("bench/answer", payload=b'{"motion": "left"}', encoding="application/json")
+        assert next(iter(replies)).ok is not None
+        times.append((perf_counter() - began) * 1e3)
+    return median(times)
+
+
+def run() -> list[Measured]:
+    with stage() as here:
+        port, alive = here.tty(), Arrival()
+        here.gateway(port)
+        watch = here.session.liveliness().declare_subscriber("bench/answer/alive", alive.note, history=True)
+        here.bare("answer", "bench/answer")
+        alive.wait()
+        ours, floor = in_turns(lambda: _command(here, port), lambda: _query(here))
+        watch.undeclare()
+    return [Measured("command to tty, p50", tuple(ours), tuple(floor), "ms", 1.5, slack=1.0)]

@@ -1,0 +1,55 @@
+"""From a write on the tty to a subscriber's callback; the floor is a bare process with pyserial's read and a put.
+
+Ours is timed to `sensor/range`, the first of the six readings and the frame that one sensors frame becomes.
+"""
+
+from time import sleep
+
+from tests.bench.measured import Measured, in_turns, percentile
+from tests.bench.stage import READING, Arrival, Stage, Tty, perf_counter, stage
+
+FRAMES = 100
+GAP_S = 0.02
+"""Between two frames; a car sends at most one in 37 ms."""
+
+
+def _times(port: Tty, arrival: Arrival) -> list[float]:
+    times = []
+    for _ in range(FRAMES):
+        sleep(GAP_S)
+        began = perf_counter()
+        port.write(READING)
+        times.append((arrival.wait() - began) * 1e3)
+    return times
+
+
+def run() -> list[Measured]:
+    with stage() as here:
+        ours, floor = _measure(here)
+    return [
+        Measured(
+            f"tty to callback, {name}",
+            tuple(percentile(times, share) for times in ours),
+            tuple(percentile(times, share) for times in floor),
+            "ms",
+            1.5,
+        )
+        for name, share in (("p50", 0.5), ("p90", 0.9))
+    ]
+
+
+def _measure(here: Stage) -> tuple[list[list[float]], list[list[float]]]:
+    port, bare_port = here.tty(), here.tty()
+    here.gateway(port)
+    came, bare_came, alive = Arrival(), Arrival(), Arrival()
+    kept = [
+        here.session.declare_subscriber("fleet/red/sensor/range", came.note),
+        here.session.declare_subscriber("bench/floor", bare_came.note),
+        here.session.liveliness().declare_subscriber("bench/floor/alive", alive.note, history=True),
+    ]
+    here.bare("tty_to_bus", bare_port.path, "bench/floor")
+    alive.wait()
+    found = in_turns(lambda: _times(port, came), lambda: _times(bare_port, bare_came))
+    for each in kept:
+        each.undeclare()
+    return found

@@ -1,0 +1,122 @@
+"""Where a benchmark plays: a hub of its own, processes, a PTY. Everything that was started is ended."""
+
+import contextlib
+import os
+import select
+import tempfile
+import threading
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from time import monotonic, perf_counter
+from typing import Any
+
+import zenoh
+
+from tests.support.ports import free_endpoint
+from tests.support.processes import PATIENCE_S, Fleet, Process
+
+FLOORS = Path(__file__).parent / "floors"
+SCRATCH = Path(__file__).resolve().parents[2] / ".tmp"
+READING = b"$4WD,CSB57.24,PV7.91,GS214,LF1011,HW01,GM10#"
+
+
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """A directory inside the clone, for as long as it is needed."""
+    SCRATCH.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=SCRATCH, prefix="bench-") as directory:
+        yield Path(directory)
+
+
+class Tty:
+    """A PTY: we hold the car's end, `path` is the port."""
+
+    def __init__(self) -> None:
+        self._car, self._port = os.openpty()
+        tty.setraw(self._port)
+        self.path = os.ttyname(self._port)
+
+    def write(self, data: bytes) -> None:
+        os.write(self._car, data)
+
+    def read(self, timeout_s: float = PATIENCE_S) -> bytes:
+        """What has come, as soon as something has; empty if nothing comes."""
+        ready, _, _ = select.select([self._car], [], [], timeout_s)
+        return os.read(self._car, 4096) if ready else b""
+
+    def drain(self, quiet_s: float = 0.0) -> None:
+        """Read until nothing has come for so long."""
+        while self.read(quiet_s):
+            pass
+
+    def close(self) -> None:
+        os.close(self._car)
+        os.close(self._port)
+
+
+class Stage:
+    """A hub, its endpoint and a bare session at it."""
+
+    def __init__(self, directory: Path) -> None:
+        self.fleet = Fleet(free_endpoint(), directory)
+        self._ttys: list[Tty] = []
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", f'["{self.fleet.endpoint}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        self.session = zenoh.open(config)
+
+    def bare(self, name: str, *arguments: str) -> Process:
+        """Start one of the floors: a program that knows nothing of ours."""
+        return self.fleet.start(str(FLOORS / f"{name}.py"), self.fleet.endpoint, *arguments)
+
+    def tty(self) -> Tty:
+        """A new PTY."""
+        self._ttys.append(Tty())
+        return self._ttys[-1]
+
+    def gateway(self, port: Tty) -> Process:
+        """A gateway whose car has been brought to a known state."""
+        process = self.fleet.gateway(port.path)
+        deadline = monotonic() + PATIENCE_S
+        while (safety := self.fleet.state("safety")) is None or safety.motors != "off":
+            assert monotonic() < deadline, process.stderr
+            port.drain(0.2)
+            port.write(READING)
+        return process
+
+    def close(self) -> None:
+        self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+        self.fleet.close()
+        for each in self._ttys:
+            each.close()
+
+
+@contextlib.contextmanager
+def stage() -> Iterator[Stage]:
+    """A stage, and its end whatever happens."""
+    with scratch() as directory:
+        built = Stage(directory)
+        try:
+            yield built
+        finally:
+            built.close()
+
+
+class Arrival:
+    """When the next thing came, noted on the thread that it came on."""
+
+    def __init__(self) -> None:
+        self._came = threading.Event()
+        self._at = 0.0
+
+    def note(self, *_: Any) -> None:
+        self._at = perf_counter()
+        self._came.set()
+
+    def wait(self) -> float:
+        """The time at which it came, on `perf_counter`; what comes next is waited for anew."""
+        assert self._came.wait(PATIENCE_S), "nothing came"
+        self._came.clear()
+        return self._at
