@@ -19,8 +19,8 @@ from tests.support.processes import Process
 
 CARS = 10
 TOPIC_NAMES = ("sensor/line", "frame/rx")
-ROUNDS = 80
-ROUND_S = 1 / 40
+ROUNDS = 500
+ROUND_S = 1/250
 SETTLE_S = 0.3
 """For what is still under way when the last message was sent."""
 
@@ -37,7 +37,7 @@ def _cost(here: Stage, fleet: str, start: Callable[[Path], Process]) -> float:
     """CPU microseconds per message."""
     publishers = _publishers(here.fleet.bus, fleet)
     line = pb.Line(left_outer=True)
-    frame = pb.Frame(data=READING, verdict="sensors", published=["sensor/line"])
+    frame = pb.RxFrame(data=READING, verdict="sensors", published=["sensor/line"])
     with tempfile.TemporaryDirectory(dir=here.fleet.directory) as directory:
         process = start(Path(directory))
         assert process.line()["ready"]

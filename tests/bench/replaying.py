@@ -1,0 +1,46 @@
+"""Export per message; the floor is Rerun's own MCAP importer, which writes the messages without a layout or lenses."""
+
+from pathlib import Path
+from time import perf_counter
+
+import rerun.chunk as rrc
+from mcap.writer import Writer
+
+from fleet.recording.session import Session
+from fleet.replay.to_rerun import export
+from tests.bench.measured import Measured, in_turns
+from tests.bench.stage import scratch
+from tests.fleet.replay.make_session import CARS, Made, drive_about
+
+SECONDS = 1200
+
+
+def _session(path: Path) -> int:
+    """Three cars for twenty minutes; the number of messages."""
+    made = Made(path, Writer)
+    for index, car in enumerate(CARS):
+        drive_about(made, car, index, SECONDS)
+    made.close()
+    return sum(made.counts.values())
+
+
+def run() -> list[Measured]:
+    with scratch() as directory:
+        source = directory / "session.mcap"
+        count = _session(source)
+
+        def ours() -> float:
+            began = perf_counter()
+            held = export(Session.open(source), directory / "ours.rrd")
+            took = perf_counter() - began
+            assert sum(held.values()) == count
+            return took / count * 1e6
+
+        def floor() -> float:
+            began = perf_counter()
+            stream = rrc.McapReader(source).stream()
+            stream.write_rrd(directory / "floor.rrd", application_id="floor", recording_id="floor")
+            return (perf_counter() - began) / count * 1e6
+
+        mine, least = in_turns(ours, floor)
+    return [Measured("export a message to Rerun", tuple(mine), tuple(least), "us", 2.0)]
