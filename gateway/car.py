@@ -103,8 +103,11 @@ class Car:
         self._stopped = asyncio.Event()
         self._alive_at = now
 
-    async def run(self) -> None:
-        """Serve the car until `stop` and until its stop is written; raises AlreadyServed, or LinkError at the start."""
+    async def run(self) -> bool:
+        """Serve the car until `stop` and until its stop is written; False if it could not be stopped.
+
+        Raises AlreadyServed, and LinkError if the link cannot be opened at the start.
+        """
         self._refuse(self._others())
         self._declare()
         work = (self._connect(), self._write_frames(), self._tick(), self._keep_hub(), self._look_again())
@@ -126,11 +129,13 @@ class Car:
                 await self._link.close()
             self._flush()
             self._out.states(self._control, self._health, self._loop.time(), force=True)
+        return not self._control.unstopped
 
     def stop(self) -> None:
         """Begin to end: the car is stopped first. Told again, end without waiting for it."""
         if self._ending:
             log.error("%s: told twice to end: its stop may be incomplete", self._settings.car)
+            self._control.unstopped = True
             self._control.link_down("the gateway was told twice to end", self._loop.time())
         self._ending = True
         self._control.shutdown(self._loop.time())
@@ -436,8 +441,8 @@ def _restored(stored: StoredHold | None, now: float) -> Hold | None:
     return Hold(stored.by, now - (time.time_ns() - stored.since_ns) / 1e9)
 
 
-async def serve(settings: Settings, opened: bus.Bus) -> None:
-    """Serve one car until SIGINT or SIGTERM; raises AlreadyServed or LinkError."""
+async def serve(settings: Settings, opened: bus.Bus) -> bool:
+    """Serve one car until SIGINT or SIGTERM; False if it could not be stopped. Raises AlreadyServed or LinkError."""
     car = Car(settings, opened)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -445,4 +450,4 @@ async def serve(settings: Settings, opened: bus.Bus) -> None:
             loop.add_signal_handler(number, car.stop)
         except NotImplementedError:  # Windows has no signal handlers on the loop
             signal.signal(number, lambda *_: loop.call_soon_threadsafe(car.stop))
-    await car.run()
+    return await car.run()

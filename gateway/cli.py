@@ -77,14 +77,14 @@ def _run(arguments: argparse.Namespace) -> int:
         return _failed(str(error), 2)
     try:
         with Bus.open(arguments.connect, start_hub=True) as opened:
-            asyncio.run(serve(settings, opened))
+            stopped = asyncio.run(serve(settings, opened))
     except BadEndpoint as error:
         return _failed(str(error), 2)
     except (AlreadyServed, LinkError, BusError) as error:
         return _failed(str(error), 1)
     except KeyboardInterrupt:  # before the loop has taken the signals over: no link was open yet
         return 130
-    return 0
+    return 0 if stopped else 1
 
 
 def _failed(words: str, code: int) -> int:

@@ -182,7 +182,8 @@ class Handover(Generic[T]):
             batch = list(self._waiting)
             self._waiting.clear()
         for item in batch:
-            self._take(item)
+            # One callback each: an item that raises takes no other with it.
+            self._loop.call_soon(self._take, item)
 
 
 @dataclass(frozen=True, slots=True)

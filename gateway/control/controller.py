@@ -96,6 +96,8 @@ class Controller:
         self._link_reason = "not connected yet"
         self._gave_up = False
         self._closing = False
+        self.unstopped = False
+        """The gateway ends, and the car could not be stopped."""
         self._ledger = Ledger()
         self._running: Running | None = None
         self._held: _Held | None = None
@@ -106,7 +108,8 @@ class Controller:
         self._sent_motion = Motion.STOP
         self._repeat = False
         self._motors_on = False
-        self._mode_sent: Pending | None = None
+        self._mode_sent: tuple[Pending, float] | None = None
+        """A mode whose effect has not been seen yet, and when its frame went out."""
         self._led = ColorLed(0, 0, 0)
         self._fan_at = float("-inf")
         self._senders: dict[str, float | None] = {}
@@ -179,6 +182,7 @@ class Controller:
         before = self.mode.verdict
         self.mode.heard(event)
         self._note_verdict(before, now)
+        self._note_effect(event, now)
         if event.signature is not Mode.MANUAL:
             return
         if event.range_cm is not None:
@@ -233,6 +237,7 @@ class Controller:
         if refusal is not None:
             return self._reject(pending, *refusal, now)
         self._ledger.accepted(command)
+        held_by = self.hold.by if self.hold is not None else None
         if command.sender.kind is not Kind.COORDINATOR and isinstance(what, Drive | SetMode | Resume):
             self._end_hold(command.sender, now)
         match what:
@@ -245,7 +250,8 @@ class Controller:
             case SetMode(mode):
                 return self._set_mode(pending, mode, now)
             case Resume():
-                return self._done(pending, f"{self.car} is not on hold", now)
+                words = f"{self.car} was not on hold" if held_by is None else f"the hold by {held_by} has ended"
+                return self._done(pending, words, now)
             case Fan(bool() as on) if on == self.fan:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
             case Fan():
@@ -279,6 +285,7 @@ class Controller:
             self._not_stopped(now)
 
     def _not_stopped(self, now: float) -> None:
+        self.unstopped = True
         words = f"ending without a stop, {self.car} cannot be reached ({self._link_reason}): look whether it drives"
         self._ledger.log(Level.ERROR, "not_stopped", words, now)
 
@@ -322,7 +329,7 @@ class Controller:
                 self._ledger.sent(source.pending, now)
             case Pending() if source is self._opening:
                 self._opening = None
-                self._mode_sent = source
+                self._mode_sent = (source, now)
                 self._ledger.sent(source, now)
             case Pending():
                 source.frames.popleft()
@@ -540,7 +547,7 @@ class Controller:
             for pending in running.commands:
                 self._ledger.sent(pending, now)
                 if isinstance(pending.command.what, SetMode):
-                    self._mode_sent = pending
+                    self._mode_sent = (pending, now)
         if running is self._running and running.frames_sent:
             self._overdue(running, now)
 
@@ -614,9 +621,12 @@ class Controller:
                     self.fan = None if self.fan is None else not self.fan
                     self._fan_at = now
             case ModeOpen(mode):
+                self._mode_sent = None
                 self._motors_on = True
                 self.mode.ask(mode, now=now, block_s=self.profile.block_s(frame))
             case ModeClose():
+                if self._mode_sent is not None and self._mode_sent[0].command.what != SetMode(Mode.MANUAL):
+                    self._mode_sent = None
                 self._sent_motion = Motion.STOP
                 self.mode.ask(Mode.MANUAL, now=now, block_s=self.profile.block_s(frame))
             case Ptz(deg):
@@ -673,6 +683,8 @@ class Controller:
     def _close_held(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
         held, self._held = self._held, None
         if held is not None:
+            if self._senders.get(held.sender.name) is not None:
+                del self._senders[held.sender.name]
             self._ledger.record(held.pending, phase, now, reason=reason, words=words)
 
     def _close_opening(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
@@ -687,8 +699,13 @@ class Controller:
         if verdict is Verdict.CONTRADICTED:
             words = f"asked for mode {self.mode.asked}, but: {self.mode.evidence}"
             self._ledger.log(Level.WARNING, "mode_contradicted", words, now)
-        elif verdict is Verdict.CONFIRMED and self._mode_sent is not None:
-            pending, self._mode_sent = self._mode_sent, None
-            what = pending.command.what
-            if isinstance(what, SetMode) and what.mode is self.mode.asked:
-                self._ledger.record(pending, Phase.EFFECT_SEEN, now, evidence=(self.mode.evidence,))
+
+    def _note_effect(self, event: Sensors, now: float) -> None:
+        """A reading that began after the mode's frame, and has its shape, is the effect."""
+        if self._mode_sent is None or self.mode.verdict is not Verdict.CONFIRMED:
+            return
+        pending, sent_at = self._mode_sent
+        what = pending.command.what
+        if isinstance(what, SetMode) and event.signature is what.mode and event.at > sent_at + UNDER_WAY_S:
+            self._mode_sent = None
+            self._ledger.record(pending, Phase.EFFECT_SEEN, now, evidence=(self.mode.evidence,))

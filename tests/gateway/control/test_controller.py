@@ -46,7 +46,7 @@ def desk() -> Desk:
         (Drive(Motion.SPIN_LEFT, 0.3), [b"$0,1,0,0,0,0,0,0,0#", STOP, STOP], [ASKED, QUEUED, SENT, COMPLETE]),
         (Drive(Motion.STOP), [], [ASKED, SENT]),
         (SetMode(Mode.TRACKING), [b"$4WD,MODE21#"], [ASKED, QUEUED, SENT]),
-        (SetMode(Mode.MANUAL), [MODE00, STOP], [ASKED, QUEUED, SENT]),
+        (SetMode(Mode.MANUAL), [MODE00, STOP], [ASKED, QUEUED, SENT, Phase.EFFECT_SEEN]),
         (Act(ColorLed(1, 2, 3)), [b"$4WD,CLR1,CLG2,CLB3#"], [ASKED, QUEUED, SENT]),
         (Act(Ptz(30)), [b"$4WD,PTZ30#"], [ASKED, QUEUED, SENT]),
         (LIGHT, [b"$0,0,0,0,0,0,2,0,0#"], [ASKED, QUEUED, SENT]),
