@@ -12,7 +12,6 @@ import random
 import signal
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -24,13 +23,14 @@ from gateway.control.controller import Controller, Hold
 from gateway.control.link_health import LinkHealth
 from gateway.control.mode import Verdict
 from gateway.control.records import Answer, Level, LogRecord, Phase
+from gateway.doors import Doors
 from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Event, Rejected
 from gateway.publish import Publications, wall_ns
 from gateway.store import Store, StoredHold
-from schemas import bus, keys, messages
+from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
 TICK_S: Final = 0.1
@@ -42,10 +42,6 @@ HEALTH_EVERY_S: Final = 1.0
 _LEVELS: Final = {Level.INFO: logging.INFO, Level.WARNING: logging.WARNING, Level.ERROR: logging.ERROR}
 
 log = logging.getLogger("gateway")
-
-
-class AlreadyServed(Exception):
-    """Another gateway serves this car; the text names it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +71,10 @@ class _Asked:
 class Car:
     """One car's gateway. `run` returns when it was told to stop and the car's stop is written."""
 
-    def __init__(self, settings: Settings, opened: bus.Bus) -> None:
+    def __init__(self, settings: Settings, opened: bus.Bus, doors: Doors) -> None:
         self._settings = settings
         self._bus = opened
+        self._doors = doors
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
         self._store = Store(settings.state_dir, settings.fleet, settings.car)
@@ -89,12 +86,6 @@ class Car:
         self._decoder = Decoder()
         self._link: Link | None = None
         self._out = Publications(opened, settings.fleet, settings.car, settings.profile, str(settings.url))
-        self._commands = bus.Handover(self._loop, self._query, limit=256)
-        self._stream = bus.Handover(self._loop, self._streamed, limit=256)
-        self._queries: bus.Handover[tuple[str, zenoh.Query]] = bus.Handover(
-            self._loop, lambda asked: self._out.answer(*asked), limit=1024
-        )
-        self._senders = bus.Handover(self._loop, self._sender, limit=1024)
         self._asked: list[_Asked] = []
         self._sent: set[str] = set()
         """Ids of commands whose first frame went out since the last answers."""
@@ -106,10 +97,18 @@ class Car:
     async def run(self) -> bool:
         """Serve the car until `stop` and until its stop is written; False if it could not be stopped.
 
-        Raises AlreadyServed, and LinkError if the link cannot be opened at the start.
+        Raises AlreadyServed (see doors.py), and LinkError if the link cannot be opened at the start.
         """
-        self._refuse(self._others())
-        self._declare()
+        now = self._loop.time()
+        self._out.health(now, loop_lag_s=0.0, bus_drops=0)
+        self._out.states(self._control, self._health, now)
+        self._doors.attach(
+            self._loop,
+            query=lambda asked: self._out.answer(*asked),
+            command=self._query,
+            streamed=self._streamed,
+            sender=self._sender,
+        )
         work = (self._connect(), self._write_frames(), self._tick(), self._keep_hub(), self._look_again())
         tasks = [asyncio.ensure_future(each) for each in work]
         stopped = asyncio.ensure_future(self._stopped.wait())
@@ -141,53 +140,12 @@ class Car:
         self._control.shutdown(self._loop.time())
         self._wake.set()
 
-    # ------------------------------------------------------------------ who serves this car
-
-    def _others(self) -> list[pb.Health]:
-        """The health of every other gateway that answers for this car."""
-        key = keys.topic_key(self._settings.fleet, self._settings.car, "state/health")
-        found = []
-        for answer in self._bus.query(key):
-            if isinstance(answer, bus.Sample):
-                health = messages.parse("fleet.v1.Health", answer.payload, answer.encoding)
-                if isinstance(health, pb.Health) and health.boot_id != self._bus.boot_id:
-                    found.append(health)
-        return found
-
-    def _refuse(self, others: list[pb.Health]) -> None:
-        for other in others:
-            raise AlreadyServed(
-                f"car {self._settings.car} is served already, by process {other.pid} on {other.host} "
-                f"(link {other.link}): stop that one first, or give this car another name"
-            )
-
     async def _look_again(self) -> None:
-        """Of two that started at the same moment, the one with the higher id yields."""
+        """Of two gateways that started at the same moment, the one with the higher id yields."""
         await asyncio.sleep(LOOK_AGAIN_S)
-        others = await asyncio.to_thread(self._others)
-        self._refuse([other for other in others if other.boot_id < self._bus.boot_id])
+        others = await asyncio.to_thread(self._doors.others)
+        self._doors.refuse([other for other in others if other.boot_id < self._bus.boot_id])
         await self._stopped.wait()
-
-    def _declare(self) -> None:
-        """Queryables first, then the token: whoever sees the token gets an answer."""
-        fleet, car = self._settings.fleet, self._settings.car
-        now = self._loop.time()
-        self._out.health(now, loop_lag_s=0.0, bus_drops=0)
-        self._out.states(self._control, self._health, now)
-        for family in ("sensor", "state"):
-            # A query on `fleet/**` reaches both: each answers for its own family only.
-            take = partial(self._hand_over, family)
-            self._bus.queryable(f"{fleet}/{car}/{family}/*", take)
-        self._bus.queryable(keys.command_key(fleet, car, "*"), self._commands)
-        self._bus.subscribe(keys.command_key(fleet, car, "drive"), self._stream)
-        self._bus.watch_tokens(
-            f"{fleet}/{keys.OPERATOR}/*", lambda key, alive: self._senders((key.rpartition("/")[2], alive))
-        )
-        self._bus.token(keys.car_token(fleet, car))
-
-    def _hand_over(self, family: str, query: zenoh.Query) -> None:
-        """On a Zenoh thread."""
-        self._queries((family, query))
 
     # ------------------------------------------------------------------ the link
 
@@ -296,7 +254,7 @@ class Car:
         verb = expression.rpartition("/")[2]
         encoding = str(query.encoding) if query.encoding is not None else ""
         payload = query.payload.to_bytes() if query.payload is not None else None
-        as_json = query.parameters.get("format") == "json" or not encoding.startswith(messages.PROTOBUF)
+        as_json = query.parameters.get("format") == "json" or not encoding.startswith(topics.PROTOBUF)
         if "*" in verb:
             with query:
                 query.reply_err(f"{expression}: name the command, there is no command {verb}", encoding="text/plain")
@@ -412,8 +370,7 @@ class Car:
             self._out.states(self._control, self._health, now)
             if now >= next_health:
                 next_health = now + HEALTH_EVERY_S
-                drops = self._commands.dropped + self._stream.dropped + self._queries.dropped + self._senders.dropped
-                self._out.health(now, loop_lag_s=worst, bus_drops=drops)
+                self._out.health(now, loop_lag_s=worst, bus_drops=self._doors.dropped)
                 worst = 0.0
 
     async def _keep_hub(self) -> None:
@@ -441,9 +398,9 @@ def _restored(stored: StoredHold | None, now: float) -> Hold | None:
     return Hold(stored.by, now - (time.time_ns() - stored.since_ns) / 1e9)
 
 
-async def serve(settings: Settings, opened: bus.Bus) -> bool:
+async def serve(settings: Settings, opened: bus.Bus, doors: Doors) -> bool:
     """Serve one car until SIGINT or SIGTERM; False if it could not be stopped. Raises AlreadyServed or LinkError."""
-    car = Car(settings, opened)
+    car = Car(settings, opened, doors)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         try:

@@ -4,10 +4,7 @@ argparse, and everything else imported where it is used: `gateway run` is starte
 """
 
 import argparse
-import asyncio
-import logging
 import sys
-from pathlib import Path
 
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 
@@ -38,7 +35,7 @@ def main() -> None:
         "--connect", metavar="ENDPOINT", help="the bus, tcp/HOST:PORT (default FLEET_ENDPOINT, or loopback)"
     )
     run.add_argument(
-        "--state-dir", type=Path, help="where e-stops and holds are kept (default: FLEET_STATE_DIR, or the user's)"
+        "--state-dir", metavar="DIR", help="where e-stops and holds are kept (default: FLEET_STATE_DIR, or the user's)"
     )
     run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
     sim = commands.add_parser("sim", help="simulated cars that behave like the real ones, hazards included")
@@ -57,27 +54,31 @@ def _sim(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from gateway.car import AlreadyServed, Settings, serve
+    from gateway.doors import AlreadyServed, Doors
     from gateway.link import BadUrl, LinkError, parse_url
     from gateway.protocol.profile import parse_platform
-    from gateway.store import default_directory
     from schemas.bus import BadEndpoint, Bus, BusError
 
-    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
     try:
-        settings = Settings(
-            car=check_name(arguments.car),
-            url=parse_url(arguments.link),
-            profile=parse_platform(arguments.platform),
-            fleet=check_name(arguments.fleet, "fleet name"),
-            state_dir=arguments.state_dir or default_directory(),
-            retry=arguments.retry,
-        )
+        car, fleet = check_name(arguments.car), check_name(arguments.fleet, "fleet name")
+        url, profile = parse_url(arguments.link), parse_platform(arguments.platform)
     except (BadKey, BadUrl, ValueError) as error:
         return _failed(str(error), 2)
     try:
         with Bus.open(arguments.connect, start_hub=True) as opened:
-            stopped = asyncio.run(serve(settings, opened))
+            doors = Doors(opened, fleet, car)
+            # The car is on the bus; what follows takes as long again to import.
+            import asyncio
+            import logging
+            from pathlib import Path
+
+            from gateway.car import Settings, serve
+            from gateway.store import default_directory
+
+            logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
+            state_dir = Path(arguments.state_dir) if arguments.state_dir else default_directory()
+            settings = Settings(car, url, profile, fleet, state_dir, arguments.retry)
+            stopped = asyncio.run(serve(settings, opened, doors))
     except BadEndpoint as error:
         return _failed(str(error), 2)
     except (AlreadyServed, LinkError, BusError) as error:

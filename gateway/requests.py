@@ -27,7 +27,7 @@ from gateway.control.records import (
 from gateway.protocol.encode import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from schemas import messages
-from schemas.topics import COMMANDS
+from schemas.topics import COMMANDS, PROTOBUF
 
 LONGEST_DRIVE_S: Final = 10.0
 """A drive that holds longer is refused: whoever drives is there to say so again."""
@@ -109,7 +109,7 @@ def parse(request: Request) -> Command:
 def _encoding(request: Request) -> str:
     if request.payload:
         return request.encoding
-    return messages.PROTOBUF  # zero bytes are a message without fields
+    return PROTOBUF  # zero bytes are a message without fields
 
 
 def _age_s(message: Any, request: Request) -> float:

@@ -4,28 +4,28 @@ A Zenoh callback runs on a foreign thread and does one thing: hand over (`Handov
 the state.
 """
 
-import asyncio
 import contextlib
 import json
 import os
 import re
 import socket
-import subprocess
 import sys
 import threading
 import time
-import uuid
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 
 import zenoh
-from google.protobuf.message import Message
 
-from schemas import messages
 from schemas.keys import BadKey
 from schemas.topics import Qos, Topic
+
+if TYPE_CHECKING:  # a gateway is on the bus before it has imported these
+    import asyncio
+
+    from google.protobuf.message import Message
 
 T = TypeVar("T")
 
@@ -122,6 +122,8 @@ def ensure_hub(endpoint: str, timeout_s: float = 10.0) -> None:
     host, _ = _host_and_port(endpoint)
     if host not in _LOOPBACK:
         raise NoFleet(f"nothing listens at {endpoint}: start a Zenoh router there, or name another with --connect")
+    import subprocess
+
     command = [sys.executable, "-m", "schemas.hub", "--endpoint", endpoint]
     hub = subprocess.Popen(
         command,
@@ -152,15 +154,31 @@ def canon(expression: str) -> str:
 
 
 class Handover(Generic[T]):
-    """Hands objects from Zenoh's threads to one asyncio loop, in order and bounded; what does not fit is counted."""
+    """Hands objects from Zenoh's threads to one asyncio loop, in order and bounded; what does not fit is counted.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, take: Callable[[T], None], *, limit: int = 1024) -> None:
+    It may be made before there is a loop: what comes waits until `attach`.
+    """
+
+    def __init__(
+        self,
+        loop: "asyncio.AbstractEventLoop | None" = None,
+        take: Callable[[T], object] | None = None,
+        *,
+        limit: int = 1024,
+    ) -> None:
         self._loop = loop
         self._take = take
         self._limit = limit
         self._lock = threading.Lock()
         self._waiting: deque[T] = deque()
         self.dropped = 0
+
+    def attach(self, loop: "asyncio.AbstractEventLoop", take: Callable[[T], object]) -> None:
+        """Say who takes what comes; on the loop's thread."""
+        with self._lock:
+            self._loop = loop
+            self._take = take
+        loop.call_soon(self._drain)
 
     def __call__(self, item: T) -> bool:
         """Called on a Zenoh thread; False if the item was dropped."""
@@ -169,10 +187,11 @@ class Handover(Generic[T]):
                 self.dropped += 1
                 return False
             self._waiting.append(item)
-            if len(self._waiting) > 1:
+            loop = self._loop
+            if loop is None or len(self._waiting) > 1:
                 return True
         try:
-            self._loop.call_soon_threadsafe(self._drain)
+            loop.call_soon_threadsafe(self._drain)
         except RuntimeError:  # the loop is closed: nobody is left to take it
             return False
         return True
@@ -181,6 +200,8 @@ class Handover(Generic[T]):
         with self._lock:
             batch = list(self._waiting)
             self._waiting.clear()
+        assert self._loop is not None
+        assert self._take is not None
         for item in batch:
             # One callback each: an item that raises takes no other with it.
             self._loop.call_soon(self._take, item)
@@ -199,8 +220,10 @@ class Sample:
     """The publisher's number for the key, modulo 2^32; 0 if it gave none."""
     deleted: bool = False
 
-    def message(self) -> Message:
+    def message(self) -> "Message":
         """The payload as the message that the encoding names; raises messages.BadPayload or KeyError."""
+        from schemas import messages
+
         name = messages.name_in(self.encoding)
         if name is None:
             raise messages.BadPayload(f"{self.key}: encoding {self.encoding!r} names no message")
@@ -232,9 +255,7 @@ class Publisher:
     """Publishes one topic of one car; numbers the messages and fills their common fields."""
 
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, source: str, boot_id: str) -> None:
-        self._publisher = session.declare_publisher(
-            key, encoding=zenoh.Encoding(messages.encoding_of(topic.message)), **_QOS[topic.qos]
-        )
+        self._publisher = session.declare_publisher(key, encoding=zenoh.Encoding(topic.encoding), **_QOS[topic.qos])
         self._source = source
         self._boot_id = boot_id
         self._headed = topic.message.startswith("fleet.v1.")
@@ -263,7 +284,7 @@ class Bus:
         self._session = session
         self._kept: list[Any] = []
         self.endpoint = endpoint
-        self.boot_id = uuid.uuid4().hex
+        self.boot_id = os.urandom(16).hex()
 
     @classmethod
     def open(cls, endpoint: str | None = None, *, start_hub: bool = False, timeout_s: float = 3.0) -> Self:

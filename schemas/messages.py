@@ -9,8 +9,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSe
 from google.protobuf.message import DecodeError, Message
 
 from schemas.gen import fleet_v1_pb2
+from schemas.topics import PROTOBUF
 
-PROTOBUF: Final = "application/protobuf"
 JSON: Final = "application/json"
 
 

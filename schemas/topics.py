@@ -6,6 +6,8 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Final
 
+PROTOBUF: Final = "application/protobuf"
+
 
 class Qos(StrEnum):
     """How a publication travels; bus.py turns it into Zenoh's priority, congestion control and express.
@@ -36,6 +38,11 @@ class Topic:
     recorded: bool = True
     entity: str = ""
     """Rerun entity below the car; empty: shown through frames and logs only."""
+
+    @property
+    def encoding(self) -> str:
+        """The Zenoh encoding of its messages: the full name stands in the schema part."""
+        return f"{PROTOBUF};{self.message}"
 
     @property
     def family(self) -> str:
