@@ -18,8 +18,8 @@ class Measured:
     ours: tuple[float, ...]
     floor: tuple[float, ...]
     unit: str
-    goal: float
-    """The ratio that is wanted at most."""
+    goal: float | None
+    """The ratio that is wanted at most; None where issue 3 sets none."""
     slack: float = 0.0
     """What may come on top of goal x floor, in `unit`."""
 
@@ -37,7 +37,7 @@ class Measured:
 
     @property
     def met(self) -> bool:
-        return self.ours_median <= self.goal * self.floor_median + self.slack
+        return self.goal is None or self.ours_median <= self.goal * self.floor_median + self.slack
 
     def to_dict(self) -> dict[str, Any]:
         """One JSON object."""

@@ -60,6 +60,8 @@ class Stage:
 
     def __init__(self, directory: Path) -> None:
         self.fleet = Fleet(free_endpoint(), directory)
+        # Where Python may not keep what it has compiled, every start would be measured as the first one ever.
+        self.fleet.environment["PYTHONDONTWRITEBYTECODE"] = ""
         self._ttys: list[Tty] = []
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
