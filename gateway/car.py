@@ -7,6 +7,7 @@ one frame at a time.
 """
 
 import asyncio
+import gc
 import logging
 import random
 import signal
@@ -190,16 +191,15 @@ class Car:
             self._wake.set()
 
     def _events(self, events: list[Event]) -> None:
-        """Publish what was measured, and take it as evidence."""
-        now = self._loop.time()
+        """Publish what was measured, which does not wait for what it means, and take it as evidence."""
         for event in events:
-            self._control.heard(event, now)
             mode = self._control.mode
             confirmed = mode.asked if mode.verdict is Verdict.CONFIRMED else None
+            self._out.event(event, wall_ns(event.at), confirmed, loaded=self._control.motors != "off")
+            self._control.heard(event, self._loop.time())
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.rejected(event.cause)
-            self._out.event(event, wall_ns(event.at), confirmed, loaded=self._control.motors != "off")
 
     def _lost(self, reason: str, *, once: bool) -> None:
         now = self._loop.time()
@@ -401,6 +401,8 @@ def _restored(stored: StoredHold | None, now: float) -> Hold | None:
 async def serve(settings: Settings, opened: bus.Bus, doors: Doors) -> bool:
     """Serve one car until SIGINT or SIGTERM; False if it could not be stopped. Raises AlreadyServed or LinkError."""
     car = Car(settings, opened, doors)
+    # What was imported stays: the collector need not look at it again while readings wait.
+    gc.freeze()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         try:

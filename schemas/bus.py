@@ -256,6 +256,7 @@ class Publisher:
 
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, source: str, boot_id: str) -> None:
         self._publisher = session.declare_publisher(key, encoding=zenoh.Encoding(topic.encoding), **_QOS[topic.qos])
+        self._id = self._publisher.id
         self._source = source
         self._boot_id = boot_id
         self._headed = topic.message.startswith("fleet.v1.")
@@ -272,7 +273,7 @@ class Publisher:
             message.seq = self.sequence
             message.boot_id = self._boot_id
         payload: bytes = message.SerializeToString()
-        source = zenoh.SourceInfo(self._publisher.id, self.sequence & 0xFFFFFFFF)
+        source = zenoh.SourceInfo(self._id, self.sequence & 0xFFFFFFFF)
         self._publisher.put(payload, source_info=source)
         return payload
 
