@@ -1,5 +1,6 @@
-"""A serial port through pyserial: one thread opens, reads and closes it, the loop writes.
+"""A serial port through pyserial: one thread opens and closes it, which can block; the loop reads and writes.
 
+Where the loop cannot watch a port (Windows), the thread reads it too; a reading is there sooner without that.
 A write never waits: a port has room for far more than one frame, so a port that does not take a frame whole and at
 once has stopped taking bytes, and the link is lost. Who uses the descriptor holds `_hold`: the thread lets go
 of a port that died at any moment, and the number of a closed descriptor may be another car's a moment later.
@@ -20,7 +21,10 @@ from gateway.link.url import SerialUrl
 WRITE_TIMEOUT_S: Final = 0.25
 """Only where the port cannot be written without waiting (Windows)."""
 WAITING_CHUNKS: Final = 256
-"""Chunks that may wait for a loop that does not read; then the thread stops reading, the port fills."""
+"""Chunks that may wait for who reads; then the port is not read any more, and fills."""
+READ_BYTES: Final = 4096
+WATCHED: Final = os.name == "posix"
+"""The loop can watch the port."""
 
 try:
     import termios
@@ -45,7 +49,8 @@ class SerialLink(Link):
         self._chunks: list[bytes] = []
         self._came = asyncio.Event()
         self._room = threading.Semaphore(WAITING_CHUNKS)
-        self._closing = False
+        self._paused = False
+        self._closing = threading.Event()
         self._lost: str | None = None
         self._opened: asyncio.Future[None] = loop.create_future()
         self._ended: asyncio.Future[None] = loop.create_future()
@@ -76,7 +81,11 @@ class SerialLink(Link):
             self._came.clear()
             await self._came.wait()
         chunks, self._chunks = self._chunks, []
-        self._room.release(len(chunks))
+        if not WATCHED:
+            self._room.release(len(chunks))
+        elif self._paused:
+            self._paused = False
+            self._watch()
         return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
     async def write(self, data: bytes) -> None:
@@ -114,11 +123,40 @@ class SerialLink(Link):
 
     def _end(self) -> None:
         """Tell the thread to end, whatever it waits for; one that still opens the port closes it again."""
-        self._closing = True
-        self._room.release()
         with self._hold, contextlib.suppress(*_GONE):
             if self._port is not None:
-                self._port.cancel_read()
+                if WATCHED:
+                    self._loop.remove_reader(self._port.fileno())
+                else:
+                    self._port.cancel_read()
+        self._closing.set()
+        self._room.release()
+
+    # ------------------------------------------------------------------ reading in the loop
+
+    def _watch(self) -> None:
+        with self._hold:
+            if self._port is not None and not self._closing.is_set():
+                self._loop.add_reader(self._port.fileno(), self._readable)
+
+    def _readable(self) -> None:
+        try:
+            with self._hold:
+                if self._port is None:
+                    return
+                data = os.read(self._port.fileno(), READ_BYTES)
+                self._paused = len(self._chunks) >= WAITING_CHUNKS
+                if self._paused:
+                    self._loop.remove_reader(self._port.fileno())
+        except BlockingIOError:
+            return
+        except _GONE as error:
+            self._lose(f"{self._url} is gone: {_cause(error)}")
+            return
+        if data:
+            self._received(data)
+        else:
+            self._lose(f"{self._url} is gone: unplugged")
 
     # ------------------------------------------------------------------ in the thread
 
@@ -136,7 +174,9 @@ class SerialLink(Link):
         self._tell(self._succeeded)
         reason = f"{self._url} was closed"
         try:
-            while not self._closing:
+            if WATCHED:
+                self._closing.wait()
+            while not self._closing.is_set():
                 data = port.read(1)
                 if waiting := port.in_waiting:
                     data += port.read(waiting)
@@ -166,6 +206,8 @@ class SerialLink(Link):
     def _succeeded(self) -> None:
         if not self._opened.done():
             self._opened.set_result(None)
+        if WATCHED:
+            self._watch()
 
     def _received(self, data: bytes) -> None:
         self._chunks.append(data)
