@@ -100,7 +100,7 @@ class AsyncCar(Verbs[Coroutine[Any, Any, Outcome]]):
 
 
 class AsyncWatch:
-    """Readings as they come; what the reader is too slow for is counted."""
+    """Readings as they come; a reader that is too slow loses the oldest."""
 
     def __init__(self) -> None:
         self._waiting: asyncio.Queue[Sample] = asyncio.Queue(QUEUE_LIMIT)
@@ -111,7 +111,7 @@ class AsyncWatch:
 
     @property
     def dropped(self) -> int:
-        """Samples that found the queue full."""
+        """Samples that made room for newer ones, or came while the loop stood still."""
         return self._full + self.hand_over.dropped
 
     def __aiter__(self) -> Self:
@@ -125,7 +125,7 @@ class AsyncWatch:
                 self.unreadable += 1
 
     def _take(self, sample: Sample) -> None:
-        try:
-            self._waiting.put_nowait(sample)
-        except asyncio.QueueFull:
+        if self._waiting.full():
+            self._waiting.get_nowait()
             self._full += 1
+        self._waiting.put_nowait(sample)

@@ -33,7 +33,7 @@ def default_sender() -> str:
     """Who asks, in one key chunk: user@host-pid."""
     try:
         user = getpass.getuser()
-    except (KeyError, OSError):  # no entry for this user id, as in some containers
+    except (KeyError, OSError, ImportError):  # no entry for this user id, as in some containers; no pwd (Windows)
         user = "user"
     return re.sub(r"[^A-Za-z0-9_.@-]", "-", f"{user}@{socket.gethostname()}-{os.getpid()}").lstrip("@")
 
@@ -165,7 +165,7 @@ class FleetClient:
     def _query(self, target: str, asking: "_Asking", payload: bytes) -> None:
         """Ask one car, or all; on a thread of the pool."""
         verb = asking.request.verb
-        words = f"{target} did not answer within {ANSWER_S:g} s: its gateway hangs"
+        words = f"{target} gave no answer: its gateway went away or failed"
         try:
             answers = self.bus.query(
                 keys.command_key(self.fleet, target, verb),
@@ -176,7 +176,9 @@ class FleetClient:
             for answer in answers:
                 if isinstance(answer, Sample):
                     asking.inbox.put((time.monotonic(), answer))
-                elif answer.words != "Timeout":
+                elif answer.words == "Timeout":
+                    words = f"{target} did not answer within {ANSWER_S:g} s: its gateway hangs"
+                else:
                     words = answer.words
         finally:
             asking.inbox.put((time.monotonic(), _Over(target, words)))
@@ -278,11 +280,19 @@ class _Asking:
                     progress.silent(words, at)
         elif isinstance(item, Sample):
             key = keys.parse(item.key)
-            answer: Any = messages.parse(topics.RESULT, item.payload, item.encoding)
             if key is not None:
-                self._of(key.car).answered(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
+                self._answer(self._of(key.car), item, at)
         else:
             self._of(item.car).event(item.phase, item.reason, item.words, item.worst_case_s, at)
+
+    def _answer(self, progress: Progress, item: Sample, at: float) -> None:
+        """One car's answer; what nobody can read costs no other car its outcome."""
+        try:
+            answer: Any = messages.parse(topics.RESULT, item.payload, item.encoding)
+        except messages.BadPayload as error:
+            progress.silent(f"what answered for {progress.car} is no gateway of this fleet: {error}", at)
+            return
+        progress.answered(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
 
     def _of(self, car: str) -> Progress:
         if car not in self._progress:

@@ -1,5 +1,6 @@
 """Readings as an operator sees them: key, time, value; and a stream of them with a bounded queue. No Zenoh here."""
 
+import contextlib
 import queue
 import threading
 from collections.abc import Callable
@@ -39,14 +40,14 @@ def reading_of(sample: Sample) -> Reading:
 
 
 class Watch:
-    """Readings as they come. Iterate; `close` (or `with`) ends it. What the reader is too slow for is counted."""
+    """Readings as they come. Iterate; `close` (or `with`) ends it. A reader that is too slow loses the oldest."""
 
-    def __init__(self, limit: int = QUEUE_LIMIT) -> None:
-        self._waiting: queue.Queue[Sample] = queue.Queue(limit)
+    def __init__(self) -> None:
+        self._waiting: queue.Queue[Sample] = queue.Queue(QUEUE_LIMIT)
         self._closed = threading.Event()
         self._undeclare: Callable[[], object] = lambda: None
         self.dropped = 0
-        """Samples that found the queue full."""
+        """Samples that made room for newer ones."""
         self.unreadable = 0
         """Samples that are no message of ours."""
 
@@ -81,8 +82,9 @@ class Watch:
             self._undeclare()
 
     def _take(self, sample: Sample) -> None:
-        """On a Zenoh thread."""
-        try:
-            self._waiting.put_nowait(sample)
-        except queue.Full:
-            self.dropped += 1
+        """On the one Zenoh thread of this subscription: nobody else puts."""
+        if self._waiting.full():
+            with contextlib.suppress(queue.Empty):  # the reader was quicker
+                self._waiting.get_nowait()
+                self.dropped += 1
+        self._waiting.put_nowait(sample)

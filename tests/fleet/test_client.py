@@ -219,6 +219,37 @@ def test_a_command_of_which_nothing_more_is_heard_ends_with_what_was_heard_last(
     assert "last heard was 'queued'" in outcome.words
 
 
+def test_an_answer_that_nobody_can_read_costs_no_other_car_its_outcome(cars: Cars, gateway: Bus) -> None:
+    def answer(car: str, payload: bytes, encoding: str) -> None:
+        def take(query: zenoh.Query) -> None:
+            with query:
+                reply(query, f"odd/{car}/@cmd/stop", payload, encoding)
+
+        gateway.queryable(f"odd/{car}/@cmd/*", take)
+        gateway.token(keys.car_token("odd", car))
+
+    answer("good", pb.Result(car="good", status="sent").SerializeToString(), messages.encoding_of(topics.RESULT))
+    answer("noise", b"\xff\xff", "application/octet-stream")
+    answer("other", pb.Range(range_m=1.0).SerializeToString(), messages.encoding_of("fleet.v1.Range"))
+    with FleetClient(cars.endpoint, "odd", sender="ann") as client:
+        wait_for(lambda: client.cars() == ["good", "noise", "other"], "all are there")
+        good, *unreadable = client.stop()
+    assert (good.car, good.ok, good.phase) == ("good", True, "sent")
+    for outcome in unreadable:
+        assert (outcome.ok, outcome.phase) == (False, "no_answer")
+        assert outcome.words.startswith(f"what answered for {outcome.car} is no gateway of this fleet: the payload is")
+
+
+def test_a_gateway_that_ends_a_query_without_a_word_does_not_hang(cars: Cars, gateway: Bus) -> None:
+    gateway.queryable("odd/brief/@cmd/*", lambda query: query.drop())
+    gateway.token(keys.car_token("odd", "brief"))
+    with FleetClient(cars.endpoint, "odd", sender="ann") as client:
+        wait_for(lambda: client.cars() == ["brief"], "it is there")
+        outcome = client.car("brief").whistle()
+    assert (outcome.ok, outcome.phase) == (False, "no_answer")
+    assert outcome.words == "brief gave no answer: its gateway went away or failed"
+
+
 def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
     asked = threading.Event()
 

@@ -1,0 +1,71 @@
+"""Readings out of samples, and what a reader that is too slow gets of a stream."""
+
+import asyncio
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+import pytest
+
+from fleet.aio import AsyncWatch
+from fleet.readings import QUEUE_LIMIT, Watch, reading_of
+from schemas import messages
+from schemas.bus import Sample
+from schemas.gen import fleet_v1_pb2 as pb
+
+RANGE = "fleet.v1.Range"
+KEY = "fleet/red/sensor/range"
+
+
+def sample(seq: int, payload: bytes | None = None) -> Sample:
+    written = pb.Range(seq=seq).SerializeToString() if payload is None else payload
+    return Sample(KEY, written, messages.encoding_of(RANGE), 1_700_000_000_000_000_000, seq)
+
+
+def test_a_reading_has_the_time_of_its_stamp_else_the_time_on_the_bus() -> None:
+    stamped = pb.Range(range_m=0.5)
+    stamped.stamp.seconds, stamped.stamp.nanos = 1_600_000_000, 123_456_789
+    reading = reading_of(sample(1, stamped.SerializeToString()))
+    assert reading.time == datetime.fromtimestamp(1_600_000_000, UTC).replace(microsecond=123_456)
+    assert (reading.key, reading.value.range_m) == (KEY, 0.5)
+    assert reading_of(sample(1)).time == datetime.fromtimestamp(1_700_000_000, UTC)
+
+
+def test_what_was_not_measured_is_not_in_the_value() -> None:
+    assert "range_m" not in reading_of(sample(1)).as_dict()
+
+
+@pytest.mark.parametrize("encoding", ["", "application/json", "application/protobuf;fleet.v1.Nothing"])
+def test_what_is_no_message_of_ours_is_no_reading(encoding: str) -> None:
+    with pytest.raises((messages.BadPayload, KeyError)):
+        reading_of(Sample(KEY, b"", encoding, 0, 0))
+
+
+def test_a_reader_that_is_too_slow_loses_the_oldest_and_is_told_how_many() -> None:
+    takes: list[Callable[[Sample], None]] = []
+
+    def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
+        takes.append(take)
+        return takes.clear
+
+    with Watch().begin(subscribe) as readings:
+        for seq in range(1, QUEUE_LIMIT + 101):
+            takes[0](sample(seq))
+        assert readings.dropped == 100
+        assert [next(readings).value.seq for _ in range(QUEUE_LIMIT)] == list(range(101, QUEUE_LIMIT + 101))
+        takes[0](sample(1, b"\xff"))
+        takes[0](sample(7))
+        assert next(readings).value.seq == 7
+        assert (readings.dropped, readings.unreadable) == (100, 1)
+    assert takes == [], "closing ends the subscription"
+    assert list(readings) == []
+
+
+async def test_so_does_an_async_reader() -> None:
+    readings = AsyncWatch()
+    for seq in range(1, QUEUE_LIMIT + 101):
+        assert readings.hand_over(sample(seq))
+        await asyncio.sleep(0)
+    for _ in range(3):
+        await asyncio.sleep(0)  # the last is on its way through the loop
+    assert [(await anext(readings)).value.seq for _ in range(QUEUE_LIMIT)] == list(range(101, QUEUE_LIMIT + 101))
+    assert readings.dropped == 100
