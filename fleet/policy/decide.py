@@ -1,6 +1,6 @@
 """What mode each car of a plan should be in now, and why. Pure and deterministic: time is an argument.
 
-A car that is on hold, or that someone else drives, is left alone, whatever the plan says.
+A car that is on hold, that someone else drives, or that cannot be reached is left alone, whatever the plan says.
 """
 
 from collections.abc import Mapping
@@ -12,6 +12,7 @@ from gateway.protocol.values import Mode
 from schemas import topics
 
 CONTRADICTED: Final = "contradicted"
+LOST: Final = "lost"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,8 @@ class CarPicture:
     mode: str = ""
     """The mode it was last asked for, as its gateway says; empty: not heard yet."""
     verdict: str = ""
+    link: str = ""
+    """As its gateway says; empty: not heard yet."""
     held_by: str | None = None
     driven_by: str | None = None
     """Who holds a motion; a coordinator never does."""
@@ -112,6 +115,8 @@ def _left_alone(car: str, known: CarPicture) -> Decision | None:
         why, change = f"{car} is on hold by {known.held_by}", "a drive, mode or resume by a person or script"
     elif known.driven_by is not None:
         why, change = f"{car} is driven by {known.driven_by}", "the end of that drive"
+    elif known.link == LOST:
+        why, change = f"the link of {car} is lost", "its return"
     else:
         return None
     return Decision(car, None, why, why, (), change, ask=False)

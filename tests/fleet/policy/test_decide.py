@@ -17,7 +17,7 @@ rules:
   - when: {car: red, reading: sensor/battery, field: level, equals: critical}
     then: {car: blue, mode: color_led}
 """)
-HERE = CarPicture(present=True, mode="manual", verdict="confirmed")
+HERE = CarPicture(present=True, mode="manual", verdict="confirmed", link="online")
 
 
 def seen(at: float, **fields: Any) -> Seen:
@@ -42,6 +42,9 @@ def decided(picture: Picture, *, since: dict[int, float] | None = None, now: flo
         (replace(HERE, mode="tracking", verdict="contradicted", held_by="ann"), None, False),
         (replace(HERE, driven_by="ann"), None, False),
         (replace(HERE, present=False), None, False),
+        (replace(HERE, link="lost"), None, False),
+        (replace(HERE, mode="unknown", link="lost"), None, False),
+        (replace(HERE, link="stale"), Mode.TRACKING, True),
     ],
 )
 def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarPicture, mode: Mode | None, ask: bool) -> None:
