@@ -34,11 +34,10 @@ def list_cars(client: FleetClient, *, as_json: bool) -> None:
     """The cars on the bus: link, mode and how sure that is, motion, who holds the car, battery."""
     cars = client.cars()
     said: dict[str, dict[str, Any]] = {car: {} for car in cars}
-    for expression in ("*/state/*", "*/sensor/battery"):
-        for reading in client.get(expression):
-            key = keys.parse(reading.key)
-            if key is not None:
-                said.setdefault(key.car, {})[key.topic] = reading.value
+    for reading in client.get("*/*/*"):  # one query: a gateway that hangs is waited for once
+        key = keys.parse(reading.key)
+        if key is not None:
+            said.setdefault(key.car, {})[key.topic] = reading.value
     if not said:
         raise click.ClickException(f"no car of fleet {client.fleet} is on the bus at {client.bus.endpoint}")
     rows = [_row(car, values) for car, values in sorted(said.items())]
@@ -47,7 +46,7 @@ def list_cars(client: FleetClient, *, as_json: bool) -> None:
             click.echo(json.dumps(row))
         return
     table = [{name: name.upper() for name in _COLUMNS}] + [
-        {name: _cell(row[name]) for name in _COLUMNS} for row in rows
+        {name: _battery(row) if name == "battery" else _cell(row[name]) for name in _COLUMNS} for row in rows
     ]
     widths = {name: max(len(row[name]) for row in table) for name in _COLUMNS}
     for cells in table:
@@ -66,8 +65,13 @@ def _row(car: str, values: Mapping[str, Any]) -> dict[str, Any]:
         "motion": motion.motion if motion else None,
         "hold": safety.hold.by if safety and safety.HasField("hold") else None,
         "motors": safety.motors if safety else None,
-        "battery": f"{battery.voltage_v:.2f} V {battery.level}" if battery else None,
+        "battery_v": battery.voltage_v if battery else None,
+        "battery_level": battery.level if battery else None,
     }
+
+
+def _battery(row: Mapping[str, Any]) -> str:
+    return "-" if row["battery_v"] is None else f"{row['battery_v']:.2f} V {row['battery_level']}"
 
 
 def _cell(value: object) -> str:
@@ -84,12 +88,22 @@ def get(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:
     """The latest value of every reading that matches KEYEXPR; `red` is every sensor of red, * is any one part."""
     readings = client.get(keyexpr)
     if not readings:
-        cars = client.cars()
-        there = f"the cars on the bus are: {', '.join(cars)}" if cars else "there is no car on the bus"
-        raise click.ClickException(f"nothing under {client.expression(keyexpr)}; {there}")
+        written = client.expression(keyexpr)
+        raise click.ClickException(f"nothing under {written}; {_what_there_is(client, written)}")
     width = max(len(reading.key) for reading in readings)
     for reading in readings:
         click.echo(_json(reading) if as_json else _line(reading, width))
+
+
+def _what_there_is(client: FleetClient, expression: str) -> str:
+    """The readings of the car that was meant, or else the cars."""
+    cars = client.cars()
+    key = keys.parse(expression)
+    if key is not None and key.car in cars:
+        begin = len(f"{client.fleet}/{key.car}/")
+        found = [reading.key[begin:] for reading in client.get(f"{client.fleet}/{key.car}/*/*")]
+        return f"{key.car} has {', '.join(found)}" if found else f"{key.car} says nothing"
+    return f"the cars on the bus are: {', '.join(cars)}" if cars else "there is no car on the bus"
 
 
 @click.command(

@@ -124,14 +124,23 @@ def test_a_fleet_without_cars(cars: Cars) -> None:
 
 
 def test_list_says_how_each_car_is(cars: Cars) -> None:
+    def told() -> list[Any] | None:
+        rows = lines(run(cars.endpoint, "list", "--json"))
+        return rows if rows[2]["battery_v"] else None
+
+    rows = wait_for(told, "red has told its battery")
+    assert [(row["car"], row["mode"], row["motors"]) for row in rows] == [
+        (car, "manual", "off") for car in ("blue", "green", "red")
+    ]
+    assert 6 < rows[2]["battery_v"] < 9
+    # A Raspberry Pi car measures none.
+    assert [(row["battery_v"] is None, row["battery_level"]) for row in rows] == [(True, None)] * 2 + [(False, "ok")]
     done = run(cars.endpoint, "list")
     table = [line.split() for line in done.stdout.splitlines()]
     assert table[0] == ["CAR", "LINK", "MODE", "VERDICT", "MOTION", "HOLD", "BATTERY"]
     assert [row[0] for row in table[1:]] == ["blue", "green", "red"]
-    rows = lines(run(cars.endpoint, "list", "--json"))
-    assert [(row["car"], row["mode"], row["motors"]) for row in rows] == [
-        (car, "manual", "off") for car in ("blue", "green", "red")
-    ]
+    assert [row[6:] for row in table[1:3]] == [["-"]] * 2
+    assert table[3][-2:] == ["V", "ok"]
 
 
 def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
@@ -148,7 +157,11 @@ def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
     assert reading["value"]["car"] == "red"
     done = run(cars.endpoint, "get", "red/sensor/sonar")
     assert done.returncode == 1
-    assert done.stderr == "fleet: nothing under fleet/red/sensor/sonar; the cars on the bus are: blue, green, red\n"
+    assert done.stderr.startswith("fleet: nothing under fleet/red/sensor/sonar; red has sensor/")
+    assert ", sensor/range, state/health, state/link, state/mode, state/motion, state/safety\n" in done.stderr
+    done = run(cars.endpoint, "get", "purple")
+    assert done.returncode == 1
+    assert done.stderr == "fleet: nothing under fleet/purple/sensor/*; the cars on the bus are: blue, green, red\n"
 
 
 def test_each_car_has_a_line_and_a_missing_one_makes_the_exit_code_1(cars: Cars) -> None:
