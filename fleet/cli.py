@@ -84,12 +84,21 @@ def main() -> None:
         code = error.exit_code
     except click.Abort:
         code = 130
+    except OSError as error:  # what the commands raise of their own, they explain: this is the output's
+        code = _no_output(error)
     try:
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever read it has seen enough; say nothing at the interpreter's end either
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 1
+    except OSError as error:
+        code = _no_output(error)
     sys.exit(code)
+
+
+def _no_output(error: OSError) -> int:
+    """Say that the output cannot be written; whoever closed a pipe has seen enough, and is told nothing."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if not isinstance(error, BrokenPipeError):
+        sys.stderr.write(f"fleet: the output cannot be written: {error.strerror}\n")
+    return 1
 
 
 def _one_line(error: click.ClickException) -> str:

@@ -99,8 +99,11 @@ class FleetClient:
 
     def get(self, expression: str) -> list[Reading]:
         """The latest value under every key that matches, sorted by key; short forms as on the command line."""
+        written = self.expression(expression)
+        if "@cmd" in written.split("/"):
+            raise keys.BadKey(f"{written} is a command, not a reading: a query of it would be carried out")
         found = []
-        for answer in self.bus.query(self.expression(expression), timeout_s=ANSWER_S, qos=Qos.STATE):
+        for answer in self.bus.query(written, timeout_s=ANSWER_S, qos=Qos.STATE):
             if isinstance(answer, Failure):
                 log.warning("not every gateway answered: %s", answer.words)
                 continue

@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from threading import Event
 from typing import Any, Final
+
+import zenoh
 
 from fleet.client import FleetClient
 from fleet.outcome import Outcome
@@ -17,7 +18,7 @@ from fleet.policy.decide import CarPicture, Decision, Picture, Seen, decide
 from fleet.policy.plan import Plan
 from fleet.verbs import mode_request
 from schemas import keys, messages, topics
-from schemas.bus import BusError, Sample, ensure_hub
+from schemas.bus import BusError, Publisher, Sample, ensure_hub, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
 
 SENDER: Final = "coordinator-"
@@ -26,9 +27,12 @@ TURN_S: Final = 0.1
 HUB_GONE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 1.0
 LONGEST_WAIT_S: Final = 30.0
+AGAIN_S: Final = 10.0
+"""Plan, assignment and decisions are published again so often, for a recording that began after them."""
 _QUEUE: Final = 4096
+_NEEDED: Final = ("state/link", "state/mode", "state/motion", "state/safety")
 
-_Item = Sample | tuple[str, bool]
+_Item = Sample | tuple[str, bool] | zenoh.Query
 
 
 class AnotherCoordinator(Exception):
@@ -63,10 +67,12 @@ class Coordinator:
     _since: Mapping[int, float] = field(default_factory=dict)
     _last: dict[str, Decision] = field(default_factory=dict)
     _asked: dict[str, _Asked] = field(default_factory=dict)
+    _published: dict[tuple[str, str], tuple[Publisher, Any]] = field(default_factory=dict)
+    """The last of each topic, and of each car in it: what a query is answered with."""
     _inbox: "queue.Queue[_Item]" = field(default_factory=lambda: queue.Queue(_QUEUE))
 
-    def run(self, stop: Event) -> None:
-        """Coordinate until `stop` is set; raises AnotherCoordinator. The cars keep their modes afterwards."""
+    def run(self, ended: Callable[[], bool]) -> None:
+        """Coordinate until `ended` says so; raises AnotherCoordinator. The cars keep their modes afterwards."""
         bus, fleet = self.client.bus, self.client.fleet
         token = f"{fleet}/{keys.COORDINATOR}"
         if bus.tokens(token):
@@ -78,11 +84,13 @@ class Coordinator:
         bus.watch_tokens(keys.car_token(fleet, "*"), lambda key, alive: self._put((key, alive)))
         publish = {name: self._publisher(name) for name in ("plan", "assignment", "decision")}
         publish["plan"](pb.Plan(text=self.plan.text, version=self.plan.version))
+        bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._put)
+        again_at = time.monotonic() + AGAIN_S
         look_again_at: float | None = time.monotonic() + LOOK_AGAIN_S
         linked_at = time.monotonic()
         with ThreadPoolExecutor(max_workers=min(32, len(self.plan.cars))) as pool:
             try:
-                while not stop.is_set():
+                while not ended():
                     self._drain()
                     now = time.monotonic()
                     linked_at = now if bus.connected else self._see_to_hub(linked_at, now)
@@ -90,6 +98,10 @@ class Coordinator:
                         look_again_at = None
                         self._yield_to_the_first()
                     self._turn(pool, publish, now)
+                    if now >= again_at:
+                        again_at = now + AGAIN_S
+                        for publisher, message in self._published.values():
+                            publisher.put(message, time.time_ns())
             finally:
                 self.client.close()  # ends what is still waited for
 
@@ -156,11 +168,14 @@ class Coordinator:
             self._take(item)
 
     def _take(self, item: _Item) -> None:
+        if isinstance(item, zenoh.Query):
+            self._answer(item)
+            return
         if isinstance(item, tuple):
             car = item[0].rpartition("/")[2]
             # What was known of a car that went may no longer be so when it is back: a hold above all.
             self._cars[car] = CarPicture(present=item[1])
-            for topic in ("state/mode", "state/motion", "state/safety"):
+            for topic in _NEEDED:
                 self._readings.pop((car, topic), None)
             self._asked.pop(car, None)
             return
@@ -180,16 +195,23 @@ class Coordinator:
         self._readings[key.car, key.topic] = Seen(fields, time.monotonic())
         self._states(key.car)
 
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            for publisher, message in self._published.values():
+                if query.key_expr.intersects(publisher.key):
+                    reply_value(query, publisher.key, message.SerializeToString(), publisher.topic)
+
     def _states(self, car: str) -> None:
         """Make the car's picture of its states: only when all that could forbid a command are known."""
         before = self._cars.get(car, CarPicture())
-        states = [self._readings.get((car, f"state/{name}")) for name in ("mode", "motion", "safety")]
-        mode, motion, safety = states
-        if not before.present or mode is None or motion is None or safety is None:
+        states = [self._readings.get((car, topic)) for topic in _NEEDED]
+        link, mode, motion, safety = states
+        if not before.present or link is None or mode is None or motion is None or safety is None:
             return
         hold = safety.fields.get("hold")
         self._cars[car] = replace(
             before,
+            link=str(link.fields["state"]),
             mode=str(mode.fields["asked"]),
             verdict=str(mode.fields["verdict"]),
             held_by=hold.by if isinstance(hold, pb.Hold) else None,
@@ -228,6 +250,7 @@ class Coordinator:
         publisher = self.client.bus.publisher(f"{self.client.fleet}/{topic.name}", topic, keys.COORDINATOR)
 
         def publish(message: Any) -> None:
+            self._published[name, getattr(message, "subject", "")] = (publisher, message)
             publisher.put(message, time.time_ns())
 
         return publish

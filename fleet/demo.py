@@ -21,6 +21,7 @@ from typing import IO, Any, Final
 import click
 
 from fleet.client import FleetClient
+from fleet.commands.common import sigterm_interrupts
 from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -109,9 +110,13 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
     def say(text: str) -> None:
         click.echo(text, err=as_json)
 
-    out.mkdir(parents=True, exist_ok=True)
-    run = Demo(out.resolve(), _free_endpoint(), say)
-    session, rrd = _run(run)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        run = Demo(out.resolve(), _free_endpoint(), say)
+        with sigterm_interrupts():
+            session, rrd = _run(run)
+    except OSError as error:
+        raise click.ClickException(f"no demo in {out}: {error.strerror}; name another directory with --out") from None
     failed = [check for check in run.checks if not check.ok]
     if as_json:
         result = {
@@ -137,10 +142,15 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
     began = time.monotonic()
     with ExitStack() as stack:
         stack.enter_context(_process(run, "hub", "schemas.hub", "--endpoint", run.endpoint))
-        run.until(lambda: bus.accepts(run.endpoint))
+        if not run.until(lambda: bus.accepts(run.endpoint)):
+            raise click.ClickException(f"no hub came up at {run.endpoint}")
         recorder = stack.enter_context(
             _process(
-                run, "recorder", "fleet.cli", "record", "--connect", run.endpoint, "--out", str(run.folder), "--json"
+                run,
+                "recorder",
+                "fleet.cli",
+                "record",
+                *("--connect", run.endpoint, "--out", str(run.folder), "--json", "--with-parent"),
             )
         )
         session = Path(_line(recorder, "recorder")["session"])
@@ -153,12 +163,12 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
         run.say("ending the gateways, the simulated cars and the recorder")
         for process in gateways.values():
             process.send_signal(signal.SIGTERM)
-        codes = {car: process.wait(END_S) for car, process in gateways.items()}
+        codes = {car: _ended(process) for car, process in gateways.items()}
         run.check("gateways end", f"exit codes {codes}", ok=set(codes.values()) == {0})
         simulator.terminate()
-        simulator.wait(END_S)
+        _ended(simulator)
         recorder.send_signal(signal.SIGTERM)
-        code = recorder.wait(END_S)
+        code = _ended(recorder)
         run.check("recording closed", f"{session.name}, exit code {code}", ok=code == 0)
     took = time.monotonic() - began
     recorded = _check_recording(run, session)
@@ -172,8 +182,10 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
 
 def _act(run: Demo, stack: ExitStack, client: FleetClient, simulator: "subprocess.Popen[str]", session: Path) -> None:
     run.say("three gateways bring their cars to a known state")
-    ready = run.until(lambda: _motors(client) == dict.fromkeys(CARS, "off"))
+    ready = run.until(lambda: _motors(client) == dict.fromkeys(CARS, "off") and run.truth.keys() == CARS.keys())
     run.check("cars ready", f"motors {_motors(client)}", ok=ready)
+    if not ready:
+        raise click.ClickException("the cars did not get ready: is the machine overloaded?")
 
     for car, (r, g, b) in LED.items():
         outcome = client.car(car).led(r, g, b)
@@ -189,7 +201,17 @@ def _act(run: Demo, stack: ExitStack, client: FleetClient, simulator: "subproces
     plan = session / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
     coordinator = stack.enter_context(
-        _process(run, "coordinator", "fleet.cli", "coordinate", "--connect", run.endpoint, "--plan", str(plan))
+        _process(
+            run,
+            "coordinator",
+            "fleet.cli",
+            "coordinate",
+            "--connect",
+            run.endpoint,
+            "--plan",
+            str(plan),
+            "--with-parent",
+        )
     )
     for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):
         seen = run.truly(car, "mode", mode)
@@ -242,7 +264,7 @@ def _act(run: Demo, stack: ExitStack, client: FleetClient, simulator: "subproces
         "held", f"on hold by {sorted(set(holds.values()))}, none moved again", ok=not moved and all(holds.values())
     )
     coordinator.send_signal(signal.SIGTERM)
-    code = coordinator.wait(END_S)
+    code = _ended(coordinator)
     run.check("coordinator ends", f"exit code {code}", ok=code == 0)
 
 
@@ -354,7 +376,18 @@ def _simulator(run: Demo, stack: ExitStack, session: Path) -> "tuple[subprocess.
 
 
 def _gateway(run: Demo, car: str, link: str) -> Any:
-    arguments = ("run", "--car", car, "--link", link, "--platform", CARS[car], "--connect", run.endpoint)
+    arguments = (
+        "run",
+        "--car",
+        car,
+        "--link",
+        link,
+        "--platform",
+        CARS[car],
+        "--connect",
+        run.endpoint,
+        "--with-parent",
+    )
     return _process(run, f"gateway of {car}", "gateway.cli", *arguments)
 
 
@@ -363,9 +396,17 @@ def _line(process: "subprocess.Popen[str]", name: str) -> dict[str, Any]:
     assert process.stdout is not None
     line = process.stdout.readline()
     if not line:
-        raise click.ClickException(f"the {name} ended before it was ready (exit code {process.wait(END_S)})")
+        raise click.ClickException(f"the {name} ended before it was ready (exit code {_ended(process)})")
     answer: dict[str, Any] = json.loads(line)
     return answer
+
+
+def _ended(process: "subprocess.Popen[str]") -> int | None:
+    """The exit code; None if it did not end in time."""
+    try:
+        return process.wait(END_S)
+    except subprocess.TimeoutExpired:
+        return None
 
 
 def _ask(process: "subprocess.Popen[str]", request: dict[str, object]) -> dict[str, Any]:

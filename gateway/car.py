@@ -9,6 +9,7 @@ one frame at a time.
 import asyncio
 import gc
 import logging
+import os
 import random
 import signal
 import time
@@ -56,6 +57,8 @@ class Settings:
     state_dir: Path
     retry: bool
     """Keep trying when the first attempt to open the link fails."""
+    parent: int | None = None
+    """Process id of the starter, with which this ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,6 +361,9 @@ class Car:
             worst = max(worst, now - due)
             self._control.stalled(now - due, now)
             self._alive_at = now
+            if self._settings.parent not in (None, os.getppid()) and not self._ending:
+                self._log(Level.WARNING, "parent_gone", "the process that started this gateway has ended: ending, too")
+                self.stop()
             self._control.tick(now)
             mode = self._control.mode
             limit = mode.silence_limit(fan=bool(self._control.fan))

@@ -4,6 +4,7 @@ argparse, and everything else imported where it is used: `gateway run` is starte
 """
 
 import argparse
+import os
 import sys
 
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
@@ -38,6 +39,9 @@ def main() -> None:
         "--state-dir", metavar="DIR", help="where e-stops and holds are kept (default: FLEET_STATE_DIR, or the user's)"
     )
     run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
+    run.add_argument(
+        "--with-parent", action="store_true", help="stop the car and end when the process that started this ends"
+    )
     sim = commands.add_parser("sim", help="simulated cars that behave like the real ones, hazards included")
     if "sim" in sys.argv[1:2]:
         from gateway.sim import command as sim_command
@@ -54,6 +58,7 @@ def _sim(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    parent = os.getppid() if arguments.with_parent else None
     from gateway.doors import AlreadyServed, Doors
     from gateway.link import BadUrl, LinkError, parse_url
     from gateway.protocol.profile import parse_platform
@@ -77,7 +82,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
             state_dir = Path(arguments.state_dir) if arguments.state_dir else default_directory()
-            settings = Settings(car, url, profile, fleet, state_dir, arguments.retry)
+            settings = Settings(car, url, profile, fleet, state_dir, arguments.retry, parent)
             stopped = asyncio.run(serve(settings, opened, doors))
     except BadEndpoint as error:
         return _failed(str(error), 2)

@@ -249,13 +249,8 @@ class Publications:
                 except BadRange as error:
                     query.reply_err(str(error), encoding="text/plain")
                     return
-                encoding = messages.encoding_of(publisher.topic.message)
                 for value in values:
-                    if form == "json":
-                        text = messages.to_json(messages.parse(publisher.topic.message, value.payload, encoding))
-                        bus.reply(query, publisher.key, text.encode(), messages.JSON)
-                    else:
-                        bus.reply(query, publisher.key, value.payload, encoding)
+                    bus.reply_value(query, publisher.key, value.payload, publisher.topic)
 
 
 def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> None:

@@ -304,7 +304,9 @@ class Bus:
         try:
             session = zenoh.open(_client_config(where, timeout_s))
         except zenoh.ZError as error:
-            raise BusError(f"what listens at {where} is no Zenoh router: {error}") from None
+            raise BusError(
+                f"what listens at {where} is no Zenoh router, or does not answer: name the fleet's with --connect"
+            ) from error
         return cls(session, where)
 
     def __enter__(self) -> Self:
@@ -409,3 +411,14 @@ class Bus:
 def reply(query: zenoh.Query, key: str, payload: bytes, encoding: str) -> None:
     """Answer a query with one value under a concrete key."""
     query.reply(key, payload, encoding=encoding, express=True)
+
+
+def reply_value(query: zenoh.Query, key: str, payload: bytes, topic: Topic) -> None:
+    """Answer a query with a value of a topic, as protobuf or as JSON as it asks (`?format=json`)."""
+    if query.parameters.get("format") == "json":
+        from schemas import messages
+
+        text = messages.to_json(messages.parse(topic.message, payload, topic.encoding))
+        reply(query, key, text.encode(), messages.JSON)
+    else:
+        reply(query, key, payload, topic.encoding)

@@ -1,6 +1,7 @@
 """`fleet coordinate`: the coordinator as a process. What it does is coordinator.py's."""
 
 import json
+import os
 import signal
 import threading
 from pathlib import Path
@@ -30,10 +31,12 @@ a plan:
       then: {car: blue, mode: obstacle_avoidance}"""
 )
 @click.option("--plan", "path", required=True, type=click.Path(path_type=Path, dir_okay=False), help="The plan, YAML.")
+@click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
 @json_option
 @bus_options
-def coordinate(path: Path, connect: str | None, fleet: str, *, as_json: bool) -> None:
+def coordinate(path: Path, connect: str | None, fleet: str, *, with_parent: bool, as_json: bool) -> None:
     """Keep the cars of a plan in their modes, until Ctrl-C; cars on hold are left alone. One line per decision."""
+    parent = os.getppid() if with_parent else None
     plan = _read(path)
     stop = threading.Event()
 
@@ -50,7 +53,9 @@ def coordinate(path: Path, connect: str | None, fleet: str, *, as_json: bool) ->
         connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True
     ) as client:
         try:
-            Coordinator(client, plan, decided, lambda words: click.echo(f"fleet: {words}", err=True)).run(stop)
+            Coordinator(client, plan, decided, lambda words: click.echo(f"fleet: {words}", err=True)).run(
+                lambda: stop.is_set() or parent not in (None, os.getppid())
+            )
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None
 

@@ -20,6 +20,8 @@ from gateway.protocol.values import Mode
 from schemas import keys, messages, topics
 
 _READINGS: Final = tuple(name for name, topic in topics.TOPICS.items() if topic.family in ("sensor", "state"))
+_LARGEST: Final = 1e12
+"""No reading comes near it; a whole number beyond what a float holds would not even compare."""
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
 
@@ -94,6 +96,11 @@ def parse(text: str, source: str = "plan") -> Plan:
         raise BadPlan(f"{source}: {where}: {error.problem or error.context}: a plan is YAML") from None
     except yaml.YAMLError as error:  # a character that YAML does not allow
         raise BadPlan(f"{source}: {' '.join(str(error).split())}: a plan is YAML") from None
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        # What PyYAML raises for a tag whose text is not of its type (`!!int zz`), a number without an end, a deep nest.
+        raise BadPlan(
+            f"{source}: a tag, a number or a nest that no plan needs: write words, numbers and `car: mode`"
+        ) from None
     root = _Place(source, "", tree)
     fields = root.mapping(required=("cars",), optional=("rules",))
     cars = fields["cars"].names()
@@ -211,6 +218,8 @@ class _Place:
     def number(self, *, least: float = -math.inf) -> float:
         """A finite number."""
         value = self.value
+        if isinstance(value, int) and abs(value) > _LARGEST:
+            self.bad("a number of a reading's size")
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < least:
             self.bad("a number" if least == -math.inf else f"a number, {least:g} or more")
         return float(value)

@@ -1,6 +1,7 @@
 """`fleet record`: the recorder as a process. What it records is recorder.py's."""
 
 import json
+import os
 import signal
 import threading
 import time
@@ -30,11 +31,13 @@ DEFAULT_OUT: Final = "sessions"
 )
 @click.option("--connect", metavar="ENDPOINT", help="The fleet's bus, e.g. tcp/127.0.0.1:7447.")
 @click.option("--fleet", default=keys.DEFAULT_FLEET, show_default=True, help="Name of the fleet.")
+@click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object per line: when ready, and at the end.")
-def record(out: Path, connect: str | None, fleet: str, *, as_json: bool) -> None:
+def record(out: Path, connect: str | None, fleet: str, *, with_parent: bool, as_json: bool) -> None:
     """Record everything of a fleet to MCAP until Ctrl-C; prints the session's directory once nothing can be missed."""
     from fleet.recording.recorder import AnotherRecorder, Recorder, RecordingFailed
 
+    parent = os.getppid() if with_parent else None
     stop = threading.Event()
     _on_signals(stop)
     try:
@@ -42,7 +45,7 @@ def record(out: Path, connect: str | None, fleet: str, *, as_json: bool) -> None
             recorder = Recorder(bus, fleet, out)
             session = recorder.start()
             _say(as_json, {"session": str(session), "state": "recording"}, f"recording fleet {fleet} to {session}")
-            _wait(bus, stop, recorder.ended)
+            _wait(bus, stop, recorder.ended, parent)
             outcome = recorder.close()
     except (BadEndpoint, keys.BadKey) as error:
         raise click.UsageError(str(error)) from None
@@ -69,10 +72,10 @@ def _on_signals(stop: threading.Event) -> None:
     signal.signal(signal.SIGTERM, ask_to_stop)
 
 
-def _wait(bus: Bus, stop: threading.Event, ended: threading.Event) -> None:
-    """Until told to stop or the recorder failed; meanwhile see that there is a hub."""
+def _wait(bus: Bus, stop: threading.Event, ended: threading.Event, parent: int | None) -> None:
+    """Until told to stop, the recorder failed, or `parent` ended; meanwhile see that there is a hub."""
     linked = time.monotonic()
-    while not stop.wait(LOOK_S) and not ended.is_set():
+    while not stop.wait(LOOK_S) and not ended.is_set() and parent in (None, os.getppid()):
         if bus.connected:
             linked = time.monotonic()
         elif time.monotonic() - linked > ALONE_S:

@@ -18,8 +18,8 @@ import zenoh
 
 from fleet.recording import directory
 from fleet.recording.segment import Segment
-from schemas import keys, messages
-from schemas.bus import Bus, Sample, reply
+from schemas import keys
+from schemas.bus import Bus, Sample, reply_value
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
 
@@ -285,8 +285,4 @@ class Recorder:
             questions, self._questions = self._questions, []
         for query in questions:
             with query:
-                if query.parameters.get("format") == "json":
-                    payload, encoding = messages.to_json(self._last).encode(), messages.JSON
-                else:
-                    payload, encoding = self._last.SerializeToString(), messages.encoding_of(STATUS.message)
-                reply(query, self._publisher.key, payload, encoding)
+                reply_value(query, self._publisher.key, self._last.SerializeToString(), STATUS)

@@ -481,3 +481,21 @@ def test_it_imports_nothing_that_it_does_not_need(fleet: Fleet, tcp_car: TcpCar)
     loaded = set(process.line())
     assert {"gateway", "zenoh", "google"} <= loaded
     assert not loaded & {"click", "pydantic", "rich", "mcap", "rerun", "yaml", "fleet", "serial", "numpy", "pyarrow"}
+
+
+def test_a_gateway_ends_with_its_starter(fleet: Fleet) -> None:
+    """Killed without a word, a supervisor leaves gateways that stop their cars and end."""
+    sim, (link,) = fleet.simulate("red:arduino:pty")
+    arguments = ["-m", "gateway.cli", "run", "--car", "red", "--link", link, "--platform", "arduino", "--with-parent"]
+    starter = fleet.start(
+        "-c",
+        f"import subprocess, sys; child = subprocess.Popen([sys.executable, *{arguments!r}]); "
+        "print(child.pid, flush=True); child.wait()",
+    )
+    gateway = starter.line()
+    fleet.ready()
+    assert fleet.ask("drive", motion="forward", duration_s=10)["status"] in TAKEN
+    wait_for(lambda: driving(sim), "the car drives")
+    starter.popen.kill()
+    wait_for(lambda: not driving(sim), "the car stands")
+    wait_for(lambda: not fleet.bus.tokens("fleet/red"), f"gateway {gateway} has ended")

@@ -16,7 +16,9 @@ class Cars(Fleet):
 
     def __init__(self, endpoint: str, directory: Path) -> None:
         super().__init__(endpoint, directory)
-        self.sim, links = self.simulate(*(f"{car}:{platform}:pty" for car, platform in CARS.items()))
+        # Named links: one that was lost comes back where it was.
+        specs = (f"{car}:{platform}:pty:{directory / car}.tty" for car, platform in CARS.items())
+        self.sim, links = self.simulate(*specs)
         self.links = dict(zip(CARS, links, strict=True))
         self.gateways: dict[str, Process] = {car: self.serve(car) for car in CARS}
         for car in CARS:

@@ -281,3 +281,9 @@ def test_no_fleet_and_bad_names_are_told_apart() -> None:
         FleetClient(fleet="A B")
     with pytest.raises(keys.BadKey, match="sender 'a/b'"):
         FleetClient(sender="a/b")
+
+
+def test_reading_a_command_is_refused_because_asking_for_it_would_carry_it_out(client: FleetClient, cars: Cars) -> None:
+    with pytest.raises(keys.BadKey, match="is a command"):
+        client.get("red/@cmd/stop")
+    assert not cars.state("safety").HasField("hold")

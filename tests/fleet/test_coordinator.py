@@ -83,7 +83,8 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
     messages: dict[str, list[Any]] = {}
     for sample in seen:
         messages.setdefault(sample.key, []).append(sample.message())
-    (plan,) = messages["fleet/@coordinator/plan"]
+    plan, *again = messages["fleet/@coordinator/plan"]
+    assert {each.version for each in again} <= {plan.version}
     assert plan.text == PLAN
     assert plan.seq == 1
     decisions = messages["fleet/@coordinator/decision"]
@@ -91,6 +92,24 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
     assert {each.subject for each in decisions} == {"red", "green"}
     last = messages["fleet/@coordinator/assignment"][-1]
     assert {role.name: list(role.cars) for role in last.roles} == {"manual": ["green"], "tracking": ["red"]}
+
+
+def test_a_car_whose_link_is_lost_is_left_alone_and_brought_to_its_mode_when_it_is_back(
+    cars: Cars, tmp_path: Path
+) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {red: tracking}")
+    lines = Lines(process)
+    lines.until("red", "tracking", "the plan")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    cars.sim.say({"car": "red", "fault": "link_drop"})
+    lost = lines.until("red", None, "the link of red is lost")
+    assert lost["would_change"] == "its return"
+    cars.sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
+    lines.until("red", "tracking", "the plan")
+    wait_for(lambda: cars.state("mode").asked == "tracking", "it is asked for again")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks again")
+    assert process.stderr == "", "nothing was asked of a car that could not be reached"
+    assert process.end(signal.SIGTERM) == 0
 
 
 def test_what_a_car_cannot_do_is_said_once_and_keeps_no_other_waiting(cars: Cars, tmp_path: Path) -> None:
@@ -107,3 +126,17 @@ def test_a_plan_with_a_mistake_is_wrong_use(cars: Cars, tmp_path: Path) -> None:
     assert process.wait() == 2
     assert "plan.yaml: cars.red: 'fast' is not allowed: one of manual, " in process.stderr
     assert process.stderr.count("\n") == 1
+
+
+def test_plan_assignment_and_decisions_can_be_asked_for(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {red: manual}")
+    Lines(process).until("red", "manual", "the plan")
+
+    def known() -> dict[str, Any]:
+        return {message.DESCRIPTOR.name: message for message in cars.get("fleet/@coordinator/*")}
+
+    wait_for(lambda: len(known()) == 3, "all three answer")
+    found = known()
+    assert found["Plan"].text == "cars: {red: manual}"
+    assert found["Decision"].subject == "red"
+    assert [role.name for role in found["Assignment"].roles] == ["manual"]

@@ -104,3 +104,22 @@ def test_a_mistake_is_named(text: str, told: str) -> None:
         parse(text, "p.yaml")
     assert told in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "cars: {red: !!bool zz}",
+        "cars: {red: !!int zz}",
+        "cars: {red: !!float zz}",
+        "cars: {red: !!timestamp zz}",
+        f"cars: {'[' * 5000}",
+        f"cars: {'{a: ' * 3000}",
+        "cars: {red: " + "9" * 5000 + "}",
+        _rule(f"{{{RANGE}, below: {'9' * 400}}}"),
+    ],
+)
+def test_what_no_plan_needs_is_refused_and_the_file_named(text: str) -> None:
+    with pytest.raises(BadPlan, match=r"^a\.yaml") as caught:
+        parse(text, "a.yaml")
+    assert len(str(caught.value).splitlines()) == 1
