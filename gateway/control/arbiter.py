@@ -109,7 +109,8 @@ def _mode(command: Command, situation: Situation) -> Refusal | None:
         return None
     return (
         Reason.WRONG_MODE,
-        f"{situation.car} is in mode {situation.asked}, where it ignores this: bring it to mode manual first",
+        f"{situation.car} is in mode {situation.asked}, where it ignores this: bring it to mode manual first "
+        "(a coordinator brings it back: stop it, which holds it)",
     )
 
 
