@@ -107,11 +107,8 @@ def _mode(command: Command, situation: Situation) -> Refusal | None:
     )
     if not needs_manual or situation.asked in (None, Mode.MANUAL):
         return None
-    return (
-        Reason.WRONG_MODE,
-        f"{situation.car} is in mode {situation.asked}, where it ignores this: bring it to mode manual first "
-        "(a coordinator brings it back: stop it, which holds it)",
-    )
+    helps = "bring it to mode manual first (a coordinator brings it back: stop it, which holds it)"
+    return Reason.WRONG_MODE, f"{situation.car} is in mode {situation.asked}, where it ignores this: {helps}"
 
 
 def _queue(command: Command, situation: Situation) -> Refusal | None:
