@@ -59,16 +59,18 @@ def export(session: Session, out: Path) -> Counter[str]:
     contents = mapping.contents(frozenset(held))
     if not contents.cars and not contents.services:
         raise NoSession(f"{session.path} holds no message of a fleet")
+    ways: dict[str, list[Any]] = {}
     stream = rrc.LazyChunkStream.merge(*(reader.stream() for reader in readers))
-    stream = stream.lenses(_lenses(), output_mode="forward_all")
-    ways = _ways(session)
-    stream = rrc.LazyChunkStream.merge(stream, rrc.LazyChunkStream.from_iter(_drawn(ways, contents)))
+    stream = rrc.LazyChunkStream.from_iter(_noting(ways, stream)).lenses(_lenses(), output_mode="forward_all")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".replay-") as scratch:
         whole = Path(scratch) / "whole.rrd"
-        # A recording stream, because only its file carries a layout; the chunks go through it unseen by Python.
+        # A recording stream, because only its file carries a layout, which comes last: the ground is known then.
         recording = rr.RecordingStream(APPLICATION, recording_id=session.name)
-        recording.save(whole, default_blueprint=blueprint.layout(contents, _ground(ways)))
+        recording.save(whole)
         recording.send_chunks(stream)
+        lines = {key: np.concatenate(parts) for key, parts in ways.items()}
+        recording.send_chunks(rrc.LazyChunkStream.from_iter(_drawn(lines, contents)))
+        recording.send_blueprint(blueprint.layout(contents, _ground(lines)), make_active=False, make_default=True)
         recording.disconnect()
         try:
             rrc.RrdReader(whole).store()  # its writer tells nobody of a full disk; a cut file has no index
@@ -156,19 +158,17 @@ def _vectors(truths: Any) -> Any:
     return _triples(_ARROW_M * np.cos(heading), _ARROW_M * np.sin(heading))
 
 
-def _ways(session: Session) -> dict[str, Any]:
-    """The true positions of each simulated car as an array of (x, y), by key."""
-    points: dict[str, list[Any]] = {}
+def _noting(ways: dict[str, list[Any]], chunks: Iterable[Any]) -> Iterable[Any]:
+    """Pass the chunks on, and note the true positions in them as arrays of (x, y), by key."""
     component = _component(mapping.TRUTH)
-    for segment in session.segments:
-        reader = rrc.McapReader(segment, recover=True, include_topic_regex=[f".*/{mapping.TRUTH}$"])
-        for chunk in reader.stream():
+    for chunk in chunks:
+        if chunk.entity_path.endswith(mapping.TRUTH):
             batch = chunk.to_record_batch()
             if component in batch.schema.names:
                 truths = batch.column(component).flatten()
                 xy = [truths.field(name).to_numpy(zero_copy_only=False) for name in ("x_m", "y_m")]
-                points.setdefault(mapping.key_of(chunk.entity_path), []).append(np.stack(xy, axis=1))
-    return {key: np.concatenate(parts) for key, parts in points.items()}
+                ways.setdefault(mapping.key_of(chunk.entity_path), []).append(np.stack(xy, axis=1))
+        yield chunk
 
 
 def _ground(ways: dict[str, Any]) -> blueprint.Ground | None:
