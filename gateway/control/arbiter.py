@@ -107,7 +107,8 @@ def _mode(command: Command, situation: Situation) -> Refusal | None:
     )
     if not needs_manual or situation.asked in (None, Mode.MANUAL):
         return None
-    helps = "bring it to mode manual first (a coordinator brings it back: stop it, which holds it)"
+    # The stop first: under a coordinator, which would bring a mode back, it is what helps.
+    helps = "stop it, or bring it to mode manual first"
     return Reason.WRONG_MODE, f"{situation.car} is in mode {situation.asked}, where it ignores this: {helps}"
 
 

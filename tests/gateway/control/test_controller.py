@@ -356,7 +356,7 @@ def test_in_another_mode_the_car_would_ignore_it(desk: Desk, what: What) -> None
     answer = desk.ask(what)
     assert (answer.reason, answer.words) == (
         Reason.WRONG_MODE,
-        "red is in mode tracking, where it ignores this: bring it to mode manual first",
+        "red is in mode tracking, where it ignores this: stop it, or bring it to mode manual first",
     )
     assert desk.ask(Drive(Motion.STOP)).status is QUEUED
     desk.run(2.0, reports=False)
