@@ -4,6 +4,7 @@ A session is a directory (directory.py) or a bare .mcap, also somebody else's. O
 """
 
 import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,11 +12,17 @@ from typing import Final, Self
 
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
+from mcap.records import Channel, Message, Schema
+from mcap.writer import Writer
 
 from fleet.recording import directory
 
 MAGIC: Final = b"\x89MCAP0\r\n"
+_RECORD: Final = struct.Struct("<BQ")  # opcode, length
+_CHUNK: Final = struct.Struct("<QQQII")  # times, size and CRC of the records, length of a name
+_FOOTER: Final = struct.Struct("<BQQQI")  # opcode, length, start of the summary and of its offsets, CRC up to here
 _FOOTER_AND_MAGIC: Final = 9 + 20 + len(MAGIC)  # a footer record has a fixed size
 
 
@@ -84,33 +91,98 @@ class Session:
         """One line on what is missing; empty if the session is whole."""
         return "; ".join(f"{path} {words}" for path, words in self.cut.items())
 
+    def check(self) -> None:
+        """Look at every CRC, which reading by way of the index does not; adds what is damaged to `cut`."""
+        for segment in self.segments:
+            if segment not in self.cut and (words := _damage(segment)):
+                self.cut[segment] = words
+
+    def rescue(self, out: Path) -> "Session":
+        """Write every whole message into a new, whole file; it as a session. For what was cut or is damaged."""
+        channels: dict[tuple[Path, int], int] = {}
+        schemas: dict[str, int] = {}
+        with out.open("xb") as file:
+            writer = Writer(file)
+            writer.start(library="zenoh-car-fleet rescue")
+            for segment in self.segments:
+                for schema, channel, message in self._whole(segment):
+                    source = (segment, channel.id)
+                    if source not in channels:
+                        name = schema.name if schema is not None else ""
+                        if schema is not None and name not in schemas:
+                            schemas[name] = writer.register_schema(name, schema.encoding, schema.data)
+                        channels[source] = writer.register_channel(
+                            channel.topic, channel.message_encoding, schemas.get(name, 0), channel.metadata
+                        )
+                    writer.add_message(
+                        channels[source], message.log_time, message.data, message.publish_time, message.sequence
+                    )
+            writer.finish()  # type: ignore[no-untyped-call]  # mcap's has no return type
+        return Session(self.path, (out,), self.description)
+
     def messages(self) -> Iterator[Recorded]:
         """Every whole message, in the order of writing; see `cut` afterwards. Raises NoSession for a foreign file."""
         for segment in self.segments:
             yield from self._read(segment)
 
     def _read(self, segment: Path) -> Iterator[Recorded]:
+        for schema, channel, message in self._whole(segment):
+            yield Recorded(
+                key=channel.topic,
+                payload=message.data,
+                message=schema.name if schema is not None and schema.encoding == "protobuf" else "",
+                encoding=channel.message_encoding,
+                published_ns=message.publish_time,
+                recorded_ns=message.log_time,
+                sequence=message.sequence,
+            )
+
+    def _whole(self, segment: Path) -> Iterator[tuple[Schema | None, Channel, Message]]:
+        """What the stock reader gives, up to where the file ends or is damaged."""
         with segment.open("rb") as file:
             # Its default order is sorted by time, for which it needs the whole file: a cut one would give nothing.
             limit = segment.stat().st_size  # a damaged length asks for more than there is
             reader = NonSeekingReader(file, validate_crcs=True, record_size_limit=limit)
-            messages = reader.iter_messages(log_time_order=False)
             try:
-                for schema, channel, message in messages:
-                    yield Recorded(
-                        key=channel.topic,
-                        payload=message.data,
-                        message=schema.name if schema is not None and schema.encoding == "protobuf" else "",
-                        encoding=channel.message_encoding,
-                        published_ns=message.publish_time,
-                        recorded_ns=message.log_time,
-                        sequence=message.sequence,
-                    )
+                yield from reader.iter_messages(log_time_order=False)
             except EndOfFile:
                 self.cut.setdefault(segment, "is cut")
             # The ways in which the reader says what is wrong: a CRC is a ValueError, an absurd length a MemoryError.
             except (McapError, ValueError, struct.error, zstandard.ZstdError, MemoryError, OverflowError) as error:
-                self.cut[segment] = f"is damaged, and not read beyond that: {error}"
+                self.cut.setdefault(segment, f"is damaged, and not read beyond that: {error}")
+
+
+def _damage(segment: Path) -> str:
+    """Why a file with an end is not whole; empty if chunks and summary have the CRCs that they were written with."""
+    with segment.open("rb") as file:
+        end = file.seek(-_FOOTER_AND_MAGIC, 2)
+        _, _, start, _, crc = _FOOTER.unpack(file.read(_FOOTER.size))
+        if crc and start:
+            file.seek(min(start, end))
+            if zlib.crc32(file.read(end + _FOOTER.size - 4 - file.tell())) != crc:
+                return "has a damaged end"
+        file.seek(len(MAGIC))
+        number = 0
+        while head := file.read(_RECORD.size):
+            if len(head) < _RECORD.size:
+                break  # the magic bytes at the end
+            opcode, length = _RECORD.unpack(head)
+            if opcode != Opcode.CHUNK:
+                file.seek(length, 1)
+                continue
+            number += 1
+            body = file.read(length)
+            try:
+                _, _, size, crc, name_length = _CHUNK.unpack_from(body)
+                compression = body[_CHUNK.size : _CHUNK.size + name_length]
+                data = body[_CHUNK.size + name_length + 8 :]
+                if compression == b"zstd":
+                    data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+            except (struct.error, zstandard.ZstdError):
+                return f"is damaged in chunk {number}, and not shown beyond that"
+            if crc and compression in (b"zstd", b"") and zlib.crc32(data) != crc:
+                return f"is damaged in chunk {number}, and not shown beyond that"
+    return ""
 
 
 def _looks_cut(segment: Path) -> str:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import click
@@ -21,23 +22,38 @@ def replay(session: Path, save: Path | None) -> None:  # fmt: skip
     """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun."""
     from fleet.recording.session import NoSession, Session
 
-    if save is None and not has_display():
-        raise click.ClickException(
-            f"there is no display here to open Rerun on: write a file, fleet replay {session} --save out.rrd"
-        )
     try:
         found = Session.open(session)
-        if found.cut:
-            click.echo(f"{found.cut_words}; showing what is whole", err=True)
+        found.check()
         if save is not None:
-            _export(found, save)
-            return
+            _refuse_target(save, found.segments)
+        elif not has_display():
+            raise click.ClickException(
+                f"there is no display here to open Rerun on: write a file, fleet replay {session} --save out.rrd"
+            )
         with tempfile.TemporaryDirectory() as scratch:
-            out = Path(scratch) / f"{found.name}.rrd"
+            if found.cut:
+                # What is whole is copied first: Rerun's own reader shows also what fails its CRC.
+                whole = found.rescue(Path(scratch) / f"{found.name}.mcap")
+                click.echo(f"{found.cut_words}; showing what is whole", err=True)
+                found = whole
+            out = save if save is not None else Path(scratch) / f"{found.name}.rrd"
             _export(found, out)
-            sys.exit(_view(out))
+            if save is None:
+                sys.exit(_view(out))
     except NoSession as error:
         raise click.ClickException(str(error)) from None
+
+
+def _refuse_target(save: Path, segments: Iterable[Path]) -> None:
+    """A recording or a device is not to be overwritten."""
+    if save.suffix != ".rrd":
+        raise click.UsageError(f"--save {save}: Rerun opens files that end in .rrd: name it {save.stem}.rrd")
+    if save.exists() and not save.is_file():
+        raise click.UsageError(f"--save {save}: this is no file: name one that ends in .rrd")
+    for segment in segments:
+        if save.exists() and save.samefile(segment):
+            raise click.UsageError(f"--save {save}: this is the recording itself: name another file")
 
 
 def has_display() -> bool:

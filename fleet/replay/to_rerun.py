@@ -67,7 +67,11 @@ def export(session: Session, out: Path) -> Counter[str]:
         # A recording stream, because only its file carries a layout, which comes last: the ground is known then.
         recording = rr.RecordingStream(APPLICATION, recording_id=session.name)
         recording.save(whole)
-        recording.send_chunks(stream)
+        try:
+            recording.send_chunks(stream)
+        except RuntimeError as error:
+            words = " ".join(str(error).split())
+            raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
         lines = {key: np.concatenate(parts) for key, parts in ways.items()}
         recording.send_chunks(rrc.LazyChunkStream.from_iter(_drawn(lines, contents)))
         recording.send_blueprint(blueprint.layout(contents, _ground(lines)), make_active=False, make_default=True)

@@ -126,9 +126,57 @@ def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert (result.exit_code, len(result.stderr.splitlines())) == (1, 1), result.stderr
         assert words in result.stderr
     if sys.platform == "linux":
-        result = CliRunner().invoke(replay, [str(foreign)])
-        assert result.exit_code == 1
-        assert "--save" in result.stderr
+        missing = CliRunner().invoke(replay, [str(tmp_path / "none")])
+        assert "there is no session at" in missing.stderr, "what is missing comes before a missing display"
+
+
+def test_without_a_display_a_file_is_proposed(made: tuple[Path, Counter[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    result = CliRunner().invoke(replay, [str(made[0])])
+    assert result.exit_code == 1
+    assert "--save out.rrd" in result.stderr
+
+
+@pytest.mark.parametrize("size", [8, 9, 20, 30, 200, 1000])
+def test_a_recording_that_was_cut_at_once_is_said(made: tuple[Path, Counter[str]], tmp_path: Path, size: int) -> None:
+    cut = tmp_path / "0001.mcap"
+    cut.write_bytes(made[0].read_bytes()[:size])
+    result = CliRunner().invoke(replay, [str(cut), "--save", str(tmp_path / "out.rrd")])
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
+    assert "holds no message of a fleet" in result.stderr
+
+
+def test_what_is_damaged_is_said_and_only_what_is_whole_is_shown(
+    made: tuple[Path, Counter[str]], tmp_path: Path
+) -> None:
+    whole = made[0].read_bytes()
+    for share in (0.3, 0.6, 0.9):
+        damaged = bytearray(whole)
+        at = int(len(whole) * share)
+        damaged[at : at + 50] = bytes(byte ^ 0x5A for byte in damaged[at : at + 50])
+        path, out = tmp_path / f"{share}.mcap", tmp_path / f"{share}.rrd"
+        path.write_bytes(damaged)
+        result = CliRunner().invoke(replay, [str(path), "--save", str(out)])
+        assert result.exit_code == 0, result.stderr
+        assert "damaged" in result.stderr
+        shown = to_rerun.rows(out)
+        assert f"{shown.total()} messages" in result.stdout
+        assert all(count <= made[1][key] for key, count in shown.items())
+
+
+def test_a_recording_or_a_device_is_not_overwritten(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    before = made[0].read_bytes()
+    link = tmp_path / "link.rrd"
+    link.symlink_to(made[0])
+    fifo = tmp_path / "fifo.rrd"
+    os.mkfifo(fifo)
+    for target in (made[0], link, fifo, Path(os.devnull)):
+        result = CliRunner().invoke(replay, [str(made[0]), "--save", str(target)])
+        assert result.exit_code == 2, target
+    assert made[0].read_bytes() == before
 
 
 def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
