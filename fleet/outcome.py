@@ -1,7 +1,7 @@
 """What becomes of one command on one car, from its answer and its events. Pure: time is an argument."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
@@ -81,8 +81,10 @@ class Progress:
         return self._phase != NO_ANSWER
 
     def answered(self, status: str, reason: str, words: str, worst_case_s: float, at: float) -> None:
-        """Take the answer to the query."""
+        """Take the answer to the query; a record of the same command may have overtaken it."""
         self._worst_case_s = max(self._worst_case_s, worst_case_s)
+        if self.outcome is not None:
+            self.outcome = replace(self.outcome, worst_case_s=self._worst_case_s)
         self._note(status, reason, words, at)
         # Nothing had to be stopped, so nothing will be complete: `sent` without a worst case is the last word.
         if status == SENT and self._until is Until.STOPPED and worst_case_s == 0:

@@ -51,6 +51,12 @@ def test_not_known_yet(until: Until, steps: Steps) -> None:
     assert told(until, steps, 2.0).outcome is None
 
 
+def test_an_answer_that_its_last_record_overtook_still_says_the_worst_case() -> None:
+    outcome = told(Until.STOPPED, [("event", "complete", 0.0), ("answer", "sent", 0.5)]).outcome
+    assert outcome is not None
+    assert (outcome.phase, outcome.ok, outcome.worst_case_s) == ("complete", True, 0.5)
+
+
 def test_a_stop_is_waited_for_as_long_as_its_gateway_announced_and_a_margin() -> None:
     assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(100 + 7.3 + 5.0)
 
