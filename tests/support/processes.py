@@ -67,6 +67,17 @@ class Process:
         assert answer["ok"], answer
         return answer
 
+    def kill(self) -> int:
+        """End it without a word; just before that, ns since the epoch."""
+        at_ns = time.time_ns()
+        self.popen.kill()
+        return at_ns
+
+    def rss_mb(self) -> float:
+        """What it holds in memory (Linux; elsewhere by `ps`)."""
+        listed = subprocess.run(["ps", "-o", "rss=", "-p", str(self.pid)], capture_output=True, text=True, check=True)
+        return int(listed.stdout) * 1024 / 1e6
+
     def end(self, number: int = signal.SIGTERM) -> int:
         """Send a signal and wait; the exit code."""
         if self.popen.poll() is None:
@@ -107,10 +118,11 @@ class Fleet:
         self._started.append(started)
         return started
 
-    def simulate(self, *cars: str) -> tuple[Process, list[str]]:
-        """Simulated cars that publish no truth (they are asked), and their links."""
+    def simulate(self, *cars: str, truth: bool = False, world: str = "room") -> tuple[Process, list[str]]:
+        """Simulated cars, and their links; without `truth` they publish none, and are asked."""
         described = [word for car in cars for word in ("--car", car)]
-        sim = self.start("-m", "gateway.cli", "sim", "--no-truth", "--seed", "3", *described)
+        published = () if truth else ("--no-truth",)
+        sim = self.start("-m", "gateway.cli", "sim", *published, "--seed", "3", "--world", world, *described)
         return sim, [sim.line()["link"] for _ in cars]
 
     def gateway(self, link: str, *more: str, car: str = "red", platform: str = "arduino") -> Process:

@@ -1,0 +1,14 @@
+"""SIGKILL of whoever drives: the car stops within its time to live + the rest of the running block + 0.3 s.
+
+And + 1 s where only its token told (issue 4, "Done when"). The simulator's truth is the judge, with its own stamps.
+"""
+
+from tests.support.kills import BUSY_S, kill_operators
+from tests.support.processes import Fleet
+
+
+def test_a_killed_operator_stops_its_car(fleet: Fleet) -> None:
+    took = kill_operators(fleet)
+    print(took)
+    late = {case: found for case, found in took.items() if found.took_s > found.limit_s + BUSY_S}
+    assert not late, late

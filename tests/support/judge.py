@@ -1,0 +1,86 @@
+"""Who says what was so: a simulated car's truth with its times, and what a gateway wrote to its car, with theirs.
+
+Times are ns since the epoch, as the publishers stamped them; all processes of a test share one clock.
+"""
+
+import threading
+from dataclasses import dataclass, field
+from typing import Any
+
+from schemas.bus import Bus, Sample
+from tests.support.processes import wait_for
+
+
+def stamp_ns(message: Any) -> int:
+    """When a message was made."""
+    return int(message.stamp.seconds * 1_000_000_000 + message.stamp.nanos)
+
+
+@dataclass
+class Judge:
+    """The motors of one simulated car and the frames that were written to it. `follow` it before anything happens."""
+
+    car: str
+    motors: list[tuple[int, bool]] = field(default_factory=list)
+    """When they went on or off, first the oldest."""
+    moved: list[tuple[int, float, float]] = field(default_factory=list)
+    """Where the car was, whenever that was another place."""
+    frames: list[tuple[int, str, bytes]] = field(default_factory=list)
+    """When, why, and what."""
+    modes: list[tuple[int, str]] = field(default_factory=list)
+    heard_ns: int = 0
+    """The newest truth."""
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @classmethod
+    def follow(cls, bus: Bus, car: str = "red") -> "Judge":
+        """Begin to watch."""
+        judge = cls(car)
+        bus.subscribe(f"fleet/{car}/sim/truth", judge._truth)
+        bus.subscribe(f"fleet/{car}/frame/tx", judge._frame)
+        return judge
+
+    @property
+    def driving(self) -> bool:
+        """Whether the motors are on, as last heard."""
+        return bool(self.motors) and self.motors[-1][1]
+
+    def wait_off(self, moment_ns: int, *, watched_s: float) -> float:
+        """Wait until the motors were off for so long; how long after a moment they went off, s, 0 if before it."""
+
+        def off() -> bool:
+            with self._lock:
+                if not self.motors or self.motors[-1][1]:
+                    return False
+                return self.heard_ns >= max(self.motors[-1][0], moment_ns) + watched_s * 1e9
+
+        wait_for(off, f"{self.car} stands")
+        with self._lock:
+            return max(0.0, (self.motors[-1][0] - moment_ns) / 1e9)
+
+    def on_after(self, moment_ns: int) -> list[float]:
+        """The times after a moment, s, at which motors went on."""
+        with self._lock:
+            return [(at - moment_ns) / 1e9 for at, on in self.motors if on and at > moment_ns]
+
+    def written_after(self, moment_ns: int) -> list[tuple[float, bytes]]:
+        """The frames written after a moment: s after it, and what."""
+        with self._lock:
+            return [((at - moment_ns) / 1e9, data) for at, _, data in self.frames if at >= moment_ns]
+
+    def _truth(self, sample: Sample) -> None:
+        truth: Any = sample.message()
+        at, on = stamp_ns(truth), bool(truth.motor_left or truth.motor_right)
+        with self._lock:
+            self.heard_ns = at
+            if not self.motors or self.motors[-1][1] != on:
+                self.motors.append((at, on))
+            if not self.modes or self.modes[-1][1] != truth.mode:
+                self.modes.append((at, truth.mode))
+            if not self.moved or self.moved[-1][1:] != (truth.x_m, truth.y_m):
+                self.moved.append((at, truth.x_m, truth.y_m))
+
+    def _frame(self, sample: Sample) -> None:
+        frame: Any = sample.message()
+        with self._lock:
+            self.frames.append((stamp_ns(frame), frame.why, frame.data))
