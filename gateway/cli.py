@@ -1,15 +1,25 @@
-"""The `gateway` command: run one car's gateway, or simulated cars.
+"""The `gateway` command: the table of its subcommands, and `gateway run`.
 
 argparse, and everything else imported where it is used: `gateway run` is started a hundred times.
 """
 
 import argparse
+import importlib
 import os
 import sys
+from typing import Final
 
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 
-_RUN_EPILOG = """\
+COMMANDS: Final = {
+    "sim": ("gateway.sim.command", "simulated cars that behave like the real ones, hazards included"),
+    "monitor": ("gateway.monitor", "what a car says, decoded beside the raw bytes"),
+    "send": ("gateway.send", "one frame to a car on the desk, checked against the table"),
+}
+"""Subcommand: the module with its `add_arguments` and `run`, imported when it is called; its line in the help."""
+
+_EPILOG: Final = "Exit codes: 0 done, 1 failed, 2 wrong use, 130 Ctrl-C."
+_RUN_EPILOG: Final = """\
 examples:
   gateway run --car red --link /dev/ttyUSB0 --platform arduino
   gateway run --car blue --link tcp://192.168.1.7:8888 --platform raspberry_pi
@@ -19,8 +29,21 @@ Ctrl-C stops the car before the process ends."""
 
 def main() -> None:
     """Entry point; exit code 2 for wrong use, 1 for a failure."""
-    parser = argparse.ArgumentParser(prog="gateway", description="One process per car: its bytes, keyed on the bus.")
+    parser = argparse.ArgumentParser(
+        prog="gateway", description="One process per car: its bytes, keyed on the bus.", epilog=_EPILOG
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_run(commands)
+    others = {name: commands.add_parser(name, help=words) for name, (_, words) in COMMANDS.items()}
+    called = sys.argv[1] if sys.argv[1:] else ""
+    if called not in COMMANDS:
+        sys.exit(_run(parser.parse_args()))
+    command = importlib.import_module(COMMANDS[called][0])
+    command.add_arguments(others[called])
+    sys.exit(command.run(parser.parse_args()))
+
+
+def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     run = commands.add_parser(
         "run",
         help="connect one car to the bus",
@@ -42,19 +65,6 @@ def main() -> None:
     run.add_argument(
         "--with-parent", action="store_true", help="stop the car and end when the process that started this ends"
     )
-    sim = commands.add_parser("sim", help="simulated cars that behave like the real ones, hazards included")
-    if "sim" in sys.argv[1:2]:
-        from gateway.sim import command as sim_command
-
-        sim_command.add_arguments(sim)
-    arguments = parser.parse_args()
-    sys.exit(_run(arguments) if arguments.command == "run" else _sim(arguments))
-
-
-def _sim(arguments: argparse.Namespace) -> int:
-    from gateway.sim import command as sim_command
-
-    return sim_command.run(arguments)
 
 
 def _run(arguments: argparse.Namespace) -> int:
