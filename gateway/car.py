@@ -15,23 +15,24 @@ import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 
 from gateway import requests
 from gateway.control import backoff
-from gateway.control.controller import Controller, Hold
+from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
 from gateway.control.mode import Verdict
-from gateway.control.records import Answer, Level, LogRecord, Phase
+from gateway.control.records import Answer, Command, EmergencyStop, Level, LogRecord, Phase, Resume
+from gateway.control.safety import Estop
 from gateway.doors import Doors
 from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Event, Rejected
 from gateway.publish import Publications, wall_ns
-from gateway.store import Store, StoredHold
+from gateway.store import Store
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -40,6 +41,8 @@ TICK_S: Final = 0.1
 HUB_GONE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 0.5
 """Two gateways that started at the same moment see each other when both have declared (design.md, "Keys")."""
+TOGETHER_S: Final = 0.2
+"""Gateways that come within this time are asked together for the e-stops that they know of."""
 HEALTH_EVERY_S: Final = 1.0
 _LEVELS: Final = {Level.INFO: logging.INFO, Level.WARNING: logging.WARNING, Level.ERROR: logging.ERROR}
 
@@ -82,10 +85,11 @@ class Car:
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
         self._store = Store(settings.state_dir, settings.fleet, settings.car)
-        self._control = Controller(
-            settings.car, settings.profile, hold=_restored(self._store.load(time.time_ns()), now)
-        )
-        self._saved_hold = self._control.hold
+        self._control = Controller(settings.car, settings.profile, kept=self._store.load(time.time_ns()))
+        self._saved = self._control.safety.kept
+        self._passing_on: set[asyncio.Task[None]] = set()
+        self._came = asyncio.Event()
+        """Another car's gateway came onto the bus."""
         self._health = LinkHealth(since=now)
         self._decoder = Decoder()
         self._link: Link | None = None
@@ -112,8 +116,16 @@ class Car:
             command=self._query,
             streamed=self._streamed,
             sender=self._sender,
+            car=self._neighbour,
         )
-        work = (self._connect(), self._write_frames(), self._tick(), self._keep_hub(), self._look_again())
+        work = (
+            self._connect(),
+            self._write_frames(),
+            self._tick(),
+            self._keep_hub(),
+            self._look_again(),
+            self._unite(),
+        )
         tasks = [asyncio.ensure_future(each) for each in work]
         stopped = asyncio.ensure_future(self._stopped.wait())
         try:
@@ -263,9 +275,12 @@ class Car:
                 query.reply_err(f"{expression}: name the command, there is no command {verb}", encoding="text/plain")
             return
         request = requests.Request(verb, payload, encoding, time.time_ns(), by_wildcard="*" in expression)
-        command_id, answer = self._command(request)
+        fleet_wide = {estop.id for estop in self._control.safety.estops if estop.fleet_wide}
+        command, answer = self._command(request)
+        if not request.by_wildcard:
+            self._pass_on(command, fleet_wide)
         key = keys.command_key(self._settings.fleet, self._settings.car, verb)
-        self._asked.append(_Asked(query, key, command_id, answer, as_json))
+        self._asked.append(_Asked(query, key, command.id, answer, as_json))
         self._wake.set()
 
     def _streamed(self, sample: bus.Sample) -> None:
@@ -282,7 +297,7 @@ class Car:
             self._command(request)
             self._wake.set()
 
-    def _command(self, request: requests.Request) -> tuple[str, Answer]:
+    def _command(self, request: requests.Request) -> tuple[Command, Answer]:
         """Parse a request and give it to control; its first record carries the request as it came."""
         now = self._loop.time()
         try:
@@ -292,7 +307,7 @@ class Car:
             command = error.command
             answer = self._control.refused(command, error.reason, error.words, now)
         self._publish_records(command.id, request)
-        return command.id, answer
+        return command, answer
 
     def _reply(self, asked: _Asked, sent: set[str]) -> None:
         answer = asked.answer
@@ -319,12 +334,13 @@ class Car:
         for each in asked:
             self._reply(each, sent)
         self._out.states(self._control, self._health, self._loop.time())
-        if self._control.hold != self._saved_hold:
-            self._saved_hold = hold = self._control.hold
+        kept = self._control.safety.kept
+        if kept != self._saved:
+            self._saved = kept
             try:
-                self._store.save(None if hold is None else StoredHold(hold.by, wall_ns(hold.since)))
+                self._store.save(kept)
             except OSError as error:
-                self._log(Level.ERROR, "not_saved", f"the hold will not survive a restart: {error}")
+                self._log(Level.ERROR, "not_saved", f"hold and e-stops will not survive a restart: {error}")
 
     def _publish_records(self, command_id: str = "", request: requests.Request | None = None) -> None:
         for record in self._control.take_records():
@@ -348,6 +364,56 @@ class Car:
         self._control.sender_alive(name, alive=alive, now=self._loop.time())
         self._wake.set()
 
+    # ------------------------------------------------------------------ the other gateways of the fleet
+
+    def _pass_on(self, command: Command, fleet_wide: set[str]) -> None:
+        """What was asked of this car alone and is meant for the fleet: ask all, under the same id."""
+        payload: pb.EstopCommand | pb.ResumeCommand
+        match command.what:
+            case EmergencyStop(why, True):
+                payload = pb.EstopCommand(why=why, scope="fleet")
+            case Resume(ids) if over := sorted(fleet_wide & set(ids) & set(self._control.safety.ended)):
+                payload = pb.ResumeCommand(ids=over)
+            case _:
+                return
+        payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
+        key = keys.command_key(self._settings.fleet, "*", command.verb)
+        encoding = messages.encoding_of(topics.COMMANDS[command.verb])
+        asking = asyncio.to_thread(self._ask_all, key, payload.SerializeToString(), encoding)
+        task = asyncio.ensure_future(asking)
+        self._passing_on.add(task)
+        task.add_done_callback(self._passing_on.discard)
+
+    def _ask_all(self, key: str, payload: bytes, encoding: str) -> None:
+        """On a thread; what each car answers is in its own records."""
+        for _ in self._bus.query(key, payload=payload, encoding=encoding):
+            pass
+
+    def _neighbour(self, change: tuple[str, bool]) -> None:
+        """Another car's gateway came or went."""
+        name, alive = change
+        if alive and name != self._settings.car:
+            self._came.set()
+
+    async def _unite(self) -> None:
+        """Fleet-wide e-stops, in force and ended, are taken over from whoever comes onto the bus."""
+        key = keys.topic_key(self._settings.fleet, "*", "state/safety")
+        while True:
+            await self._came.wait()
+            await asyncio.sleep(TOGETHER_S)
+            self._came.clear()
+            for answer in await asyncio.to_thread(lambda: list(self._bus.query(key))):
+                if not isinstance(answer, bus.Sample):
+                    continue
+                try:
+                    shown: Any = answer.message()
+                except (messages.BadPayload, KeyError) as error:
+                    log.warning("%s: no state of a gateway of this fleet: %s", answer.key, error)
+                    continue
+                estops = [_estop(each) for each in shown.estops]
+                self._control.unite(estops, shown.ended, shown.car, self._loop.time())
+            self._wake.set()
+
     # ------------------------------------------------------------------ time, and the hub
 
     async def _tick(self) -> None:
@@ -366,7 +432,7 @@ class Car:
                 self.stop()
             self._control.tick(now)
             mode = self._control.mode
-            limit = mode.silence_limit(fan=bool(self._control.fan))
+            limit = mode.silence_limit(fan=bool(self._control.believed.fan))
             self._health.judge(
                 now=now,
                 limit_s=limit,
@@ -397,11 +463,9 @@ class Car:
                 self._log(Level.ERROR, "no_hub", str(error))
 
 
-def _restored(stored: StoredHold | None, now: float) -> Hold | None:
-    """A hold from before the restart, on this process's monotonic clock."""
-    if stored is None:
-        return None
-    return Hold(stored.by, now - (time.time_ns() - stored.since_ns) / 1e9)
+def _estop(shown: pb.Estop) -> Estop:
+    at_ns = shown.stamp.seconds * 1_000_000_000 + shown.stamp.nanos
+    return Estop(shown.id, shown.by, shown.why, at_ns, shown.scope == "fleet")
 
 
 async def serve(settings: Settings, opened: bus.Bus, doors: Doors) -> bool:

@@ -34,6 +34,7 @@ class Doors:
         self._stream: bus.Handover[bus.Sample] = bus.Handover(limit=256)
         self._queries: bus.Handover[tuple[str, zenoh.Query]] = bus.Handover()
         self._senders: bus.Handover[tuple[str, bool]] = bus.Handover()
+        self._cars: bus.Handover[tuple[str, bool]] = bus.Handover()
         # Queryables first, then the token: whoever sees the token gets an answer.
         for family in FAMILIES:
             # A query on `fleet/**` reaches both: each answers for its own family only.
@@ -42,6 +43,7 @@ class Doors:
         opened.subscribe(keys.command_key(fleet, car, "drive"), self._stream)
         opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._sender)
         opened.token(keys.car_token(fleet, car))
+        opened.watch_tokens(keys.car_token(fleet, "*"), self._neighbour)
 
     def attach(
         self,
@@ -51,17 +53,20 @@ class Doors:
         command: "Callable[[zenoh.Query], object]",
         streamed: "Callable[[bus.Sample], object]",
         sender: "Callable[[tuple[str, bool]], object]",
+        car: "Callable[[tuple[str, bool]], object]",
     ) -> None:
-        """Say who takes what comes, and what has come already: (family, query), commands, drives, (sender, alive)."""
+        """Say who takes what comes, and came: (family, query), commands, drives, (sender, alive), (car, alive)."""
         self._queries.attach(loop, query)
         self._commands.attach(loop, command)
         self._stream.attach(loop, streamed)
         self._senders.attach(loop, sender)
+        self._cars.attach(loop, car)
 
     @property
     def dropped(self) -> int:
         """How much came that nobody could take in time."""
-        return self._queries.dropped + self._commands.dropped + self._stream.dropped + self._senders.dropped
+        handovers = (self._queries, self._commands, self._stream, self._senders, self._cars)
+        return sum(handover.dropped for handover in handovers)
 
     def others(self) -> list[Any]:
         """The fleet.v1.Health of every other gateway that answers for this car."""
@@ -88,3 +93,7 @@ class Doors:
     def _sender(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
         """On a Zenoh thread."""
         self._senders((key.rpartition("/")[2], alive))
+
+    def _neighbour(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
+        """On a Zenoh thread."""
+        self._cars((key.rpartition("/")[2], alive))

@@ -183,12 +183,13 @@ class Publications:
 
     def states(self, control: Controller, health: LinkHealth, now: float, *, force: bool = False) -> None:
         """Publish each state that changed, and all of them once a second."""
-        mode, hold = control.mode, control.hold
+        mode, believed, safety = control.mode, control.believed, control.safety
+        lease = safety.leased(now)
         changes: dict[str, tuple[object, ...]] = {
             "state/link": (health.state, health.reconnects, health.state == "lost" and health.reason),
             "state/mode": (mode.asked, mode.inferred, mode.verdict),
-            "state/motion": (control.motion, control.owner, control.fan, control.servo_deg, control.speed),
-            "state/safety": (hold, control.motors),
+            "state/motion": (control.motion, control.owner, believed.fan, believed.servo_deg, believed.speed),
+            "state/safety": (safety.kept, lease and lease.holder, control.motors),
         }
         for name, told in changes.items():
             late = now - self._told_at.get(name, float("-inf")) >= STATE_EVERY_S
@@ -281,19 +282,28 @@ def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
 def _fill_motion(message: pb.Motion, control: Controller, now: float) -> None:
     message.motion = control.motion or "unknown"
     message.source = "unknown" if control.motion is None else "commanded" if control.owner else "assumed"
-    message.speed = control.profile.speed.fraction(control.speed)
+    message.speed = control.profile.speed.fraction(control.believed.speed)
     message.owner = control.owner
     message.expires_in_s = control.expires_in_s(now)
-    message.fan = bool(control.fan)
-    if control.servo_deg is not None:
-        message.servo_deg = control.servo_deg
+    message.fan = bool(control.believed.fan)
+    if control.believed.servo_deg is not None:
+        message.servo_deg = control.believed.servo_deg
 
 
 def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
-    if control.hold is not None:
-        message.hold.by = control.hold.by
-        since_ns = wall_ns(control.hold.since)
-        message.hold.since.seconds, message.hold.since.nanos = divmod(since_ns, 1_000_000_000)
+    safety = control.safety
+    for estop in safety.estops:
+        scope = "fleet" if estop.fleet_wide else "car"
+        shown = message.estops.add(id=estop.id, by=estop.by, why=estop.why, scope=scope)
+        shown.stamp.seconds, shown.stamp.nanos = divmod(estop.at_ns, 1_000_000_000)
+    message.ended.extend(safety.ended)
+    if safety.hold is not None:
+        message.hold.by = safety.hold.by
+        message.hold.since.seconds, message.hold.since.nanos = divmod(safety.hold.since_ns, 1_000_000_000)
+    lease = safety.leased(now)
+    if lease is not None:
+        message.lease.holder, message.lease.kind = lease.holder.name, lease.holder.kind
+        message.lease.expires_in_s = lease.until - now
     message.motors = control.motors
     message.worst_stop_s = control.worst_stop_s(now)
 

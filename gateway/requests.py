@@ -14,6 +14,7 @@ from gateway.control.records import (
     ChangeSpeed,
     Command,
     Drive,
+    EmergencyStop,
     Fan,
     Find,
     Kind,
@@ -22,6 +23,7 @@ from gateway.control.records import (
     Sender,
     SetMode,
     Stop,
+    TakeLease,
     What,
 )
 from gateway.protocol.encode import ArmSet, ColorLed, EncodeError, General, Ptz, encode
@@ -31,9 +33,14 @@ from schemas.topics import COMMANDS, PROTOBUF
 
 LONGEST_DRIVE_S: Final = 10.0
 """A drive that holds longer is refused: whoever drives is there to say so again."""
+LONGEST_NAME: Final = 128
+"""Of a sender or an id, characters."""
+LONGEST_WHY: Final = 200
+"""Of an e-stop's reason, characters; the rest is cut off: nobody's e-stop fails over its words."""
 _DRIVE_TTL_S: Final = 0.5
 _TTL_S: Final = 2.0  # messages.md: greatest age at arrival, default 0.5 for drive, 2 for the rest
-_WITHOUT_PAYLOAD: Final = ("stop", "estop")
+_STOPS: Final[dict[str, What]] = {"stop": Stop(), "estop": EmergencyStop()}
+"""The verbs that need no payload, and are obeyed whatever is in it."""
 BY_WILDCARD: Final = ("stop", "estop", "resume")
 """Verbs that may be asked of several cars with one query (design.md, "Keys")."""
 
@@ -71,33 +78,42 @@ class BadRequest(ValueError):
 def parse(request: Request) -> Command:
     """The command in a request; raises BadRequest."""
     verb = request.verb
-    blank = Command(uuid.uuid4().hex, verb, Sender(), Stop(), streamed=request.streamed)
+    blank = Command(uuid.uuid4().hex, verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
     if verb not in COMMANDS:
         words = f"{verb!r} is no command; there are: {', '.join(COMMANDS)}"
         raise BadRequest(Reason.UNSUPPORTED, words, blank)
     if request.by_wildcard and verb not in BY_WILDCARD:
         words = f"{verb} cannot be asked by wildcard: name one car (only {', '.join(BY_WILDCARD)} can)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
-    if request.payload is None and verb not in _WITHOUT_PAYLOAD:
+    if request.payload is None and verb not in _STOPS:
         words = f"{verb} without a payload: give {COMMANDS[verb]} or its JSON (only stop and estop need none)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
+    try:
+        return _filled(blank, request)
+    except BadRequest as error:
+        stops = _STOPS.get(verb)
+        if stops is None:
+            raise
+        # Whatever is wrong with its words: somebody wants this car to stop.
+        return replace(error.command, what=stops, note=f"stopped, though: {error.words}")
+
+
+def _filled(blank: Command, request: Request) -> Command:
+    verb = blank.verb
     try:
         message: Any = messages.parse(COMMANDS[verb], request.payload or b"", _encoding(request))
     except messages.BadPayload as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", blank) from None
-    command = replace(blank, id=message.id or blank.id, sender=Sender(message.sender or "anonymous"))
+    command = blank
     try:
-        sender = Sender(_sender(message.sender), _word("kind", message.kind or Kind.SCRIPT, Kind))
-        command = replace(command, sender=sender)
+        command = replace(command, id=_text("id", message.id) or blank.id)
+        command = replace(command, sender=Sender(_text("sender", message.sender, "/*$#?") or "anonymous"))
+        kind: Kind = _word("kind", message.kind or Kind.SCRIPT, Kind)
+        command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
         what = _WHAT[verb](message)
-    except NotImplementedError as error:
-        raise BadRequest(Reason.UNSUPPORTED, f"{verb}: {error}", command) from None
     except (ValueError, EncodeError) as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", command) from None
-    if message.take:
-        words = f"{verb}: take is not supported yet: ask without it"
-        raise BadRequest(Reason.UNSUPPORTED, words, command)
     return replace(
         command,
         what=what,
@@ -124,10 +140,15 @@ def _age_s(message: Any, request: Request) -> float:
     return max(0.0, age_ns / 1e9)
 
 
-def _sender(name: str) -> str:
-    if set(name) & set("/*$#?"):
-        raise ValueError(f"sender {name!r} is not allowed: no /, *, $, # or ?")
-    return name or "anonymous"
+def _text(field: str, value: str, forbidden: str = "") -> str:
+    """A name as it goes into states and files; a sender's also stands in the key of its token."""
+    if set(value) & set(forbidden):
+        raise ValueError(f"{field} {value!r} is not allowed: none of {' '.join(forbidden)} may be in it")
+    if not value.isprintable():
+        raise ValueError(f"{field} {value!r} is not allowed: no control characters")
+    if len(value) > LONGEST_NAME:
+        raise ValueError(f"{field} of {len(value)} characters is too long: at most {LONGEST_NAME}")
+    return value
 
 
 def _word(field: str, value: str, kind: Any) -> Any:
@@ -199,14 +220,11 @@ def _fan(message: Any) -> What:
     return Fan(None if not message.state else message.state == "on")
 
 
-def _lease(_: Any) -> What:
-    raise NotImplementedError("leases are not supported yet")
-
-
-def _resume(message: Any) -> What:
-    if message.ids:
-        raise NotImplementedError("no e-stop is latched yet, so there are no ids to end: leave them out to end a hold")
-    return Resume()
+def _estop(message: Any) -> What:
+    if message.scope not in ("", "car", "fleet"):
+        raise ValueError(f"scope {message.scope!r}: allowed are car (the default) and fleet")
+    why = "".join(each if each.isprintable() else " " for each in message.why)
+    return EmergencyStop(why[:LONGEST_WHY], message.scope == "fleet")
 
 
 def _checked(frame: ColorLed | Ptz | ArmSet) -> Act:
@@ -225,8 +243,8 @@ _WHAT: Final[dict[str, Callable[[Any], What]]] = {
     "speed": lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
     "fan": _fan,
     "stop": lambda _: Stop(),
-    "estop": lambda _: Stop(emergency=True),
-    "resume": _resume,
-    "lease": _lease,
+    "estop": _estop,
+    "resume": lambda message: Resume(tuple(message.ids)),
+    "lease": lambda message: TakeLease(message.release),
     "find": lambda _: Find(),
 }

@@ -1,20 +1,14 @@
-"""What survives a restart of the gateway, in one small JSON file a car: who put it on hold, and since when."""
+"""What survives a restart of the gateway, in one small JSON file a car: its hold, its e-stops and the ended ones."""
 
 import json
 import os
 import sys
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from gateway.control.safety import Estop, Hold, Kept
 
 STATE_VARIABLE = "FLEET_STATE_DIR"
-
-
-@dataclass(frozen=True, slots=True)
-class StoredHold:
-    """A hold; `since_ns`: ns since the epoch."""
-
-    by: str
-    since_ns: int
 
 
 def default_directory() -> Path:
@@ -34,31 +28,60 @@ class Store:
     def __init__(self, directory: Path, fleet: str, car: str) -> None:
         self.path = directory / f"{fleet}.{car}.json"
 
-    def load(self, now_ns: int) -> StoredHold | None:
-        """The hold that was in force; a file that cannot be read counts as one: better held than driven off."""
+    def load(self, now_ns: int) -> Kept:
+        """What was in force; a file that cannot be read counts as a hold: better held than driven off."""
         try:
             text = self.path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            return None
+            return Kept()
         except (OSError, UnicodeDecodeError) as error:
-            return StoredHold(f"unreadable {self.path.name}: {error}", now_ns)
+            return Kept(Hold(f"unreadable {self.path.name}: {error}", now_ns))
         try:
-            hold = json.loads(text)["hold"]
-            if hold is None:
-                return None
-            by = str(hold["by"])
-            by.encode()  # JSON can say half a surrogate pair, a message cannot
-            return StoredHold(by, min(max(0, int(hold["since_ns"])), now_ns))
-        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-            return StoredHold(f"unreadable {self.path.name}", now_ns)
+            return _kept(json.loads(text), now_ns)
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+            return Kept(Hold(f"unreadable {self.path.name}", now_ns))
 
-    def save(self, hold: StoredHold | None) -> None:
+    def save(self, kept: Kept) -> None:
         """Write the file whole or not at all; raises OSError."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        content = {"hold": None if hold is None else {"by": hold.by, "since_ns": hold.since_ns}}
+        hold = kept.hold
+        content = {
+            "hold": None if hold is None else {"by": hold.by, "since_ns": hold.since_ns},
+            "estops": [
+                {"id": each.id, "by": each.by, "why": each.why, "at_ns": each.at_ns, "fleet_wide": each.fleet_wide}
+                for each in kept.estops
+            ],
+            "ended": list(kept.ended),
+        }
         scratch = self.path.with_suffix(".new")
         with scratch.open("w", encoding="utf-8") as file:
             json.dump(content, file)
             file.flush()
             os.fsync(file.fileno())
         scratch.replace(self.path)
+
+
+def _kept(content: Any, now_ns: int) -> Kept:
+    """Raises what a wrong type or a missing name raises. A file of an earlier version has only the hold."""
+    hold = content["hold"]
+    return Kept(
+        None if hold is None else Hold(_text(hold["by"]), _past(hold["since_ns"], now_ns)),
+        tuple(_estop(each, now_ns) for each in content.get("estops", ())),
+        tuple(_text(each) for each in content.get("ended", ())),
+    )
+
+
+def _estop(content: Any, now_ns: int) -> Estop:
+    identity, by, why = (_text(content[name]) for name in ("id", "by", "why"))
+    return Estop(identity, by, why, _past(content["at_ns"], now_ns), content["fleet_wide"] is True)
+
+
+def _text(value: Any) -> str:
+    text = str(value)
+    text.encode()  # JSON can say half a surrogate pair, a message cannot
+    return text
+
+
+def _past(value: Any, now_ns: int) -> int:
+    """A moment on the wall clock; a clock that was set back since makes none of the future."""
+    return min(max(0, int(value)), now_ns)

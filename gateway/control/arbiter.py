@@ -1,13 +1,29 @@
-"""May this command be carried out on this car now? One pure function from a picture of the car to a refusal or none.
+"""May this command be carried out on this car now? One table of what each command needs, and one rule for each need.
 
-From every state, stop and estop are let through.
+Pure: a picture of the car in, a refusal or none out. From every state stop and estop are let through.
 """
 
 from dataclasses import dataclass
 from typing import Final
 
-from gateway.control.records import Act, ChangeSpeed, Command, Drive, Fan, Find, Kind, Reason, Resume, SetMode, Stop
-from gateway.protocol.encode import General
+from gateway.control.records import (
+    Act,
+    ChangeSpeed,
+    Command,
+    Drive,
+    EmergencyStop,
+    Fan,
+    Find,
+    Kind,
+    Reason,
+    Resume,
+    SetMode,
+    Stop,
+    TakeLease,
+    What,
+)
+from gateway.control.safety import Estop, Lease
+from gateway.protocol.encode import ArmSet, General, Ptz
 from gateway.protocol.profile import Profile
 from gateway.protocol.values import Mode, Motion
 
@@ -21,6 +37,7 @@ class Situation:
 
     car: str
     profile: Profile
+    now: float
     link_open: bool
     link_reason: str
     answering: bool
@@ -29,90 +46,160 @@ class Situation:
     asked: Mode | None
     """The mode the car is in, or is about to be in."""
     held_by: str | None
+    estops: tuple[Estop, ...]
+    lease: Lease | None
+    battery: str
+    """Why the battery allows no new drive, in words; empty if it does."""
     fan: bool | None
     queued: int
 
 
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What must be so before a command is carried out."""
+
+    not_estopped: bool = True
+    not_held: bool = True
+    """Of a coordinator: that the car is not on hold."""
+    lease: bool = False
+    """That nobody who ranks as high drives the car."""
+    battery: bool = False
+    link: bool = True
+    manual: bool = False
+    """Mode 0, in which alone the car obeys it."""
+    queue: bool = False
+
+
+_ANYTIME: Final = Needs(not_estopped=False, not_held=False, link=False)
+_MOVES: Final = Needs(lease=True, battery=True, manual=True)
+_ACTS: Final = Needs(manual=True, queue=True)
+_TURNS: Final = Needs(lease=True, manual=True, queue=True)
+
+RELEASE: Final = Needs(lease=True)
+"""A drive with motion stop: it moves nothing."""
+CLOSE: Final = Needs(lease=True)
+"""Mode manual: it stops the car."""
+TABLE: Final[dict[type[What], Needs]] = {
+    Stop: _ANYTIME,
+    EmergencyStop: _ANYTIME,
+    Resume: _ANYTIME,
+    TakeLease: Needs(lease=True, link=False),
+    Drive: _MOVES,
+    SetMode: Needs(lease=True, battery=True),
+    Act: _ACTS,
+    ChangeSpeed: _TURNS,
+    Fan: _TURNS,
+    Find: _ACTS,
+}
+
 Refusal = tuple[Reason, str]
+
+
+def needs(what: What) -> Needs:
+    """What this command needs."""
+    match what:
+        case Drive(Motion.STOP):
+            return RELEASE
+        case SetMode(Mode.MANUAL):
+            return CLOSE
+        case TakeLease(release=True):
+            return _ANYTIME
+        case Act(Ptz() | ArmSet()):
+            return _TURNS
+        case Act(General() as frame) if frame.servo is not None:
+            return _TURNS
+        case _:
+            return TABLE[type(what)]
 
 
 def refuse(command: Command, situation: Situation) -> Refusal | None:
     """Why the command is refused, or None. The words name the car, the state, and what to do."""
     what = command.what
-    if isinstance(what, Stop):
+    if isinstance(what, Stop | EmergencyStop):
         return None
     if command.age_s > command.ttl_s:
         return Reason.STALE, f"{command.age_s:.1f} s old on arrival, at most {command.ttl_s:g} s is allowed: ask again"
-    for rule in (_platform, _hold, _link, _mode, _queue):
-        refusal = rule(command, situation)
-        if refusal is not None:
-            return refusal
-    return None
+    unknown = _unknown(what, situation)
+    if unknown is not None:
+        return Reason.UNSUPPORTED, unknown
+    if isinstance(what, Resume):
+        return _resume(what, command.sender.kind, situation)
+    return _unmet(command, needs(what), situation)
 
 
-def _platform(command: Command, situation: Situation) -> Refusal | None:
-    what, profile = command.what, situation.profile
-    words: str | None = None
+def _unknown(what: What, situation: Situation) -> str | None:
+    """Why this car could never do it."""
+    profile = situation.profile
     match what:
-        case SetMode(mode):
-            if mode is not Mode.MANUAL and mode not in profile.modes:
-                known = ", ".join(sorted(profile.modes))
-                words = f"a {profile.name} car does not know mode {mode}; it knows: {known}"
+        case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
+            known = ", ".join(sorted(profile.modes))
+            return f"a {profile.name} car does not know mode {mode}; it knows: {known}"
         case Act(frame):
-            words = profile.refusal(frame)
+            return profile.refusal(frame)
         case ChangeSpeed(step):
-            words = profile.refusal(General(Motion.STOP, speed=step))
+            return profile.refusal(General(Motion.STOP, speed=step))
         case Fan(on):
             words = profile.refusal(General(Motion.STOP, fan=True))
             if words is None and on is not None and situation.fan is None:
-                words = (
+                return (
                     f"whether {situation.car}'s fan runs is not known: only a toggle is possible (leave the state out)"
                 )
+            return words
         case Drive(motion):
-            words = profile.refusal(General(motion))
+            return profile.refusal(General(motion))
         case _:
-            pass
-    return None if words is None else (Reason.UNSUPPORTED, words)
+            return None
 
 
-def _hold(command: Command, situation: Situation) -> Refusal | None:
-    if command.sender.kind is not Kind.COORDINATOR:
-        return None
-    if isinstance(command.what, Resume):
+def _resume(resume: Resume, kind: Kind, situation: Situation) -> Refusal | None:
+    if kind is Kind.COORDINATOR:
         return Reason.HELD, "a coordinator may not resume a car: a person or a script does"
-    if situation.held_by is None:
-        return None
-    ends = "a drive, mode or resume by a person or script ends it"
-    return Reason.HELD, f"{situation.car} is on hold ({situation.held_by} stopped it): {ends}"
-
-
-def _link(command: Command, situation: Situation) -> Refusal | None:
-    if isinstance(command.what, Resume):
-        return None
-    if situation.closing:
-        return Reason.LINK_DOWN, f"the gateway of {situation.car} is ending"
-    if not situation.link_open:
-        return Reason.LINK_DOWN, f"{situation.car} cannot be reached: {situation.link_reason}"
-    if not situation.answering:
-        return (
-            Reason.LINK_DOWN,
-            f"{situation.car} does not answer: no reading since its recovery; is it on, and the platform right?",
-        )
+    in_force = [estop.id for estop in situation.estops]
+    if resume.ids and not set(resume.ids) & set(in_force):
+        there = f"in force: {', '.join(in_force)}" if in_force else "none is in force"
+        return Reason.BAD_VALUE, f"{situation.car} has no e-stop {', '.join(resume.ids)}; {there}"
     return None
 
 
-def _mode(command: Command, situation: Situation) -> Refusal | None:
-    needs_manual = isinstance(command.what, Act | ChangeSpeed | Fan | Find) or (
-        isinstance(command.what, Drive) and command.what.motion is not Motion.STOP
-    )
-    if not needs_manual or situation.asked in (None, Mode.MANUAL):
-        return None
-    # The stop first: under a coordinator, which would bring a mode back, it is what helps.
-    helps = "stop it, or bring it to mode manual first"
-    return Reason.WRONG_MODE, f"{situation.car} is in mode {situation.asked}, where it ignores this: {helps}"
+def _unmet(command: Command, needed: Needs, situation: Situation) -> Refusal | None:
+    """The first need that is not met."""
+    car, sender = situation.car, command.sender
+    if needed.not_estopped and situation.estops:
+        first = situation.estops[0]
+        why = f": {first.why}" if first.why else ""
+        ids = " ".join(estop.id for estop in situation.estops)
+        return Reason.ESTOPPED, f"{car} is e-stopped by {first.by}{why}; a person or script ends it: resume {ids}"
+    if needed.not_held and sender.kind is Kind.COORDINATOR and situation.held_by is not None:
+        ends = "a drive, mode or resume by a person or script ends it"
+        return Reason.HELD, f"{car} is on hold ({situation.held_by} stopped it): {ends}"
+    lease, now = situation.lease, situation.now
+    if needed.lease and lease is not None and lease.refuses(sender, now, take=command.take):
+        words = f"{car} is driven by {lease.holder.name} ({lease.holder.kind}), for {lease.until - now:.1f} s more"
+        if sender.kind is lease.holder.kind is Kind.PERSON:
+            return Reason.LEASED, f"{words}: wait, or take it"
+        return Reason.LEASED, f"{words}: wait" + (", or ask as a person" if sender.kind is not Kind.PERSON else "")
+    if needed.battery and situation.battery:
+        return Reason.BATTERY_LOW, situation.battery
+    if needed.link:
+        refusal = _unreachable(situation)
+        if refusal is not None:
+            return refusal
+    if needed.manual and situation.asked not in (None, Mode.MANUAL):
+        # The stop first: under a coordinator, which would bring a mode back, it is what helps.
+        helps = "stop it, or bring it to mode manual first"
+        return Reason.WRONG_MODE, f"{car} is in mode {situation.asked}, where it ignores this: {helps}"
+    if needed.queue and situation.queued >= QUEUE_LIMIT:
+        return Reason.QUEUE_FULL, f"{situation.queued} commands wait for {car} already: ask again in a second"
+    return None
 
 
-def _queue(command: Command, situation: Situation) -> Refusal | None:
-    if isinstance(command.what, Act | ChangeSpeed | Fan | Find) and situation.queued >= QUEUE_LIMIT:
-        return Reason.QUEUE_FULL, f"{situation.queued} commands wait for {situation.car} already: ask again in a second"
+def _unreachable(situation: Situation) -> Refusal | None:
+    car = situation.car
+    if situation.closing:
+        return Reason.LINK_DOWN, f"the gateway of {car} is ending"
+    if not situation.link_open:
+        return Reason.LINK_DOWN, f"{car} cannot be reached: {situation.link_reason}"
+    if not situation.answering:
+        words = f"{car} does not answer: no reading since its recovery; is it on, and the platform right?"
+        return Reason.LINK_DOWN, words
     return None

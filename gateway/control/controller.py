@@ -6,10 +6,12 @@ one frame on its way.
 """
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
 from gateway.control import arbiter, recipes, stop
+from gateway.control.believed import Believed
 from gateway.control.ledger import Ledger, Pending
 from gateway.control.mode import ModeTruth, Verdict
 from gateway.control.outbox import Pacing
@@ -20,6 +22,7 @@ from gateway.control.records import (
     ChangeSpeed,
     Command,
     Drive,
+    EmergencyStop,
     Fan,
     Find,
     Kind,
@@ -31,19 +34,20 @@ from gateway.control.records import (
     Sender,
     SetMode,
     Stop,
+    TakeLease,
     Why,
     Write,
 )
+from gateway.control.safety import LEASE_S, Estop, Hold, Kept, Safety
+from gateway.control.senders import PAUSE_S, Senders
 from gateway.control.stop import Running
-from gateway.protocol.encode import ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, encode
+from gateway.protocol.encode import ColorLed, Frame, General, ModeClose, ModeOpen, encode
 from gateway.protocol.profile import Profile, StopStyle
 from gateway.protocol.readings import Event, Sensors
 from gateway.protocol.values import Mode, Motion
 
 PATIENCE_S: Final = 10.0
 """How long a one-shot or a mode may wait for a busy car before it is too old to matter."""
-SENDER_GONE_S: Final = 1.0
-"""A sender is lost when its token has been away so long: a restarted hub takes all tokens down for half a second."""
 STALL_S: Final = 0.5
 """A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
 WIRE_S: Final = 0.02  # protocol.md: 20 ms of wire for a frame of 19 bytes at 960 B/s
@@ -52,14 +56,6 @@ UNDER_WAY_S: Final = 0.06
 """A reading that came sooner after a frame was under way when the frame was sent."""
 FAN_SETTLED_S: Final = 2.0
 """Readings this long after a toggle were sent with the fan as it is now."""
-
-
-@dataclass(frozen=True, slots=True)
-class Hold:
-    """Who stopped the car, and when on the monotonic clock: the coordinator leaves it alone."""
-
-    by: str
-    since: float
 
 
 @dataclass(slots=True)
@@ -80,15 +76,13 @@ class _Held:
 class Controller:
     """One car's control. See the module's docstring for how it is driven."""
 
-    def __init__(self, car: str, profile: Profile, *, hold: Hold | None = None) -> None:
+    def __init__(self, car: str, profile: Profile, *, kept: Kept | None = None) -> None:
         self.car = car
         self.profile = profile
         self.mode = ModeTruth(profile)
         self.pacing = Pacing(profile)
-        self.hold = hold
-        self.fan: bool | None = None
-        self.servo_deg: int | None = None
-        self.speed = profile.speed.start
+        self.believed = Believed(profile)
+        self.safety = Safety.restored(kept or Kept())
         self.known = False
         """The last recovery is complete and no write has failed since: what is sent will be read as it is meant."""
         self._link_open = False
@@ -105,14 +99,9 @@ class Controller:
         self._acts: deque[Pending] = deque()
         self._source: Running | _Held | Pending | None = None
         """Whose frame `poll` returned last; None for a repetition."""
-        self._sent_motion = Motion.STOP
-        self._repeat = False
-        self._motors_on = False
         self._mode_sent: tuple[Pending, float] | None = None
         """A mode whose effect has not been seen yet, and when its frame went out."""
-        self._led = ColorLed(0, 0, 0)
-        self._fan_at = float("-inf")
-        self._senders: dict[str, float | None] = {}
+        self._senders = Senders()
 
     # ------------------------------------------------------------------ what is known
 
@@ -121,12 +110,12 @@ class Controller:
         """`off` only after a stop that is complete; `unknown` while the car's state is."""
         if not self.known:
             return "unknown"
-        return "on" if self._motors_on else "off"
+        return "on" if self.believed.motors_on else "off"
 
     @property
     def motion(self) -> Motion | None:
         """The motion that was sent last; None while the car's state is unknown."""
-        return self._sent_motion if self.known else None
+        return self.believed.motion if self.known else None
 
     @property
     def owner(self) -> str:
@@ -143,6 +132,11 @@ class Controller:
         if self._opening is not None and isinstance(self._opening.command.what, SetMode):
             return self._opening.command.what.mode
         return self.mode.asked
+
+    @property
+    def hold(self) -> Hold | None:
+        """Who stopped the car, if it is on hold."""
+        return self.safety.hold
 
     def take_records(self) -> list[Record]:
         """The records since the last call."""
@@ -163,7 +157,7 @@ class Controller:
         self._link_open = False
         self._link_reason = reason
         self.known = False
-        self._repeat = False
+        self.believed.repeat = False
         self._mode_sent = None
         self._source = None
         running, self._running = self._running, None
@@ -173,7 +167,7 @@ class Controller:
             self._not_stopped(now)
         self._drop(Phase.FAILED, cause, reason, now)
         self.mode.forget()
-        self.fan = None
+        self.believed.fan = None
 
     def heard(self, event: Event, now: float) -> None:
         """Take an event of the decoder as evidence."""
@@ -187,8 +181,8 @@ class Controller:
             return
         if event.range_cm is not None:
             self.pacing.echo_seen = event.range_cm > 0
-        if now > self._fan_at + FAN_SETTLED_S and self.profile.stop_style is not StopStyle.RASPBERRY_PI:
-            self.fan = False  # protocol.md: a car whose fan runs sends no readings
+        if now > self.believed.fan_at + FAN_SETTLED_S and self.profile.stop_style is not StopStyle.RASPBERRY_PI:
+            self.believed.fan = False  # protocol.md: a car whose fan runs sends no readings
         running = self._running
         if running is None:
             if self._gave_up and self._link_open:
@@ -202,17 +196,29 @@ class Controller:
         """Weigh silence; called a few times a second."""
         before = self.mode.verdict
         if self._link_open and self.known and self._running is None:
-            self.mode.silent(now=now, blocked_until=self.pacing.flight_until, fan=bool(self.fan))
+            self.mode.silent(now=now, blocked_until=self.pacing.flight_until, fan=bool(self.believed.fan))
         self._note_verdict(before, now)
 
     def sender_alive(self, name: str, *, alive: bool, now: float) -> None:
         """A sender's liveliness token appeared or went."""
         if alive:
-            self._senders[name] = None
-        elif self._held is not None and self._held.sender.name == name:
-            self._senders[name] = now
+            self._senders.appeared(name)
         else:
-            self._senders.pop(name, None)
+            self._senders.vanished(name, now, driving=self._held is not None and self._held.sender.name == name)
+
+    def unite(self, estops: Iterable[Estop], ended: Iterable[str], shown_by: str, now: float) -> None:
+        """Take over the fleet-wide e-stops, in force and ended, that another gateway of the fleet shows."""
+        begun, over = self.safety.unite(estops, ended)
+        for estop in over:
+            self._ledger.log(Level.WARNING, "estop_ended", f"e-stop {estop.id} has ended, as {shown_by} shows", now)
+        if not begun:
+            return
+        why = f": {begun[0].why}" if begun[0].why else ""
+        words = f"e-stop {begun[0].id} by {begun[0].by} is in force in the fleet, as {shown_by} shows{why}"
+        self._ledger.log(Level.ERROR, "estop_joined", words, now)
+        self._halt(words, now)
+        if self._link_open and not self._closing:
+            self._begin(stop.full(self.profile, known=self.known), Why.STOP, now)
 
     def stalled(self, gap_s: float, now: float) -> None:
         """The loop slept for `gap_s`: with motion held the car is stopped first."""
@@ -229,16 +235,20 @@ class Controller:
         if not command.streamed:
             self._ledger.record(pending, Phase.ASKED, now)
         what = command.what
-        if isinstance(what, Stop):
+        if isinstance(what, Stop | EmergencyStop):
             return self._stop(pending, now)
         if self._ledger.known(command):
             return self._reject(pending, Reason.DUPLICATE, f"a command with id {command.id} came already", now)
-        refusal = arbiter.refuse(command, self._situation())
+        refusal = arbiter.refuse(command, self._situation(now))
         if refusal is not None:
             return self._reject(pending, *refusal, now)
+        if command.streamed and not self._heard_again(command, now):
+            words = f"{self.car} was stopped: let go for {PAUSE_S:g} s (or send stop), then drive again"
+            return self._reject(pending, Reason.HELD, words, now)
         self._ledger.accepted(command)
-        held_by = self.hold.by if self.hold is not None else None
-        if command.sender.kind is not Kind.COORDINATOR and isinstance(what, Drive | SetMode | Resume):
+        if arbiter.needs(what).lease:
+            self._lease(command, now)
+        if command.sender.kind is not Kind.COORDINATOR and isinstance(what, Drive | SetMode):
             self._end_hold(command.sender, now)
         match what:
             case Drive(Motion.STOP):
@@ -249,10 +259,11 @@ class Controller:
                 return self._close_mode(pending, now)
             case SetMode(mode):
                 return self._set_mode(pending, mode, now)
-            case Resume():
-                words = f"{self.car} was not on hold" if held_by is None else f"the hold by {held_by} has ended"
-                return self._done(pending, words, now)
-            case Fan(bool() as on) if on == self.fan:
+            case Resume(ids):
+                return self._resume(pending, ids, now)
+            case TakeLease(release):
+                return self._take_lease(pending, now, release=release)
+            case Fan(bool() as on) if on == self.believed.fan:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
             case Fan():
                 pending.frames.append(General(Motion.STOP, fan=True))
@@ -262,7 +273,7 @@ class Controller:
                 pending.frames.append(General(Motion.STOP, speed=step))
             case Find():
                 whistle = General(Motion.STOP, whistle=True)
-                pending.frames.extend((whistle, ColorLed(255, 255, 255), whistle, self._led))
+                pending.frames.extend((whistle, ColorLed(255, 255, 255), whistle, self.believed.led))
         self._acts.append(pending)
         return self._queued(pending, now)
 
@@ -312,9 +323,9 @@ class Controller:
             return self._open_mode(self._opening, now)
         if self._acts:  # asked before the mode, in which the car would ignore them
             pending = self._acts[0]
-            return self._write(self._with_motion(pending.frames[0]), Why.COMMAND, pending, pending)
-        if self._repeat and now >= self.pacing.repeat_at:
-            return self._write(General(self._sent_motion), Why.REPEAT, None, held.pending if held else None)
+            return self._write(self.believed.with_motion(pending.frames[0]), Why.COMMAND, pending, pending)
+        if self.believed.repeat and now >= self.pacing.repeat_at:
+            return self._write(General(self.believed.motion), Why.REPEAT, None, held.pending if held else None)
         return None
 
     def wrote(self, write: Write, now: float) -> None:
@@ -338,7 +349,7 @@ class Controller:
                     if self._acts and self._acts[0] is source:
                         self._acts.popleft()
             case None:
-                self._repeat = False
+                self.believed.repeat = False
 
     def write_failed(self, reason: str, now: float) -> None:
         """The frame that `poll` returned did not go out whole: the caller closes the link and opens it again."""
@@ -360,7 +371,7 @@ class Controller:
                 times.append(self.pacing.flight_until)
             if self._opening is not None:
                 times.append(self.pacing.ready_at(Gate.ALONE if self.at_rest else Gate.FLIGHT))
-            if self._repeat:
+            if self.believed.repeat:
                 times.append(self.pacing.repeat_at)
         return max(now, min(times, default=float("inf")))
 
@@ -386,19 +397,72 @@ class Controller:
 
     def _stop(self, pending: Pending, now: float) -> Answer:
         command = pending.command
-        if command.sender.kind is not Kind.COORDINATOR and self.hold is None:
-            self.hold = Hold(command.sender.name, now)
-        self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"{command.verb} by {command.sender.name}", now)
+        sender, latched = command.sender, command.note
+        if isinstance(command.what, EmergencyStop):
+            estop = Estop(command.id, sender.name, command.what.why, command.asked_ns, command.what.fleet_wide)
+            until = f"latched as {self.safety.latch(estop).id} until it is resumed"
+            latched = f"{until}; {command.note}" if command.note else until
+        elif sender.kind is not Kind.COORDINATOR:
+            self.safety.held_by(sender.name, command.asked_ns)
+        self._halt(f"{command.verb} by {sender.name}", now)
         if not self._link_open or self._closing:
             why = "its gateway is ending" if self._closing else self._link_reason
             words = f"{self.car} cannot be reached: {why}; it is stopped first when its link is back"
-            return self._reject(pending, Reason.LINK_DOWN, words, now)
+            return self._reject(pending, Reason.LINK_DOWN, f"{words} ({latched})" if latched else words, now)
         worst = self.worst_stop_s(now)
-        self._ledger.record(pending, Phase.QUEUED, now, worst_case_s=worst)
+        self._ledger.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
         self._begin(stop.full(self.profile, known=self.known), Why.STOP, now, pending)
-        assert isinstance(command.what, Stop)
-        words = "stopped and held; this version latches nothing" if command.what.emergency else ""
-        return Answer(Phase.QUEUED, words=words, worst_case_s=worst)
+        return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
+
+    def _halt(self, words: str, now: float) -> None:
+        """Nothing that waits is sent, and no stream that runs is obeyed before it has paused."""
+        self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        self.safety.driven_no_more(now)
+        self._senders.halt(now)
+
+    def _heard_again(self, command: Command, now: float) -> bool:
+        what = command.what
+        release = isinstance(what, Drive) and what.motion is Motion.STOP
+        return self._senders.streamed(command.sender.name, now, release=release)
+
+    def _resume(self, pending: Pending, ids: tuple[str, ...], now: float) -> Answer:
+        sender = pending.command.sender.name
+        if ids:
+            over = " ".join(estop.id for estop in self.safety.end(ids))
+            words = f"e-stop {over} was ended by {sender}"
+            self._ledger.log(Level.WARNING, "estop_ended", words, now)
+        elif self.hold is not None:
+            words = f"the hold by {self.hold.by} has ended"
+            self._end_hold(pending.command.sender, now)
+        else:
+            words = f"{self.car} was not on hold"
+        if self.safety.estops:
+            words += f"; still in force: e-stop {' '.join(estop.id for estop in self.safety.estops)}"
+        elif self.hold is not None:
+            words += f"; on hold (by {self.hold.by}) until a person or script drives, sets a mode or resumes"
+        return self._done(pending, words, now)
+
+    def _lease(self, command: Command, now: float) -> None:
+        """The car is the sender's while it drives; who had it is told by whom it was taken."""
+        sender, before = command.sender, self.safety.leased(now)
+        lasts_s = command.what.duration_s if isinstance(command.what, Drive) else 0.0
+        self.safety.grant(sender, now + lasts_s)
+        if before is None or before.holder == sender:
+            return
+        words = f"taken over by {sender.name} ({sender.kind}) from {before.holder.name} ({before.holder.kind})"
+        self._ledger.log(Level.INFO, "lease_taken", f"{self.car}: {words}", now)
+        if self._held is not None and self._held.sender != sender and not isinstance(command.what, Drive | SetMode):
+            self._release(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+
+    def _take_lease(self, pending: Pending, now: float, *, release: bool) -> Answer:
+        sender = pending.command.sender
+        if not release:
+            return self._done(pending, f"{self.car} is {sender.name}'s for {LEASE_S:g} s, and while it drives", now)
+        if not self.safety.release(sender):
+            return self._done(pending, f"{sender.name} had no lease of {self.car}", now)
+        if self._held is not None and self._held.sender == sender:
+            self._release(Phase.COMPLETE, None, f"released by {sender.name}", now)
+        return self._done(pending, f"{self.car} is free", now)
 
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
         sender, held = pending.command.sender, self._held
@@ -408,7 +472,7 @@ class Controller:
                 f"{self.car} is busy for {free_at - now:.1f} s more, longer than this drive's {drive.duration_s:g} s"
             )
             return self._reject(pending, Reason.EXPIRED, words, now)
-        watched = self._senders.get(sender.name, 0.0) is None
+        watched = self._senders.watched(sender.name)
         if held is not None and held.motion is drive.motion and held.sender == sender:
             return self._drive_on(held, pending, now + drive.duration_s, now)
         words = f"{drive.motion} by {sender.name}"
@@ -485,19 +549,23 @@ class Controller:
         if self.hold is not None:
             words = f"the hold by {self.hold.by} was ended by {sender.name}"
             self._ledger.log(Level.INFO, "hold_ended", words, now)
-            self.hold = None
+            self.safety.hold = None
 
-    def _situation(self) -> arbiter.Situation:
+    def _situation(self, now: float) -> arbiter.Situation:
         return arbiter.Situation(
             car=self.car,
             profile=self.profile,
+            now=now,
             link_open=self._link_open,
             link_reason=self._link_reason,
             answering=not self._gave_up,
             closing=self._closing,
             asked=self.asked,
             held_by=self.hold.by if self.hold else None,
-            fan=self.fan,
+            estops=self.safety.estops,
+            lease=self.safety.leased(now),
+            battery="",
+            fan=self.believed.fan,
             queued=len(self._acts),
         )
 
@@ -510,14 +578,14 @@ class Controller:
     @property
     def at_rest(self) -> bool:
         """Known to stand in mode 0 after a complete stop."""
-        return self.known and self._manual and not self._motors_on
+        return self.known and self._manual and not self.believed.motors_on
 
     def _soft(self) -> Recipe:
         return stop.soft(self.profile, known=self.known, manual=self._manual)
 
     def _begin(self, recipe: Recipe, why: Why, now: float, pending: Pending | None = None) -> None:
         """Carry out a recipe, or join the one that runs if that is no weaker."""
-        self._repeat = False
+        self.believed.repeat = False
         joining = [pending] if pending is not None else []
         running = self._running
         turn_s = self.profile.mode_turn_s(self.mode.asked) if self.mode.asked is not None else 0.0
@@ -558,7 +626,7 @@ class Controller:
             self._ledger.log(Level.INFO, "recovered", f"{self.car} is in a known state: stopped, mode manual", now)
         self.known = True
         self._gave_up = False
-        self._motors_on = False
+        self.believed.motors_on = False
         for pending in running.commands:
             if not isinstance(pending.command.what, SetMode):
                 self._ledger.record(pending, Phase.COMPLETE, now)
@@ -591,12 +659,6 @@ class Controller:
         self._source = source
         return Write(frame, encode(frame), why, by.command.id if by is not None else "")
 
-    def _with_motion(self, frame: Frame) -> Frame:
-        """Every general frame carries a motion: the one that holds now."""
-        if not isinstance(frame, General):
-            return frame
-        return General(self._sent_motion, frame.whistle, frame.speed, frame.servo, frame.sing, frame.light, frame.fan)
-
     def _open_mode(self, pending: Pending, now: float) -> Write | None:
         """Open a mode, from rest in mode 0 only: opening while driving leaves the motors as they were, blind."""
         assert isinstance(pending.command.what, SetMode)
@@ -609,30 +671,15 @@ class Controller:
 
     def _note_frame(self, frame: Frame, now: float) -> None:
         """What a written frame does to what we know of the car."""
+        self.believed.wrote(frame, now)
         match frame:
-            case General():
-                if frame.motion is not Motion.STOP:
-                    self._repeat = self._repeat or frame.motion is not self._sent_motion
-                    self._motors_on = True
-                self._sent_motion = frame.motion
-                if frame.speed is not None:
-                    self.speed = self.profile.speed.step(self.speed, frame.speed)
-                if frame.fan:
-                    self.fan = None if self.fan is None else not self.fan
-                    self._fan_at = now
             case ModeOpen(mode):
                 self._mode_sent = None
-                self._motors_on = True
                 self.mode.ask(mode, now=now, block_s=self.profile.block_s(frame))
             case ModeClose():
                 if self._mode_sent is not None and self._mode_sent[0].command.what != SetMode(Mode.MANUAL):
                     self._mode_sent = None
-                self._sent_motion = Motion.STOP
                 self.mode.ask(Mode.MANUAL, now=now, block_s=self.profile.block_s(frame))
-            case Ptz(deg):
-                self.servo_deg = deg
-            case ColorLed():
-                self._led = frame
             case _:
                 pass
         if self.profile.stop_style is StopStyle.RASPBERRY_PI and self.mode.asked is None:
@@ -641,8 +688,7 @@ class Controller:
     # ------------------------------------------------------------------ time
 
     def _held_until(self, held: _Held) -> float:
-        gone_at = self._senders.get(held.sender.name) if held.watched else None
-        return held.expires_at if gone_at is None else min(held.expires_at, gone_at + SENDER_GONE_S)
+        return min(held.expires_at, self._senders.lost_at(held.sender.name)) if held.watched else held.expires_at
 
     def _expire(self, now: float) -> None:
         held = self._held
@@ -683,8 +729,9 @@ class Controller:
     def _close_held(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
         held, self._held = self._held, None
         if held is not None:
-            if self._senders.get(held.sender.name) is not None:
-                del self._senders[held.sender.name]
+            self._senders.forget(held.sender.name)
+            if phase is not Phase.SUPERSEDED:
+                self.safety.driven_no_more(now)
             self._ledger.record(held.pending, phase, now, reason=reason, words=words)
 
     def _close_opening(self, phase: Phase, reason: Reason, words: str, now: float) -> None:

@@ -96,12 +96,27 @@ class Fan:
 class Stop:
     """Stop, and hold the car against the coordinator unless the coordinator asked."""
 
-    emergency: bool = False
+
+@dataclass(frozen=True, slots=True)
+class EmergencyStop:
+    """Stop, and refuse everything until it is ended by its id. `fleet_wide`: every gateway of the fleet latches it."""
+
+    why: str = ""
+    fleet_wide: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """End the hold."""
+    """End the e-stops of these ids; without ids, the hold."""
+
+    ids: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TakeLease:
+    """Reserve the car for the sender for a moment, or give it back."""
+
+    release: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +124,7 @@ class Find:
     """Make the car blink and beep, without moving it."""
 
 
-What = Drive | SetMode | Act | ChangeSpeed | Fan | Stop | Resume | Find
+What = Drive | SetMode | Act | ChangeSpeed | Fan | Stop | EmergencyStop | Resume | TakeLease | Find
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +137,12 @@ class Command:
     what: What
     age_s: float = 0.0
     ttl_s: float = 2.0
+    take: bool = False
+    """A person takes the car from an equal."""
+    note: str = ""
+    """What was wrong with a stop that is carried out all the same."""
+    asked_ns: int = 0
+    """Wall clock, ns since the epoch."""
     streamed: bool = False
     """One of a stream of publications: nobody waits for an answer, and repetitions are not recorded one by one."""
 

@@ -13,6 +13,7 @@ from gateway.control.records import (
     ChangeSpeed,
     Command,
     Drive,
+    EmergencyStop,
     Fan,
     Find,
     Kind,
@@ -21,6 +22,7 @@ from gateway.control.records import (
     Sender,
     SetMode,
     Stop,
+    TakeLease,
     What,
 )
 from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz
@@ -82,9 +84,13 @@ def general(**fields: Any) -> Act:
         ("fan", {"state": "off"}, Fan(on=False)),
         ("stop", {}, Stop()),
         ("stop", None, Stop()),
-        ("estop", {"why": "smoke", "scope": "fleet"}, Stop(emergency=True)),
-        ("estop", None, Stop(emergency=True)),
+        ("estop", {"why": "smoke", "scope": "fleet"}, EmergencyStop("smoke", fleet_wide=True)),
+        ("estop", {"why": "x" * 999, "scope": "car"}, EmergencyStop("x" * 200)),
+        ("estop", None, EmergencyStop()),
         ("resume", {}, Resume()),
+        ("resume", {"ids": ["a", "b"]}, Resume(("a", "b"))),
+        ("lease", {}, TakeLease()),
+        ("lease", {"release": True}, TakeLease(release=True)),
         ("find", {}, Find()),
     ],
 )
@@ -126,7 +132,8 @@ def test_every_verb_of_the_table_is_known_here() -> None:
         ("drive", {"motion": 1}, Reason.BAD_VALUE, "the payload is not the JSON of fleet.v1.DriveCommand"),
         ("drive", {"motion": "forward", "kind": "boss"}, Reason.BAD_VALUE, "person, script, coordinator"),
         ("drive", {"motion": "forward", "sender": "a/b"}, Reason.BAD_VALUE, "sender 'a/b' is not allowed"),
-        ("drive", {"motion": "forward", "take": True}, Reason.UNSUPPORTED, "take is not supported yet"),
+        ("drive", {"motion": "forward", "sender": "a\nb"}, Reason.BAD_VALUE, "no control characters"),
+        ("drive", {"motion": "forward", "id": "x" * 129}, Reason.BAD_VALUE, "id of 129 characters is too long"),
         ("mode", {"mode": "parking"}, Reason.BAD_VALUE, "mode 'parking': allowed are manual, "),
         ("led", {"r": 1, "b": 1}, Reason.BAD_VALUE, "no g given: r, g and b are needed, 0..255 each"),
         ("led", {"r": 1, "g": 256, "b": 1}, Reason.BAD_VALUE, "g: 256, allowed are whole numbers 0..255"),
@@ -142,16 +149,36 @@ def test_every_verb_of_the_table_is_known_here() -> None:
         ("arm", {"joint_deg": [1, 2, 3, 4, 5, 999]}, Reason.BAD_VALUE, "joint_deg[5]: 999"),
         ("speed", {}, Reason.BAD_VALUE, "no step given: allowed are up, down"),
         ("fan", {"state": "fast"}, Reason.BAD_VALUE, "allowed are on, off, or none to toggle"),
-        ("resume", {"ids": ["x"]}, Reason.UNSUPPORTED, "no e-stop is latched yet"),
-        ("lease", {}, Reason.UNSUPPORTED, "leases are not supported yet"),
-        ("stop", [1], Reason.BAD_VALUE, "the payload is not the JSON of fleet.v1.StopCommand"),
-        ("stop", {"sender": "\ud800"}, Reason.BAD_VALUE, "the payload is not the JSON"),
     ],
 )
 def test_what_is_no_command_is_refused_with_words(verb: str, payload: Any, reason: Reason, words: str) -> None:
     error = refused(verb, payload)
     assert error.reason is reason
     assert words in error.words
+
+
+@pytest.mark.parametrize(
+    ("payload", "words"),
+    [
+        ([1], "the payload is not the JSON of fleet.v1.StopCommand"),
+        ({"sender": "\ud800"}, "the payload is not the JSON"),
+        ({"sender": "a/b"}, "sender 'a/b' is not allowed"),
+        ({"kind": "boss"}, "kind 'boss': allowed are"),
+        ({"ttl_s": 0}, "ttl_s 0"),
+        ({"id": "x" * 200}, "too long"),
+    ],
+)
+def test_a_stop_is_a_stop_whatever_is_wrong_with_its_words(payload: Any, words: str) -> None:
+    stop = ask("stop", payload)
+    assert stop.what == Stop()
+    assert stop.note.startswith("stopped, though: stop: ")
+    assert words in stop.note
+    assert ask("estop", payload).what == EmergencyStop()
+
+
+def test_an_e_stop_for_an_unknown_scope_stops_this_car() -> None:
+    assert ask("estop", {"scope": "world", "sender": "mia"}).what == EmergencyStop()
+    assert "allowed are car (the default) and fleet" in ask("estop", {"scope": "world"}).note
 
 
 def test_a_refusal_is_recorded_under_the_id_and_the_sender_that_were_given() -> None:

@@ -8,40 +8,48 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gateway.store import Store, StoredHold, default_directory
+from gateway.control.safety import Estop, Hold, Kept
+from gateway.store import Store, default_directory
 
 NOW = 1_800_000_000_000_000_000
 
 
 def test_a_hold_is_read_back_by_the_next_process(tmp_path: Path) -> None:
     directory = tmp_path / "not" / "yet" / "there"
-    hold = StoredHold("mia", NOW - 5)
-    Store(directory, "fleet", "red").save(hold)
-    assert Store(directory, "fleet", "red").load(NOW) == hold
-    assert Store(directory, "fleet", "blue").load(NOW) is None
-    assert Store(directory, "other", "red").load(NOW) is None
-    Store(directory, "fleet", "red").save(None)
-    assert Store(directory, "fleet", "red").load(NOW) is None
+    estop = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=True)
+    kept = Kept(Hold("mia", NOW - 5), (estop,), ("e0",))
+    Store(directory, "fleet", "red").save(kept)
+    assert Store(directory, "fleet", "red").load(NOW) == kept
+    assert Store(directory, "fleet", "blue").load(NOW) == Kept()
+    assert Store(directory, "other", "red").load(NOW) == Kept()
+    Store(directory, "fleet", "red").save(Kept())
+    assert Store(directory, "fleet", "red").load(NOW) == Kept()
     assert [path.name for path in directory.iterdir()] == ["fleet.red.json"]
 
 
 def test_a_hold_from_the_future_began_now(tmp_path: Path) -> None:
     store = Store(tmp_path, "fleet", "red")
-    store.save(StoredHold("mia", NOW + 10**30))
-    assert store.load(NOW) == StoredHold("mia", NOW)
+    store.save(Kept(Hold("mia", NOW + 10**30)))
+    assert store.load(NOW) == Kept(Hold("mia", NOW))
+
+
+def test_a_file_of_a_version_without_e_stops_is_read(tmp_path: Path) -> None:
+    store = Store(tmp_path, "fleet", "red")
+    store.path.write_text('{"hold": {"by": "mia", "since_ns": 7}}')
+    assert store.load(NOW) == Kept(Hold("mia", 7))
 
 
 def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
-        Store(tmp_path / "file", "fleet", "red").save(None)
-    assert Store(tmp_path / "file", "fleet", "red").load(NOW) is not None
+        Store(tmp_path / "file", "fleet", "red").save(Kept())
+    assert Store(tmp_path / "file", "fleet", "red").load(NOW).hold is not None
     store = Store(tmp_path, "fleet", "red")
-    store.save(StoredHold("mia", 1))
+    store.save(Kept(Hold("mia", 1)))
     (tmp_path / "fleet.red.new").mkdir()
     with pytest.raises(OSError, match="fleet"):
-        store.save(None)
-    assert store.load(NOW) == StoredHold("mia", 1)
+        store.save(Kept())
+    assert store.load(NOW) == Kept(Hold("mia", 1))
 
 
 @pytest.mark.parametrize(
@@ -60,6 +68,10 @@ def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -
         '{"hold": {"by": "mia", "since_ns": Infinity}}',
         '{"hold": {"by": "mia", "since_ns": NaN}}',
         '{"hold": {"by": "\\ud800", "since_ns": 3}}',
+        '{"hold": null, "estops": 3}',
+        '{"hold": null, "estops": [3]}',
+        '{"hold": null, "estops": [{"id": "e"}]}',
+        '{"hold": null, "ended": 3}',
         "[" * 100_000,
         '{"hold": {"by": "mia", "since_ns": ' + "9" * 5000 + "}}",
     ],
@@ -67,7 +79,7 @@ def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -
 def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
     store = Store(tmp_path, "fleet", "red")
     store.path.write_text(text)
-    held = store.load(NOW)
+    held = store.load(NOW).hold
     assert held is not None
     assert (held.since_ns, held.by[:10]) == (NOW, "unreadable")
     held.by.encode()
@@ -78,7 +90,7 @@ def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
 def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: bytes) -> None:
     store = Store(tmp_path, "fleet", "red")
     store.path.write_bytes(content)
-    held = store.load(NOW)
+    held = store.load(NOW).hold
     if held is None:
         assert json.loads(content)["hold"] is None
     else:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from gateway.control.controller import Controller, Hold
+from gateway.control.controller import Controller
 from gateway.control.records import (
     Answer,
     Command,
@@ -15,6 +15,7 @@ from gateway.control.records import (
     What,
     Why,
 )
+from gateway.control.safety import Kept
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import parse_platform
 
@@ -34,9 +35,9 @@ COORDINATOR = Sender("plan", Kind.COORDINATOR)
 class Desk:
     """Drives a controller exactly as its loop does: it is woken by what it says, and by what happens."""
 
-    def __init__(self, platform: str = "arduino", *, hold: Hold | None = None) -> None:
+    def __init__(self, platform: str = "arduino", *, kept: Kept | None = None) -> None:
         self.now = 100.0
-        self.control = Controller("red", parse_platform(platform), hold=hold)
+        self.control = Controller("red", parse_platform(platform), kept=kept)
         self.sent: list[tuple[float, bytes, Why]] = []
         self.records: list[CommandRecord] = []
         self.logs: list[LogRecord] = []
@@ -70,11 +71,19 @@ class Desk:
         streamed: bool = False,
         age_s: float = 0.0,
         pump: bool = True,
+        take: bool = False,
     ) -> Answer:
         """Give a command."""
         self.number += 1
         command = Command(
-            identity or f"c{self.number}", type(what).__name__, sender, what, age_s=age_s, streamed=streamed
+            identity or f"c{self.number}",
+            type(what).__name__,
+            sender,
+            what,
+            age_s=age_s,
+            take=take,
+            asked_ns=int(self.now * 1e9),
+            streamed=streamed,
         )
         answer = self.control.command(command, self.now)
         if pump:

@@ -4,11 +4,12 @@ import random
 
 import pytest
 
-from gateway.control.controller import PATIENCE_S, Hold
+from gateway.control.controller import PATIENCE_S
 from gateway.control.records import (
     Act,
     ChangeSpeed,
     Drive,
+    EmergencyStop,
     Fan,
     Find,
     Phase,
@@ -20,6 +21,7 @@ from gateway.control.records import (
     What,
     Why,
 )
+from gateway.control.safety import Hold, Kept
 from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz, parse_sent
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from tests.gateway.control.desk import BACK, COORDINATOR, MODE00, PERSON, RUN, SCRIPT, STOP, TRACKING, Desk
@@ -62,7 +64,7 @@ def desk() -> Desk:
             [ASKED, QUEUED, SENT],
         ),
         (Stop(), [MODE00, STOP], [ASKED, QUEUED, SENT, COMPLETE]),
-        (Stop(emergency=True), [MODE00, STOP], [ASKED, QUEUED, SENT, COMPLETE]),
+        (EmergencyStop("smoke"), [MODE00, STOP], [ASKED, QUEUED, SENT, COMPLETE]),
         (Resume(), [], [ASKED, SENT]),
     ],
     ids=str,
@@ -297,16 +299,17 @@ def test_a_mode_asked_while_driving_stops_first_then_what_waits_then_opens(desk:
 def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Desk) -> None:
     assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
     desk.ask(Stop(), PERSON)
-    assert desk.control.hold == Hold("mia", desk.now)
+    assert desk.control.hold == Hold("mia", int(desk.now * 1e9))
     desk.run(600.0)
     everything: list[What] = [FORWARD, Drive(Motion.STOP), SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), LIGHT, Fan()]
     for what in [*everything, ChangeSpeed(SpeedStep.UP), Find(), Resume()]:
         answer = desk.ask(what, COORDINATOR)
         assert (answer.status, answer.reason) == (Phase.REJECTED, Reason.HELD), what
-    for what in (Stop(), Stop(emergency=True)):
-        assert desk.ask(what, COORDINATOR).status is QUEUED
+    for what in (Stop(), EmergencyStop("smoke")):
+        assert desk.ask(what, COORDINATOR, identity=type(what).__name__).status is QUEUED
     assert desk.control.hold is not None
     assert desk.control.hold.by == "mia", "the first keeps it"
+    assert desk.ask(Resume(("EmergencyStop",)), PERSON).status is SENT
     for what in (LIGHT, WHISTLE, Find()):
         assert desk.ask(what, PERSON).status is QUEUED
     assert desk.control.hold is not None, "only a drive, a mode or resume end it"
@@ -341,7 +344,7 @@ def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Desk) -
 
 
 def test_a_hold_from_before_a_restart_counts() -> None:
-    desk = Desk(hold=Hold("mia", 1.0)).ready()
+    desk = Desk(kept=Kept(Hold("mia", 1))).ready()
     assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
     assert desk.ask(FORWARD, PERSON).status is QUEUED
 
@@ -428,7 +431,7 @@ def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Desk) -> None:
     desk.take()
     for identity in ("held", "act"):
         assert desk.end(identity) == (Phase.FAILED, Reason.LINK_DOWN), identity
-    assert (desk.control.motors, desk.control.motion, desk.control.fan) == ("unknown", None, None)
+    assert (desk.control.motors, desk.control.motion, desk.control.believed.fan) == ("unknown", None, None)
     stop = desk.ask(Stop(), PERSON)
     assert (stop.status, stop.reason) == (Phase.REJECTED, Reason.LINK_DOWN)
     assert desk.control.hold is not None, "a stop by hand holds, reached or not"
@@ -642,8 +645,8 @@ def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
     for _ in range(3):
         pair.ask(Fan())
         pair.run(2.5)
-        assert pair.car.truth.fan is pair.control.fan
+        assert pair.car.truth.fan is pair.control.believed.fan
     for step in (SpeedStep.DOWN, SpeedStep.DOWN, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP):
         pair.ask(ChangeSpeed(step))
         pair.run(0.5)
-        assert pair.car.truth.speed == pair.control.speed
+        assert pair.car.truth.speed == pair.control.believed.speed

@@ -1,0 +1,69 @@
+"""Who commands the car, over time: whose liveliness token is gone, and whose stream of drives must pause first."""
+
+from dataclasses import dataclass, field
+from typing import Final
+
+SENDER_GONE_S: Final = 1.0
+"""A sender is lost when its token has been away so long: a restarted hub takes all tokens down for half a second."""
+PAUSE_S: Final = 0.5
+"""After a stop, whoever streams drives is heard again when the stream has paused so long, or has said `stop`.
+
+Without it the next sample of a stick that somebody still leans on would drive on, 50 ms after another person's stop.
+"""
+_REMEMBERED: Final = 256
+
+
+@dataclass(slots=True)
+class Senders:
+    """Tokens and streams, by sender's name. Times are seconds on one monotonic clock."""
+
+    _tokens: dict[str, float | None] = field(default_factory=dict)
+    """None while the token is there; since when it is gone."""
+    _streams: dict[str, float] = field(default_factory=dict)
+    """When a sender's last streamed drive came."""
+    _halted: set[str] = field(default_factory=set)
+
+    # ------------------------------------------------------------------ tokens
+
+    def appeared(self, name: str) -> None:
+        """The sender's token is there."""
+        self._tokens[name] = None
+
+    def vanished(self, name: str, now: float, *, driving: bool) -> None:
+        """The sender's token is gone; of who does not drive nothing need be remembered."""
+        if driving:
+            self._tokens[name] = now
+        else:
+            self._tokens.pop(name, None)
+
+    def watched(self, name: str) -> bool:
+        """Whether the sender has a token now."""
+        return self._tokens.get(name, 0.0) is None
+
+    def lost_at(self, name: str) -> float:
+        """When the sender counts as lost; inf while its token is there."""
+        gone_at = self._tokens.get(name)
+        return float("inf") if gone_at is None else gone_at + SENDER_GONE_S
+
+    def forget(self, name: str) -> None:
+        """The sender drives no more: if its token is gone, so is what was remembered of it."""
+        if self._tokens.get(name) is not None:
+            del self._tokens[name]
+
+    # ------------------------------------------------------------------ streams
+
+    def streamed(self, name: str, now: float, *, release: bool) -> bool:
+        """Note a streamed drive; False if it must not be obeyed, since the stream has not paused after a stop."""
+        last = self._streams.pop(name, float("-inf"))
+        if release or now - last >= PAUSE_S:
+            self._halted.discard(name)
+        self._streams[name] = now
+        while len(self._streams) > _REMEMBERED:
+            oldest = next(iter(self._streams))
+            del self._streams[oldest]
+            self._halted.discard(oldest)
+        return name not in self._halted
+
+    def halt(self, now: float) -> None:
+        """The car was stopped: streams that run must pause before they are heard again."""
+        self._halted.update(name for name, last in self._streams.items() if now - last < PAUSE_S)

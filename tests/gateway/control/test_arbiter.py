@@ -1,0 +1,156 @@
+"""The arbiter over the whole product of what it looks at: stop wins everywhere, and nobody moves what they may not."""
+
+import itertools
+from collections.abc import Iterator
+
+import pytest
+
+from gateway.control.arbiter import QUEUE_LIMIT, TABLE, Situation, needs, refuse
+from gateway.control.records import (
+    Act,
+    ChangeSpeed,
+    Command,
+    Drive,
+    EmergencyStop,
+    Fan,
+    Find,
+    Kind,
+    Reason,
+    Resume,
+    Sender,
+    SetMode,
+    Stop,
+    TakeLease,
+    What,
+)
+from gateway.control.safety import Estop, Lease
+from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz
+from gateway.protocol.profile import parse_platform
+from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+
+NOW = 100.0
+WHATS: list[What] = [
+    Stop(),
+    EmergencyStop(),
+    EmergencyStop("smoke", fleet_wide=True),
+    Resume(),
+    Resume(("e1",)),
+    Resume(("other",)),
+    TakeLease(),
+    TakeLease(release=True),
+    Drive(Motion.FORWARD),
+    Drive(Motion.STOP),
+    SetMode(Mode.TRACKING),
+    SetMode(Mode.MANUAL),
+    Act(General(Motion.STOP, light=Light.RED)),
+    Act(General(Motion.STOP, whistle=True)),
+    Act(General(Motion.STOP, servo=ServoAction.FRONT_LEFT)),
+    Act(ColorLed(1, 2, 3)),
+    Act(Ptz(90)),
+    Act(ArmSet((0,) * 6)),
+    ChangeSpeed(SpeedStep.UP),
+    Fan(),
+    Fan(on=True),
+    Find(),
+]
+MOVES = (Drive, SetMode, ChangeSpeed, Fan)
+"""What moves the car, or how it moves; with servo and arm it needs the lease."""
+SENDERS = [Sender("ann", kind) for kind in Kind]
+LEASES = [None, *(Lease(Sender("bob", kind), NOW + 1.0) for kind in Kind), Lease(Sender("bob", Kind.PERSON), NOW - 1.0)]
+RANK = [Kind.COORDINATOR, Kind.SCRIPT, Kind.PERSON]
+ESTOP = Estop("e1", "eve", "smoke", 1, fleet_wide=False)
+
+
+def situations() -> Iterator[Situation]:
+    """2 x 2 x 2 x 2 x 4 x 2 x 2 x 5 x 2 x 2 x 4 states: mode, hold, e-stop, lease, link, platform, battery."""
+    for (
+        (link, answering, closing, held, estopped, lease, battery, queued),
+        asked,
+        platform,
+    ) in itertools.product(
+        itertools.product(
+            (True, False), (True, False), (True, False), (None, "mia"), ((), (ESTOP,)), LEASES, ("", "flat"), (0, 8)
+        ),
+        (None, Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED),
+        ("arduino", "raspberry_pi", "unknown", "stm32+arm"),
+    ):
+        profile = PROFILES[platform]
+        yield Situation(
+            "red", profile, NOW, link, "gone", answering, closing, asked, held, estopped, lease, battery, None, queued
+        )
+
+
+PROFILES = {name: parse_platform(name) for name in ("arduino", "raspberry_pi", "unknown", "stm32+arm")}
+
+
+@pytest.mark.parametrize("sender", SENDERS, ids=lambda sender: sender.kind)
+@pytest.mark.parametrize("what", WHATS, ids=repr)
+def test_every_command_in_every_state(what: What, sender: Sender) -> None:
+    seen: set[Reason | None] = set()
+    for take in (False, True):
+        command = Command("c", "verb", sender, what, take=take)
+        for at in situations():
+            refusal = refuse(command, at)
+            seen.add(refusal and refusal[0])
+            if refusal is not None:
+                assert at.car in refusal[1] or refusal[0] in (Reason.UNSUPPORTED, Reason.HELD, Reason.BATTERY_LOW)
+            _check(command, at, None if refusal is None else refusal[0])
+    if isinstance(what, Drive) and what.motion is not Motion.STOP:
+        every = {None, *(Reason.ESTOPPED, Reason.LEASED, Reason.BATTERY_LOW, Reason.LINK_DOWN, Reason.WRONG_MODE)}
+        assert seen == (every | {Reason.HELD} if sender.kind is Kind.COORDINATOR else every)
+
+
+def _check(command: Command, at: Situation, reason: Reason | None) -> None:
+    """What must hold, said in another way than the arbiter's rules."""
+    what, kind = command.what, command.sender.kind
+    if isinstance(what, Stop | EmergencyStop):
+        assert reason is None, "stop wins from every state"
+        return
+    if isinstance(what, Resume):
+        allowed = kind is not Kind.COORDINATOR and (not what.ids or (what.ids == ("e1",) and bool(at.estops)))
+        assert (reason is None) == allowed
+        return
+    if what == TakeLease(release=True):
+        assert reason is None
+        return
+    if reason is not None:
+        return
+    assert not at.estops, "an e-stopped car obeys nothing"
+    assert not (at.held_by and kind is Kind.COORDINATOR), "no coordinator's command moves a held car"
+    if not isinstance(what, TakeLease):
+        assert at.link_open
+        assert at.answering
+        assert not at.closing
+    moves = isinstance(what, MOVES) or (isinstance(what, Act) and _turns(what))
+    if (moves or isinstance(what, TakeLease)) and at.lease is not None and at.lease.until > NOW:
+        mine, theirs = RANK.index(kind), RANK.index(at.lease.holder.kind)
+        assert mine > theirs or (mine == theirs and command.take and kind is Kind.PERSON)
+    if at.battery:
+        assert not isinstance(what, Drive) or what.motion is Motion.STOP
+        assert not isinstance(what, SetMode) or what.mode is Mode.MANUAL
+    releases = isinstance(what, Drive) and what.motion is Motion.STOP
+    if not isinstance(what, SetMode | TakeLease) and not releases:
+        assert at.asked in (None, Mode.MANUAL), "the car would ignore it"
+    if isinstance(what, Act | ChangeSpeed | Fan | Find):
+        assert at.queued < QUEUE_LIMIT
+
+
+def _turns(act: Act) -> bool:
+    return isinstance(act.frame, Ptz | ArmSet) or (isinstance(act.frame, General) and act.frame.servo is not None)
+
+
+def test_the_table_has_every_command() -> None:
+    assert {type(what) for what in WHATS} == set(TABLE)
+    for what in WHATS:
+        assert needs(what)
+
+
+@pytest.mark.parametrize("what", [what for what in WHATS if not isinstance(what, Stop | EmergencyStop)], ids=repr)
+def test_what_came_too_late_is_stale_but_a_stop_never_is(what: What) -> None:
+    calm = Situation("red", PROFILES["stm32+arm"], NOW, True, "", True, False, Mode.MANUAL, None, (), None, "", True, 0)
+    late = Command("c", "verb", Sender("ann"), what, age_s=2.1, ttl_s=2.0)
+    refusal = refuse(late, calm)
+    assert refusal is not None
+    assert refusal[0] is Reason.STALE
+    for stop in (Stop(), EmergencyStop()):
+        assert refuse(Command("c", "stop", Sender("ann"), stop, age_s=1e9, ttl_s=2.0), calm) is None

@@ -1,0 +1,211 @@
+"""Who may move the car, through control: e-stops, leases, and streams that must pause after a stop."""
+
+import pytest
+
+from gateway.control.records import (
+    Act,
+    Drive,
+    EmergencyStop,
+    Kind,
+    Phase,
+    Reason,
+    Resume,
+    Sender,
+    SetMode,
+    Stop,
+    TakeLease,
+)
+from gateway.control.safety import Estop, Kept
+from gateway.protocol.encode import ColorLed
+from gateway.protocol.values import Mode, Motion
+from tests.gateway.control.desk import COORDINATOR, MODE00, PERSON, RUN, SCRIPT, STOP, Desk
+
+SENT, QUEUED, REJECTED, SUPERSEDED = Phase.SENT, Phase.QUEUED, Phase.REJECTED, Phase.SUPERSEDED
+FORWARD = Drive(Motion.FORWARD, 5.0)
+BOB = Sender("bob", Kind.PERSON)
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk().ready()
+
+
+# ---------------------------------------------------------------------- e-stop
+
+
+def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Desk) -> None:
+    desk.ask(FORWARD, SCRIPT)
+    answer = desk.ask(EmergencyStop("smoke"), PERSON, identity="e1")
+    assert answer.status is QUEUED
+    assert "latched as e1" in answer.words
+    assert answer.worst_case_s > 0
+    desk.run(600.0)
+    assert desk.frames == [RUN, MODE00, STOP]
+    assert desk.life("e1") == [Phase.ASKED, QUEUED, SENT, Phase.COMPLETE]
+    for what in (FORWARD, SetMode(Mode.MANUAL), Act(ColorLed(1, 2, 3)), TakeLease(), Drive(Motion.STOP)):
+        refused = desk.ask(what, PERSON)
+        assert (refused.status, refused.reason) == (REJECTED, Reason.ESTOPPED)
+        assert "red is e-stopped by mia: smoke; a person or script ends it: resume e1" in refused.words
+    assert desk.ask(Stop(), SCRIPT).status is QUEUED
+    assert desk.ask(Resume(("e2",)), PERSON).reason is Reason.BAD_VALUE
+    assert "still in force: e-stop e1" in desk.ask(Resume(), PERSON).words, "without ids it ends the hold"
+    assert desk.control.hold is None
+    assert desk.ask(Resume(("e1",)), SCRIPT).status is SENT
+    assert desk.logs[-1].code == "estop_ended"
+    desk.run(5.0)
+    assert desk.ask(FORWARD, SCRIPT).status is QUEUED
+
+
+def test_the_hold_outlives_the_e_stop(desk: Desk) -> None:
+    desk.ask(EmergencyStop("smoke"), COORDINATOR, identity="e1")
+    desk.run(5.0)
+    assert "on hold (by plan)" in desk.ask(Resume(("e1",)), PERSON).words
+    assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
+    assert desk.ask(FORWARD, PERSON).status is QUEUED
+
+
+def test_an_e_stop_of_a_car_out_of_reach_is_latched_all_the_same(desk: Desk) -> None:
+    desk.control.link_down("unplugged", desk.now)
+    answer = desk.ask(EmergencyStop(), PERSON, identity="e1")
+    assert (answer.status, answer.reason) == (REJECTED, Reason.LINK_DOWN)
+    assert "it is stopped first when its link is back (latched as e1" in answer.words
+    desk.control.link_up(desk.now)
+    desk.run(10.0)
+    assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
+
+
+def test_an_e_stop_survives_a_restart() -> None:
+    estop = Estop("e1", "mia", "smoke", 7, fleet_wide=False)
+    desk = Desk(kept=Kept(None, (estop,), ())).ready()
+    assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
+    desk.ask(Resume(("e1",)), PERSON)
+    assert desk.control.safety.kept == Kept(None, (), ("e1",))
+
+
+def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Desk) -> None:
+    desk.ask(FORWARD, SCRIPT, identity="d")
+    estop = Estop("e1", "mia", "smoke", 7, fleet_wide=True)
+    desk.control.unite([estop], [], "blue", desk.now)
+    desk.run(3.0)
+    assert desk.frames == [RUN, MODE00, STOP]
+    assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
+    assert desk.logs[0].code == "estop_joined"
+    assert "as blue shows: smoke" in desk.logs[0].words
+    desk.sent.clear()
+    desk.control.unite([estop], [], "green", desk.now)
+    desk.run(3.0)
+    assert desk.frames == [], "it is known already"
+    desk.control.unite([], ["e1"], "blue", desk.now)
+    assert desk.ask(FORWARD, PERSON).status is QUEUED
+
+
+def test_an_e_stop_at_rest_is_carried_out_too(desk: Desk) -> None:
+    desk.control.unite([Estop("e1", "mia", "", 7, fleet_wide=True)], [], "blue", desk.now)
+    desk.run(3.0)
+    assert desk.frames == [MODE00, STOP]
+
+
+# ---------------------------------------------------------------------- lease
+
+
+def test_who_drives_has_the_car_and_two_seconds_more(desk: Desk) -> None:
+    desk.ask(Drive(Motion.FORWARD, 3.0), SCRIPT)
+    other = Sender("other")
+    refused = desk.ask(Drive(Motion.LEFT), other)
+    assert (refused.status, refused.reason) == (REJECTED, Reason.LEASED)
+    assert "red is driven by script (script), for 5.0 s more: wait, or ask as a person" in refused.words
+    desk.run(4.9)
+    assert desk.ask(Drive(Motion.STOP), other).reason is Reason.LEASED, "whose idle stick would stop another's car"
+    assert desk.ask(Act(ColorLed(1, 2, 3)), other).status is QUEUED
+    desk.run(0.2)
+    assert desk.ask(Drive(Motion.LEFT), other).status is QUEUED
+
+
+def test_a_release_shortens_the_lease(desk: Desk) -> None:
+    desk.ask(Drive(Motion.FORWARD, 9.0), SCRIPT)
+    desk.ask(Drive(Motion.STOP), SCRIPT)
+    desk.run(2.1)
+    assert desk.ask(FORWARD, Sender("other")).status is QUEUED
+
+
+def test_a_person_outranks_a_script_and_the_loser_is_told_by_whom(desk: Desk) -> None:
+    desk.ask(FORWARD, SCRIPT, identity="d")
+    assert desk.ask(Drive(Motion.LEFT, 1.0), PERSON).status is QUEUED
+    assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
+    assert (
+        desk.records[-2].words == "left by mia" or "mia" in [r.words for r in desk.records if r.command.id == "d"][-1]
+    )
+    assert desk.logs[-1].code == "lease_taken"
+    assert "taken over by mia (person) from script (script)" in desk.logs[-1].words
+    assert "driven by mia (person)" in desk.ask(FORWARD, SCRIPT).words
+
+
+def test_between_persons_the_holder_keeps_it_unless_it_is_taken(desk: Desk) -> None:
+    desk.ask(FORWARD, PERSON, identity="d")
+    assert desk.ask(FORWARD, BOB).words.endswith("wait, or take it")
+    assert desk.ask(Drive(Motion.BACK, 1.0), BOB, take=True).status is QUEUED
+    assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
+    assert desk.ask(FORWARD, PERSON).reason is Reason.LEASED
+    assert desk.ask(FORWARD, SCRIPT, take=True).reason is Reason.LEASED, "only a person may take"
+
+
+def test_taking_the_lease_alone_stops_what_the_other_drove(desk: Desk) -> None:
+    desk.ask(FORWARD, SCRIPT, identity="d")
+    assert desk.ask(TakeLease(), PERSON).status is SENT
+    assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
+    desk.run(3.0)
+    assert desk.frames == [RUN, STOP, STOP]
+
+
+def test_a_lease_can_be_given_back(desk: Desk) -> None:
+    desk.ask(FORWARD, PERSON, identity="d")
+    assert "bob had no lease" in desk.ask(TakeLease(release=True), BOB).words
+    assert desk.ask(TakeLease(release=True), PERSON).words == "red is free"
+    assert desk.end("d") == (Phase.COMPLETE, None)
+    assert desk.ask(FORWARD, BOB).status is QUEUED
+
+
+def test_a_stop_needs_no_lease_and_ends_it(desk: Desk) -> None:
+    desk.ask(Drive(Motion.FORWARD, 9.0), PERSON)
+    assert desk.ask(Stop(), SCRIPT).status is QUEUED
+    desk.run(2.1)
+    assert desk.ask(FORWARD, BOB).status is QUEUED
+
+
+# ---------------------------------------------------------------------- streams after a stop
+
+
+def test_a_stick_that_is_leaned_on_after_anothers_stop_does_not_drive_on(desk: Desk) -> None:
+    stick = Drive(Motion.FORWARD, 0.5)
+    for _ in range(10):
+        desk.ask(stick, SCRIPT, streamed=True)
+        desk.run(0.1)
+    desk.ask(Stop(), PERSON, identity="s")
+    for _ in range(50):
+        refused = desk.ask(stick, SCRIPT, streamed=True)
+        assert (refused.reason, "let go" in refused.words) == (Reason.HELD, True)
+        desk.run(0.1)
+    assert desk.frames == [RUN, RUN, MODE00, STOP]
+    assert desk.control.hold is not None, "what was refused ends no hold"
+    rejected = [record for record in desk.records if record.phase is REJECTED]
+    assert len(rejected) == 1, "one record for the whole stream"
+    desk.run(0.5)
+    assert desk.ask(stick, SCRIPT, streamed=True).status is QUEUED, "let go, and taken again"
+
+
+def test_a_stream_that_says_stop_is_heard_again_at_once(desk: Desk) -> None:
+    stick = Drive(Motion.FORWARD, 0.5)
+    desk.ask(stick, SCRIPT, streamed=True)
+    desk.ask(Stop(), SCRIPT)
+    desk.run(0.1)
+    assert desk.ask(stick, SCRIPT, streamed=True).reason is Reason.HELD
+    desk.ask(Drive(Motion.STOP), SCRIPT, streamed=True)
+    desk.run(0.1)
+    assert desk.ask(Drive(Motion.FORWARD, 9.0), SCRIPT, streamed=True).status is QUEUED
+
+
+def test_a_single_drive_is_no_stream(desk: Desk) -> None:
+    desk.ask(FORWARD, SCRIPT)
+    desk.ask(Stop(), PERSON)
+    desk.run(2.0)
+    assert desk.ask(FORWARD, SCRIPT).status is QUEUED
