@@ -31,6 +31,7 @@ _CLASSES: Final[dict[str, Any]] = {
     for topic in topics.CAR_TOPICS
     if topic.message.startswith("fleet.v1.")
 }
+"""A message is made anew each time: one that is cleared and filled again keeps what it held before in memory."""
 _LEVELS: Final = {Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
 
 
@@ -49,7 +50,6 @@ class Publications:
         self._url = url
         self._publishers: dict[str, bus.Publisher] = {}
         self._rings: dict[str, Ring] = {}
-        self._scratch: dict[str, Any] = {}
         self._told: dict[str, tuple[object, ...]] = {}
         self._told_at: dict[str, float] = {}
         for topic in topics.CAR_TOPICS:
@@ -59,8 +59,6 @@ class Publications:
             self._publishers[topic.name] = opened.publisher(key, topic, car)
             if topic.family in ("sensor", "state"):
                 self._rings[topic.name] = Ring(RING if topic.family == "sensor" else 1)
-            if topic.name in _CLASSES:
-                self._scratch[topic.name] = _CLASSES[topic.name]()
         self._process = _Process()
 
     # ------------------------------------------------------------------ readings
@@ -76,12 +74,12 @@ class Publications:
             case ArmReading():
                 verdict = "arm"
                 if all(joint is not None for joint in event.joint_deg):
-                    message = self._cleared("sensor/arm")
+                    message = _CLASSES["sensor/arm"]()
                     message.joint_deg.extend(event.joint_deg)
                     self._reading("sensor/arm", message, stamp_ns, published)
             case ImuReading():
                 verdict = "imu"
-                message = self._cleared("sensor/imu")
+                message = _CLASSES["sensor/imu"]()
                 message.gyro_x_raw, message.gyro_y_raw, message.gyro_z_raw = event.gyro
                 message.accel_x_raw, message.accel_y_raw, message.accel_z_raw = event.accel
                 self._reading("sensor/imu", message, stamp_ns, published)
@@ -89,7 +87,7 @@ class Publications:
                 verdict = "echo"
             case Rejected(cause=cause):
                 verdict = str(cause)
-        frame = self._cleared("frame/rx")
+        frame = _CLASSES["frame/rx"]()
         frame.data = event.raw
         frame.verdict = verdict
         frame.published.extend(published)
@@ -100,32 +98,32 @@ class Publications:
     ) -> None:
         measured = self._profile.measured(event, confirmed)
         if "range" in measured and event.range_cm is not None:
-            message = self._cleared("sensor/range")
+            message = _CLASSES["sensor/range"]()
             message.no_echo = event.range_cm == 0
             if event.range_cm:
                 message.range_m = round(event.range_cm / 100, 4)
             self._reading("sensor/range", message, stamp_ns, published)
         if "battery" in measured and event.voltage_v is not None:
-            message = self._cleared("sensor/battery")
+            message = _CLASSES["sensor/battery"]()
             message.voltage_v = event.voltage_v
             message.charge, message.charge_error = battery.charge(event.voltage_v, loaded=loaded)
             message.level = battery.level(event.voltage_v)
             self._reading("sensor/battery", message, stamp_ns, published)
         if "grayscale" in measured and event.grayscale is not None:
-            message = self._cleared("sensor/grayscale")
+            message = _CLASSES["sensor/grayscale"]()
             message.raw = event.grayscale
             self._reading("sensor/grayscale", message, stamp_ns, published)
         if "line" in measured and event.line is not None:
-            message = self._cleared("sensor/line")
+            message = _CLASSES["sensor/line"]()
             message.left_outer, message.left_inner, message.right_inner, message.right_outer = event.line
             self._reading("sensor/line", message, stamp_ns, published)
         obstacle = self._profile.obstacle(event, confirmed)
         if obstacle is not None:
-            message = self._cleared("sensor/obstacle")
+            message = _CLASSES["sensor/obstacle"]()
             message.left, message.right = obstacle
             self._reading("sensor/obstacle", message, stamp_ns, published)
         if "light" in measured and event.light is not None:
-            message = self._cleared("sensor/light")
+            message = _CLASSES["sensor/light"]()
             message.left, message.right = event.light
             self._reading("sensor/light", message, stamp_ns, published)
 
@@ -133,16 +131,11 @@ class Publications:
         self._rings[name].add(stamp_ns, self._publishers[name].put(message, stamp_ns))
         published.append(name)
 
-    def _cleared(self, name: str) -> Any:
-        message = self._scratch[name]
-        message.Clear()
-        return message
-
     # ------------------------------------------------------------------ frames out, records
 
     def written(self, write: Write, stamp_ns: int, *, whole: bool) -> None:
         """Publish a frame that was written, or was not."""
-        frame = self._cleared("frame/tx")
+        frame = _CLASSES["frame/tx"]()
         frame.data = write.data
         frame.command_id = write.command_id
         frame.why = write.why
@@ -151,7 +144,7 @@ class Publications:
 
     def command(self, record: CommandRecord, request: tuple[bytes, str] | None) -> None:
         """Publish one transition of a command; the first carries the request as it came."""
-        event = self._cleared("event/command")
+        event = _CLASSES["event/command"]()
         command = record.command
         event.id = command.id
         event.verb = command.verb
@@ -198,7 +191,7 @@ class Publications:
                 self._state(name, control, health, now)
 
     def _state(self, name: str, control: Controller, health: LinkHealth, now: float) -> None:
-        message = self._cleared(name)
+        message = _CLASSES[name]()
         match name:
             case "state/link":
                 _fill_link(message, health, self._url, now)
@@ -212,7 +205,7 @@ class Publications:
 
     def health(self, now: float, *, loop_lag_s: float, bus_drops: int) -> None:
         """Publish what the gateway's process does."""
-        message = self._cleared("state/health")
+        message = _CLASSES["state/health"]()
         self._process.fill(message, now)
         message.host = socket.gethostname()
         message.link = self._url
