@@ -18,7 +18,7 @@ COMMANDS: Final = {
     "mode": ("fleet.commands.driving:mode", "Bring cars into a mode."),
     "stop": ("fleet.commands.driving:stop", "Stop cars (all, if none is named) and hold them against the coordinator."),
     "estop": ("fleet.commands.driving:estop", "Emergency stop of cars, or of the fleet."),
-    "resume": ("fleet.commands.driving:resume", "End the hold of cars."),
+    "resume": ("fleet.commands.driving:resume", "End the hold or the e-stops of cars."),
     "led": ("fleet.commands.acting:led", "Set the colour LED."),
     "light": ("fleet.commands.acting:light", "Set the light."),
     "servo": ("fleet.commands.acting:servo", "Move a servo."),

@@ -208,14 +208,19 @@ class Coordinator:
         link, mode, motion, safety = states
         if not before.present or link is None or mode is None or motion is None or safety is None:
             return
-        hold = safety.fields.get("hold")
+        hold, lease = safety.fields.get("hold"), safety.fields.get("lease")
+        estops: Any = safety.fields.get("estops") or ()
+        driver = motion.fields["owner"]
+        if not driver and isinstance(lease, pb.Lease) and lease.kind != "coordinator":
+            driver = lease.holder
         self._cars[car] = replace(
             before,
             link=str(link.fields["state"]),
             mode=str(mode.fields["asked"]),
             verdict=str(mode.fields["verdict"]),
             held_by=hold.by if isinstance(hold, pb.Hold) else None,
-            driven_by=str(motion.fields["owner"]) or None,
+            estopped_by=estops[0].by if estops else None,
+            driven_by=str(driver) or None,
         )
 
     # ------------------------------------------------------------------ there is only one; and the hub

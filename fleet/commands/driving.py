@@ -91,15 +91,50 @@ def estop(client: FleetClient, cars: tuple[tuple[str, ...], ...], why: str, *, a
     epilog="""\b
 examples:
   fleet resume red
-  fleet resume red blue"""
+  fleet resume red --estops
+  fleet resume red blue --id 5f0c2e"""
 )
 @click.argument("cars", type=Cars(), nargs=-1, required=True, metavar="CAR...")
-@click.option("--id", "ids", multiple=True, metavar="ID", help="An e-stop to end; may be given several times.")
+@click.option(
+    "--id", "ids", multiple=True, metavar="ID", help="An e-stop to end, or its beginning; as often as needed."
+)
+@click.option("--estops", is_flag=True, help="End every e-stop that is in force on these cars, then the hold.")
 @json_option
 @with_client
-def resume(client: FleetClient, cars: tuple[tuple[str, ...], ...], ids: tuple[str, ...], *, as_json: bool) -> None:
-    """End the hold of cars: the coordinator may use them again."""
-    carry_out(client, resume_request(ids), _flat(cars) or (), as_json=as_json)
+def resume(
+    client: FleetClient, cars: tuple[tuple[str, ...], ...], ids: tuple[str, ...], *, estops: bool, as_json: bool
+) -> None:
+    """End the hold of cars: the coordinator may use them again. With --id or --estops, end their e-stops.
+
+    An e-stop of the whole fleet ends on every car when it ends on one.
+    """
+    if estops and ids:
+        raise click.UsageError("--estops ends every e-stop: leave --id out")
+    named = list(dict.fromkeys(_flat(cars) or ()))
+    if not estops and not ids:
+        carry_out(client, resume_request(), named, as_json=as_json)
+    outcomes = []
+    for car in named:
+        in_force = _in_force(client, car)
+        chosen = in_force if estops else [_the_one(car, begun, in_force) for begun in ids]
+        if chosen:
+            outcomes += client.ask(resume_request(chosen), [car])
+    if estops and all(outcome.ok for outcome in outcomes):
+        outcomes = client.ask(resume_request(), named)
+    end_with(outcomes, as_json=as_json)
+
+
+def _in_force(client: FleetClient, car: str) -> list[str]:
+    """The ids of the e-stops in force on a car."""
+    return [estop.id for reading in client.get(f"{car}/state/safety") for estop in reading.value.estops]
+
+
+def _the_one(car: str, begun: str, in_force: list[str]) -> str:
+    """The id that begins so; what is no e-stop of this car is left to its gateway to refuse."""
+    found = [each for each in in_force if each.startswith(begun)]
+    if len(found) > 1 and begun not in found:
+        raise click.UsageError(f"--id {begun}: several e-stops of {car} begin so: {', '.join(found)}")
+    return begun if begun in found or not found else found[0]
 
 
 def _flat(cars: tuple[tuple[str, ...], ...]) -> list[str] | None:

@@ -46,7 +46,7 @@ def list_cars(client: FleetClient, *, as_json: bool) -> None:
             click.echo(json.dumps(row))
         return
     table = [{name: name.upper() for name in _COLUMNS}] + [
-        {name: _battery(row) if name == "battery" else _cell(row[name]) for name in _COLUMNS} for row in rows
+        {name: _shown(name, row) for name in _COLUMNS} for row in rows
     ]
     widths = {name: max(len(row[name]) for row in table) for name in _COLUMNS}
     for cells in table:
@@ -64,18 +64,19 @@ def _row(car: str, values: Mapping[str, Any]) -> dict[str, Any]:
         "verdict": mode.verdict if mode else None,
         "motion": motion.motion if motion else None,
         "hold": safety.hold.by if safety and safety.HasField("hold") else None,
+        "estops": [estop.id for estop in safety.estops] if safety else [],
         "motors": safety.motors if safety else None,
         "battery_v": battery.voltage_v if battery else None,
         "battery_level": battery.level if battery else None,
     }
 
 
-def _battery(row: Mapping[str, Any]) -> str:
-    return "-" if row["battery_v"] is None else f"{row['battery_v']:.2f} V {row['battery_level']}"
-
-
-def _cell(value: object) -> str:
-    return str(value) if value else "-"
+def _shown(name: str, row: Mapping[str, Any]) -> str:
+    if name == "battery":
+        return "-" if row["battery_v"] is None else f"{row['battery_v']:.2f} V {row['battery_level']}"
+    if name == "hold" and row["estops"]:
+        return f"e-stop {' '.join(row['estops'])}"
+    return str(row[name]) if row[name] else "-"
 
 
 @click.command(

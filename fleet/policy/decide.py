@@ -34,6 +34,7 @@ class CarPicture:
     verdict: str = ""
     link: str = ""
     """As its gateway says; empty: not heard yet."""
+    estopped_by: str | None = None
     held_by: str | None = None
     driven_by: str | None = None
     """Who holds a motion; a coordinator never does."""
@@ -111,6 +112,8 @@ def _left_alone(car: str, known: CarPicture) -> Decision | None:
         why, change = f"{car} is not on the bus", "its gateway coming up"
     elif not known.mode:  # so it is not known either whether there is a hold
         why, change = f"{car} has not said yet how it is", "its first states"
+    elif known.estopped_by is not None:
+        why, change = f"{car} is e-stopped by {known.estopped_by}", "a resume by a person or script"
     elif known.held_by is not None:
         why, change = f"{car} is on hold by {known.held_by}", "a drive, mode or resume by a person or script"
     elif known.driven_by is not None:

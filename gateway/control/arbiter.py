@@ -47,6 +47,8 @@ class Situation:
     """The mode the car is in, or is about to be in."""
     held_by: str | None
     estops: tuple[Estop, ...]
+    ended: tuple[str, ...]
+    """Ids of e-stops that were ended."""
     lease: Lease | None
     battery: str
     """Why the battery allows no new drive, in words; empty if it does."""
@@ -155,7 +157,7 @@ def _resume(resume: Resume, kind: Kind, situation: Situation) -> Refusal | None:
     if kind is Kind.COORDINATOR:
         return Reason.HELD, "a coordinator may not resume a car: a person or a script does"
     in_force = [estop.id for estop in situation.estops]
-    if resume.ids and not set(resume.ids) & set(in_force):
+    if resume.ids and not set(resume.ids) & {*in_force, *situation.ended}:
         there = f"in force: {', '.join(in_force)}" if in_force else "none is in force"
         return Reason.BAD_VALUE, f"{situation.car} has no e-stop {', '.join(resume.ids)}; {there}"
     return None

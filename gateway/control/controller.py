@@ -203,8 +203,12 @@ class Controller:
         """A sender's liveliness token appeared or went."""
         if alive:
             self._senders.appeared(name)
-        else:
-            self._senders.vanished(name, now, driving=self._held is not None and self._held.sender.name == name)
+            return
+        driving = self._held is not None and self._held.sender.name == name
+        self._senders.vanished(name, now, driving=driving)
+        lease = self.safety.lease
+        if not driving and lease is not None and lease.holder.name == name:
+            self.safety.release(lease.holder)  # a command line that is done: the next one need not wait
 
     def unite(self, estops: Iterable[Estop], ended: Iterable[str], shown_by: str, now: float) -> None:
         """Take over the fleet-wide e-stops, in force and ended, that another gateway of the fleet shows."""
@@ -429,8 +433,9 @@ class Controller:
         sender = pending.command.sender.name
         if ids:
             over = " ".join(estop.id for estop in self.safety.end(ids))
-            words = f"e-stop {over} was ended by {sender}"
-            self._ledger.log(Level.WARNING, "estop_ended", words, now)
+            words = f"e-stop {over} was ended by {sender}" if over else "ended already"
+            if over:
+                self._ledger.log(Level.WARNING, "estop_ended", words, now)
         elif self.hold is not None:
             words = f"the hold by {self.hold.by} has ended"
             self._end_hold(pending.command.sender, now)
@@ -563,6 +568,7 @@ class Controller:
             asked=self.asked,
             held_by=self.hold.by if self.hold else None,
             estops=self.safety.estops,
+            ended=self.safety.ended,
             lease=self.safety.leased(now),
             battery="",
             fan=self.believed.fan,
@@ -729,7 +735,8 @@ class Controller:
     def _close_held(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
         held, self._held = self._held, None
         if held is not None:
-            self._senders.forget(held.sender.name)
+            if self._senders.forget(held.sender.name):
+                self.safety.release(held.sender)
             if phase is not Phase.SUPERSEDED:
                 self.safety.driven_no_more(now)
             self._ledger.record(held.pending, phase, now, reason=reason, words=words)

@@ -45,10 +45,12 @@ class Senders:
         gone_at = self._tokens.get(name)
         return float("inf") if gone_at is None else gone_at + SENDER_GONE_S
 
-    def forget(self, name: str) -> None:
-        """The sender drives no more: if its token is gone, so is what was remembered of it."""
-        if self._tokens.get(name) is not None:
+    def forget(self, name: str) -> bool:
+        """The sender drives no more: if its token is gone, so is what was remembered of it. True if it is gone."""
+        gone = self._tokens.get(name) is not None
+        if gone:
             del self._tokens[name]
+        return gone
 
     # ------------------------------------------------------------------ streams
 

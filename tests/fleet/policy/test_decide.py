@@ -39,6 +39,7 @@ def decided(picture: Picture, *, since: dict[int, float] | None = None, now: flo
         (CarPicture(), None, False),
         (CarPicture(present=True), None, False),
         (replace(HERE, held_by="ann"), None, False),
+        (replace(HERE, estopped_by="ann"), None, False),
         (replace(HERE, mode="tracking", verdict="contradicted", held_by="ann"), None, False),
         (replace(HERE, driven_by="ann"), None, False),
         (replace(HERE, present=False), None, False),

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -36,6 +37,7 @@ WHATS: list[What] = [
     Resume(),
     Resume(("e1",)),
     Resume(("other",)),
+    Resume(("over",)),
     TakeLease(),
     TakeLease(release=True),
     Drive(Motion.FORWARD),
@@ -74,9 +76,22 @@ def situations() -> Iterator[Situation]:
         (None, Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED),
         ("arduino", "raspberry_pi", "unknown", "stm32+arm"),
     ):
-        profile = PROFILES[platform]
         yield Situation(
-            "red", profile, NOW, link, "gone", answering, closing, asked, held, estopped, lease, battery, None, queued
+            car="red",
+            profile=PROFILES[platform],
+            now=NOW,
+            link_open=link,
+            link_reason="gone",
+            answering=answering,
+            closing=closing,
+            asked=asked,
+            held_by=held,
+            estops=estopped,
+            ended=("over",),
+            lease=lease,
+            battery=battery,
+            fan=None,
+            queued=queued,
         )
 
 
@@ -107,7 +122,9 @@ def _check(command: Command, at: Situation, reason: Reason | None) -> None:
         assert reason is None, "stop wins from every state"
         return
     if isinstance(what, Resume):
-        allowed = kind is not Kind.COORDINATOR and (not what.ids or (what.ids == ("e1",) and bool(at.estops)))
+        allowed = kind is not Kind.COORDINATOR and (
+            not what.ids or what.ids == ("over",) or (what.ids == ("e1",) and bool(at.estops))
+        )
         assert (reason is None) == allowed
         return
     if what == TakeLease(release=True):
@@ -147,7 +164,13 @@ def test_the_table_has_every_command() -> None:
 
 @pytest.mark.parametrize("what", [what for what in WHATS if not isinstance(what, Stop | EmergencyStop)], ids=repr)
 def test_what_came_too_late_is_stale_but_a_stop_never_is(what: What) -> None:
-    calm = Situation("red", PROFILES["stm32+arm"], NOW, True, "", True, False, Mode.MANUAL, None, (), None, "", True, 0)
+    calm = replace(
+        next(situations()),
+        profile=PROFILES["stm32+arm"],
+        asked=Mode.MANUAL,
+        closing=False,
+        fan=True,
+    )
     late = Command("c", "verb", Sender("ann"), what, age_s=2.1, ttl_s=2.0)
     refusal = refuse(late, calm)
     assert refusal is not None
