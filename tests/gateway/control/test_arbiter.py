@@ -122,9 +122,8 @@ def _check(command: Command, at: Situation, reason: Reason | None) -> None:
         assert reason is None, "stop wins from every state"
         return
     if isinstance(what, Resume):
-        allowed = kind is not Kind.COORDINATOR and (
-            not what.ids or what.ids == ("over",) or (what.ids == ("e1",) and bool(at.estops))
-        )
+        in_force = what.ids == ("e1",) and bool(at.estops)
+        allowed = kind is not Kind.COORDINATOR and (not what.ids or what.ids == ("over",) or in_force)
         assert (reason is None) == allowed
         return
     if what == TakeLease(release=True):

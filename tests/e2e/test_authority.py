@@ -1,0 +1,82 @@
+"""E-stops, holds and leases across gateways and restarts, on real processes."""
+
+import time
+
+from fleet.client import FleetClient
+from tests.support.processes import Fleet, driving, wait_for
+
+
+def estops(fleet: Fleet, car: str) -> list[str]:
+    state = fleet.state("safety", car)
+    return [] if state is None else [estop.id for estop in state.estops]
+
+
+def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gateway(fleet: Fleet) -> None:
+    sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
+    gateways = [fleet.gateway(red), fleet.gateway(blue, car="blue")]
+    for car in ("red", "blue"):
+        fleet.ready(car)
+        assert fleet.ask("drive", car, motion="forward", duration_s=10)["status"] in ("sent", "queued")
+        wait_for(lambda car=car: driving(sim, car), f"{car} drives")  # type: ignore[misc]  # bound at once
+    answer = fleet.ask("estop", id="e1", sender="mia", why="smoke", scope="fleet")
+    assert "latched as e1" in answer["words"]
+    wait_for(lambda: estops(fleet, "blue") == ["e1"], "blue has it from red")
+    wait_for(lambda: not driving(sim) and not driving(sim, "blue"), "both stand")
+
+    # Green was not there; blue is killed, and its next gateway has only the file.
+    gateways[1].kill()
+    _, (green,) = fleet.simulate("green:arduino:tcp")
+    fleet.gateway(green, car="green")
+    wait_for(lambda: estops(fleet, "green") == ["e1"], "green has it from red")
+    assert fleet.state("safety", "green").hold.by == "mia"
+    assert fleet.ask("drive", "green", motion="forward")["reason"] == "estopped"
+
+    # It ends while blue is away: blue comes back with it, and learns of its end.
+    assert fleet.ask("resume", ids=["e1"], kind="person")["status"] == "sent"
+    wait_for(lambda: estops(fleet, "green") == [], "green knows of its end")
+    fleet.gateway(blue, car="blue")
+    wait_for(lambda: fleet.state("safety", "blue") is not None, "blue is back")
+    wait_for(lambda: estops(fleet, "blue") == [], "blue knows of its end")
+    assert list(fleet.state("safety", "blue").ended) == ["e1"]
+    fleet.ready("blue")
+    assert fleet.ask("drive", "blue", motion="forward")["status"] in ("sent", "queued")
+
+
+def test_an_e_stop_of_one_car_is_its_own(fleet: Fleet) -> None:
+    _, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
+    for car, link in (("red", red), ("blue", blue)):
+        fleet.gateway(link, car=car)
+        fleet.ready(car)
+    with FleetClient(fleet.endpoint, sender="mia", kind="person") as client:
+        (outcome,) = client.estop(["red"], "smoke")
+        assert outcome.ok
+        assert client.car("blue").drive("forward").ok
+        refused = client.car("red").drive("forward")
+        assert (refused.ok, refused.reason) == (False, "estopped")
+        assert client.resume(["red"], estops(fleet, "red"))[0].ok
+        assert client.car("red").drive("forward").ok
+
+
+def test_the_next_command_line_need_not_wait_for_the_last_ones_lease(fleet: Fleet) -> None:
+    _, (red,) = fleet.simulate("red:arduino:tcp")
+    fleet.gateway(red)
+    fleet.ready()
+    for sender in ("mia-1", "mia-2", "mia-3"):
+        with FleetClient(fleet.endpoint, sender=sender, kind="person") as client:
+            assert client.car("red").drive("forward", 0.2, wait=True).ok
+            assert fleet.state("safety").lease.holder == sender
+        wait_for(lambda: not fleet.state("safety").HasField("lease"), "given back")
+
+
+def test_a_stop_with_a_broken_payload_stops(fleet: Fleet) -> None:
+    sim, (red,) = fleet.simulate("red:arduino:tcp")
+    fleet.gateway(red)
+    fleet.ready()
+    fleet.ask("drive", motion="forward", duration_s=10)
+    wait_for(lambda: driving(sim), "it drives")
+    began = time.monotonic()
+    answer = fleet.ask("stop", kind="boss", sender="a/b")
+    assert answer["status"] in ("sent", "queued")
+    assert "stopped, though: stop: sender 'a/b' is not allowed" in answer["words"]
+    wait_for(lambda: not driving(sim), "it stands")
+    assert time.monotonic() - began < 8
