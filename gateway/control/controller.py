@@ -243,10 +243,12 @@ class Controller:
             return self._stop(pending, now)
         if self._ledger.known(command):
             return self._reject(pending, Reason.DUPLICATE, f"a command with id {command.id} came already", now)
+        # A stream is noted also while it is refused: a lease that lapses after a stop must not set it going.
+        halted = command.streamed and not self._heard_again(command, now)
         refusal = arbiter.refuse(command, self._situation(now))
         if refusal is not None:
             return self._reject(pending, *refusal, now)
-        if command.streamed and not self._heard_again(command, now):
+        if halted:
             words = f"{self.car} was stopped: let go for {PAUSE_S:g} s (or send stop), then drive again"
             return self._reject(pending, Reason.HELD, words, now)
         self._ledger.accepted(command)

@@ -191,6 +191,19 @@ def test_a_stick_that_is_leaned_on_after_anothers_stop_does_not_drive_on(desk: D
     assert desk.ask(stick, SCRIPT, streamed=True).status is QUEUED, "let go, and taken again"
 
 
+def test_a_stick_that_a_lease_kept_out_does_not_drive_when_it_lapses_after_a_stop(desk: Desk) -> None:
+    stick = Drive(Motion.FORWARD, 0.5)
+    for _ in range(10):
+        desk.ask(stick, PERSON, streamed=True)
+        assert desk.ask(stick, SCRIPT, streamed=True).reason is Reason.LEASED
+        desk.run(0.1)
+    desk.ask(Stop(), BOB)
+    for _ in range(50):
+        assert desk.ask(stick, SCRIPT, streamed=True).status is REJECTED
+        desk.run(0.1)
+    assert desk.frames == [RUN, MODE00, STOP]
+
+
 def test_a_stream_that_says_stop_is_heard_again_at_once(desk: Desk) -> None:
     stick = Drive(Motion.FORWARD, 0.5)
     desk.ask(stick, SCRIPT, streamed=True)
