@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 FAMILIES: Final = ("sensor", "state")
+STREAM_WAITING: Final = 32
+"""Drives of streams that may wait: of a flood the newest, and few, so that a stop never waits for long behind them."""
 
 
 class AlreadyServed(Exception):
@@ -31,7 +33,7 @@ class Doors:
         self._car = car
         self.refuse(self.others())
         self._commands: bus.Handover[zenoh.Query] = bus.Handover(limit=256)
-        self._stream: bus.Handover[bus.Sample] = bus.Handover(limit=256)
+        self._stream: bus.Handover[bus.Sample] = bus.Handover(limit=STREAM_WAITING, newest=True)
         self._queries: bus.Handover[tuple[str, zenoh.Query]] = bus.Handover()
         self._senders: bus.Handover[tuple[str, bool]] = bus.Handover()
         self._cars: bus.Handover[tuple[str, bool]] = bus.Handover()

@@ -156,7 +156,8 @@ def canon(expression: str) -> str:
 class Handover(Generic[T]):
     """Hands objects from Zenoh's threads to one asyncio loop, in order and bounded; what does not fit is counted.
 
-    It may be made before there is a loop: what comes waits until `attach`.
+    Left out is what comes while it is full or, with `newest`, what has waited longest. It may be made before there is
+    a loop: what comes waits until `attach`.
     """
 
     def __init__(
@@ -165,10 +166,12 @@ class Handover(Generic[T]):
         take: Callable[[T], object] | None = None,
         *,
         limit: int = 1024,
+        newest: bool = False,
     ) -> None:
         self._loop = loop
         self._take = take
         self._limit = limit
+        self._newest = newest
         self._lock = threading.Lock()
         self._waiting: deque[T] = deque()
         self.dropped = 0
@@ -181,11 +184,13 @@ class Handover(Generic[T]):
         loop.call_soon(self._drain)
 
     def __call__(self, item: T) -> bool:
-        """Called on a Zenoh thread; False if the item was dropped."""
+        """Called on a Zenoh thread; False if the item was left out."""
         with self._lock:
             if len(self._waiting) >= self._limit:
                 self.dropped += 1
-                return False
+                if not self._newest:
+                    return False
+                self._waiting.popleft()
             self._waiting.append(item)
             loop = self._loop
             if loop is None or len(self._waiting) > 1:

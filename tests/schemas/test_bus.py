@@ -180,6 +180,17 @@ async def test_a_handover_keeps_order_is_bounded_and_counts_what_it_drops() -> N
     assert taken == [*range(10), 99]
 
 
+async def test_a_handover_of_the_newest_leaves_out_what_waited_longest() -> None:
+    taken: list[int] = []
+    handover = bus.Handover(asyncio.get_running_loop(), taken.append, limit=10, newest=True)
+    thread = threading.Thread(target=lambda: [handover(number) for number in range(25)])
+    thread.start()
+    thread.join()
+    assert handover.dropped == 15
+    await turns()
+    assert taken == list(range(15, 25))
+
+
 def test_a_reply_in_json_is_protobufs_mapping() -> None:
     text = messages.to_json(pb.Line(car="red", left_inner=True, seq=7))
     assert '"left_inner":true' in text
