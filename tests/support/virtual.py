@@ -38,6 +38,8 @@ class Pair:
         self.records: list[CommandRecord] = []
         self.logs: list[LogRecord] = []
         self.number = 0
+        self.cut: int | None = None
+        """How many bytes of the next write get through before the link breaks; None: all, and it holds."""
         self.run(start_s, linked=False)
 
     def connect(self) -> None:
@@ -46,6 +48,12 @@ class Pair:
             self.car.connected(self.now)
         self.decoder = Decoder()
         self.control.link_up(self.now)
+
+    def lose(self, reason: str = "unplugged") -> None:
+        """The link is cut: what is on the wire is lost."""
+        self.car.drop_link(self.now)
+        self.control.link_down(reason, self.now)
+        self._take()
 
     def ready(self) -> "Pair":
         """Connect and wait until recovery is complete and a reading has come."""
@@ -103,10 +111,18 @@ class Pair:
 
     def _pump(self) -> None:
         while (write := self.control.poll(self.now)) is not None:
+            if self.cut is not None:
+                self.car.feed(write.data[: self.cut], self.now)
+                self.cut = None
+                self.control.write_failed("the write was cut", self.now)
+                break
             self.sent.append((self.now, write.data))
             self.car.feed(write.data, self.now)
             self.control.wrote(write, self.now)
             self.decoder.sent(write.data, self.now)
+        self._take()
+
+    def _take(self) -> None:
         for record in self.control.take_records():
             if isinstance(record, CommandRecord):
                 self.records.append(record)

@@ -1,0 +1,367 @@
+"""Every row of protocol.md's hazards tables, careless against ours: the same situation, the same wish.
+
+The careless half writes frames straight to the simulated car (tests/gateway/sim/hazards.py asserts what that does);
+ours asks the gateway's control for the same. The judge of both is the simulated car's motors.
+"""
+
+import random
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+
+from gateway.control.records import Act, Answer, Drive, Fan, Phase, Reason, SetMode, Stop
+from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz, parse_sent
+from gateway.protocol.values import Light, Mode, Motion
+from gateway.sim.core.raspberry_pi import Transport
+from tests.gateway.sim.hazards import HAZARDS, Hazard
+from tests.gateway.sim.strangers import virtual
+from tests.support.virtual import Pair
+
+RECOVERED_S = 7.3
+"""protocol.md, recovery: theory, never over 7.3 s outside avoidance."""
+SETTLED_S = 9.0
+"""Long enough for every stop, and for a car that drives on to be seen."""
+
+Ours = Callable[[Pair], None]
+OURS: dict[str, Ours] = {}
+
+
+def ours(*rows: str) -> Callable[[Ours], Ours]:
+    """Register what the gateway does in a row's situation, by the beginning of the row's words."""
+
+    def keep(play: Ours) -> Ours:
+        OURS.update(dict.fromkeys(rows, play))
+        return play
+
+    return keep
+
+
+def of(hazard: Hazard) -> Ours:
+    found = [play for row, play in OURS.items() if hazard.row.startswith(row)]
+    assert len(found) == 1, f"{hazard.row!r} has {len(found)} counterparts"
+    return found[0]
+
+
+@pytest.mark.parametrize("hazard", HAZARDS, ids=str)
+async def test_careless_and_ours(hazard: Hazard) -> None:
+    await hazard.play(virtual(hazard.platform, world=hazard.world(), tcp=hazard.tcp))
+    transport = Transport.TCP if hazard.tcp else Transport.SERIAL
+    pair = Pair(hazard.platform, world=hazard.world(), transport=transport).ready()
+    of(hazard)(pair)
+    assert all(parse_sent(data) is not None for _, data in pair.sent), "one whole frame in each write"
+
+
+def test_every_counterpart_has_its_row() -> None:
+    rows = [hazard.row for hazard in HAZARDS]
+    assert [row for row in OURS if not any(name.startswith(row) for name in rows)] == []
+
+
+# ---------------------------------------------------------------------- how it is judged
+
+
+def driving(pair: Pair, motion: Motion = Motion.FORWARD) -> None:
+    pair.ask(Drive(motion, 10.0))
+    pair.until(lambda: pair.car.truth.driving, 3.0)
+
+
+def blocked(pair: Pair, by: Act | Fan) -> None:
+    """Deaf from now on, by a frame that the car has read."""
+    pair.ask(by)
+    pair.until(lambda: pair.car.truth.blocked, 3.0)
+
+
+def stops(pair: Pair) -> Answer:
+    """Ask for a stop: the motors are off for good within what the answer announces."""
+    asked_at = pair.now
+    answer = pair.ask(Stop(), verb="stop", identity="the-stop")
+    pair.run(SETTLED_S)
+    assert pair.off_for_good_at() - asked_at <= answer.worst_case_s
+    assert pair.phases("the-stop")[-1] is Phase.COMPLETE
+    assert pair.control.motors == "off"
+    return answer
+
+
+def recovers(pair: Pair) -> None:
+    """The link is back: recovery brings the car to rest in mode 0, and the gateway knows it."""
+    since = pair.now
+    assert pair.control.motors == "unknown"
+    pair.connect()
+    pair.until(lambda: pair.control.known, 30.0)
+    pair.run(SETTLED_S)
+    assert pair.off_for_good_at() - since <= RECOVERED_S
+    assert pair.car.truth.mode is Mode.MANUAL
+    assert pair.control.motors == "off"
+
+
+def refused(pair: Pair, what: Act | SetMode) -> None:
+    sent = len(pair.sent)
+    assert pair.ask(what).reason is Reason.UNSUPPORTED
+    pair.run(2.0)
+    assert all(parse_sent(data) == General(Motion.FORWARD) for _, data in pair.sent[sent:]), "only the repetition"
+
+
+PTZ = Act(Ptz(90))
+
+
+# ---------------------------------------------------------------------- the Arduino program
+
+
+@ours("one frame while it is blocked")
+def one_frame(pair: Pair) -> None:
+    """A run during a block is obeyed after it, and ends when its time is over."""
+    blocked(pair, PTZ)
+    pair.ask(Drive(Motion.FORWARD, 1.5))
+    pair.until(lambda: pair.car.truth.driving, 1.5)
+    pair.run(SETTLED_S)
+    assert pair.off_for_good_at() < pair.now - 5.0
+
+
+@ours("two frames while it is blocked, the second a stop")
+def two_frames(pair: Pair) -> None:
+    blocked(pair, PTZ)
+    pair.ask(Drive(Motion.FORWARD, 5.0))
+    stops(pair)
+
+
+@ours("a run, 60 ms, a stop, while the ranging gets no echo")
+def no_echo(pair: Pair) -> None:
+    pair.until(lambda: not pair.car.truth.blocked, 3.0)
+    pair.until(lambda: pair.car.truth.blocked, 3.0)
+    pair.ask(Drive(Motion.FORWARD, 5.0))
+    pair.run(0.06)
+    stops(pair)
+
+
+@ours("stop, then MODE00, both while blocked")
+def stop_then_mode(pair: Pair) -> None:
+    driving(pair)
+    blocked(pair, PTZ)
+    pair.ask(Drive(Motion.STOP))
+    pair.ask(SetMode(Mode.MANUAL))
+    pair.run(SETTLED_S)
+    assert pair.off_for_good_at() < pair.now - 5.0
+    assert pair.car.truth.mode is Mode.MANUAL
+
+
+@ours("MODE00, then stop, both while blocked")
+def mode_then_stop(pair: Pair) -> None:
+    driving(pair)
+    blocked(pair, PTZ)
+    pair.ask(SetMode(Mode.MANUAL))
+    stops(pair)
+
+
+@ours("MODE00 alone, in any mode (", "a general stop in a mode other than 0")
+def in_any_mode(pair: Pair) -> None:
+    """Whatever the mode, and whichever way of stopping is asked: what is written is the frame that stops there."""
+    for mode in (mode for mode in Mode if mode is not Mode.MANUAL):
+        driving(pair)
+        pair.ask(SetMode(mode))
+        pair.until(lambda mode=mode: pair.car.truth.mode is mode, 12.0)
+        pair.run(5.0)
+        asked_at = pair.now
+        answer = pair.ask(Drive(Motion.STOP))
+        pair.run(SETTLED_S)
+        assert pair.off_for_good_at() - asked_at <= answer.worst_case_s
+        assert pair.car.truth.mode is Mode.MANUAL
+
+
+@ours("a mode opened while driving (")
+def opened_while_driving(pair: Pair) -> None:
+    """The motors are off before the mode's frame is written."""
+    for mode in (Mode.REMOTE_CONTROL, Mode.COLOR_LED, Mode.TRACKING):
+        driving(pair, Motion.BACK)
+        pair.ask(SetMode(mode), identity=mode)
+        pair.until(lambda mode=mode: Phase.SENT in pair.phases(mode), 6.0)
+        assert pair.off_for_good_at() < pair.now
+        pair.until(lambda mode=mode: pair.car.truth.mode is mode, 3.0)
+        assert not pair.car.truth.driving
+        stops(pair)
+
+
+@ours("a named frame it does not know: wedged")
+def wedged(pair: Pair) -> None:
+    driving(pair)
+    refused(pair, Act(ArmSet((90,) * 6)))
+    stops(pair)
+
+
+def cut(pair: Pair, what: Act | Drive, count: int) -> None:
+    """A write that is cut after so many bytes, and the link with it."""
+    pair.cut = count
+    pair.ask(what)
+    pair.run(2.0)
+    assert pair.cut is None
+
+
+@ours("half of a named frame: wedged", "half of a named frame, then a MODE frame: it can OPEN mode 4")
+def half_named(pair: Pair) -> None:
+    for what, length in ((PTZ, 12), (Act(ColorLed(255, 0, 16)), 24)):
+        for count in range(1, length):
+            driving(pair)
+            cut(pair, what, count)
+            assert pair.car.truth.driving
+            recovers(pair)
+
+
+@ours(
+    "half a general frame, then a stop",
+    "half a general frame, then MODE00",
+    "a lone # ends a half frame, whose motion is then obeyed",
+)
+def half_general(pair: Pair) -> None:
+    for count in range(1, 19):
+        driving(pair)
+        cut(pair, Drive(Motion.BACK, 5.0), count)
+        assert pair.car.truth.driving
+        recovers(pair)
+
+
+@ours("a lone # with nothing pending acts as a stop in mode 0")
+def lone_hash(pair: Pair) -> None:
+    """It is only ever written by recovery, which wants the car stopped."""
+    driving(pair)
+    assert not any(data == b"#" for _, data in pair.sent[4:])
+    pair.lose()
+    assert pair.car.truth.driving
+    recovers(pair)
+
+
+@ours("half a frame, #, 50 ms, MODE00, all while blocked")
+def half_while_blocked(pair: Pair) -> None:
+    """A recovery whose second frame is cut, and the next one, all within one block."""
+    for count in range(1, 12):
+        driving(pair)
+        blocked(pair, PTZ)
+        pair.lose()
+        pair.connect()
+        pair.cut = count
+        pair.run(0.02)
+        pair.until(lambda: pair.cut is None, 0.1)
+        assert pair.car.truth.blocked
+        recovers(pair)
+
+
+@ours("the fan on: obeys motion, but sends no readings until it is off again")
+def fan(pair: Pair) -> None:
+    """A stop needs no reading to be complete, and toggles nothing."""
+    pair.ask(Fan())
+    pair.until(lambda: pair.car.truth.fan, 3.0)
+    driving(pair)
+    stops(pair)
+    assert pair.car.truth.fan
+    assert sum(frame.fan for frame in general(pair)) == 1
+
+
+def general(pair: Pair) -> list[General]:
+    frames = (parse_sent(data) for _, data in pair.sent)
+    return [frame for frame in frames if isinstance(frame, General)]
+
+
+# ---------------------------------------------------------------------- the Raspberry Pi programs
+
+
+@ours("a MODE frame: nothing")
+def pi_mode(pair: Pair) -> None:
+    driving(pair)
+    refused(pair, SetMode(Mode.TRACKING))
+    stops(pair)
+    assert not any(b"MODE" in data for _, data in pair.sent)
+
+
+@ours(
+    "over TCP, a frame cut over two receives is ignored whole",
+    "over TCP, a write not beginning with $ is ignored whole",
+    "over TCP, two frames in one receive: only the first",
+)
+def pi_writes(pair: Pair) -> None:
+    """One whole frame in each write, 60 ms between them: nothing for a receive to join or cut."""
+    moments = random.Random(7)
+    for _ in range(30):
+        pair.ask(Drive(moments.choice([Motion.FORWARD, Motion.BACK, Motion.LEFT]), 5.0))
+        pair.run(0.1 * moments.random())
+    stops(pair)
+    assert all(data.startswith(b"$") and data.endswith(b"#") for _, data in pair.sent)
+    times = [at for at, _ in pair.sent]
+    assert min(b - a for a, b in pairwise(times)) >= 0.06 - 1e-9
+
+
+@ours(
+    "over TCP, two frames while the fan blocks it: only the first",
+    "over Bluetooth, several frames while it is blocked: only the LAST",
+)
+def pi_fan(pair: Pair) -> None:
+    blocked(pair, Fan())
+    pair.ask(Drive(Motion.FORWARD, 5.0))
+    pair.run(0.06)
+    stops(pair)
+    blocked(pair, Fan())
+    for motion in (Motion.FORWARD, Motion.STOP, Motion.BACK):
+        pair.ask(Drive(motion, 5.0))
+    pair.until(lambda: pair.car.truth.driving, 3.0)
+    assert pair.car.truth.motor_left < 0, "the newest motion wins"
+    stops(pair)
+
+
+@ours("a short frame kills the program")
+def pi_short(pair: Pair) -> None:
+    """A general frame is written with its nine fields or not at all."""
+    pi_writes(pair)
+    assert all(len(data) == 19 for _, data in pair.sent)
+    assert pair.car.alive
+
+
+@ours("over Bluetooth a half frame ended by a lone # kills the program")
+def pi_lone_hash(pair: Pair) -> None:
+    for count in range(1, 19):
+        driving(pair)
+        cut(pair, Drive(Motion.BACK, 5.0), count)
+        recovers(pair)
+        assert pair.car.alive
+    assert not any(data == b"#" for _, data in pair.sent)
+
+
+@ours("the TCP client goes away")
+def pi_hang_up(pair: Pair) -> None:
+    """No gateway at this end can prevent it, so it says what is so. What it can: close only after a stop."""
+    driving(pair)
+    pair.control.shutdown(pair.now)
+    pair.until(lambda: pair.control.finished, 3.0)
+    pair.lose("closed")
+    pair.run(SETTLED_S, linked=False)
+    assert not pair.car.alive
+    assert not pair.car.truth.driving
+
+    cut_off = Pair("raspberry_pi", transport=Transport.TCP).ready()
+    driving(cut_off)
+    cut_off.lose("connection refused")
+    cut_off.run(2.0, linked=False)
+    assert not cut_off.car.alive
+    assert cut_off.car.truth.driving
+    assert cut_off.control.motors == "unknown"
+    answer = cut_off.ask(Stop(), verb="stop")
+    assert answer.reason is Reason.LINK_DOWN
+    assert "cannot be reached: connection refused" in answer.words
+
+
+@ours("light 1 cycles; lights 5..8 are not known")
+def pi_light(pair: Pair) -> None:
+    for light in (Light.WHITE, Light.CYAN, Light.MAGENTA, Light.YELLOW, Light.OFF):
+        refused(pair, Act(General(Motion.STOP, light=light)))
+    before = pair.car.truth.led
+    pair.ask(Act(General(Motion.STOP, light=Light.GREEN)))
+    pair.run(1.0)
+    assert (before, pair.car.truth.led) == ("off", "#00ff00")
+
+
+# ---------------------------------------------------------------------- no dead-man
+
+
+@ours("no dead-man")
+def dead_man(pair: Pair) -> None:
+    """A motion that nobody holds ends by itself: half a second after it was asked."""
+    pair.ask(Drive(Motion.FORWARD))
+    asked_at = pair.now
+    pair.run(SETTLED_S)
+    assert asked_at < pair.off_for_good_at() <= asked_at + 0.5 + 0.1
