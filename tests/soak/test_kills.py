@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.flooding import FLIGHT_S, PER_S, flood
 from tests.support.kills import OPERATORS, Took, kill_operators
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet
@@ -45,3 +46,20 @@ def test_killed_operators(tmp_path: Path, world: str) -> None:
             found.setdefault(case, []).append(took)
     show(found)
     assert not [f"{case}: {each}" for case, took in found.items() for each in took if each.late]
+
+
+@pytest.mark.soak
+def test_a_minute_of_10000_drives_a_second(tmp_path: Path) -> None:
+    for fleet in fleets(tmp_path, 1):
+        found = flood(fleet, seconds=60.0, stops=12)
+    print(
+        f"\n{found.published} drives in 62 s, {found.left_out} left out, {len(found.frames)} frames on the wire, "
+        f"at least {min(found.apart_s):.3f} s apart; a stop's first frame after {max(found.stopped_s):.3f} s at most; "
+        f"memory {found.rss_mb[0]:.1f} MB, then {min(found.rss_mb):.1f} to {max(found.rss_mb):.1f}"
+    )
+    assert found.published > 0.95 * 62 * PER_S
+    assert all(data.count(b"$") == 1 for _, data in found.frames)
+    assert min(found.apart_s) > FLIGHT_S - 0.001
+    assert max(found.rss_mb) < found.rss_mb[0] + 20.0
+    assert not found.drove_on_s, "nobody has let go"
+    assert max(found.stopped_s) < FLIGHT_S + 0.05

@@ -1,0 +1,22 @@
+"""An operator that publishes drives as fast as it is told: kind, publications a second, seconds. Says how many."""
+
+import json
+import sys
+import time
+
+from schemas import bus, keys, messages
+
+kind, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
+drives = [
+    json.dumps({"motion": motion, "duration_s": 0.5, "sender": f"flood-{kind}", "kind": kind}).encode()
+    for motion in ("forward", "back", "left", "right")
+]
+with bus.Bus.open() as opened:
+    key = keys.command_key("fleet", "red", "drive")
+    began, number = time.monotonic(), 0
+    while (now := time.monotonic() - began) < seconds:
+        while number < min(now, seconds) * rate:
+            opened.put_command(key, drives[number % 4], messages.JSON, number)
+            number += 1
+        time.sleep(0.002)  # in bursts, as a busy machine would make them
+    sys.stdout.write(f"{number}\n")
