@@ -38,6 +38,8 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 TICK_S: Final = 0.1
 """How often silence is weighed, states are looked at, and the loop notes that it was not stalled."""
+LONGEST_SLEEP_S: Final = 3600.0
+"""No timer may lie at infinity."""
 HUB_GONE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 0.5
 """Two gateways that started at the same moment see each other when both have declared (design.md, "Keys")."""
@@ -98,6 +100,8 @@ class Car:
         self._sent: set[str] = set()
         """Ids of commands whose first frame went out since the last answers."""
         self._wake = asyncio.Event()
+        self._wake_at = now
+        """Until when the writer sleeps, if nothing wakes it."""
         self._ending = False
         self._stopped = asyncio.Event()
         self._alive_at = now
@@ -203,7 +207,7 @@ class Car:
             now = self._loop.time()
             self._health.received(len(data), now)
             self._events(self._decoder.feed(data, now))
-            self._wake.set()
+            self._wake_if_due(now)
 
     def _events(self, events: list[Event]) -> None:
         """Publish what was measured, which does not wait for what it means, and take it as evidence."""
@@ -236,10 +240,20 @@ class Car:
             if self._control.finished:
                 self._stopped.set()
             now = self._loop.time()
-            wake_at = min(self._control.next_at(now), self._decoder.deadline() or float("inf"), now + TICK_S)
-            timer = self._loop.call_at(wake_at, self._wake.set)
+            self._wake_at = self._due_at(now)
+            timer = self._loop.call_at(min(self._wake_at, now + LONGEST_SLEEP_S), self._wake.set)
             await self._wake.wait()
             timer.cancel()
+
+    def _wake_if_due(self, now: float) -> None:
+        """Wake the writer if it has something to do: for each reading, which seldom needs it, it would cost a third."""
+        if self._control.has_records or self._due_at(now) < self._wake_at:
+            self._wake.set()
+
+    def _due_at(self, now: float) -> float:
+        """When there is something to write, or to be made of what has come, if nothing else happens."""
+        deadline = self._decoder.deadline()
+        return min(self._control.next_at(now), float("inf") if deadline is None else deadline)
 
     async def _pump(self) -> None:
         now = self._loop.time()
@@ -431,6 +445,7 @@ class Car:
                 self._log(Level.WARNING, "parent_gone", "the process that started this gateway has ended: ending, too")
                 self.stop()
             self._control.tick(now)
+            self._wake_if_due(now)
             mode = self._control.mode
             limit = mode.silence_limit(fan=bool(self._control.believed.fan))
             self._health.judge(

@@ -138,6 +138,11 @@ class Controller:
         """Who stopped the car, if it is on hold."""
         return self.safety.hold
 
+    @property
+    def has_records(self) -> bool:
+        """Whether there is something to take."""
+        return self._ledger.waiting
+
     def take_records(self) -> list[Record]:
         """The records since the last call."""
         return self._ledger.take()

@@ -30,6 +30,11 @@ class Ledger:
         self._ids: OrderedDict[str, None] = OrderedDict()
         self._refused: dict[str, Reason] = {}
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there are records to take."""
+        return bool(self._records)
+
     def take(self) -> list[Record]:
         """The records since the last call."""
         records, self._records = self._records, []

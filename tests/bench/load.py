@@ -1,0 +1,158 @@
+"""A gateway under load: its CPU at 25 tracking frames a second, commands meanwhile, and its memory after an hour of them.
+
+The floors: a bare loop with the same puts; a query that a bare process answers at once; its own memory before.
+"""
+
+import json
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from time import monotonic, sleep
+
+from tests.bench.commands import GAP_S, TURNS
+from tests.bench.measured import Measured, in_turns, percentile
+from tests.bench.stage import READING, Arrival, Stage, Tty, perf_counter, stage
+from tests.support.processes import PATIENCE_S, Process
+
+TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
+RATE_HZ = 25
+WINDOW_S = 8.0
+COMMANDS = 30
+HOUR = 3600 * RATE_HZ
+"""Frames in an hour of tracking."""
+SETTLED = HOUR // 10
+"""Every ring is full by then: 1,500 readings are kept, and it takes a minute."""
+AT_ONCE = 100
+
+
+def _cpu_s(process: Process) -> float:
+    """User and system time of a process: by /proc in ticks of 10 ms, elsewhere by `ps`, in hundredths."""
+    listed = subprocess.run(["ps", "-o", "time=", "-p", str(process.pid)], capture_output=True, text=True, check=True)
+    try:
+        with open(f"/proc/{process.pid}/stat", encoding="ascii") as file:
+            fields = file.read().rpartition(") ")[2].split()
+        return (int(fields[11]) + int(fields[12])) / 100
+    except FileNotFoundError:
+        minutes, _, seconds = listed.stdout.strip().rpartition(":")
+        return int(minutes or 0) * 60 + float(seconds)
+
+
+@contextmanager
+def _frames(port: Tty, frame: bytes) -> Iterator[None]:
+    """Frames at the rate of a tracking car, from a thread of their own."""
+    over = threading.Event()
+
+    def send() -> None:
+        due = monotonic()
+        while not over.wait(max(0.0, due - monotonic())):
+            port.write(frame)
+            due += 1 / RATE_HZ
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def _cpu(process: Process, port: Tty) -> float:
+    """Share of a core, in percent."""
+    with _frames(port, TRACKING):
+        sleep(0.5)
+        before, began = _cpu_s(process), monotonic()
+        sleep(WINDOW_S)
+        return (_cpu_s(process) - before) / (monotonic() - began) * 100
+
+
+def _track(here: Stage, port: Tty) -> None:
+    """Bring the gateway's car into tracking, and have it confirmed."""
+    here.fleet.ask("mode", mode="tracking")
+    deadline = monotonic() + PATIENCE_S
+    while (mode := here.fleet.state("mode")).verdict != "confirmed" or mode.asked != "tracking":
+        assert monotonic() < deadline, mode
+        port.drain(0.2)
+        port.write(TRACKING)
+
+
+def _commands(here: Stage, port: Tty) -> list[float]:
+    """From asking to the tty, ms, while mode-0 frames (six readings each) come at the same rate."""
+    times = []
+    with _frames(port, READING):
+        for _ in range(COMMANDS):
+            motion, frame = next(TURNS)
+            sleep(GAP_S)
+            port.drain()
+            began = perf_counter()
+            payload = json.dumps({"motion": motion, "duration_s": 5})
+            replies = here.session.get("fleet/red/@cmd/drive", payload=payload, encoding="application/json")
+            seen, deadline = b"", monotonic() + PATIENCE_S
+            while frame not in seen:
+                assert monotonic() < deadline, seen
+                seen += port.read()
+            times.append((perf_counter() - began) * 1e3)
+            assert all(reply.ok is not None for reply in replies)
+    return times[1:]  # the first may have met the stop of what was held before
+
+
+def _queries(here: Stage) -> list[float]:
+    times = []
+    for _ in range(COMMANDS):
+        sleep(GAP_S)
+        began = perf_counter()
+        assert next(iter(here.session.get("bench/answer", payload=b"{}"))).ok is not None
+        times.append((perf_counter() - began) * 1e3)
+    return times[1:]
+
+
+def _feed(here: Stage, port: Tty, count: int) -> None:
+    """Give the gateway frames as fast as it takes them; what it has taken it says in state/link."""
+    taken = here.fleet.state("link").rx_frames
+    for begun in range(0, count, AT_ONCE):
+        port.write(TRACKING * AT_ONCE)
+        deadline = monotonic() + PATIENCE_S
+        if begun % (20 * AT_ONCE) == 0:  # the PTY holds the rest back by itself
+            while here.fleet.state("link").rx_frames < taken + begun:
+                assert monotonic() < deadline
+                sleep(0.02)
+    deadline = monotonic() + PATIENCE_S
+    while here.fleet.state("link").rx_frames < taken + count:
+        assert monotonic() < deadline
+        sleep(0.05)
+
+
+def run() -> list[Measured]:
+    with stage() as here:
+        port, bare_port, alive, answering = here.tty(), here.tty(), Arrival(), Arrival()
+        gateway = here.gateway(port)
+        kept = [
+            here.session.liveliness().declare_subscriber("bench/loop/alive", alive.note, history=True),
+            here.session.liveliness().declare_subscriber("bench/answer/alive", answering.note, history=True),
+        ]
+        bare = here.bare("loop", bare_port.path, "bench/loop")
+        here.bare("answer", "bench/answer")
+        alive.wait()
+        answering.wait()
+        ours, floor = in_turns(lambda: _commands(here, port), lambda: _queries(here))
+        _track(here, port)
+        cpu, bare_cpu = in_turns(lambda: _cpu(gateway, port), lambda: _cpu(bare, bare_port))
+        _feed(here, port, SETTLED)
+        before = gateway.rss_mb()
+        _feed(here, port, HOUR)
+        after = gateway.rss_mb()
+        for each in kept:
+            each.undeclare()
+    return [
+        Measured("gateway CPU, 25 frames/s", tuple(cpu), tuple(bare_cpu), "%", 2.0),
+        Measured(
+            "command to tty, p90, 25 frames/s",
+            tuple(percentile(times, 0.9) for times in ours),
+            tuple(percentile(times, 0.9) for times in floor),
+            "ms",
+            1.5,
+            slack=1.0,
+        ),
+        Measured("RSS after an hour of frames", (after,), (before,), "MB", 1.05),
+    ]
