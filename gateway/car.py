@@ -452,7 +452,7 @@ class Car:
                 now=now,
                 limit_s=limit,
                 why_quiet=f"{mode.asked or 'an unknown mode'} is silent",
-                blocked_until=self._control.pacing.flight_until,
+                blocked_until=self._control.pacing.blocked_until,
             )
             self._out.states(self._control, self._health, now)
             if now >= next_health:

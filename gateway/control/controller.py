@@ -13,7 +13,7 @@ from typing import Final
 from gateway.control import arbiter, recipes, stop
 from gateway.control.believed import Believed
 from gateway.control.ledger import Ledger, Pending
-from gateway.control.mode import ModeTruth, Verdict
+from gateway.control.mode import MANUAL_SILENCE_S, ModeTruth, Verdict
 from gateway.control.outbox import Pacing
 from gateway.control.recipes import Gate, Recipe
 from gateway.control.records import (
@@ -89,6 +89,8 @@ class Controller:
         self._was_open = False
         self._link_reason = "not connected yet"
         self._gave_up = False
+        self._unheard = False
+        """The car was silent for longer than it ever is, on an open link: what was sent may not have come."""
         self._closing = False
         self.unstopped = False
         """The gateway ends, and the car could not be stopped."""
@@ -108,7 +110,7 @@ class Controller:
     @property
     def motors(self) -> str:
         """`off` only after a stop that is complete; `unknown` while the car's state is."""
-        if not self.known:
+        if not self.known or self._unheard:
             return "unknown"
         return "on" if self.believed.motors_on else "off"
 
@@ -152,7 +154,7 @@ class Controller:
     def link_up(self, now: float) -> None:
         """The link is open: bring the car to a known state."""
         self._link_open = self._was_open = True
-        self._gave_up = False
+        self._gave_up = self._unheard = False
         self.known = False
         self.pacing.reset()
         self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
@@ -182,6 +184,9 @@ class Controller:
         self.mode.heard(event)
         self._note_verdict(before, now)
         self._note_effect(event, now)
+        if self._unheard:
+            self._heard_again(now)
+            return
         if event.signature is not Mode.MANUAL:
             return
         if event.range_cm is not None:
@@ -201,8 +206,29 @@ class Controller:
         """Weigh silence; called a few times a second."""
         before = self.mode.verdict
         if self._link_open and self.known and self._running is None:
-            self.mode.silent(now=now, blocked_until=self.pacing.flight_until, fan=bool(self.believed.fan))
+            self._weigh_silence(now)
         self._note_verdict(before, now)
+
+    def _weigh_silence(self, now: float) -> None:
+        fan, blocked_until = bool(self.believed.fan), self.pacing.blocked_until
+        self.mode.silent(now=now, blocked_until=blocked_until, fan=fan)
+        expected = self.mode.asked is not None and self.mode.silence_limit(fan=fan) is not None
+        silent_s = self.mode.unheard_s(now=now, blocked_until=blocked_until)
+        if expected and not self._unheard and silent_s > MANUAL_SILENCE_S:
+            self._unheard = True
+            words = (
+                f"{self.car} was not heard for {silent_s:.1f} s: whether it moves is not known "
+                "(off, out of reach, or its link stuck); it is stopped when it is heard again"
+            )
+            self._ledger.log(Level.WARNING, "unheard", words, now)
+
+    def _heard_again(self, now: float) -> None:
+        """A link that was stuck may deliver at once what was written meanwhile, of which a car obeys only the first."""
+        self._unheard = self.known = False
+        words = f"{self.car} is heard again: it is stopped first"
+        self._ledger.log(Level.INFO, "answers_again", words, now)
+        self._drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
+        self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
 
     def sender_alive(self, name: str, *, alive: bool, now: float) -> None:
         """A sender's liveliness token appeared or went."""
@@ -249,7 +275,7 @@ class Controller:
         if self._ledger.known(command):
             return self._reject(pending, Reason.DUPLICATE, f"a command with id {command.id} came already", now)
         # A stream is noted also while it is refused: a lease that lapses after a stop must not set it going.
-        halted = command.streamed and not self._heard_again(command, now)
+        halted = command.streamed and not self._has_let_go(command, now)
         refusal = arbiter.refuse(command, self._situation(now))
         if refusal is not None:
             return self._reject(pending, *refusal, now)
@@ -431,7 +457,7 @@ class Controller:
         self.safety.driven_no_more(now)
         self._senders.halt(now)
 
-    def _heard_again(self, command: Command, now: float) -> bool:
+    def _has_let_go(self, command: Command, now: float) -> bool:
         what = command.what
         release = isinstance(what, Drive) and what.motion is Motion.STOP
         return self._senders.streamed(command.sender.name, now, release=release)
@@ -692,7 +718,10 @@ class Controller:
             case ModeClose():
                 if self._mode_sent is not None and self._mode_sent[0].command.what != SetMode(Mode.MANUAL):
                     self._mode_sent = None
-                self.mode.ask(Mode.MANUAL, now=now, block_s=self.profile.block_s(frame))
+                # It is read when the turn of the mode before is over: near an obstacle 4.3 s later.
+                left = self.mode.asked
+                turn_s = 0.0 if left is None or left is Mode.MANUAL else self.profile.mode_turn_s(left)
+                self.mode.ask(Mode.MANUAL, now=now, block_s=turn_s + self.profile.block_s(frame))
             case _:
                 pass
         if self.profile.stop_style is StopStyle.RASPBERRY_PI and self.mode.asked is None:

@@ -100,11 +100,15 @@ class ModeTruth:
                 self.evidence = f"silent for {now - max(self._heard_at, self._asked_at):.0f} s, as expected"
                 self.evidence_at = now
             return
-        since = max(self._heard_at, self._settled_at, blocked_until)
-        if now - since > limit:
+        silent_s = self.unheard_s(now=now, blocked_until=blocked_until)
+        if silent_s > limit:
             self.verdict = Verdict.CONTRADICTED
-            self.evidence = f"silent for {now - since:.1f} s, {self.asked} reports at least every {limit:g} s"
+            self.evidence = f"silent for {silent_s:.1f} s, {self.asked} reports at least every {limit:g} s"
             self.evidence_at = now
+
+    def unheard_s(self, *, now: float, blocked_until: float) -> float:
+        """How long there was no reading, s, known blocks left out."""
+        return now - max(self._heard_at, self._settled_at, blocked_until)
 
     def silence_limit(self, *, fan: bool) -> float | None:
         """The longest silence that fits the asked mode, s; None where silence is normal."""

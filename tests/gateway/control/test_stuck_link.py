@@ -1,0 +1,87 @@
+"""A link that is open and delivers nothing: what is said of the car meanwhile, and what is done when it is back."""
+
+import pytest
+
+from gateway.control.mode import Verdict
+from gateway.control.records import Drive, SetMode, Stop
+from gateway.protocol.values import Mode, Motion
+from tests.support.virtual import Pair
+
+FORWARD = Drive(Motion.FORWARD, 3.0)
+
+
+class Wire:
+    """What is between control and the car: while it is stuck it takes what is written, and keeps it."""
+
+    def __init__(self, pair: Pair) -> None:
+        self._pair = pair
+        self._feed = pair.car.feed
+        self._receive = pair._receive
+        self._kept = b""
+        self.stuck = False
+        pair.car.feed = self.feed  # type: ignore[method-assign]
+        pair._receive = self.receive  # type: ignore[method-assign]
+
+    def feed(self, data: bytes, now: float) -> None:
+        if self.stuck:
+            self._kept += data
+        else:
+            self._feed(data, now)
+
+    def receive(self, *, linked: bool) -> None:
+        self._receive(linked=linked and not self.stuck)
+        if self.stuck:
+            self._pair.control.tick(self._pair.now)
+
+    def free(self) -> None:
+        self.stuck = False
+        self._feed(self._kept, self._pair.now)
+
+
+@pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
+def test_a_car_that_is_not_heard_may_be_moving_and_is_stopped_when_it_is_heard_again(platform: str) -> None:
+    pair = Pair(platform, start_s=2.0).ready()
+    wire = Wire(pair)
+    pair.ask(FORWARD)
+    pair.run(0.2)
+    wire.stuck = True
+    took = pair.until(lambda: pair.control.motors == "unknown", 6.0)
+    assert took > 1.9, "the silence that a report without echo explains is none"
+    pair.run(5.0)
+    assert pair.car.truth.motor_left, "its stop is in the wire"
+    assert pair.control.motors == "unknown"
+    pair.ask(Drive(Motion.BACK, 0.5))  # also this is kept by the wire, with its stops, and arrives with them
+    pair.run(3.0)
+    wire.free()
+    pair.until(lambda: pair.control.motors == "off", 12.0)
+    assert not pair.car.truth.motor_left
+    assert [log.code for log in pair.logs if log.code != "mode_contradicted"][-3:] == [
+        "unheard",
+        "answers_again",
+        "recovered",
+    ]
+
+
+def test_a_car_that_is_driven_on_is_not_thought_to_be_heard() -> None:
+    """Frames without a block explain no silence, however many."""
+    pair = Pair("arduino", start_s=2.0).ready()
+    wire = Wire(pair)
+    wire.stuck = True
+    for number in range(20):
+        pair.ask(Drive((Motion.FORWARD, Motion.BACK)[number % 2], 0.5))
+        pair.run(0.25)
+    assert pair.control.motors == "unknown"
+    assert pair.control.mode.verdict is Verdict.CONTRADICTED
+
+
+def test_a_stop_in_obstacle_avoidance_takes_its_time_and_is_no_silence() -> None:
+    pair = Pair("arduino", start_s=2.0).ready()
+    pair.ask(SetMode(Mode.OBSTACLE_AVOIDANCE))
+    pair.run(8.0)
+    for _ in range(10):
+        pair.ask(Stop())
+        pair.until(lambda: pair.control.motors == "off", 8.0)
+        pair.run(6.0)
+        pair.ask(SetMode(Mode.OBSTACLE_AVOIDANCE))
+        pair.run(8.7)
+    assert not [log for log in pair.logs if log.code in ("unheard", "mode_contradicted")]
