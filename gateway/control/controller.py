@@ -15,7 +15,7 @@ from gateway.control.believed import Believed
 from gateway.control.ledger import Ledger, Pending
 from gateway.control.mode import MANUAL_SILENCE_S, ModeTruth, Verdict
 from gateway.control.outbox import Pacing
-from gateway.control.recipes import Gate, Recipe
+from gateway.control.recipes import Recipe
 from gateway.control.records import (
     Act,
     Answer,
@@ -50,8 +50,6 @@ PATIENCE_S: Final = 10.0
 """How long a one-shot or a mode may wait for a busy car before it is too old to matter."""
 STALL_S: Final = 0.5
 """A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
-WIRE_S: Final = 0.02  # protocol.md: 20 ms of wire for a frame of 19 bytes at 960 B/s
-RECOVERY_WORST_S: Final = 7.3  # protocol.md, "recovery": theory, never over 7.3 s outside avoidance
 UNDER_WAY_S: Final = 0.06
 """A reading that came sooner after a frame was under way when the frame was sent."""
 FAN_SETTLED_S: Final = 2.0
@@ -190,7 +188,7 @@ class Controller:
         if event.signature is not Mode.MANUAL:
             return
         if event.range_cm is not None:
-            self.pacing.echo_seen = event.range_cm > 0
+            self.pacing.heard(event.at)
         if now > self.believed.fan_at + FAN_SETTLED_S and self.profile.stop_style is not StopStyle.RASPBERRY_PI:
             self.believed.fan = False  # protocol.md: a car whose fan runs sends no readings
         running = self._running
@@ -253,7 +251,7 @@ class Controller:
         self._ledger.log(Level.ERROR, "estop_joined", words, now)
         self._halt(words, now)
         if self._link_open and not self._closing:
-            self._begin(stop.full(self.profile, known=self.known), Why.STOP, now)
+            self._begin(self._full(now), Why.STOP, now)
 
     def stalled(self, gap_s: float, now: float) -> None:
         """The loop slept for `gap_s`: with motion held the car is stopped first."""
@@ -328,7 +326,7 @@ class Controller:
         self._closing = True
         self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)
         if self._link_open:
-            self._begin(stop.full(self.profile, known=self.known), Why.SHUTDOWN, now)
+            self._begin(self._full(now), Why.SHUTDOWN, now)
         elif self._was_open:
             self._not_stopped(now)
 
@@ -339,8 +337,10 @@ class Controller:
 
     @property
     def finished(self) -> bool:
-        """After `shutdown`: the last frame of the stop is written."""
-        return self._closing and (self._running is None or self._running.frames_sent)
+        """After `shutdown`: the last frame is written, and a Raspberry Pi, which dies when we go, has obeyed it."""
+        if self._closing and self._running is not None and self.profile.stop_style is not StopStyle.RASPBERRY_PI:
+            return self._running.frames_sent
+        return self._closing and self._running is None
 
     # ------------------------------------------------------------------ frames out
 
@@ -407,7 +407,7 @@ class Controller:
             if self._acts or (self._held is not None and not self._held.pending.sent):
                 times.append(self.pacing.flight_until)
             if self._opening is not None:
-                times.append(self.pacing.ready_at(Gate.ALONE if self.at_rest else Gate.FLIGHT))
+                times.append(self.pacing.open_at(now) if self.at_rest else self.pacing.flight_until)
             if self.believed.repeat:
                 times.append(self.pacing.repeat_at)
         return max(now, min(times, default=float("inf")))
@@ -416,19 +416,10 @@ class Controller:
 
     def worst_stop_s(self, now: float) -> float:
         """The longest that a stop asked now takes until the motors are off (protocol.md, "Worst case of a stop")."""
-        running, style = self._running, self.profile.stop_style
-        if style is not StopStyle.RASPBERRY_PI and not self.known:
-            began = running.first_at if running is not None and running.first_at is not None else now
-            avoiding = self.profile.mode_turn_s(Mode.OBSTACLE_AVOIDANCE)
-            return max(0.0, began + RECOVERY_WORST_S - now) + avoiding
-        if style is StopStyle.UNKNOWN:
-            return RECOVERY_WORST_S
-        gate = Gate.FLIGHT if style is StopStyle.RASPBERRY_PI else Gate.ALONE
-        if running is not None and running.recipe.rank >= recipes.FULL.rank and running.first_at is not None:
-            # The frame that stops it is on its way.
-            return max(running.first_at + running.turn_s - now, 0.0) + WIRE_S
-        wait = max(0.0, self.pacing.ready_at(gate) - now)
-        return wait + self.profile.mode_turn_s(self.mode.asked or Mode.MANUAL) + WIRE_S
+        recipe, running = self._full(now), self._running
+        if running is not None and running.recipe.rank >= recipe.rank:
+            return running.worst_s(now)
+        return stop.worst_s(recipe, self._for_stop(now), self.pacing, now)
 
     # ------------------------------------------------------------------ commands, one by one
 
@@ -448,7 +439,7 @@ class Controller:
             return self._reject(pending, Reason.LINK_DOWN, f"{words} ({latched})" if latched else words, now)
         worst = self.worst_stop_s(now)
         self._ledger.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
-        self._begin(stop.full(self.profile, known=self.known), Why.STOP, now, pending)
+        self._begin(self._full(now), Why.STOP, now, pending)
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
 
     def _halt(self, words: str, now: float) -> None:
@@ -551,13 +542,13 @@ class Controller:
         worst = self.worst_stop_s(now)
         if not pending.command.streamed:
             self._ledger.record(pending, Phase.QUEUED, now, worst_case_s=worst)
-        self._begin(self._soft(), Why.STOP, now, None if pending.command.streamed else pending)
+        self._begin(self._soft(now), Why.STOP, now, None if pending.command.streamed else pending)
         return Answer(Phase.QUEUED, worst_case_s=worst)
 
     def _close_mode(self, pending: Pending, now: float) -> Answer:
         self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {pending.command.sender.name}", now)
         answer = self._queued(pending, now)
-        self._begin(stop.full(self.profile, known=self.known), Why.COMMAND, now, pending)
+        self._begin(self._full(now), Why.COMMAND, now, pending)
         return answer
 
     def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
@@ -619,19 +610,26 @@ class Controller:
         """Known to stand in mode 0 after a complete stop."""
         return self.known and self._manual and not self.believed.motors_on
 
-    def _soft(self) -> Recipe:
-        return stop.soft(self.profile, known=self.known, manual=self._manual)
+    def _soft(self, now: float) -> Recipe:
+        return stop.soft(self._for_stop(now))
+
+    def _full(self, now: float) -> Recipe:
+        return stop.full(self._for_stop(now))
+
+    def _for_stop(self, now: float) -> stop.Situation:
+        contradicted = self.mode.verdict is Verdict.CONTRADICTED
+        return stop.Situation(self.profile, self.known, self.mode.asked, contradicted, self.pacing.clear_at(now))
 
     def _begin(self, recipe: Recipe, why: Why, now: float, pending: Pending | None = None) -> None:
         """Carry out a recipe, or join the one that runs if that is no weaker."""
         self.believed.repeat = False
         joining = [pending] if pending is not None else []
         running = self._running
-        turn_s = self.profile.mode_turn_s(self.mode.asked) if self.mode.asked is not None else 0.0
+        worst_at = now + stop.worst_s(recipe, self._for_stop(now), self.pacing, now)
         if running is None:
-            self._running = Running(recipe, why, now, joining, turn_s=turn_s)
+            self._running = Running(recipe, why, now, joining, worst_at=worst_at)
         elif running.recipe.rank < recipe.rank:
-            self._running = Running(recipe, why, now, running.commands + joining, turn_s=turn_s)
+            self._running = Running(recipe, why, now, running.commands + joining, worst_at=worst_at)
         else:
             running.commands.extend(joining)
             if why is Why.SHUTDOWN:
@@ -702,9 +700,9 @@ class Controller:
         """Open a mode, from rest in mode 0 only: opening while driving leaves the motors as they were, blind."""
         assert isinstance(pending.command.what, SetMode)
         if not self.at_rest:
-            self._begin(stop.full(self.profile, known=self.known), Why.STOP, now)
+            self._begin(self._full(now), Why.STOP, now)
             return self._step(now)
-        if now < self.pacing.ready_at(Gate.ALONE):
+        if now < self.pacing.open_at(now):
             return None
         return self._write(ModeOpen(pending.command.what.mode), Why.COMMAND, pending, pending)
 
@@ -751,7 +749,7 @@ class Controller:
         """The held motion is over: a soft stop, unless the car stands and never got it."""
         self._close_held(phase, reason, words, now)
         if self._link_open and self._running is None and not self.at_rest:
-            self._begin(self._soft(), Why.STOP, now)
+            self._begin(self._soft(now), Why.STOP, now)
 
     def _free_at(self, now: float) -> float:
         """When the car can take a motion, as far as it is known."""

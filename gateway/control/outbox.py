@@ -3,34 +3,52 @@
 Knows frames and times, not commands; what is to be written is decided by the controller.
 """
 
+from typing import Final
+
 from gateway.control.recipes import REPEAT_S, Gate
 from gateway.protocol.encode import Frame
 from gateway.protocol.profile import Profile
 
-FLIGHT_S = 0.06
+FLIGHT_S: Final = 0.06
 """A frame is in flight for 0.06 s or its block, whichever is longer (protocol.md): a report may be under way."""
+AWAKE_S: Final = 0.6
+"""A car that has just reported ranges again no sooner than 0.85 s later (protocol.md: once a second in mode 0); what is
+written within this time of a reading is read at once, with 0.25 s left for the link's own delays."""
+REPORT_S: Final = 2.2
+"""A car in mode 0 that can report does so within this time: once a second, and 1.0 s more without an echo."""
 
 
 class Pacing:
-    """The last frame written, and what follows from it. Times are seconds on one monotonic clock."""
+    """The last frame written, and what follows from it. Times are seconds on one monotonic clock.
+
+    A frame lies unread in the car's buffer while a ranging without echo blocks it: for 1.0 s, so less than `REPEAT_S`.
+    It is certainly read sooner if the car was awake when it was written, or has sent a reading since. That the last
+    ranging had an echo says nothing of the next.
+    """
 
     def __init__(self, profile: Profile) -> None:
         self._profile = profile
-        self._written_at = float("-inf")
-        self._block_s = 0.0
-        self.echo_seen = False
-        """The last ranging had an echo. False also until a reading has come: the car may be blocked for a second."""
-
-    def wrote(self, frame: Frame, now: float) -> None:
-        """A frame was handed to the link."""
-        self._written_at = now
-        self._block_s = self._profile.block_s(frame)
+        self.reset()
 
     def reset(self) -> None:
         """The link is new: nothing of ours is on it, and nothing is known."""
         self._written_at = float("-inf")
         self._block_s = 0.0
-        self.echo_seen = False
+        self._read_by = float("-inf")
+        self._heard_at = float("-inf")
+
+    def wrote(self, frame: Frame, now: float) -> None:
+        """A frame was handed to the link."""
+        awake_at = max(now, self.block_until) if now <= self._heard_at + AWAKE_S else float("inf")
+        self._read_by = min(awake_at + FLIGHT_S, now + REPEAT_S)
+        self._written_at = now
+        self._block_s = self._profile.block_s(frame)
+
+    def heard(self, at: float) -> None:
+        """A mode-0 reading has come: the car has ranged, and reads what waits."""
+        self._heard_at = at
+        if at >= self._written_at + FLIGHT_S:  # a sooner one was under way when the frame was written
+            self._read_by = min(self._read_by, at)
 
     @property
     def written_at(self) -> float:
@@ -49,10 +67,25 @@ class Pacing:
 
     @property
     def buffer_until(self) -> float:
-        """Until when the last frame may lie in the car's buffer unread."""
-        if self.echo_seen:
-            return self.flight_until
-        return self._written_at + REPEAT_S + self._block_s
+        """Until when the last frame may lie in the car's buffer unread, or is in flight and may still be joined.
+
+        A longer block does not matter: what is written once the frame is read lies in the buffer alone.
+        """
+        return max(self._read_by, min(self.flight_until, self._written_at + REPEAT_S))
+
+    @property
+    def block_from(self) -> float:
+        """When the last frame's block ends at the soonest."""
+        return self._written_at + self._block_s
+
+    @property
+    def block_until(self) -> float:
+        """When the last frame's block ends at the latest."""
+        return self._read_by + self._block_s
+
+    def clear_at(self, now: float) -> bool:
+        """Nothing of ours can be unread when the next frame is written that waits for those in flight."""
+        return self.buffer_until <= max(now, self.flight_until)
 
     def ready_at(self, gate: Gate) -> float:
         """From when on a frame that waits for `gate` may be written."""
@@ -63,6 +96,13 @@ class Pacing:
                 return self.flight_until
             case Gate.ALONE:
                 return self.buffer_until
+
+    def open_at(self, now: float) -> float:
+        """When a mode may be opened: awake, so that its block begins at once; or when no reading will come."""
+        alone = max(now, self.buffer_until, self.flight_until)
+        if alone <= self._heard_at + AWAKE_S:
+            return alone
+        return max(now, self.buffer_until + REPORT_S)
 
     @property
     def repeat_at(self) -> float:

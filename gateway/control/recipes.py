@@ -46,7 +46,7 @@ class Recipe:
 
     @property
     def length_s(self) -> float:
-        """From the first frame to the last, s, if nothing is waited for."""
+        """From the first frame to the last, s, if nothing is waited for but what is certain."""
         at = 0.0
         for index, step in enumerate(self.steps):
             at = max(at + step.after_s if index else 0.0, step.from_start_s)
@@ -61,6 +61,10 @@ SOFT: Final = Recipe("soft", 1, (Step(_STOP, Gate.FLIGHT), Step(_STOP, Gate.FLIG
 
 # protocol.md, stopping, full
 FULL: Final = Recipe("full", 2, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+
+# The same where a frame of ours may lie in the buffer: `MODE00` behind it would be read at the wrong place, and waits.
+# The general stop need not: behind that frame it is lost without harm, and mostly there is none.
+FULL_BEHIND: Final = Recipe("full_behind", 2, (Step(_STOP, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
 
 # protocol.md, stopping, Raspberry Pi
 _PI_STEPS: Final = (Step(_STOP, Gate.FLIGHT), Step(_STOP, after_s=0.06), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S))

@@ -1,6 +1,7 @@
-"""A stop that is being carried out: one recipe at a time, step by step. What is sent is in recipes.py."""
+"""Which stop, how long it takes at worst, and one that is being carried out, step by step. The frames: recipes.py."""
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from gateway.control import recipes
 from gateway.control.ledger import Pending
@@ -9,6 +10,40 @@ from gateway.control.recipes import Recipe
 from gateway.control.records import Why
 from gateway.protocol.encode import Frame
 from gateway.protocol.profile import Profile, StopStyle
+from gateway.protocol.timing import FRAME_S, MODE_TURN_S, mode_open_s
+from gateway.protocol.values import Mode
+
+WIRE_S: Final = 0.02  # protocol.md: 20 ms of wire for a frame of 19 bytes at 960 B/s
+RECOVERY_WORST_S: Final = 7.3  # protocol.md, "recovery": theory, never over 7.3 s outside avoidance
+_AVOIDING_S: Final = MODE_TURN_S[Mode.OBSTACLE_AVOIDANCE]
+"""Of a car in an unknown state it is not known that it is not avoiding obstacles."""
+IN_TIME_S: Final = 0.2
+"""A frame written so long before a block can end lies in the buffer when it does, whatever the link's own delay."""
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What the choice of a stop looks at."""
+
+    profile: Profile
+    known: bool
+    """Recovery is complete and no write has failed since."""
+    mode: Mode | None
+    """The mode that was asked last."""
+    contradicted: bool
+    clear: bool
+    """No frame of ours can lie unread in the car's buffer when the first frame of the stop is written."""
+
+    @property
+    def manual(self) -> bool:
+        """Mode 0 is the last asked and not contradicted."""
+        return self.mode is Mode.MANUAL and not self.contradicted
+
+    @property
+    def turn_s(self) -> float:
+        """The longest that a turn of the mode's own loop is deaf; of the slowest mode, if it is not known which."""
+        known = self.mode is not None and not self.contradicted
+        return self.profile.mode_turn_s(self.mode if known and self.mode is not None else Mode.OBSTACLE_AVOIDANCE)
 
 
 @dataclass(slots=True)
@@ -23,8 +58,8 @@ class Running:
     first_at: float | None = None
     last_at: float = float("-inf")
     retries: int = 0
-    turn_s: float = 0.0
-    """How long the car may be in a turn of its mode, deaf, before it reads the first frame."""
+    worst_at: float = float("-inf")
+    """When the motors are off at the latest."""
 
     @property
     def frames_sent(self) -> bool:
@@ -47,7 +82,14 @@ class Running:
     @property
     def obeyed_at(self) -> float:
         """When the car has obeyed at the latest, if no reading says so earlier and none has to."""
-        return max(self.last_at, self.began_at if self.first_at is None else self.first_at + self.turn_s)
+        return max(self.last_at, self.worst_at)
+
+    def worst_s(self, now: float) -> float:
+        """How long it takes from now on, at worst."""
+        worst_at = self.worst_at
+        if self.recipe.confirmed and self.frames_sent:  # should all its frames have met a deaf car, it tries again
+            worst_at = max(worst_at, self.last_at + recipes.CONFIRM_S + _AVOIDING_S)
+        return max(worst_at - now, 0.0) + WIRE_S
 
     def wake_at(self, pacing: Pacing) -> float:
         """When there is something to do: the next step, or the end of the patience."""
@@ -58,7 +100,9 @@ class Running:
     def over_at(self, pacing: Pacing, now: float) -> float:
         """When it will be over, as far as that is known."""
         began = self.first_at if self.first_at is not None else max(now, self.due_at(pacing))
-        return began + max(self.recipe.length_s, self.turn_s)
+        return (
+            began + self.recipe.length_s if self.recipe.confirmed else max(began + self.recipe.length_s, self.worst_at)
+        )
 
     def stepped(self, now: float) -> bool:
         """A step's frame was written; True if it was the first."""
@@ -71,7 +115,16 @@ class Running:
 
     def again(self, now: float) -> "Running":
         """The short recovery that follows when no reading confirmed this one."""
-        return Running(recipes.RETRY, self.why, now, self.commands, first_at=now, last_at=now, retries=self.retries + 1)
+        return Running(
+            recipes.RETRY,
+            self.why,
+            now,
+            self.commands,
+            first_at=now,
+            last_at=now,
+            retries=self.retries + 1,
+            worst_at=now + _AVOIDING_S,
+        )
 
 
 def recovery(profile: Profile) -> Recipe:
@@ -85,17 +138,41 @@ def recovery(profile: Profile) -> Recipe:
             return recipes.RECOVERY
 
 
-def full(profile: Profile, *, known: bool) -> Recipe:
-    """What `stop`, `estop` and a shutdown send. `known`: recovery is complete and no write has failed since."""
-    if known and profile.stop_style is StopStyle.MODE_FRAME:
-        return recipes.FULL
-    return recovery(profile)
+def full(situation: Situation) -> Recipe:
+    """What `stop`, `estop` and a shutdown send."""
+    if not situation.known or situation.profile.stop_style is not StopStyle.MODE_FRAME:
+        return recovery(situation.profile)
+    return recipes.FULL_BEHIND if situation.manual and not situation.clear else recipes.FULL
 
 
-def soft(profile: Profile, *, known: bool, manual: bool) -> Recipe:
-    """What release and expiry send. `manual`: mode 0 is the last asked and not contradicted."""
-    if profile.stop_style is StopStyle.RASPBERRY_PI:
+def soft(situation: Situation) -> Recipe:
+    """What release and expiry send."""
+    if situation.profile.stop_style is StopStyle.RASPBERRY_PI:
         return recipes.PI_SOFT
-    if known and manual and profile.stop_style is StopStyle.MODE_FRAME:
+    if situation.known and situation.manual and situation.profile.stop_style is StopStyle.MODE_FRAME:
         return recipes.SOFT
-    return full(profile, known=known)
+    return full(situation)
+
+
+def worst_s(recipe: Recipe, situation: Situation, pacing: Pacing, now: float) -> float:
+    """How long a recipe that begins now takes at worst until the motors are off for good (protocol.md, stopping).
+
+    What it waits for + the rest of the block it meets + the wire; and where its first frames may be lost, because a
+    frame of ours lies unread in the car's buffer, the wait until the one that is alone there.
+    """
+    flight_s = max(pacing.flight_until - now, 0.0)
+    block_s = max(pacing.block_until - now, 0.0)
+    ranging_s = situation.profile.mode_turn_s(Mode.MANUAL)
+    lost_s = 0.0 if situation.clear else recipes.REPEAT_S
+    if recipe is recipes.FULL:
+        alone_s = max(pacing.buffer_until - now, 0.0)
+        if not situation.manual and now + alone_s + IN_TIME_S < pacing.block_from:
+            return block_s + WIRE_S  # it lies in the buffer when the opening ends, and is obeyed before the first turn
+        return max(alone_s, block_s) + situation.turn_s + WIRE_S
+    if recipe.rank < recipes.RECOVERY.rank:
+        twice_s = FRAME_S if recipe in (recipes.PI, recipes.PI_SOFT) and not situation.clear else 0.0
+        return max(flight_s + twice_s + lost_s, block_s) + ranging_s + WIRE_S
+    if recipe is recipes.UNKNOWN and situation.known:
+        # A stop and a `MODE00` in one string: neither works, it beeps as if mode 0 was opened, then takes the third.
+        return flight_s + ranging_s + mode_open_s(Mode.MANUAL) + WIRE_S
+    return RECOVERY_WORST_S + _AVOIDING_S
