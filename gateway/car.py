@@ -62,6 +62,7 @@ class Settings:
     state_dir: Path
     retry: bool
     """Keep trying when the first attempt to open the link fails."""
+    longest_drive_s: float = requests.LONGEST_DRIVE_S
     parent: int | None = None
     """Process id of the starter, with which this ends."""
 
@@ -288,7 +289,11 @@ class Car:
             with query:
                 query.reply_err(f"{expression}: name the command, there is no command {verb}", encoding="text/plain")
             return
-        request = requests.Request(verb, payload, encoding, time.time_ns(), by_wildcard="*" in expression)
+        longest_s = self._settings.longest_drive_s
+        by_wildcard = "*" in expression
+        request = requests.Request(
+            verb, payload, encoding, time.time_ns(), longest_drive_s=longest_s, by_wildcard=by_wildcard
+        )
         fleet_wide = {estop.id for estop in self._control.safety.estops if estop.fleet_wide}
         command, answer = self._command(request)
         if not request.by_wildcard:
@@ -306,6 +311,7 @@ class Car:
                 sample.encoding,
                 time.time_ns(),
                 sampled_ns=sample.time_ns,
+                longest_drive_s=self._settings.longest_drive_s,
                 by_wildcard="*" in sample.key,
             )
             self._command(request)

@@ -13,6 +13,7 @@ from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 
 COMMANDS: Final = {
     "sim": ("gateway.sim.command", "simulated cars that behave like the real ones, hazards included"),
+    "scan": ("gateway.scan", "the ports and Bluetooth devices there are, and which of them speak as a car does"),
     "monitor": ("gateway.monitor", "what a car says, decoded beside the raw bytes"),
     "send": ("gateway.send", "one frame to a car on the desk, checked against the table"),
 }
@@ -61,6 +62,9 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     run.add_argument(
         "--state-dir", metavar="DIR", help="where e-stops and holds are kept (default: FLEET_STATE_DIR, or the user's)"
     )
+    run.add_argument(
+        "--longest-drive", metavar="S", type=float, default=10.0, help="longest duration_s of a drive (default 10 s)"
+    )
     run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
     run.add_argument(
         "--with-parent", action="store_true", help="stop the car and end when the process that started this ends"
@@ -79,6 +83,9 @@ def _run(arguments: argparse.Namespace) -> int:
         url, profile = parse_url(arguments.link), parse_platform(arguments.platform)
     except (BadKey, BadUrl, ValueError) as error:
         return _failed(str(error), 2)
+    longest_s = arguments.longest_drive
+    if not 0 < longest_s <= 3600:
+        return _failed(f"--longest-drive {longest_s:g}: allowed are more than 0 and at most 3600 s", 2)
     try:
         with Bus.open(arguments.connect, start_hub=True) as opened:
             doors = Doors(opened, fleet, car)
@@ -92,7 +99,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
             state_dir = Path(arguments.state_dir) if arguments.state_dir else default_directory()
-            settings = Settings(car, url, profile, fleet, state_dir, arguments.retry, parent)
+            settings = Settings(car, url, profile, fleet, state_dir, arguments.retry, longest_s, parent)
             stopped = asyncio.run(serve(settings, opened, doors))
     except BadEndpoint as error:
         return _failed(str(error), 2)

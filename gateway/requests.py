@@ -32,7 +32,7 @@ from schemas import messages
 from schemas.topics import COMMANDS, PROTOBUF
 
 LONGEST_DRIVE_S: Final = 10.0
-"""A drive that holds longer is refused: whoever drives is there to say so again."""
+"""A drive that holds longer is refused, unless `gateway run --longest-drive` allows it: who drives can say so again."""
 LONGEST_NAME: Final = 128
 """Of a sender or an id, characters."""
 LONGEST_WHY: Final = 200
@@ -56,6 +56,7 @@ class Request:
     """Wall clock, ns since the epoch."""
     sampled_ns: int | None = None
     """Zenoh timestamp of a publication; None for a query."""
+    longest_drive_s: float = LONGEST_DRIVE_S
     by_wildcard: bool = False
     """It was asked of several cars with one key expression."""
 
@@ -111,7 +112,7 @@ def _filled(blank: Command, request: Request) -> Command:
         kind: Kind = _word("kind", message.kind or Kind.SCRIPT, Kind)
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
-        what = _WHAT[verb](message)
+        what = _drive(message, request.longest_drive_s) if verb == "drive" else _WHAT[verb](message)
     except (ValueError, EncodeError) as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", command) from None
     return replace(
@@ -165,10 +166,10 @@ def _seconds(field: str, value: float, top: float) -> float:
     return value
 
 
-def _drive(message: Any) -> What:
+def _drive(message: Any, longest_s: float) -> What:
     duration_s = 0.5
     if message.HasField("duration_s"):
-        duration_s = _seconds("duration_s", message.duration_s, LONGEST_DRIVE_S)
+        duration_s = _seconds("duration_s", message.duration_s, longest_s)
     return Drive(_word("motion", message.motion, Motion), duration_s)
 
 
@@ -233,7 +234,6 @@ def _checked(frame: ColorLed | Ptz | ArmSet) -> Act:
 
 
 _WHAT: Final[dict[str, Callable[[Any], What]]] = {
-    "drive": _drive,
     "mode": _mode,
     "led": _led,
     "light": _light,

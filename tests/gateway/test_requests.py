@@ -186,6 +186,12 @@ def test_a_refusal_is_recorded_under_the_id_and_the_sender_that_were_given() -> 
     assert (error.command.id, error.command.sender) == ("abc", Sender("mia", Kind.PERSON))
 
 
+def test_a_gateway_may_allow_longer_drives() -> None:
+    payload = {"motion": "forward", "duration_s": 60}
+    assert ask("drive", payload, longest_drive_s=60.0).what == Drive(Motion.FORWARD, 60.0)
+    assert "at most 59 s" in refused("drive", payload, longest_drive_s=59.0).words
+
+
 def test_a_refused_stream_is_still_a_stream() -> None:
     for payload in ({"motion": "up"}, {}, b"\xff", None):
         error = refused("drive", payload, sampled_ns=NOW)
