@@ -74,7 +74,7 @@ def _track(here: Stage, port: Tty) -> None:
     while (mode := here.fleet.state("mode")).verdict != "confirmed" or mode.asked != "tracking":
         assert monotonic() < deadline, mode
         port.drain(0.2)
-        port.write(TRACKING)
+        port.write(TRACKING if mode.asked == "tracking" else READING)
 
 
 def _commands(here: Stage, port: Tty) -> list[float]:
