@@ -1,6 +1,6 @@
 """`gateway monitor`: what a car says, decoded beside the raw bytes, live or from a file. It only listens.
 
-How an event is shown is in `Lines`, what is counted in `Tally`. No state is inferred here (see `control`).
+How an event is shown is in `Lines`; what it says, and what is counted, in `heard`.
 """
 
 import argparse
@@ -8,18 +8,17 @@ import asyncio
 import json
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 from gateway import capture, desk
+from gateway.heard import Tally, describe
 from gateway.link import Link, LinkLost, LinkUrl, open_link, parse_url
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
-from gateway.protocol.readings import ArmReading, Echo, Event, ImuReading, Reject, Rejected, Sensors
+from gateway.protocol.readings import Event, Rejected
 
 DESCRIPTION: Final = "What a car says, decoded beside the raw bytes. It only listens; Ctrl-C ends it."
 EPILOG: Final = """\
@@ -200,121 +199,6 @@ class Lines:
         )
         words = "  ".join(_words(fields))
         return f"{at}  {raw}{gap}  {self._paint(colour, words) if colour else words}"
-
-
-@dataclass(slots=True)
-class Tally:
-    """What has come over one link. Times in seconds since the start."""
-
-    since: float | None = None
-    until: float = 0.0
-    bytes: int = 0
-    kinds: Counter[str] = field(default_factory=Counter)
-    rejects: Counter[str] = field(default_factory=Counter)
-    modes: Counter[str] = field(default_factory=Counter)
-    contradictions: Counter[str] = field(default_factory=Counter)
-
-    def count(self, event: Event, profile: Profile) -> None:
-        """Take an event in."""
-        match event:
-            case Sensors():
-                self.kinds["sensors"] += 1
-                self.modes[" or ".join(event.candidates)] += 1
-                self.rejects.update(reject.cause for reject in event.rejects)
-                self.contradictions.update(profile.contradictions(event))
-            case ArmReading():
-                self.kinds["arm"] += 1
-                self.rejects.update(reject.cause for reject in event.rejects)
-            case ImuReading():
-                self.kinds["imu"] += 1
-            case Echo():
-                self.kinds["echo"] += 1
-            case Rejected():
-                self.rejects[event.cause] += 1
-
-    @property
-    def frames(self) -> int:
-        """Good frames."""
-        return self.kinds.total()
-
-    @property
-    def seconds(self) -> float:
-        """How long the link was listened to."""
-        return max(0.0, self.until - (self.since or 0.0))
-
-    def fields(self) -> dict[str, Any]:
-        """For a script."""
-        return {
-            "frames": dict(self.kinds),
-            "rejects": dict(self.rejects),
-            "modes": dict(self.modes),
-            "contradictions": dict(self.contradictions),
-            "bytes": self.bytes,
-            "seconds": round(self.seconds, 3),
-        }
-
-    def words(self) -> str:
-        """One line for a person."""
-        heard = f"{self.frames} frames in {self.seconds:.1f} s"
-        if self.seconds and self.frames:
-            heard += f" ({self.frames / self.seconds:.1f}/s)"
-        if not self.bytes:
-            return f"{heard}: nothing came. Is the car on? In some modes, and while its fan runs, it is silent"
-        if self.rejects:
-            causes = ", ".join(f"{cause} {count}" for cause, count in self.rejects.most_common())
-            heard += f", {self.rejects.total()} rejected ({causes})"
-        if self.modes:
-            modes = ", ".join(mode if len(self.modes) == 1 else f"{mode} {n}" for mode, n in self.modes.most_common())
-            heard += f"; mode by their shape: {modes}"
-        elif not self.frames:
-            heard += ": no car of this protocol, or another baud rate"
-        for words, count in self.contradictions.most_common():
-            heard += f"; {count} times against the platform: {words}"
-        return heard
-
-
-def describe(event: Event, profile: Profile) -> dict[str, Any]:
-    """What an event says: `kind`, and what was measured, as in the messages of the bus."""
-    match event:
-        case Sensors():
-            return {"kind": "sensors", **_measured(event, profile)}
-        case ArmReading():
-            return {"kind": "arm", "joint_deg": list(event.joint_deg), **_rejected(event.rejects)}
-        case ImuReading():
-            return {"kind": "imu", "gyro_raw": list(event.gyro), "accel_raw": list(event.accel)}
-        case Echo():
-            return {"kind": "echo"}
-        case Rejected():
-            return {"kind": "rejected", "cause": event.cause, "detail": event.detail}
-
-
-def _measured(event: Sensors, profile: Profile) -> dict[str, Any]:
-    measured = profile.measured(event)
-    fields: dict[str, Any] = {}
-    if "range" in measured and event.range_cm is not None:
-        fields |= {"range_m": round(event.range_cm / 100, 4)} if event.range_cm else {"no_echo": True}
-    if "battery" in measured:
-        fields["voltage_v"] = event.voltage_v
-    if "grayscale" in measured:
-        fields["grayscale"] = event.grayscale
-    if "line" in measured:
-        fields["line"] = _bits(event.line)
-    if (obstacle := profile.obstacle(event)) is not None:
-        fields["obstacle"] = _bits(obstacle)
-    if "light" in measured:
-        fields["light"] = _bits(event.light)
-    fields["modes"] = list(event.candidates)
-    if contradictions := profile.contradictions(event):
-        fields["contradicts"] = list(contradictions)
-    return fields | _rejected(event.rejects)
-
-
-def _rejected(rejects: Sequence[Reject]) -> dict[str, Any]:
-    return {"rejected": {reject.word: reject.text for reject in rejects}} if rejects else {}
-
-
-def _bits(bits: Sequence[bool] | None) -> str:
-    return "".join("1" if bit else "0" for bit in bits or ())
 
 
 def _words(fields: dict[str, Any]) -> Iterator[str]:

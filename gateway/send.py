@@ -177,9 +177,8 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
             lines.append(
                 f"it is opening mode {mode}, which takes up to 3.5 s, and keeps its motors as they were for that"
             )
-            if mode not in (Mode.REMOTE_CONTROL, Mode.COLOR_LED):
-                lines.append("then it drives by itself")
-            lines.append(f"in any mode but 0 it obeys only a mode frame; back to mode 0: {again} '{_MANUAL}'")
+            then = "obeys" if mode in (Mode.REMOTE_CONTROL, Mode.COLOR_LED) else "drives by itself, and obeys"
+            lines.append(f"then it {then} only a mode frame; stop it, and back to mode 0: {again} '{_MANUAL}'")
         case ModeClose():
             lines.append("its motors are off and it is in mode 0, as soon as it is not busy (4.3 s in avoidance)")
         case Ptz() | ColorLed() | ArmSet():
@@ -190,8 +189,8 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
             lines.append(
                 "this is not in the table: what the car does is not known. It may drive, or ignore what follows"
             )
-    if frame is None or moves(frame):
+    if frame is None or (isinstance(frame, General) and moves(frame)):
         lines.append(f"stop it: {again} '{_STOP}'")
         if profile.stop_style is not StopStyle.RASPBERRY_PI:
-            lines.append(f"     or: {again} '{_MANUAL}', which a Raspberry Pi car does not know, in any mode")
+            lines.append(f"     or: {again} '{_MANUAL}', obeyed in every mode, but not known to a Raspberry Pi car")
     return lines

@@ -1,9 +1,9 @@
 """Byte streams to a car: serial, TCP. Bytes only; what they mean is the protocol's."""
 
-from gateway.link.base import BadUrl, CannotOpen, Link, LinkError, LinkLost
+from gateway.link.base import BadUrl, Busy, CannotOpen, Link, LinkError, LinkLost
 from gateway.link.url import LinkUrl, SerialUrl, TcpUrl, parse_url
 
-__all__ = ["BadUrl", "CannotOpen", "Link", "LinkError", "LinkLost", "LinkUrl", "open_link", "parse_url"]
+__all__ = ["BadUrl", "Busy", "CannotOpen", "Link", "LinkError", "LinkLost", "LinkUrl", "open_link", "parse_url"]
 
 OPEN_TIMEOUT_S = 5.0
 

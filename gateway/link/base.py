@@ -19,6 +19,10 @@ class CannotOpen(LinkError):
     """The link was not opened; nothing was sent."""
 
 
+class Busy(CannotOpen):
+    """Another program has the port."""
+
+
 class LinkLost(LinkError):
     """The link is gone. A write that raises this may have sent all, some or none of its bytes."""
 

@@ -15,7 +15,7 @@ from typing import Final
 
 import serial
 
-from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkLost
+from gateway.link.base import CLOSE_S, Busy, CannotOpen, Link, LinkLost
 from gateway.link.url import SerialUrl
 
 WRITE_TIMEOUT_S: Final = 0.25
@@ -36,6 +36,7 @@ except ImportError:  # Windows
 
 # ValueError: a path or a baud rate that the system cannot express.
 _NOT_OPENED: Final[tuple[type[Exception], ...]] = (*_GONE, ValueError)
+_BUSY: Final = frozenset({errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK})
 
 
 class SerialLink(Link):
@@ -71,7 +72,8 @@ class SerialLink(Link):
                 f"{self._url}: the port did not open within {timeout_s:g} s: is the device there?"
             ) from None
         except _NOT_OPENED as error:
-            raise CannotOpen(why_not_open(self._url, error)) from None
+            kind = Busy if getattr(error, "errno", None) in _BUSY else CannotOpen
+            raise kind(why_not_open(self._url, error)) from None
 
     async def read(self) -> bytes:
         """The next bytes as they came; raises LinkLost."""
@@ -247,7 +249,7 @@ def why_not_open(url: SerialUrl, error: Exception) -> str:
         return f"{url}: there is no such port; {_ports()}"
     if code in (errno.EACCES, errno.EPERM):
         return f"{url}: no permission; {_group(url.path)}"
-    if code in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
+    if code in _BUSY:
         return f"{url}: the port is in use by another program (a second gateway?): end that one first"
     if code == errno.EISDIR or os.path.isdir(url.path):  # noqa: PTH112 - a device path, not a file to work with
         return f"{url}: this is a directory, not a serial port; {_ports()}"
