@@ -98,7 +98,8 @@ class Progress:
     def missing(self, present: Sequence[str], at: float) -> None:
         """The car has no token."""
         there = f"there are: {', '.join(present)}" if present else "there is none"
-        self._end(NO_ANSWER, "", f"no car {self.car} on the bus; {there}", at, ok=False)
+        words = f"no car {self.car} on the bus, so whether it moves is not known; {there}"
+        self._end(NO_ANSWER, "", words, at, ok=False)
 
     def silent(self, words: str, at: float) -> None:
         """Its query is over; a car that has not said anything did not answer."""

@@ -117,7 +117,8 @@ async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
         raise CannotOpen(f"{url}: there is no host {url.host!r}: check the name, or give its address") from None
     except ConnectionRefusedError:
         words = (
-            "nothing listens on that port (a Raspberry Pi car's program dies with its last client: restart it there)"
+            "nothing listens on that port (a Raspberry Pi car's program dies with its last client: its motors stay as "
+            "they were and nothing can reach them, so look whether it drives, switch it off, restart the program there)"
         )
         raise CannotOpen(f"{url}: {words}") from None
     except OSError as error:

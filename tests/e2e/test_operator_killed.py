@@ -9,6 +9,5 @@ from tests.support.processes import Fleet
 
 def test_a_killed_operator_stops_its_car(fleet: Fleet) -> None:
     took = kill_operators(fleet)
-    print(took)
     late = {case: found for case, found in took.items() if found.took_s > found.limit_s + BUSY_S}
     assert not late, late

@@ -70,7 +70,9 @@ def test_a_missing_car_keeps_no_other_from_its_command(client: FleetClient) -> N
         ("purple", False, "no_answer"),
         ("red", True, "sent"),
     ]
-    assert outcomes[1].words == "no car purple on the bus; there are: blue, green, red"
+    assert (
+        outcomes[1].words == "no car purple on the bus, so whether it moves is not known; there are: blue, green, red"
+    )
 
 
 def test_a_refusal_carries_its_reason_and_words(client: FleetClient) -> None:

@@ -1,13 +1,13 @@
 """What tests/e2e kills and cuts once, many times and with nothing added for a busy machine: `make soak` runs alone."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.support.flooding import FLIGHT_S, PER_S, flood
-from tests.support.kills import OPERATORS, Took, kill_operators
+from tests.support.kills import DOINGS, MORE_DOINGS, OPERATORS, Took, cut_links, kill_gateways, kill_operators
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet
 
@@ -28,11 +28,17 @@ def fleets(directory: Path, rounds: int) -> Iterator[Fleet]:
             fleet.close()
 
 
-def show(found: dict[str, list[Took]]) -> None:
+def judged(rounds: Iterable[dict[str, Took]]) -> None:
+    """Show the times of all rounds, and find none that is over its limit."""
+    found: dict[str, list[Took]] = {}
+    for each in rounds:
+        for what, took in each.items():
+            found.setdefault(what, []).append(took)
     print(f"\n{'what':60} {'best':>7} {'worst':>7} {'limit':>7}")
     for what, took in found.items():
         times = sorted(each.took_s for each in took)
         print(f"{what:60} {times[0]:7.3f} {times[-1]:7.3f} {took[0].limit_s:7.2f}")
+    assert not [f"{what}: {each}" for what, took in found.items() for each in took if each.late]
 
 
 @pytest.mark.soak
@@ -40,12 +46,20 @@ def show(found: dict[str, list[Took]]) -> None:
 def test_killed_operators(tmp_path: Path, world: str) -> None:
     more_s = NO_ECHO_S if world == "open" else 0.0
     operators = tuple(replace(each, block_s=each.block_s + more_s) for each in OPERATORS)
-    found: dict[str, list[Took]] = {}
-    for fleet in fleets(tmp_path, ROUNDS):
-        for case, took in kill_operators(fleet, operators, world).items():
-            found.setdefault(case, []).append(took)
-    show(found)
-    assert not [f"{case}: {each}" for case, took in found.items() for each in took if each.late]
+    judged(kill_operators(fleet, operators, world) for fleet in fleets(tmp_path, ROUNDS))
+
+
+@pytest.mark.soak
+def test_killed_gateways(tmp_path: Path) -> None:
+    judged(
+        kill_gateways(fleet, doings)
+        for fleet, doings in zip(fleets(tmp_path, 2 * ROUNDS), (DOINGS, MORE_DOINGS) * ROUNDS, strict=True)
+    )
+
+
+@pytest.mark.soak
+def test_cut_links(tmp_path: Path) -> None:
+    judged(cut_links(fleet, tmp_path / str(number)) for number, fleet in enumerate(fleets(tmp_path, ROUNDS)))
 
 
 @pytest.mark.soak

@@ -3,15 +3,19 @@
 Nothing is judged here: each function says what was measured and what is allowed.
 """
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from tests.support.judge import Judge
 from tests.support.processes import Fleet, Process, wait_for
+from tests.support.tap import Tap
 
 BUSY_S: Final = 1.0
 """What a machine that runs other tests may add to a time; the soak, which runs alone, allows nothing."""
+START_S: Final = 1.0
+"""A gateway is on its car's link within a second of its start."""
 WATCHED_S: Final = 2.5
 """Motors that are off for so long stay off: the longest block after a stop that is not obstacle avoidance is over."""
 OPERATOR: Final = Path(__file__).parents[1] / "e2e" / "operator_that_dies.py"
@@ -98,3 +102,132 @@ def kill_operators(fleet: Fleet, operators: tuple[Operator, ...] = OPERATORS, wo
     return {
         str(each): Took(judges[each.car].wait_off(at, watched_s=WATCHED_S), each.limit_s) for each, at in killed.items()
     }
+
+
+# ---------------------------------------------------------------------- gateways
+
+
+@dataclass(frozen=True, slots=True)
+class Doing:
+    """What a car does when its gateway is killed, and protocol.md's time for the recovery that follows."""
+
+    car: str
+    what: str
+    limit_s: float
+
+    def begin(self, fleet: Fleet, judge: Judge) -> None:
+        """Bring the car to it."""
+        if self.what.startswith("driving"):
+            fleet.ask("drive", self.car, motion="forward", duration_s=10)
+            wait_for(lambda: judge.driving, f"{self.car} drives")
+            if self.what != "driving":
+                fleet.ask("servo", self.car, servo="front", deg=40)
+            return
+        mode = self.what.removeprefix("opening ")
+        fleet.ask("mode", self.car, mode=mode)
+        opening = f"$4WD,MODE{MODE_DIGITS[mode]}1#".encode()
+        wait_for(lambda: judge.frames[-1][2] == opening, f"{self.car} opens {mode}")
+        if self.what == mode:
+            wait_for(lambda: judge.modes[-1][1] == mode, f"{self.car} is in {mode}")
+
+
+MODE_DIGITS: Final = {
+    "tracking": 2,
+    "obstacle_avoidance": 3,
+    "color_led": 4,
+    "light_seeking": 5,
+    "following": 6,
+}
+# protocol.md, "Stopping", recovery: idle 0.06 s, and a report under way takes 0.04 s; else the rest of the block; in
+# theory 7.3 s outside avoidance, which blocks 4.3 s.
+DOINGS: Final = (
+    Doing("a", "driving", 0.1),
+    Doing("b", "driving with a servo on its way", 0.65 + 0.1),
+    Doing("c", "tracking", 0.1 + 0.1),
+    Doing("d", "opening following", 7.3),
+)
+MORE_DOINGS: Final = (
+    Doing("a", "following", 0.1 + 0.1),
+    Doing("b", "light_seeking", 0.1 + 0.1),
+    Doing("c", "color_led", 0.75 + 0.1),
+    Doing("d", "obstacle_avoidance", 7.3 + 4.3),
+    Doing("e", "opening tracking", 7.3),
+)
+
+
+def kill_gateways(fleet: Fleet, doings: tuple[Doing, ...] = DOINGS) -> dict[str, Took]:
+    """Kill every car's gateway, then start new ones: how soon each begins, and how long from there the car goes on."""
+    judges = {each.car: Judge.follow(fleet.bus, each.car) for each in doings}
+    _, links = fleet.simulate(*(f"{each.car}:arduino:pty" for each in doings), truth=True)
+    where = dict(zip(judges, links, strict=True))
+    gateways = [fleet.gateway(link, car=car) for car, link in where.items()]
+    for car in judges:
+        fleet.ready(car)
+    for each in sorted(doings, key=lambda doing: doing.what.startswith(("driving", "opening"))):
+        each.begin(fleet, judges[each.car])
+    for gateway in gateways:
+        killed_ns = gateway.kill()
+    wait_for(lambda: not fleet.bus.tokens("fleet/*"), "all are gone")
+    assert all(judge.driving for judge, doing in zip(judges.values(), doings, strict=True) if "driving" in doing.what)
+    started_ns = time.time_ns()
+    for car, link in where.items():
+        fleet.gateway(link, car=car)
+    for car in judges:
+        safety = wait_for(lambda car=car: fleet.state("safety", car), f"{car} is served again")
+        assert safety.motors == "unknown", car
+    found = {}
+    for each in doings:
+        judge = judges[each.car]
+        (first_s, data) = wait_for(lambda judge=judge: judge.written_after(killed_ns), f"{each} is recovered")[0]
+        assert data == b"#", each
+        first_ns = killed_ns + int(first_s * 1e9)
+        found[f"gateway killed, {each.what}: begins"] = Took((first_ns - started_ns) / 1e9, START_S)
+        found[f"gateway killed, {each.what}: stands"] = Took(judge.wait_off(first_ns, watched_s=5.0), each.limit_s)
+        fleet.ready(each.car)
+        assert judge.modes[-1][1] == "manual", each
+    return found
+
+
+# ---------------------------------------------------------------------- links
+
+
+def cut_links(fleet: Fleet, directory: Path) -> dict[str, Took]:
+    """Cut the links of cars that drive, in three ways, then bring them back: as kill_gateways."""
+    cuts = {"a": "pty closed", "b": "tcp reset", "c": "tcp stuck"}
+    judges = {car: Judge.follow(fleet.bus, car) for car in cuts}
+    sim, links = fleet.simulate(f"a:arduino:pty:{directory / 'tty'}", "b:arduino:tcp", "c:arduino:tcp", truth=True)
+    reset, stuck = Tap(links[1]), Tap(links[2])
+    try:
+        for car, link in zip(cuts, (links[0], reset.link, stuck.link), strict=True):
+            fleet.gateway(link, car=car)
+        for car in cuts:
+            fleet.ready(car)
+        for car in cuts:
+            fleet.ask("drive", car, motion="forward", duration_s=10)
+            wait_for(lambda car=car: judges[car].driving, f"{car} drives")
+        sim.say({"car": "a", "fault": "link_drop"})
+        reset.reset()
+        stuck.stall()
+        for car in cuts:
+            wait_for(lambda car=car: fleet.state("safety", car).motors == "unknown", f"{car} may be moving, it is said")
+        assert [fleet.state("link", car).state for car in cuts] == ["lost", "lost", "stale"]
+        assert all(judge.driving for judge in judges.values()), "nothing stops a car that nothing reaches"
+        back_ns = time.time_ns()
+        sim.say({"car": "a", "fault": "link_drop", "for_s": 0})
+        reset.accept()
+        stuck.flow()
+        found = {}
+        for car, cut in cuts.items():
+            judge = judges[car]
+            first_s = wait_for(
+                lambda judge=judge: next((at for at, data in judge.written_after(back_ns) if data == b"#"), None),
+                f"{car} is recovered",
+            )
+            found[f"{cut}: begins"] = Took(first_s, 1.1)  # a report a second, or a try a second
+            first_ns = back_ns + int(first_s * 1e9)
+            found[f"{cut}: stands"] = Took(judge.wait_off(first_ns, watched_s=5.0), 0.1)
+            fleet.ready(car)
+    finally:
+        reset.close()
+        stuck.close()
+    return found

@@ -1,0 +1,52 @@
+"""SIGKILL of a gateway, or its link cut, while its car drives: what is known meanwhile, and how it is stopped.
+
+The simulator's truth is the judge, with its own stamps. Many times over, and strictly: tests/soak/test_kills.py.
+"""
+
+from pathlib import Path
+
+from fleet.client import FleetClient
+from tests.support.judge import Judge
+from tests.support.kills import BUSY_S, cut_links, kill_gateways
+from tests.support.processes import Fleet, wait_for
+
+
+def test_a_killed_gateways_successor_stops_the_car_at_once(fleet: Fleet) -> None:
+    found = kill_gateways(fleet)
+    late = {what: str(took) for what, took in found.items() if took.took_s > took.limit_s + BUSY_S}
+    assert not late, late
+
+
+def test_a_cut_link_that_is_back_stops_the_car_at_once(fleet: Fleet, tmp_path: Path) -> None:
+    found = cut_links(fleet, tmp_path)
+    late = {what: str(took) for what, took in found.items() if took.took_s > took.limit_s + BUSY_S}
+    assert not late, late
+
+
+def test_a_raspberry_pi_car_whose_gateway_was_killed_drives_on_and_it_is_said(fleet: Fleet) -> None:
+    """Its program dies with its client (protocol.md): nobody can stop it, and nobody says that it stands."""
+    judge = Judge.follow(fleet.bus)
+    sim, (link,) = fleet.simulate("red:raspberry_pi:tcp", truth=True)
+    gateway = fleet.gateway(link, platform="raspberry_pi")
+    fleet.ready()
+    fleet.ask("drive", motion="forward", duration_s=10)
+    wait_for(lambda: judge.driving, "it drives")
+    gateway.kill()
+    with FleetClient(fleet.endpoint, sender="mia", kind="person") as client:
+        wait_for(lambda: not client.cars(), "its gateway is gone")
+        outcome = client.car("red").stop()
+        assert not outcome.ok
+        assert outcome.words == "no car red on the bus, so whether it moves is not known; there is none"
+    words = "its motors stay as they were and nothing can reach them, so look whether it drives, switch it off"
+    wait_for(lambda: not sim.say({"car": "red", "ask": "truth"})["alive"], "its program has died")
+    again = fleet.gateway(link, platform="raspberry_pi")
+    assert again.wait() == 1
+    assert words in again.stderr
+    fleet.gateway(link, "--retry", platform="raspberry_pi")
+    wait_for(lambda: (state := fleet.state("link")) and state.state == "lost" and words in state.reason, "the same")
+    assert fleet.state("safety").motors == "unknown"
+    assert fleet.state("motion").motion == "unknown"
+    answer = fleet.ask("stop", sender="mia", kind="person")
+    assert (answer["status"], answer["reason"]) == ("rejected", "link_down")
+    assert words in answer["words"]
+    assert judge.driving
