@@ -23,7 +23,6 @@ from gateway import requests
 from gateway.control import backoff
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
-from gateway.control.mode import Verdict
 from gateway.control.records import Answer, Command, EmergencyStop, Level, LogRecord, Phase, Resume
 from gateway.control.safety import Estop
 from gateway.doors import Doors
@@ -31,12 +30,12 @@ from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Event, Rejected
-from gateway.publish import Publications, wall_ns
+from gateway.publish import RAW_PER_S, Publications, wall_ns
 from gateway.store import Store
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
-TICK_S: Final = 0.1
+TICK_S: Final = 0.2
 """How often silence is weighed, states are looked at, and the loop notes that it was not stalled."""
 LONGEST_SLEEP_S: Final = 3600.0
 """No timer may lie at infinity."""
@@ -46,6 +45,10 @@ LOOK_AGAIN_S: Final = 0.5
 TOGETHER_S: Final = 0.2
 """Gateways that come within this time are asked together for the e-stops that they know of."""
 HEALTH_EVERY_S: Final = 1.0
+TURN_BYTES: Final = 1024
+"""Bytes that are looked at before others get their turn, a stop above all; a car sends 960 a second."""
+FLOOD_OVER_S: Final = 10.0
+"""A flood is told of again when it was over for so long."""
 _LEVELS: Final = {Level.INFO: logging.INFO, Level.WARNING: logging.WARNING, Level.ERROR: logging.ERROR}
 
 log = logging.getLogger("gateway")
@@ -95,6 +98,7 @@ class Car:
         """Another car's gateway came onto the bus."""
         self._health = LinkHealth(since=now)
         self._decoder = Decoder()
+        self._flood_until = now
         self._link: Link | None = None
         self._out = Publications(opened, settings.fleet, settings.car, settings.profile, str(settings.url))
         self._asked: list[_Asked] = []
@@ -207,15 +211,32 @@ class Car:
             data = await link.read()
             now = self._loop.time()
             self._health.received(len(data), now)
-            self._events(self._decoder.feed(data, now))
+            verdict = self._control.mode.verdict
+            for start in range(0, len(data), TURN_BYTES):
+                if start:
+                    await asyncio.sleep(0)
+                self._events(self._decoder.feed(data[start : start + TURN_BYTES], now))
+            if self._control.mode.verdict is not verdict:
+                self._wake.set()
             self._wake_if_due(now)
+
+    def _left_out(self, now: float) -> None:
+        """A raw frame was not published: counted, and told of once for each flood."""
+        self._health.rejected("raw_not_published")
+        if now >= self._flood_until:
+            words = (
+                f"{self._settings.car} sends more than any car does: of its raw frames {RAW_PER_S:g} a second are "
+                "published, the rest is counted in state/link as raw_not_published (another device, or another baud rate?)"
+            )
+            self._log(Level.WARNING, "flood", words)
+        self._flood_until = now + FLOOD_OVER_S
 
     def _events(self, events: list[Event]) -> None:
         """Publish what was measured, which does not wait for what it means, and take it as evidence."""
         for event in events:
-            mode = self._control.mode
-            confirmed = mode.asked if mode.verdict is Verdict.CONFIRMED else None
-            self._out.event(event, wall_ns(event.at), confirmed, loaded=self._control.motors != "off")
+            confirmed = self._control.mode.confirmed
+            if not self._out.event(event, wall_ns(event.at), confirmed, loaded=self._control.motors != "off"):
+                self._left_out(event.at)
             self._control.heard(event, self._loop.time())
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
@@ -453,12 +474,11 @@ class Car:
             self._control.tick(now)
             self._wake_if_due(now)
             mode = self._control.mode
-            limit = mode.silence_limit(fan=bool(self._control.believed.fan))
             self._health.judge(
                 now=now,
-                limit_s=limit,
+                limit_s=mode.silence_limit(fan=bool(self._control.believed.fan)),
+                unheard_s=mode.unheard_s(now),
                 why_quiet=f"{mode.asked or 'an unknown mode'} is silent",
-                blocked_until=self._control.pacing.blocked_until,
             )
             self._out.states(self._control, self._health, now)
             if now >= next_health:

@@ -117,8 +117,7 @@ class Publications:
             message = _CLASSES["sensor/line"]()
             message.left_outer, message.left_inner, message.right_inner, message.right_outer = event.line
             self._reading("sensor/line", message, stamp_ns, published)
-        obstacle = self._profile.obstacle(event, confirmed)
-        if obstacle is not None:
+        if "obstacle" in measured and (obstacle := self._profile.obstacle(event, confirmed)) is not None:
             message = _CLASSES["sensor/obstacle"]()
             message.left, message.right = obstacle
             self._reading("sensor/obstacle", message, stamp_ns, published)
