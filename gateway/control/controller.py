@@ -208,10 +208,10 @@ class Controller:
         self._note_verdict(before, now)
 
     def _weigh_silence(self, now: float) -> None:
-        fan, blocked_until = bool(self.believed.fan), self.pacing.blocked_until
-        self.mode.silent(now=now, blocked_until=blocked_until, fan=fan)
-        expected = self.mode.asked is not None and self.mode.silence_limit(fan=fan) is not None
-        silent_s = self.mode.unheard_s(now=now, blocked_until=blocked_until)
+        fan = bool(self.believed.fan)
+        self.mode.silent(now=now, fan=fan)
+        expected = self.mode.silence_limit(fan=fan) is not None
+        silent_s = self.mode.unheard_s(now)
         if expected and not self._unheard and silent_s > MANUAL_SILENCE_S:
             self._unheard = True
             words = (
@@ -716,12 +716,9 @@ class Controller:
             case ModeClose():
                 if self._mode_sent is not None and self._mode_sent[0].command.what != SetMode(Mode.MANUAL):
                     self._mode_sent = None
-                # It is read when the turn of the mode before is over: near an obstacle 4.3 s later.
-                left = self.mode.asked
-                turn_s = 0.0 if left is None or left is Mode.MANUAL else self.profile.mode_turn_s(left)
-                self.mode.ask(Mode.MANUAL, now=now, block_s=turn_s + self.profile.block_s(frame))
+                self.mode.ask(Mode.MANUAL, now=now, block_s=self.profile.block_s(frame))
             case _:
-                pass
+                self.mode.wrote(self.profile.block_s(frame), now=now)
         if self.profile.stop_style is StopStyle.RASPBERRY_PI and self.mode.asked is None:
             self.mode.ask(Mode.MANUAL, now=now, block_s=0.0)
 

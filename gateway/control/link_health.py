@@ -52,9 +52,9 @@ class LinkHealth:
         self.rx_bytes += count
         self.last_rx_at = now
 
-    def rejected(self, cause: str) -> None:
+    def rejected(self, cause: str, count: int = 1) -> None:
         """Bytes were no reading."""
-        self.rejects[cause] = self.rejects.get(cause, 0) + 1
+        self.rejects[cause] = self.rejects.get(cause, 0) + count
 
     def wrote(self, count: int, now: float) -> None:
         """A frame was written."""
@@ -69,23 +69,26 @@ class LinkHealth:
         sent = sum(count for at, count in self._writes if at >= now - AIRTIME_WINDOW_S)
         return min(1.0, sent / (BYTES_PER_S * AIRTIME_WINDOW_S))
 
-    def judge(self, *, now: float, limit_s: float | None, why_quiet: str, blocked_until: float) -> bool:
-        """Bring the state up to date; `limit_s`: the longest normal silence, None if any is. True on a change."""
+    def judge(self, *, now: float, limit_s: float | None, unheard_s: float, why_quiet: str) -> bool:
+        """Bring the state up to date; True on a change.
+
+        `limit_s`: the longest normal silence, None if any is. `unheard_s`: how long there was no reading, what our own
+        frames explain left out (see `ModeTruth`).
+        """
         if self.state is LinkState.LOST:
             return False
         before = self.state
         up_at = self._up_at if self._up_at is not None else now
-        heard = self.last_rx_at if self.last_rx_at is not None else up_at
-        silence = now - max(heard, min(blocked_until, now))
-        if self.last_rx_at is not None and now - self.last_rx_at <= (limit_s if limit_s is not None else STALE_S):
+        silence_s = now - (self.last_rx_at if self.last_rx_at is not None else up_at)
+        if self.last_rx_at is not None and silence_s <= (limit_s if limit_s is not None else STALE_S):
             self._set(LinkState.ONLINE, "heard", now)
         elif limit_s is None:
             self._set(LinkState.QUIET, why_quiet, now)
-        elif silence <= limit_s:
+        elif min(silence_s, unheard_s) <= limit_s:
             if self.last_rx_at is not None:
                 self._set(LinkState.QUIET, "the car is busy", now)
         else:
-            self._set(LinkState.STALE, f"nothing heard for {now - heard:.1f} s, expected every {limit_s:g} s", now)
+            self._set(LinkState.STALE, f"nothing heard for {silence_s:.1f} s, expected every {limit_s:g} s", now)
         return self.state is not before
 
     def _set(self, state: LinkState, reason: str, now: float) -> None:

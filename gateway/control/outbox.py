@@ -61,11 +61,6 @@ class Pacing:
         return self._written_at + max(FLIGHT_S, self._block_s)
 
     @property
-    def blocked_until(self) -> float:
-        """Until when the last frame keeps the car from reporting; -inf if it does not."""
-        return self._written_at + self._block_s if self._block_s > FLIGHT_S else float("-inf")
-
-    @property
     def buffer_until(self) -> float:
         """Until when the last frame may lie in the car's buffer unread, or is in flight and may still be joined.
 

@@ -109,6 +109,16 @@ class Profile:
         """The modes in which this car sends no readings (observed placeholders: 1, 3, 4 silent)."""
         return self.modes & {Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED}
 
+    @property
+    def possible_modes(self) -> frozenset[Mode]:
+        """The modes that this car may be in, whoever brought it there; any, if its platform is not known."""
+        return frozenset(Mode) if self.kind is Platform.UNKNOWN else self.modes
+
+    @property
+    def fan_silences(self) -> bool:
+        """Whether it may send no readings while its fan runs (hazards: the fan on; Raspberry Pi: it blocks 1 s)."""
+        return self.kind is not Platform.RASPBERRY_PI
+
     def refusal(self, frame: Frame) -> str | None:
         """Why this frame is never sent to this car, in words for a person; None if the car knows it."""
         match frame:

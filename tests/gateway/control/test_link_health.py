@@ -5,8 +5,10 @@ import pytest
 from gateway.control.link_health import LinkHealth, LinkState
 
 
-def judged(health: LinkHealth, now: float, *, limit_s: float | None = 3.0, blocked_until: float = 0.0) -> LinkState:
-    health.judge(now=now, limit_s=limit_s, why_quiet="color_led is silent", blocked_until=blocked_until)
+def judged(
+    health: LinkHealth, now: float, *, limit_s: float | None = 3.0, unheard_s: float = float("inf")
+) -> LinkState:
+    health.judge(now=now, limit_s=limit_s, unheard_s=unheard_s, why_quiet="color_led is silent")
     return health.state
 
 
@@ -22,7 +24,7 @@ def test_from_lost_to_online_to_stale_and_back(start: float) -> None:
     assert (judged(health, start + 15), health.since) == (LinkState.ONLINE, start + 15)
     assert judged(health, start + 18) is LinkState.ONLINE
     assert judged(health, start + 18.1) is LinkState.STALE
-    assert judged(health, start + 20, blocked_until=start + 19) is LinkState.QUIET
+    assert judged(health, start + 20, unheard_s=1.0) is LinkState.QUIET
     assert health.reason == "the car is busy"
     assert judged(health, start + 30, limit_s=None) is LinkState.QUIET
     assert health.reason == "color_led is silent"
@@ -78,5 +80,5 @@ def test_a_change_is_told_once() -> None:
     health = LinkHealth()
     health.up(1.0)
     health.received(1, 2.0)
-    assert health.judge(now=2.0, limit_s=3.0, why_quiet="", blocked_until=0.0)
-    assert not health.judge(now=2.5, limit_s=3.0, why_quiet="", blocked_until=0.0)
+    assert health.judge(now=2.0, limit_s=3.0, unheard_s=0.0, why_quiet="")
+    assert not health.judge(now=2.5, limit_s=3.0, unheard_s=0.0, why_quiet="")

@@ -18,6 +18,8 @@ EITHER = b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM00"
 """Before a silence: light seeking whose `#` is late, or following, which has none."""
 SILENT = (Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED)
 BLOCK_S = 2.5
+SETTLED_S = {mode: BLOCK_S + (0.1 if mode is Mode.MANUAL else 1.0) for mode in Mode}
+"""The turn of the mode that is left, and the block."""
 
 
 def reading(shape: bytes, at: float) -> Sensors:
@@ -27,34 +29,40 @@ def reading(shape: bytes, at: float) -> Sensors:
     return event
 
 
-def asked(mode: Mode, at: float = 0.0) -> ModeTruth:
+def asked(mode: Mode) -> ModeTruth:
+    """A car that was in mode 0, or in tracking, and heard there; at 0.0 the mode was asked."""
     truth = ModeTruth(parse_platform("arduino"))
-    truth.ask(mode, now=at, block_s=BLOCK_S)
+    before = Mode.TRACKING if mode is Mode.MANUAL else Mode.MANUAL
+    truth.ask(before, now=-10.0, block_s=1.0)
+    truth.heard(reading(SHAPES[before], -0.1))
+    assert truth.confirmed is before
+    truth.ask(mode, now=0.0, block_s=BLOCK_S)
+    assert (truth.verdict, truth.evidence) == (ASSUMED, f"{mode} was asked, nothing heard since")
     return truth
 
 
 def test_before_anything_is_asked_nothing_is_said() -> None:
     truth = ModeTruth(parse_platform("arduino"))
-    truth.silent(now=100.0, blocked_until=0.0, fan=False)
+    truth.silent(now=100.0, fan=False)
     truth.heard(reading(SHAPES[Mode.TRACKING], 1.0))
-    assert (truth.asked, truth.inferred, truth.verdict) == (None, Mode.TRACKING, ASSUMED)
+    assert (truth.asked, truth.inferred, truth.verdict, truth.confirmed) == (None, Mode.TRACKING, ASSUMED, None)
+    assert truth.silence_limit(fan=False) is None
 
 
 @pytest.mark.parametrize("mode", SHAPES)
 def test_its_own_shape_confirms_a_mode(mode: Mode) -> None:
     truth = asked(mode)
-    assert (truth.verdict, truth.evidence) == (ASSUMED, f"{mode} was asked, nothing heard since")
-    truth.heard(reading(SHAPES[mode], BLOCK_S + 1))
-    assert (truth.verdict, truth.inferred) == (CONFIRMED, mode)
-    assert (truth.evidence, truth.evidence_at) == (f"a reading with the shape of {mode}", BLOCK_S + 1)
+    truth.heard(reading(SHAPES[mode], 3.0))
+    assert (truth.verdict, truth.inferred, truth.confirmed, truth.candidates) == (CONFIRMED, mode, mode, (mode,))
+    assert (truth.evidence, truth.evidence_at) == (f"a reading with the shape of {mode}", 3.0)
 
 
 def test_a_shape_of_two_modes_confirms_neither_and_speaks_against_neither() -> None:
     for mode in (Mode.LIGHT_SEEKING, Mode.FOLLOWING):
         truth = asked(mode)
         for number in range(2 * CONTRADICTING_FRAMES):
-            truth.heard(reading(EITHER, BLOCK_S + number))
-        assert truth.verdict is ASSUMED
+            truth.heard(reading(EITHER, SETTLED_S[mode] + number))
+        assert (truth.verdict, truth.inferred) == (ASSUMED, None)
         assert set(truth.candidates) == {Mode.LIGHT_SEEKING, Mode.FOLLOWING}
 
 
@@ -63,25 +71,40 @@ def test_three_readings_running_of_another_mode_contradict(mode: Mode) -> None:
     truth = asked(mode)
     for number in range(1, CONTRADICTING_FRAMES + 1):
         assert truth.verdict is ASSUMED
-        truth.heard(reading(SHAPES[Mode.TRACKING], BLOCK_S + number))
-    assert (truth.verdict, truth.inferred) == (CONTRADICTED, Mode.TRACKING)
+        truth.heard(reading(SHAPES[Mode.TRACKING], 4.0 + number))
+    assert (truth.verdict, truth.inferred, truth.confirmed) == (CONTRADICTED, Mode.TRACKING, None)
     assert truth.evidence == "3 readings running with the shape of tracking"
     if mode in SHAPES:
-        truth.heard(reading(SHAPES[mode], BLOCK_S + 9))
+        truth.heard(reading(SHAPES[mode], 9.0))
         assert truth.verdict is CONFIRMED, "it is believed again"
 
 
 def test_two_of_another_mode_are_forgotten_when_its_own_comes() -> None:
     truth = asked(Mode.TRACKING)
     for number, mode in enumerate([Mode.MANUAL, Mode.MANUAL, Mode.TRACKING, Mode.MANUAL, Mode.MANUAL]):
-        truth.heard(reading(SHAPES[mode], BLOCK_S + number))
+        truth.heard(reading(SHAPES[mode], 4.0 + number))
     assert truth.verdict is CONFIRMED
+
+
+def test_a_damaged_reading_of_another_mode_does_not_confirm() -> None:
+    """A tracking frame with one digit changed has the shape of mode 0: there is no checksum."""
+    truth = asked(Mode.MANUAL)
+    damaged = reading(b"$4WD,CSB0,PV8,GS0,LF1001,HW01,GM00#", 5.0)
+    assert damaged.signature is Mode.MANUAL
+    for number in range(20):
+        event = damaged if number % 5 == 2 else reading(SHAPES[Mode.TRACKING], 5.0)
+        truth.heard(event._replace(at=5.0 + number / 27))
+        assert truth.verdict is (ASSUMED if number < 5 else CONTRADICTED), number
+    for number in range(CONTRADICTING_FRAMES):
+        assert truth.verdict is CONTRADICTED
+        truth.heard(damaged._replace(at=6.0 + number / 27))
+    assert truth.verdict is CONFIRMED, "three running are not damaged"
 
 
 def test_readings_that_were_under_way_while_it_opens_do_not_count() -> None:
     truth = asked(Mode.TRACKING)
     for number in range(20):
-        truth.heard(reading(SHAPES[Mode.MANUAL], BLOCK_S * number / 20))
+        truth.heard(reading(SHAPES[Mode.MANUAL], SETTLED_S[Mode.TRACKING] * number / 20))
     assert truth.verdict is ASSUMED
 
 
@@ -91,30 +114,94 @@ def test_readings_that_were_under_way_while_it_opens_do_not_count() -> None:
 )
 def test_silence_contradicts_a_mode_that_talks(mode: Mode, limit_s: float) -> None:
     truth = asked(mode)
-    truth.silent(now=BLOCK_S + limit_s - 0.01, blocked_until=0.0, fan=False)
+    truth.silent(now=SETTLED_S[mode] + limit_s - 0.01, fan=False)
     assert truth.verdict is ASSUMED, "its opening is a block that is known"
-    truth.heard(reading(SHAPES[mode], BLOCK_S + 1))
-    truth.silent(now=BLOCK_S + 1 + limit_s, blocked_until=0.0, fan=False)
+    truth.heard(reading(SHAPES[mode], 10.0))
+    truth.silent(now=10.0 + limit_s, fan=False)
     assert truth.verdict is CONFIRMED
-    truth.silent(now=BLOCK_S + 5 + limit_s, blocked_until=BLOCK_S + 5.1, fan=False)
-    assert truth.verdict is CONFIRMED, "a block of ours"
-    truth.silent(now=BLOCK_S + 99, blocked_until=0.0, fan=True)
-    assert truth.verdict is CONFIRMED, "a fan that runs"
-    truth.silent(now=BLOCK_S + 1.01 + limit_s, blocked_until=0.0, fan=False)
+    truth.silent(now=10.01 + limit_s, fan=False)
     assert truth.verdict is CONTRADICTED
     assert truth.evidence == f"silent for {limit_s:.1f} s, {mode} reports at least every {limit_s:g} s"
-    truth.heard(reading(SHAPES[mode], BLOCK_S + 20))
+    truth.silent(now=13.5, fan=False)
+    assert (truth.candidates, truth.inferred) == (SILENT, None)
+    truth.heard(reading(SHAPES[mode], 20.0))
     assert truth.verdict is CONFIRMED
+
+
+def test_blocks_of_ours_explain_as_much_silence_as_they_last() -> None:
+    truth = asked(Mode.MANUAL)
+    truth.heard(reading(SHAPES[Mode.MANUAL], 10.0))
+    for at, block_s in ((8.0, 5.0), (10.1, 0.3), (10.5, 0.65), (11.2, 0.06), (11.3, 0.06)):
+        truth.wrote(block_s, now=at)
+    truth.silent(now=13.94, fan=False)
+    assert truth.verdict is CONFIRMED
+    assert truth.unheard_s(13.94) == pytest.approx(2.99)
+    truth.silent(now=13.96, fan=False)
+    assert truth.verdict is CONTRADICTED, "a block before the reading is over, and a motion is none"
+
+
+def test_a_frame_may_be_obeyed_after_the_reading_that_was_under_way() -> None:
+    truth = asked(Mode.MANUAL)
+    truth.wrote(0.65, now=9.2)
+    truth.heard(reading(SHAPES[Mode.MANUAL], 10.0))
+    assert truth.unheard_s(11.0) == pytest.approx(0.35)
+
+
+def test_no_frames_however_many_explain_a_silence_for_ever() -> None:
+    truth = asked(Mode.MANUAL)
+    for number in range(1000):
+        truth.wrote(0.3, now=10.0 + 0.3 * number)
+        truth.silent(now=10.0 + 0.3 * number, fan=False)
+    assert truth.verdict is CONTRADICTED
+
+
+def test_a_fan_that_runs_silences_the_car_and_what_was_confirmed_fades() -> None:
+    truth = asked(Mode.MANUAL)
+    truth.heard(reading(SHAPES[Mode.MANUAL], 10.0))
+    truth.silent(now=13.0, fan=True)
+    assert truth.verdict is CONFIRMED
+    truth.silent(now=70.0, fan=True)
+    assert (truth.verdict, truth.evidence) == (ASSUMED, "silent for 60 s, as expected while its fan runs")
+    assert (truth.candidates, truth.inferred) == (tuple(Mode), None)
+    truth.silent(now=73.0, fan=False)
+    assert truth.verdict is ASSUMED, "the clock began when the fan was off"
+    truth.silent(now=73.1, fan=False)
+    assert truth.verdict is CONTRADICTED
+
+
+def test_a_mode_without_its_own_readings_is_contradicted_as_by_silence() -> None:
+    """Mode 0 reports once a second: three of its readings would take three times as long."""
+    truth = asked(Mode.TRACKING)
+    truth.heard(reading(SHAPES[Mode.TRACKING], 9.9))
+    truth.heard(reading(SHAPES[Mode.MANUAL], 10.8))
+    truth.silent(now=10.85, fan=False)
+    assert truth.verdict is CONFIRMED
+    truth.silent(now=11.0, fan=False)
+    assert truth.verdict is CONTRADICTED
+    assert truth.evidence == "no reading with the shape of tracking for 1.1 s, the last has that of manual"
 
 
 @pytest.mark.parametrize("mode", SILENT)
 def test_silence_never_confirms(mode: Mode) -> None:
     truth = asked(mode)
-    truth.silent(now=12.0, blocked_until=0.0, fan=False)
+    truth.silent(now=3.4, fan=False)
+    assert truth.evidence == f"{mode} was asked, nothing heard since"
+    truth.silent(now=12.0, fan=False)
     assert (truth.verdict, truth.evidence) == (ASSUMED, "silent for 12 s, as expected")
+    assert (truth.candidates, truth.inferred) == (SILENT, None)
     assert truth.silence_limit(fan=False) is None
-    truth.silent(now=1e6, blocked_until=0.0, fan=False)
+    truth.silent(now=1e6, fan=False)
     assert truth.verdict is ASSUMED
+
+
+def test_two_stray_readings_in_a_silent_mode_are_forgotten_after_silence() -> None:
+    truth = asked(Mode.COLOR_LED)
+    for at in (10.0, 11.0, 20.0, 21.0):
+        truth.heard(reading(SHAPES[Mode.MANUAL], at))
+        truth.silent(now=at + 1, fan=False)
+        truth.silent(now=at + 4, fan=False)
+    assert truth.verdict is ASSUMED
+    assert truth.evidence == "silent for 4 s, as expected"
 
 
 def test_asked_again_for_manual_a_confirmed_car_stays_confirmed() -> None:
@@ -124,6 +211,38 @@ def test_asked_again_for_manual_a_confirmed_car_stays_confirmed() -> None:
     assert truth.verdict is CONFIRMED
     truth.ask(Mode.TRACKING, now=6.0, block_s=BLOCK_S)
     assert (truth.asked, truth.verdict) == (Mode.TRACKING, ASSUMED)
+
+
+@pytest.mark.parametrize(
+    ("before", "latest_s"), [(Mode.OBSTACLE_AVOIDANCE, 5.3), (Mode.COLOR_LED, 1.75), (Mode.TRACKING, 1.1), (None, 5.3)]
+)
+def test_it_is_in_the_new_mode_when_the_turn_of_the_old_one_and_the_block_are_over(
+    before: Mode | None, latest_s: float
+) -> None:
+    truth = ModeTruth(parse_platform("arduino"))
+    if before is not None:
+        truth.ask(before, now=0.0, block_s=BLOCK_S)
+    truth.ask(Mode.MANUAL, now=100.0, block_s=1.0)
+    assert truth.unheard_s(100.0 + latest_s) == pytest.approx(0.0)
+    truth.ask(Mode.MANUAL, now=101.1, block_s=1.0)
+    assert truth.unheard_s(100.0 + max(latest_s, 3.1)) == pytest.approx(0.0), "the first one may wait still"
+
+
+@pytest.mark.parametrize(("platform", "fits"), [("raspberry_pi", ()), ("unknown", SILENT), ("stm32", SILENT)])
+def test_silence_of_a_car_that_knows_no_silent_mode_is_none_of_its_modes(platform: str, fits: tuple[Mode, ...]) -> None:
+    truth = ModeTruth(parse_platform(platform))
+    truth.ask(Mode.MANUAL, now=0.0, block_s=0.0)
+    truth.heard(reading(b"$4WD,CSB57,PV8.4,GS0,LF1011,HW01,GM10#", 5.0))
+    assert truth.verdict is CONFIRMED
+    truth.silent(now=8.1, fan=False)
+    assert (truth.verdict, truth.candidates) == (CONTRADICTED, fits)
+    assert ("its program has ended" in truth.evidence) is (not fits)
+
+
+def test_the_fan_of_a_raspberry_pi_car_silences_nothing() -> None:
+    truth = ModeTruth(parse_platform("raspberry_pi"))
+    truth.ask(Mode.MANUAL, now=0.0, block_s=0.0)
+    assert truth.silence_limit(fan=True) == 3.0
 
 
 def test_a_lost_link_forgets() -> None:
