@@ -358,8 +358,8 @@ class Controller:
             return self._write(General(held.motion), Why.COMMAND, held, held.pending)
         if self._opening is not None and not (self._acts and self.at_rest):
             return self._open_mode(self._opening, now)
-        if self._acts:  # asked before the mode, in which the car would ignore them
-            pending = self._acts[0]
+        if self._acts and now >= self.pacing.act_at(self._acts[0].frames[0]):
+            pending = self._acts[0]  # asked before the mode, in which the car would ignore them
             return self._write(self.believed.with_motion(pending.frames[0]), Why.COMMAND, pending, pending)
         if self.believed.repeat and now >= self.pacing.repeat_at:
             return self._write(General(self.believed.motion), Why.REPEAT, None, held.pending if held else None)
@@ -404,7 +404,9 @@ class Controller:
         if self._running is not None:
             times.append(self._running.wake_at(self.pacing))
         elif self.known:
-            if self._acts or (self._held is not None and not self._held.pending.sent):
+            if self._acts:
+                times.append(self.pacing.act_at(self._acts[0].frames[0]))
+            if self._held is not None and not self._held.pending.sent:
                 times.append(self.pacing.flight_until)
             if self._opening is not None:
                 times.append(self.pacing.open_at(now) if self.at_rest else self.pacing.flight_until)
@@ -618,7 +620,8 @@ class Controller:
 
     def _for_stop(self, now: float) -> stop.Situation:
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
-        return stop.Situation(self.profile, self.known, self.mode.asked, contradicted, self.pacing.clear_at(now))
+        clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
+        return stop.Situation(self.profile, self.known, self.mode.asked, contradicted, clear, blocked)
 
     def _begin(self, recipe: Recipe, why: Why, now: float, pending: Pending | None = None) -> None:
         """Carry out a recipe, or join the one that runs if that is no weaker."""

@@ -72,7 +72,8 @@ class ModeTruth:
         """A frame that should bring the car into `mode` was written, which then blocks it for `block_s`."""
         # It is obeyed when the turn of the mode that is left ends, which is not known to be another than the slowest.
         left = self.asked if self.verdict is not Verdict.CONTRADICTED else None
-        settled_at = now + self.profile.mode_turn_s(left or Mode.OBSTACLE_AVOIDANCE) + block_s
+        heard_at = now if mode is self.asked else max(now, self._settled_at)  # a mode that still opens is deaf
+        settled_at = heard_at + self.profile.mode_turn_s(left or Mode.OBSTACLE_AVOIDANCE) + block_s
         if mode is self.asked:  # what an earlier frame waits for, this one does, too
             settled_at = max(settled_at, self._settled_at)
         self._settled_at = settled_at

@@ -6,8 +6,8 @@ Knows frames and times, not commands; what is to be written is decided by the co
 from typing import Final
 
 from gateway.control.recipes import REPEAT_S, Gate
-from gateway.protocol.encode import Frame
-from gateway.protocol.profile import Profile
+from gateway.protocol.encode import Frame, General
+from gateway.protocol.profile import Profile, StopStyle
 
 FLIGHT_S: Final = 0.06
 """A frame is in flight for 0.06 s or its block, whichever is longer (protocol.md): a report may be under way."""
@@ -22,8 +22,8 @@ class Pacing:
     """The last frame written, and what follows from it. Times are seconds on one monotonic clock.
 
     A frame lies unread in the car's buffer while a ranging without echo blocks it: for 1.0 s, so less than `REPEAT_S`.
-    It is certainly read sooner if the car was awake when it was written, or has sent a reading since. That the last
-    ranging had an echo says nothing of the next.
+    It is certainly read sooner if the car was awake when it was written, or has sent a reading since; then those that
+    lay there before it may block the car once more. That the last ranging had an echo says nothing of the next.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -34,13 +34,15 @@ class Pacing:
         """The link is new: nothing of ours is on it, and nothing is known."""
         self._written_at = float("-inf")
         self._block_s = 0.0
+        self._before_s = 0.0
         self._read_by = float("-inf")
         self._heard_at = float("-inf")
 
     def wrote(self, frame: Frame, now: float) -> None:
         """A frame was handed to the link."""
         awake_at = max(now, self.block_until) if now <= self._heard_at + AWAKE_S else float("inf")
-        self._read_by = min(awake_at + FLIGHT_S, now + REPEAT_S)
+        self._before_s = max(self._before_s, self._block_s) if now < self._read_by else 0.0
+        self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_S, self.block_until))
         self._written_at = now
         self._block_s = self._profile.block_s(frame)
 
@@ -48,7 +50,7 @@ class Pacing:
         """A mode-0 reading has come: the car has ranged, and reads what waits."""
         self._heard_at = at
         if at >= self._written_at + FLIGHT_S:  # a sooner one was under way when the frame was written
-            self._read_by = min(self._read_by, at)
+            self._read_by = min(self._read_by, at + self._before_s)
 
     @property
     def written_at(self) -> float:
@@ -78,6 +80,10 @@ class Pacing:
         """When the last frame's block ends at the latest."""
         return self._read_by + self._block_s
 
+    def blocked_at(self, now: float) -> bool:
+        """The last frame's block runs, and no ranging, in which that frame would lie unread."""
+        return self._block_s > FLIGHT_S and self.clear_at(now) and now < self.block_until
+
     def clear_at(self, now: float) -> bool:
         """Nothing of ours can be unread when the next frame is written that waits for those in flight."""
         return self.buffer_until <= max(now, self.flight_until)
@@ -91,6 +97,12 @@ class Pacing:
                 return self.flight_until
             case Gate.ALONE:
                 return self.buffer_until
+
+    def act_at(self, frame: Frame) -> float:
+        """From when on a frame that acts once may be written."""
+        if self._profile.stop_style is StopStyle.RASPBERRY_PI and not isinstance(frame, General):
+            return max(self.flight_until, self.buffer_until)  # in one receive behind another it kills the program
+        return self.flight_until
 
     def open_at(self, now: float) -> float:
         """When a mode may be opened: awake, so that its block begins at once; or when no reading will come."""

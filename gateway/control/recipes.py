@@ -98,5 +98,20 @@ UNKNOWN: Final = Recipe(
     confirmed=True,
 )
 
+# The same where a frame of ours may lie in the buffer and mode 0 is certain: `MODE00` in one string with a servo frame
+# would open a mode. General stops stop every platform there; `MODE00` comes last, alone.
+UNKNOWN_BEHIND: Final = Recipe(
+    "unknown_platform_behind",
+    3,
+    (
+        Step(_STOP, Gate.FLIGHT),
+        Step(_STOP, after_s=0.06),
+        Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S),
+        Step(_MANUAL, Gate.ALONE, after_s=REPEAT_S),
+        Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S),
+    ),
+    confirmed=True,
+)
+
 # protocol.md, stopping, "If none has come 4.5 s after it"
 RETRY: Final = Recipe("recovery_again", 3, (Step(_MANUAL), Step(_STOP, after_s=REPEAT_S)), confirmed=True)

@@ -33,6 +33,8 @@ class Situation:
     contradicted: bool
     clear: bool
     """No frame of ours can lie unread in the car's buffer when the first frame of the stop is written."""
+    blocked: bool = False
+    """In mode 0 a block of ours runs: the car ranges some time after it, but not at once."""
 
     @property
     def manual(self) -> bool:
@@ -140,9 +142,13 @@ def recovery(profile: Profile) -> Recipe:
 
 def full(situation: Situation) -> Recipe:
     """What `stop`, `estop` and a shutdown send."""
-    if not situation.known or situation.profile.stop_style is not StopStyle.MODE_FRAME:
+    style = situation.profile.stop_style
+    if not situation.known or style is StopStyle.RASPBERRY_PI:
         return recovery(situation.profile)
-    return recipes.FULL_BEHIND if situation.manual and not situation.clear else recipes.FULL
+    behind = situation.manual and not situation.clear
+    if style is StopStyle.UNKNOWN:
+        return recipes.UNKNOWN_BEHIND if behind else recipes.UNKNOWN
+    return recipes.FULL_BEHIND if behind else recipes.FULL
 
 
 def soft(situation: Situation) -> Recipe:
@@ -162,17 +168,17 @@ def worst_s(recipe: Recipe, situation: Situation, pacing: Pacing, now: float) ->
     """
     flight_s = max(pacing.flight_until - now, 0.0)
     block_s = max(pacing.block_until - now, 0.0)
-    ranging_s = situation.profile.mode_turn_s(Mode.MANUAL)
+    ranging_s = FRAME_S if situation.blocked else situation.profile.mode_turn_s(Mode.MANUAL)
     lost_s = 0.0 if situation.clear else recipes.REPEAT_S
     if recipe is recipes.FULL:
         alone_s = max(pacing.buffer_until - now, 0.0)
         if not situation.manual and now + alone_s + IN_TIME_S < pacing.block_from:
             return block_s + WIRE_S  # it lies in the buffer when the opening ends, and is obeyed before the first turn
-        return max(alone_s, block_s) + situation.turn_s + WIRE_S
-    if recipe.rank < recipes.RECOVERY.rank:
-        twice_s = FRAME_S if recipe in (recipes.PI, recipes.PI_SOFT) and not situation.clear else 0.0
-        return max(flight_s + twice_s + lost_s, block_s) + ranging_s + WIRE_S
-    if recipe is recipes.UNKNOWN and situation.known:
+        return max(alone_s, block_s) + (ranging_s if situation.manual else situation.turn_s) + WIRE_S
+    if recipe is recipes.RECOVERY or (not situation.known and situation.profile.stop_style is StopStyle.UNKNOWN):
+        return RECOVERY_WORST_S + _AVOIDING_S
+    if recipe is recipes.UNKNOWN:
         # A stop and a `MODE00` in one string: neither works, it beeps as if mode 0 was opened, then takes the third.
-        return flight_s + ranging_s + mode_open_s(Mode.MANUAL) + WIRE_S
-    return RECOVERY_WORST_S + _AVOIDING_S
+        return max(flight_s + FRAME_S, block_s) + ranging_s + mode_open_s(Mode.MANUAL) + WIRE_S
+    twice_s = FRAME_S if lost_s and recipe not in (recipes.SOFT, recipes.FULL_BEHIND) else 0.0
+    return max(flight_s + twice_s + lost_s, block_s) + ranging_s + WIRE_S

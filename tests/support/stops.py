@@ -1,0 +1,454 @@
+"""`stop` at random moments in every mode and load: what is played, and what the simulated car's motors say of it.
+
+`rows` gives the distribution per state, for the soak's table and for whoever wants the numbers (the README's page on
+what happens when). A state is what control can tell apart; many loads lead to each.
+"""
+
+import random
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, fields
+
+from gateway.control.mode import Verdict
+from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, SetMode, Stop
+from gateway.protocol.encode import ColorLed, General, Ptz
+from gateway.protocol.profile import Platform, StopStyle
+from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.sim.core.raspberry_pi import Transport
+from gateway.sim.core.world import SONAR_CONE, SONAR_STEEPEST, Lamp, World
+from tests.support.virtual import Pair
+
+LONGEST_S = 4.0
+"""Outside obstacle avoidance and links just restored no stop takes longer."""
+AVOIDING_S = 4.3
+RATIO = 1.5
+"""The announced worst case is at most so many times the worst seen."""
+AVOIDANCE = Mode.OBSTACLE_AVOIDANCE
+READS_PINS = (Mode.REMOTE_CONTROL, Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING)
+WHISTLE = Act(General(Motion.STOP, whistle=True))
+MOTIONS = (Motion.FORWARD, Motion.LEFT, Motion.SPIN_RIGHT, Motion.BACK)
+
+Load = Callable[[Pair, random.Random], None]
+
+
+# ---------------------------------------------------------------------- worlds
+
+
+def echoing() -> World:
+    """The room, and lamps that are seen from everywhere, so that light seeking drives."""
+    room = World.room()
+    return World(room.walls, room.line, [Lamp(9.0, 0.0, reach_m=50.0), Lamp(-9.0, 0.0, reach_m=50.0)])
+
+
+def before_a_wall() -> World:
+    """What following follows."""
+    return World([(0.4, -9.0, 0.4, 9.0)])
+
+
+class Flickering(World):
+    """The room, in which every second ranging gets no echo: what slanted walls and curtains do."""
+
+    def __init__(self, seed: int = 1) -> None:
+        room = echoing()
+        super().__init__(room.walls, room.line, room.lamps)
+        self._chance = random.Random(seed)
+        self._rays = 0
+        self._silent = False
+
+    def ray(self, x: float, y: float, angle: float, steepest: float = 0.0) -> float | None:
+        if steepest != SONAR_STEEPEST:  # the infrared sensors
+            return super().ray(x, y, angle, steepest)
+        if self._rays == 0:
+            self._silent = self._chance.random() < 0.5
+        self._rays = (self._rays + 1) % len(SONAR_CONE)
+        return None if self._silent else super().ray(x, y, angle, steepest)
+
+
+WORLDS: dict[str, Callable[[], World]] = {"echo": echoing, "no-echo": World.open_field, "flickering": Flickering}
+
+
+# ---------------------------------------------------------------------- loads
+
+
+def rest(pair: Pair, moments: random.Random) -> None:
+    pair.run(3 * moments.random())
+
+
+def driving(pair: Pair, moments: random.Random) -> None:
+    pair.ask(Drive(Motion.FORWARD, 10.0))
+    pair.run(3 * moments.random())
+
+
+def steering(pair: Pair, moments: random.Random) -> None:
+    """A new motion every 50 to 250 ms: what a joystick does."""
+    for _ in range(12):
+        pair.ask(Drive(moments.choice(MOTIONS), 0.5))
+        pair.run(0.05 + 0.2 * moments.random())
+
+
+def let_go(pair: Pair, moments: random.Random) -> None:
+    """Within the soft stop after a drive."""
+    pair.ask(Drive(Motion.FORWARD, 0.3))
+    pair.run(0.3 + 1.3 * moments.random())
+
+
+def acting(pair: Pair, moments: random.Random) -> None:
+    """One-shots of every kind queue while it drives."""
+    pair.ask(Drive(Motion.FORWARD, 10.0))
+    for what in (WHISTLE, Act(Ptz(45)), Act(ColorLed(255, 2, 3)), WHISTLE, Act(Ptz(120))):
+        pair.ask(what)
+    pair.run(2.5 * moments.random())
+
+
+def one_shot(what: Act | Fan | Find | ChangeSpeed, block_s: float) -> Load:
+    """While driving, from just before it is written to the end of its block."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        pair.ask(Drive(Motion.FORWARD, 10.0))
+        pair.run(2.5 + 2 * moments.random())
+        pair.ask(what)
+        pair.run((block_s + 0.1) * moments.random())
+
+    return load
+
+
+def fan(pair: Pair, moments: random.Random) -> None:
+    """No reading comes while it runs."""
+    pair.ask(Fan())
+    pair.run(1.5)
+    pair.ask(Drive(Motion.FORWARD, 10.0))
+    pair.run(2 * moments.random())
+
+
+def again(pair: Pair, moments: random.Random) -> None:
+    """A second stop while the first is under way."""
+    steering(pair, moments)
+    pair.ask(Stop(), verb="stop")
+    pair.run(1.2 * moments.random())
+
+
+def opening(mode: Mode) -> Load:
+    """From the stop before it to the end of its block."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        pair.ask(Drive(Motion.FORWARD, 10.0))
+        pair.run(0.5)
+        pair.ask(SetMode(mode))
+        if moments.random() < 0.2:
+            pair.run(4.0 * moments.random())
+            return
+        pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), 9.0)
+        pair.run(3.6 * moments.random())
+
+    return load
+
+
+def inside(mode: Mode) -> Load:
+    def load(pair: Pair, moments: random.Random) -> None:
+        pair.ask(SetMode(mode))
+        pair.until(lambda: pair.car.truth.mode is mode, 9.0)
+        pair.run(5.0 + 6.0 * moments.random())
+
+    return load
+
+
+def closing(mode: Mode) -> Load:
+    """While `mode manual` is under way."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        inside(mode)(pair, moments)
+        pair.ask(SetMode(Mode.MANUAL))
+        pair.run(2.2 * moments.random())
+
+    return load
+
+
+@dataclass(frozen=True)
+class Case:
+    """One load on one car in one world."""
+
+    name: str
+    load: Load
+    platform: str = "arduino"
+    world: str = "echo"
+    where: Callable[[], World] | None = None
+    """Another world than the one named."""
+    told: str | None = None
+    """The platform that the gateway was told, if not the true one."""
+    transport: Transport = Transport.SERIAL
+
+    def __str__(self) -> str:
+        platform = self.platform if self.platform != "raspberry_pi" else f"{self.platform}-{self.transport}"
+        return f"{platform}-{self.name}-{self.world}{f'-told-{self.told}' if self.told else ''}"
+
+    def pair(self, seed: int) -> Pair:
+        """The two, just set up, the car running for two seconds."""
+        world = (self.where or WORLDS[self.world])()
+        return Pair(self.platform, seed=seed, world=world, told=self.told, transport=self.transport, start_s=2.0)
+
+
+SERVO = Act(General(Motion.STOP, servo=ServoAction.FRONT_LEFT))
+LIGHT = Act(General(Motion.STOP, light=Light.RED))
+MOVING: list[tuple[str, Load]] = [
+    ("rest", rest),
+    ("driving", driving),
+    ("steering", steering),
+    ("let-go", let_go),
+    ("again", again),
+]
+EVERY_CAR: list[tuple[str, Load]] = [
+    *MOVING,
+    ("whistle", one_shot(WHISTLE, 0.3)),
+    ("servo", one_shot(SERVO, 0.65)),
+    ("light", one_shot(LIGHT, 0.06)),
+    ("speed", one_shot(ChangeSpeed(SpeedStep.UP), 0.06)),
+    ("fan", one_shot(Fan(), 1.0)),
+    ("fan-on", fan),
+]
+NAMED: list[tuple[str, Load]] = [
+    ("ptz", one_shot(Act(Ptz(45)), 0.65)),
+    ("led", one_shot(Act(ColorLed(255, 2, 3)), 0.1)),
+    ("find", one_shot(Find(), 1.0)),
+    ("acting", acting),
+]
+OPENED = [mode for mode in Mode if mode is not Mode.MANUAL]
+IN_MODES: list[tuple[str, Load]] = [
+    (f"{how.__name__}-{mode}", how(mode)) for how in (opening, inside, closing) for mode in OPENED
+]
+TRANSPORTS = tuple(Transport)
+
+
+def _cases() -> Iterable[Case]:
+    for world in WORLDS:
+        for name, load in (*EVERY_CAR, *NAMED):
+            yield Case(name, load, world=world)
+        for name, load in IN_MODES:
+            # Avoiding without an echo is deaf for ever, with the motors braked: a row of its own below.
+            if AVOIDANCE not in name or world == "echo" or name.startswith("opening"):
+                yield Case(name, load, world=world)
+        for name, load in EVERY_CAR:
+            yield Case(name, load, world=world, told="unknown")
+            for transport in TRANSPORTS:
+                yield Case(name, load, "raspberry_pi", world, transport=transport)
+        for transport in TRANSPORTS:
+            for name, load in NAMED:
+                yield Case(name, load, "raspberry_pi", world, transport=transport)
+            for name, load in MOVING:
+                yield Case(name, load, "raspberry_pi", world, told="unknown", transport=transport)
+        for name, load in MOVING:
+            yield Case(name, load, "stm32", world)
+    yield Case(f"inside-{Mode.FOLLOWING}", inside(Mode.FOLLOWING), world="wall", where=before_a_wall)
+    yield Case(f"closing-{Mode.FOLLOWING}", closing(Mode.FOLLOWING), world="wall", where=before_a_wall)
+
+
+CASES = tuple(_cases())
+
+
+# ---------------------------------------------------------------------- links just restored
+
+
+def half(*whats: Drive | Act | SetMode) -> Load:
+    """The write is cut anywhere in its frame, and the link with it."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        pair.cut = 1 + int(17 * moments.random())
+        pair.ask(moments.choice(whats))
+        pair.run(9.0)
+        assert pair.cut is None
+
+    return load
+
+
+def within(what: Act | SetMode, block_s: float) -> Load:
+    """The link is cut in the block of a frame that the car has read."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        pair.ask(what)
+        pair.until(lambda: pair.car.truth.blocked and not pair.control.believed.motors_on, 12.0)
+        pair.run(block_s * moments.random())
+
+    return load
+
+
+def cut_off(before: Load) -> Load:
+    """And the link is lost, comes back after a moment, and a stop is asked for while it recovers."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        before(pair, moments)
+        pair.lose()
+        pair.run(1.5 * moments.random(), linked=False)
+        pair.connect()
+        pair.run(moments.choice([0.0, 0.0, 6.0]) * moments.random())
+
+    return load
+
+
+def then(first: Load, second: Load) -> Load:
+    def load(pair: Pair, moments: random.Random) -> None:
+        first(pair, moments)
+        second(pair, moments)
+
+    return load
+
+
+HALF_GENERAL = half(*(Drive(motion, 5.0) for motion in (Motion.RIGHT, Motion.SPIN_LEFT)))
+HALF_NAMED = half(Act(Ptz(135)), Act(ColorLed(255, 128, 33)), Act(Ptz(45)))
+LOST: list[tuple[str, Load]] = [
+    ("rest", cut_off(rest)),
+    ("driving", cut_off(driving)),
+    ("steering", cut_off(steering)),
+    ("half-general", cut_off(then(driving, HALF_GENERAL))),
+    ("half-general-acting", cut_off(then(acting, HALF_GENERAL))),
+]
+LOST_NAMED: list[tuple[str, Load]] = [
+    ("acting", cut_off(acting)),
+    ("half-named", cut_off(then(driving, HALF_NAMED))),
+    *((f"opening-{mode}", cut_off(opening(mode))) for mode in OPENED),
+    *((f"in-{mode}", cut_off(inside(mode))) for mode in OPENED),
+]
+RESTORED = (
+    *(Case(f"restored-{name}", load, world=world) for world in WORLDS for name, load in LOST),
+    *(
+        Case(f"restored-{name}", load, world=world)
+        for world in WORLDS
+        for name, load in LOST_NAMED
+        if AVOIDANCE not in name or world == "echo"
+    ),
+    *(Case(f"restored-{name}", load, world=world, told="unknown") for world in WORLDS for name, load in LOST),
+    *(Case(f"restored-{name}", load, "raspberry_pi", world) for world in WORLDS for name, load in LOST),
+)
+
+
+# ---------------------------------------------------------------------- one play of a case
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One stop. Times from when it was asked, s."""
+
+    case: str
+    seed: int
+    state: str
+    announced_s: float
+    motors_off_s: float
+    """Motors off, and off for good; 0 if they were off."""
+    settled_s: float
+    """And back in mode 0, where nothing but a command of ours turns them on."""
+    complete_s: float
+    """What the final record says."""
+    motors: str
+    """What control says of them in the end."""
+    phase: str
+    """How the stop's life ended."""
+
+
+def state_of(pair: Pair) -> str:
+    """What control can tell apart when a stop is asked."""
+    control, now = pair.control, pair.now
+    style = control.profile.stop_style
+    kind = {
+        StopStyle.MODE_FRAME: "",
+        StopStyle.UNKNOWN: "unknown platform, ",
+        StopStyle.RASPBERRY_PI: f"{Platform.RASPBERRY_PI}, ",
+    }
+    running = control._running
+    if not control.known:
+        return f"{kind[style]}link just restored"
+    if running is not None and running.recipe.rank > 1:
+        avoiding = " of obstacle avoidance" if running.worst_at - running.began_at > AVOIDING_S else ""
+        return f"{kind[style]}a stop under way{avoiding}"
+    mode = control.mode.asked
+    if control.mode.verdict is Verdict.CONTRADICTED:
+        return f"{kind[style]}mode contradicted"
+    if mode is None or mode is Mode.MANUAL:
+        pacing = control.pacing
+        unread = "a frame may be unread" if not pacing.clear_at(now) else ""
+        what = unread or ("in a block of ours" if pacing.blocked_at(now) else "nothing unread")
+        return f"{kind[style]}{Mode.MANUAL}, {what}"
+    if now < control.pacing.block_until:
+        return f"{kind[style]}opening {mode}"
+    # protocol.md gives these one row, "up to 0.1 s per turn"; the infrared remote is taken as one of them.
+    return f"{kind[style]}in {'a mode that reads pins' if mode in READS_PINS else mode}"
+
+
+def play(case: Case, seed: int) -> Seen:
+    """Bring a car into the case's load, ask for a stop at a random moment, and watch until it is over."""
+    moments = random.Random(f"{case} {seed}")
+    pair = case.pair(seed).ready()
+    pair.run(moments.random())
+    case.load(pair, moments)
+    state, asked_at = state_of(pair), pair.now
+    answer = pair.ask(Stop(), verb="stop", identity="the-stop")
+    settled_at = asked_at
+    end = asked_at + (22.0 if "restored" in state else 9.0)
+    while pair.car.truth.mode is not Mode.MANUAL and pair.now < end:
+        pair.run(0.001)
+        settled_at = pair.now
+    pair.run(end - pair.now)
+    off_at = pair.off_for_good_at()
+    last = [record for record in pair.records if record.command.id == "the-stop"][-1]
+    return Seen(
+        str(case),
+        seed,
+        state,
+        answer.worst_case_s,
+        max(0.0, off_at - asked_at),
+        max(off_at, settled_at) - asked_at if settled_at > asked_at else max(0.0, off_at - asked_at),
+        last.took_s if last.phase is Phase.COMPLETE else float("inf"),
+        pair.control.motors,
+        last.phase,
+    )
+
+
+# ---------------------------------------------------------------------- the distribution
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """All stops that were asked for in one state; s."""
+
+    state: str
+    stops: int
+    p50_s: float
+    p90_s: float
+    worst_s: float
+    announced_s: float
+    """The longest that was announced."""
+    ratio: float
+    """Of the longest announced to the worst seen."""
+    worst_motors_s: float
+    """The worst until the motors were off: 0 where a mode is opened, in which they never come on."""
+    worst_case: str
+    """Where the worst was seen."""
+
+
+def rows(seen: Iterable[Seen]) -> list[Row]:
+    """The distribution per state."""
+    states: dict[str, list[Seen]] = {}
+    for one in seen:
+        states.setdefault(one.state, []).append(one)
+    return [_row(state, states[state]) for state in sorted(states)]
+
+
+def _row(state: str, stops: list[Seen]) -> Row:
+    stops = sorted(stops, key=lambda one: one.settled_s)
+    worst = stops[-1]
+    announced = max(one.announced_s for one in stops)
+    return Row(
+        state,
+        len(stops),
+        stops[len(stops) // 2].settled_s,
+        stops[len(stops) * 9 // 10].settled_s,
+        worst.settled_s,
+        announced,
+        announced / worst.settled_s if worst.settled_s else float("inf"),
+        max(one.motors_off_s for one in stops),
+        f"{worst.case} {worst.seed}",
+    )
+
+
+def tsv(table: Iterable[Row]) -> str:
+    """The rows as tab-separated text with a heading."""
+    lines = ["\t".join(field.name for field in fields(Row))]
+    for row in table:
+        lines.append("\t".join(f"{v:.3f}" if isinstance(v, float) else str(v) for v in asdict(row).values()))
+    return "\n".join(lines) + "\n"
