@@ -70,13 +70,11 @@ class ModeTruth:
 
     def ask(self, mode: Mode, *, now: float, block_s: float) -> None:
         """A frame that should bring the car into `mode` was written, which then blocks it for `block_s`."""
-        # It is obeyed when the turn of the mode that is left ends, which is not known to be another than the slowest.
+        # It is obeyed when the block of the frame before is over, and the turn of the mode that is left: of the slowest
+        # one, if that is not known.
         left = self.asked if self.verdict is not Verdict.CONTRADICTED else None
-        heard_at = now if mode is self.asked else max(now, self._settled_at)  # a mode that still opens is deaf
-        settled_at = heard_at + self.profile.mode_turn_s(left or Mode.OBSTACLE_AVOIDANCE) + block_s
-        if mode is self.asked:  # what an earlier frame waits for, this one does, too
-            settled_at = max(settled_at, self._settled_at)
-        self._settled_at = settled_at
+        turn_s = self.profile.mode_turn_s(left or Mode.OBSTACLE_AVOIDANCE)
+        self._settled_at = max(self._settled_at, now + turn_s) + block_s
         if mode is self.asked is Mode.MANUAL and self.verdict is Verdict.CONFIRMED:
             return
         self.asked = mode

@@ -225,7 +225,7 @@ def test_it_is_in_the_new_mode_when_the_turn_of_the_old_one_and_the_block_are_ov
     truth.ask(Mode.MANUAL, now=100.0, block_s=1.0)
     assert truth.unheard_s(100.0 + latest_s) == pytest.approx(0.0)
     truth.ask(Mode.MANUAL, now=101.1, block_s=1.0)
-    assert truth.unheard_s(100.0 + max(latest_s, 3.1)) == pytest.approx(0.0), "the first one may wait still"
+    assert truth.unheard_s(101.0 + max(latest_s, 2.1)) == pytest.approx(0.0), "it waits for the one before"
 
 
 @pytest.mark.parametrize(("platform", "fits"), [("raspberry_pi", ()), ("unknown", SILENT), ("stm32", SILENT)])
