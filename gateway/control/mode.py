@@ -51,6 +51,8 @@ class ModeTruth:
     _asked_at: float = field(default=float("-inf"))
     _settled_at: float = field(default=float("-inf"))
     """From when on the car is in the asked mode, if it has obeyed."""
+    _obeyed_at: float = field(default=float("-inf"))
+    """The same, if it was in that mode before the last frame."""
     _heard_at: float = field(default=float("-inf"))
     _own_at: float = field(default=float("-inf"))
     """When the last reading came that fits the asked mode, and the last that does not."""
@@ -75,6 +77,7 @@ class ModeTruth:
         left = self.asked if self.verdict is not Verdict.CONTRADICTED else None
         turn_s = self.profile.mode_turn_s(left or Mode.OBSTACLE_AVOIDANCE)
         self._settled_at = max(self._settled_at, now + turn_s) + block_s
+        self._obeyed_at = now + self.profile.mode_turn_s(mode) + block_s
         if mode is self.asked is Mode.MANUAL and self.verdict is Verdict.CONFIRMED:
             return
         self.asked = mode
@@ -115,6 +118,7 @@ class ModeTruth:
             if len(candidates) > 1:
                 return
             self._for += 1
+            self._settled_at = min(self._settled_at, self._obeyed_at)
             if at >= self._asked_at and (self._for >= CONTRADICTING_FRAMES or at > self._other_at + MIXED_S):
                 self._conclude(Verdict.CONFIRMED, f"a reading with the shape of {self.asked}", at)
             return

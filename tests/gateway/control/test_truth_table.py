@@ -1,0 +1,158 @@
+"""Which mode a car is in, against the car: every pair of (asked, true) of tests/vectors/mode_truth.tsv.
+
+The true mode is made another in each way that a car's mode changes without us: another writer on its link, a reset, a
+mode frame that is lost.
+"""
+
+import pytest
+
+from gateway.control.mode import Verdict
+from gateway.control.records import SetMode
+from gateway.protocol.values import Mode
+from tests.support.truth import WORLDS, car_in, frame_of, lose_next_mode_frame
+from tests.support.vectors import rows
+from tests.support.virtual import Pair
+
+TABLE = rows("mode_truth")
+LONG_S = 15.0
+"""Longer than any time of the table."""
+TALKING = frozenset({Mode.MANUAL, Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING})
+BY = {
+    "3 readings": ("3 readings running",),
+    "silence of 3 s": ("silent for 3.",),
+    "3 readings, or silence of 3 s": (
+        "3 readings running",
+        "silent for 3.",
+        "no reading with the shape of manual for 3.",
+    ),
+    "1 s without a reading of its own": ("silent for 1.", "no reading with the shape of"),
+}
+
+Row = dict[str, str]
+each_world = pytest.mark.parametrize("world", WORLDS)
+
+
+def names(row: Row) -> str:
+    return f"{row['asked']}-{row['true']}"
+
+
+def modes(row: Row) -> tuple[Mode, Mode]:
+    return Mode(row["asked"]), Mode(row["true"])
+
+
+def contradicted(pair: Pair, row: Row, within: str, since: float) -> None:
+    """It is contradicted in time, and by what the table says."""
+    pair.until(lambda: pair.control.mode.verdict is Verdict.CONTRADICTED, LONG_S)
+    assert pair.now - since <= float(row[within]), pair.control.mode
+    assert any(words in pair.control.mode.evidence for words in BY[row["by"]]), pair.control.mode.evidence
+    assert pair.logs[-1].code in ("mode_contradicted", "unheard")
+
+
+def never(pair: Pair, row: Row) -> None:
+    """What cannot be told apart stays assumed, and the candidates say so."""
+    pair.run(LONG_S)
+    assert pair.control.mode.verdict is Verdict(row["verdict"]) is Verdict.ASSUMED
+    assert set(modes(row)) <= set(pair.control.mode.candidates)
+    assert pair.control.mode.inferred is None
+
+
+def test_the_table_has_every_pair_and_says_what_cannot_be_known() -> None:
+    assert {modes(row) for row in TABLE} == {(asked, true) for asked in Mode for true in Mode}
+    assert len(TABLE) == len(Mode) ** 2
+    for row in TABLE:
+        asked, true = modes(row)
+        silent = asked not in TALKING and true not in TALKING
+        same = "assumed" if asked not in TALKING else "confirmed"
+        assert row["verdict"] == (same if asked is true else "assumed" if silent else "contradicted")
+
+
+@pytest.mark.parametrize("platform", ["arduino", "stm32"])
+@each_world
+@pytest.mark.parametrize("row", TABLE, ids=names)
+def test_another_writer_brings_the_car_to_another_mode(row: Row, world: str, platform: str) -> None:
+    asked, true = modes(row)
+    pair = car_in(asked, world, seed=TABLE.index(row), platform=platform)
+    assert pair.control.mode.verdict is (Verdict.CONFIRMED if asked in TALKING else Verdict.ASSUMED)
+    if asked is not true:
+        pair.car.feed(frame_of(true), pair.now)
+        if asked is Mode.OBSTACLE_AVOIDANCE and world == "no-echo":
+            pair.run(LONG_S)
+            assert pair.car.truth.mode is asked, "protocol.md: with no echo at all it is deaf for ever"
+            assert pair.control.mode.verdict is Verdict.ASSUMED
+            return
+        pair.until(lambda: pair.car.truth.mode is true, 6.0)
+    if row["verdict"] == "contradicted":
+        contradicted(pair, row, "within_s", pair.now)
+    elif asked in TALKING:
+        pair.run(LONG_S)
+        assert pair.control.mode.confirmed is asked
+        assert pair.control.mode.candidates == (asked,)
+    else:
+        never(pair, row)
+
+
+@each_world
+@pytest.mark.parametrize("row", [row for row in TABLE if row["true"] == "manual"], ids=names)
+def test_a_reset_brings_the_car_to_mode_0(row: Row, world: str) -> None:
+    asked, _ = modes(row)
+    pair = car_in(asked, world, seed=TABLE.index(row))
+    pair.car.brown_out(pair.now)
+    if asked is Mode.MANUAL:
+        pair.run(LONG_S)
+        assert pair.control.mode.confirmed is Mode.MANUAL, "a reset in mode 0 cannot be seen"
+    else:
+        contradicted(pair, row, "within_s", pair.now)
+
+
+FROM_ASKING = [row for row in TABLE if row["asked_s"] != "-"]
+
+
+@each_world
+@pytest.mark.parametrize("row", [row for row in FROM_ASKING if row["asked"] != row["true"]], ids=names)
+def test_a_mode_frame_that_is_lost(row: Row, world: str) -> None:
+    """Control asks for a mode while the car is in the true one, and the frame does not reach it."""
+    asked, true = modes(row)
+    pair = car_in(true, world, seed=TABLE.index(row))
+    lost = lose_next_mode_frame(pair)
+    pair.ask(SetMode(asked))
+    pair.until(lambda: bool(lost), 6.0)
+    contradicted(pair, row, "asked_s", lost[0])
+    assert pair.car.truth.mode is true
+
+
+@pytest.mark.parametrize(
+    ("row", "before", "world"),
+    [
+        (row, before, world)
+        for row in FROM_ASKING
+        if row["asked"] == row["true"]
+        for before in (tuple(Mode)[1:] if row["asked"] == Mode.MANUAL else (Mode.MANUAL,))
+        for world in WORLDS
+        if (before, world) != (Mode.OBSTACLE_AVOIDANCE, "no-echo")  # where it is deaf for ever
+    ],
+    ids=lambda value: names(value) if isinstance(value, dict) else str(value),
+)
+def test_a_mode_that_is_so_is_confirmed(row: Row, before: Mode, world: str) -> None:
+    asked, _ = modes(row)
+    pair = car_in(before, world, seed=TABLE.index(row))
+    pair.ask(SetMode(asked))
+    pair.until(lambda: pair.control.mode.asked is asked, 6.0)
+    asked_at = pair.now
+    pair.until(lambda: pair.control.mode.confirmed is asked, LONG_S)
+    assert pair.now - asked_at <= float(row["asked_s"])
+    assert not [log for log in pair.logs if log.code in ("mode_contradicted", "unheard")]
+
+
+@each_world
+def test_a_raspberry_pi_car_knows_mode_0_only(world: str) -> None:
+    pair = car_in(Mode.MANUAL, world, seed=1, platform="raspberry_pi")
+    for mode in Mode:
+        pair.car.feed(frame_of(mode), pair.now)
+        pair.run(5.0)
+        assert pair.car.truth.mode is pair.control.mode.confirmed is Mode.MANUAL
+    pair.car.feed(b"$1#", pair.now)  # shorter than its nine fields: the program dies
+    pair.until(lambda: not pair.car.alive, 2.0)
+    took = pair.until(lambda: pair.control.mode.verdict is Verdict.CONTRADICTED, 4.0)
+    assert took <= 3.2
+    assert "its program has ended" in pair.control.mode.evidence
+    assert pair.control.mode.candidates == ()
