@@ -9,6 +9,8 @@ from gateway.protocol.values import Motion
 
 REPEAT_S: Final = 1.1
 """A block that we know nothing of lasts up to 1.0 s; a frame sent 1.1 s after the last is alone in the buffer."""
+SILENCE_S: Final = 3.7
+"""From the first frame of recovery to the one that is certain: longer than any block outside avoidance."""
 CONFIRM_S: Final = 4.5
 """How long recovery waits for a mode-0 reading: avoidance blocks 4.3 s."""
 RETRIES: Final = 3
@@ -78,7 +80,7 @@ RECOVERY: Final = Recipe(
     (
         Step(Reset()),
         Step(_MANUAL, after_s=0.05),
-        Step(_MANUAL, from_start_s=3.7),
+        Step(_MANUAL, from_start_s=SILENCE_S),
         Step(_STOP, from_start_s=4.8),
     ),
     confirmed=True,
@@ -92,7 +94,7 @@ UNKNOWN: Final = Recipe(
         Step(_STOP, Gate.FLIGHT),
         Step(_MANUAL, after_s=0.06),
         Step(_STOP, after_s=REPEAT_S),
-        Step(_MANUAL, from_start_s=3.7),
+        Step(_MANUAL, from_start_s=SILENCE_S),
         Step(_STOP, from_start_s=4.8),
     ),
     confirmed=True,

@@ -89,7 +89,8 @@ class Running:
     def worst_s(self, now: float) -> float:
         """How long it takes from now on, at worst."""
         worst_at = self.worst_at
-        if self.recipe.confirmed and self.frames_sent:  # should all its frames have met a deaf car, it tries again
+        if self.recipe in (recipes.RECOVERY, recipes.RETRY) and self.frames_sent:
+            # Should all its frames have been read at the wrong place, in one string, it tries again.
             worst_at = max(worst_at, self.last_at + recipes.CONFIRM_S + _AVOIDING_S)
         return max(worst_at - now, 0.0) + WIRE_S
 
@@ -175,10 +176,14 @@ def worst_s(recipe: Recipe, situation: Situation, pacing: Pacing, now: float) ->
         if not situation.manual and now + alone_s + IN_TIME_S < pacing.block_from:
             return block_s + WIRE_S  # it lies in the buffer when the opening ends, and is obeyed before the first turn
         return max(alone_s, block_s) + (ranging_s if situation.manual else situation.turn_s) + WIRE_S
-    if recipe is recipes.RECOVERY or (not situation.known and situation.profile.stop_style is StopStyle.UNKNOWN):
+    if recipe is recipes.RECOVERY:
         return RECOVERY_WORST_S + _AVOIDING_S
+    if recipe is recipes.UNKNOWN and not situation.known:
+        # No string that its frames make, with half of any frame before them, opens a mode that its second part misses.
+        return recipes.SILENCE_S + _AVOIDING_S + WIRE_S
     if recipe is recipes.UNKNOWN:
         # A stop and a `MODE00` in one string: neither works, it beeps as if mode 0 was opened, then takes the third.
         return max(flight_s + FRAME_S, block_s) + ranging_s + mode_open_s(Mode.MANUAL) + WIRE_S
-    twice_s = FRAME_S if lost_s and recipe not in (recipes.SOFT, recipes.FULL_BEHIND) else 0.0
+    one = recipe in (recipes.SOFT, recipes.FULL_BEHIND) or (situation.clear and situation.known)
+    twice_s = 0.0 if one else FRAME_S  # the second of two general stops: the first may end half a frame, or be lost
     return max(flight_s + twice_s + lost_s, block_s) + ranging_s + WIRE_S

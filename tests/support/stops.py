@@ -6,11 +6,13 @@ what happens when). A state is what control can tell apart; many loads lead to e
 
 import random
 from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
+from itertools import product
 
 from gateway.control.mode import Verdict
 from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, SetMode, Stop
-from gateway.protocol.encode import ColorLed, General, Ptz
+from gateway.protocol.encode import ColorLed, General, ModeOpen, Ptz, encode
 from gateway.protocol.profile import Platform, StopStyle
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.sim.core.raspberry_pi import Transport
@@ -42,6 +44,19 @@ def echoing() -> World:
 def before_a_wall() -> World:
     """What following follows."""
     return World([(0.4, -9.0, 0.4, 9.0)])
+
+
+def in_a_pen() -> World:
+    """Walls on all sides: avoidance does nothing but back off, look and turn, 4.3 s each time."""
+    corners = [(-0.25, -0.25), (0.25, -0.25), (0.25, 0.25), (-0.25, 0.25)]
+    return World([(*a, *b) for a, b in zip(corners, (*corners[1:], corners[0]), strict=True)])
+
+
+def on_black() -> World:
+    """A floor that is all line: tracking takes its sharpest turn, for ever."""
+    rows = [0.01 * number for number in range(-30, 31)]
+    line = [(x, y) for number, y in enumerate(rows) for x in ((0.3, -0.3) if number % 2 else (-0.3, 0.3))]
+    return World([(3.0, -3.0, 3.0, 3.0)], [(0.0, 0.0), *line])
 
 
 class Flickering(World):
@@ -85,6 +100,16 @@ def steering(pair: Pair, moments: random.Random) -> None:
         pair.run(0.05 + 0.2 * moments.random())
 
 
+def lossy(before: Load) -> Load:
+    """And what the car sends is lost from just before the stop on."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        before(pair, moments)
+        pair.deaf_until = pair.now + 2.0
+
+    return load
+
+
 def let_go(pair: Pair, moments: random.Random) -> None:
     """Within the soft stop after a drive."""
     pair.ask(Drive(Motion.FORWARD, 0.3))
@@ -123,7 +148,7 @@ def again(pair: Pair, moments: random.Random) -> None:
     """A second stop while the first is under way."""
     steering(pair, moments)
     pair.ask(Stop(), verb="stop")
-    pair.run(1.2 * moments.random())
+    pair.run(1.2 * moments.random() ** 3)
 
 
 def opening(mode: Mode) -> Load:
@@ -157,7 +182,7 @@ def closing(mode: Mode) -> Load:
     def load(pair: Pair, moments: random.Random) -> None:
         inside(mode)(pair, moments)
         pair.ask(SetMode(Mode.MANUAL))
-        pair.run(2.2 * moments.random())
+        pair.run(2.2 * moments.random() ** 3)
 
     return load
 
@@ -192,8 +217,10 @@ MOVING: list[tuple[str, Load]] = [
     ("rest", rest),
     ("driving", driving),
     ("steering", steering),
+    ("steering-lossy", lossy(steering)),
     ("let-go", let_go),
     ("again", again),
+    ("again-lossy", lossy(again)),
 ]
 EVERY_CAR: list[tuple[str, Load]] = [
     *MOVING,
@@ -222,8 +249,8 @@ def _cases() -> Iterable[Case]:
         for name, load in (*EVERY_CAR, *NAMED):
             yield Case(name, load, world=world)
         for name, load in IN_MODES:
-            # Avoiding without an echo is deaf for ever, with the motors braked: a row of its own below.
-            if AVOIDANCE not in name or world == "echo" or name.startswith("opening"):
+            # Avoiding without an echo it is deaf for ever, with the motors braked (test_stops.py).
+            if AVOIDANCE not in name or world == "echo":
                 yield Case(name, load, world=world)
         for name, load in EVERY_CAR:
             yield Case(name, load, world=world, told="unknown")
@@ -236,6 +263,9 @@ def _cases() -> Iterable[Case]:
                 yield Case(name, load, "raspberry_pi", world, told="unknown", transport=transport)
         for name, load in MOVING:
             yield Case(name, load, "stm32", world)
+    yield Case(f"inside-{Mode.TRACKING}", inside(Mode.TRACKING), world="black", where=on_black)
+    yield Case(f"inside-{AVOIDANCE}", inside(AVOIDANCE), world="pen", where=in_a_pen)
+    yield Case(f"closing-{AVOIDANCE}", closing(AVOIDANCE), world="pen", where=in_a_pen)
     yield Case(f"inside-{Mode.FOLLOWING}", inside(Mode.FOLLOWING), world="wall", where=before_a_wall)
     yield Case(f"closing-{Mode.FOLLOWING}", closing(Mode.FOLLOWING), world="wall", where=before_a_wall)
 
@@ -282,6 +312,31 @@ def cut_off(before: Load) -> Load:
     return load
 
 
+def half_closing(count: int) -> Load:
+    """The frame that closes a mode is cut, late in a turn of it."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        pair.cut = count
+        pair.ask(SetMode(Mode.MANUAL))
+        pair.run(4.3 * moments.random(), linked=False)
+        pair.connect()
+
+    return load
+
+
+def found(mode: Mode) -> Load:
+    """A gateway that was told nothing finds a car in a mode."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        driving(pair, moments)
+        pair.lose()
+        pair.car.feed(encode(ModeOpen(mode)), pair.now)
+        pair.run(9.0 * moments.random(), linked=False)
+        pair.connect()
+
+    return load
+
+
 def then(first: Load, second: Load) -> Load:
     def load(pair: Pair, moments: random.Random) -> None:
         first(pair, moments)
@@ -312,6 +367,16 @@ RESTORED = (
         for world in WORLDS
         for name, load in LOST_NAMED
         if AVOIDANCE not in name or world == "echo"
+    ),
+    # Ended by `#` and with two `MODE00` behind it, all within one turn of 4.3 s, this half opens the colour LED mode.
+    *(
+        Case(f"restored-half-mode-{count}", then(inside(AVOIDANCE), half_closing(count)), world="pen", where=in_a_pen)
+        for count in (4, 7, 9)
+    ),
+    *(
+        Case(f"restored-found-{mode}", found(mode), world="pen", where=in_a_pen, told=told)
+        for mode in OPENED
+        for told in (None, "unknown")
     ),
     *(Case(f"restored-{name}", load, world=world, told="unknown") for world in WORLDS for name, load in LOST),
     *(Case(f"restored-{name}", load, "raspberry_pi", world) for world in WORLDS for name, load in LOST),
@@ -444,6 +509,18 @@ def _row(state: str, stops: list[Seen]) -> Row:
         max(one.motors_off_s for one in stops),
         f"{worst.case} {worst.seed}",
     )
+
+
+def _play(chosen: tuple[int, int]) -> Seen:
+    number, seed = chosen
+    return play((*CASES, *RESTORED)[number], seed)
+
+
+def distribution(moments: int) -> list[Row]:
+    """Every case at so many moments, on all processors."""
+    chosen = product(range(len(CASES) + len(RESTORED)), range(moments))
+    with ProcessPoolExecutor() as pool:
+        return rows(pool.map(_play, chosen, chunksize=50))
 
 
 def tsv(table: Iterable[Row]) -> str:

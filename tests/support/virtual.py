@@ -40,6 +40,8 @@ class Pair:
         self.number = 0
         self.cut: int | None = None
         """How many bytes of the next write get through before the link breaks; None: all, and it holds."""
+        self.deaf_until = 0.0
+        """Until when what the car sends is lost on the way."""
         self.run(start_s, linked=False)
 
     def connect(self) -> None:
@@ -101,7 +103,7 @@ class Pair:
 
     def _receive(self, *, linked: bool) -> None:
         for at, data in self.car.advance(self.now):
-            if linked:
+            if linked and at >= self.deaf_until:
                 for event in self.decoder.feed(data, at):
                     self.control.heard(event, self.now)
         if linked:
