@@ -47,10 +47,13 @@ class Description:
     @classmethod
     def read(cls, directory: Path) -> Self | None:
         """The description in a directory; None if there is none that can be read. Unknown fields are left out."""
+        path = directory / DESCRIPTION
         try:
-            values: Any = json.loads((directory / DESCRIPTION).read_text(encoding="utf-8"))
+            values: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+            if not isinstance(values.get("format", FORMAT), int):
+                return None
             return cls(**{name: values[name] for name in cls.__slots__ if name in values})
-        except (OSError, ValueError, TypeError):
+        except (OSError, ValueError, TypeError, AttributeError):
             return None
 
     def write(self, directory: Path) -> None:

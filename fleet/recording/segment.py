@@ -32,7 +32,8 @@ class Segment:
 
     def __init__(self, path: Path, about: Mapping[str, str]) -> None:
         self._file = path.open("xb")
-        self._writer: Any = Writer(self._file)  # half of its methods have no types
+        # Half of its methods have no types. Its own checksums leave out what lies between chunks.
+        self._writer: Any = Writer(self._file, enable_data_crcs=True)
         self._writer.start(library=f"zenoh-car-fleet; {LIBRARY_IDENTIFIER}")
         self._writer.add_metadata("session", dict(about))
         self._schemas: dict[str, int] = {}

@@ -6,8 +6,12 @@ import sys
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from fleet.recording.session import Session
 
 
 @click.command()
@@ -32,10 +36,10 @@ def replay(session: Path, save: Path | None) -> None:  # fmt: skip
                 f"there is no display here to open Rerun on: write a file, fleet replay {session} --save out.rrd"
             )
         with tempfile.TemporaryDirectory() as scratch:
-            if found.cut:
-                # What is whole is copied first: Rerun's own reader shows also what fails its CRC.
-                whole = found.rescue(Path(scratch) / f"{found.name}.mcap")
-                click.echo(f"{found.cut_words}; showing what is whole", err=True)
+            if found.damage:
+                # What is whole is copied first: Rerun's own reader shows also what fails its checksum.
+                whole = _rescue(found, Path(scratch) / f"{found.name}.mcap")
+                click.echo(f"{found.damage_words}; showing what is whole", err=True)
                 found = whole
             out = save if save is not None else Path(scratch) / f"{found.name}.rrd"
             _export(found, out)
@@ -63,11 +67,19 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def _export(session: object, out: Path) -> None:
-    from fleet.recording.session import Session
+def _rescue(session: "Session", out: Path) -> "Session":
+    try:
+        return session.rescue(out)
+    except OSError as error:
+        raise click.ClickException(
+            f"what is whole of {session.path} cannot be copied to {out.parent}: {error.strerror}; "
+            "set TMPDIR to a directory with room"
+        ) from None
+
+
+def _export(session: "Session", out: Path) -> None:
     from fleet.replay.to_rerun import ExportFailed, export
 
-    assert isinstance(session, Session)
     try:
         held = export(session, out)
     except ExportFailed as error:

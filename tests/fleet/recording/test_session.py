@@ -1,6 +1,7 @@
-"""Reading sessions back: whole, cut anywhere, damaged, and what is none."""
+"""Which files are a session, and what is wrong with it as a whole. Damage within a file is test_salvage.py's."""
 
 import io
+import os
 from pathlib import Path
 
 import pytest
@@ -8,61 +9,61 @@ from mcap.writer import Writer
 
 from fleet.recording.session import NoSession, Session
 
-CHUNKS, PER_CHUNK = 5, 20
 
-
-@pytest.fixture(scope="module")
-def whole() -> tuple[bytes, list[int]]:
-    """A file of five chunks, and where each chunk begins."""
+def mcap(*sequences: int) -> bytes:
+    """A whole file with these messages."""
     out = io.BytesIO()
     writer = Writer(out)
     writer.start()
     channel = writer.register_channel("fleet/red/x", "json", 0)
-    begins = []
-    for chunk in range(CHUNKS):
-        begins.append(out.tell())
-        for number in range(PER_CHUNK):
-            sequence = chunk * PER_CHUNK + number
-            writer.add_message(channel, sequence, b'{"number": %d}' % sequence, sequence, sequence)
-        writer.flush()
-    begins.append(out.tell())
-    writer.finish()
-    return out.getvalue(), begins
+    for sequence in sequences:
+        writer.add_message(channel, sequence, b"{}", sequence, sequence)
+    writer.finish()  # type: ignore[no-untyped-call]  # it has no return type
+    return out.getvalue()
 
 
-def test_a_file_cut_anywhere_gives_every_whole_chunk_and_says_so(
-    whole: tuple[bytes, list[int]], tmp_path: Path
-) -> None:
-    data, begins = whole
-    path = tmp_path / "0001.mcap"
-    for length in range(9, len(data)):
-        path.write_bytes(data[:length])
-        session = Session.open(tmp_path)
-        numbers = [message.sequence for message in session.messages()]
-        assert numbers == list(range(len(numbers)))
-        # A chunk's index follows it, so a cut in the index still gives the chunk.
-        chunks = sum(1 for end in begins[1:] if end <= length)
-        assert len(numbers) // PER_CHUNK in (chunks, chunks + 1)
-        assert len(numbers) % PER_CHUNK == 0
-        assert "cut" in session.cut_words, length
-    path.write_bytes(data)
-    session = Session.open(path)
-    assert len(list(session.messages())) == CHUNKS * PER_CHUNK
-    assert not session.cut_words
+def test_a_file_that_is_none_hides_no_other(tmp_path: Path) -> None:
+    (tmp_path / "0001.mcap").write_bytes(mcap(1, 2))
+    (tmp_path / "0002.mcap").write_bytes(b"")
+    (tmp_path / "0003.mcap").mkdir()
+    (tmp_path / "0005.mcap").write_bytes(mcap(3)[:-20])
+    session = Session.open(tmp_path)
+    assert [message.sequence for message in session.messages()] == [1, 2, 3]
+    rescued = session.rescue(tmp_path / "rescued.mcap")
+    assert [message.sequence for message in rescued.messages()] == [1, 2, 3]
+    rescued.check()
+    assert not rescued.damage
+    words = session.damage_words
+    assert "\n" not in words
+    for part in (
+        "0002.mcap is empty",
+        "0003.mcap is not a regular file",
+        "lacks 1 of its files, the first is 0004.mcap",
+    ):
+        assert part in words
+    assert f"{tmp_path / '0005.mcap'} is cut" in words
+    assert "0001.mcap" not in words
 
 
-def test_damage_in_the_middle_keeps_what_came_before_and_says_so(
-    whole: tuple[bytes, list[int]], tmp_path: Path
-) -> None:
-    data, begins = whole
-    # Not its first byte: a record of an unknown kind must be skipped, says the format.
-    for at in range(begins[2] + 1, begins[3], 3):
-        path = tmp_path / "x.mcap"
-        path.write_bytes(data[:at] + bytes([data[at] ^ 0x55]) + data[at + 1 :])
-        session = Session.open(path)
-        numbers = [message.sequence for message in session.messages()]
-        assert numbers[: 2 * PER_CHUNK] == list(range(2 * PER_CHUNK))
-        assert len(numbers) == CHUNKS * PER_CHUNK or session.cut_words, at
+def test_a_session_of_which_nothing_is_whole_is_refused_with_the_cause(tmp_path: Path) -> None:
+    (tmp_path / "0001.mcap").write_bytes(mcap(1)[:40])
+    with pytest.raises(NoSession, match=r"holds no message that is whole: .*0001\.mcap is cut .*: byte 8: "):
+        Session.open(tmp_path).rescue(tmp_path / "rescued.mcap")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "null", "7", '{"format": "2"}', '{"format": null}', "\0", '{"fleet": 1}'])
+def test_a_description_that_cannot_be_read_hides_no_message(tmp_path: Path, text: str) -> None:
+    (tmp_path / "0001.mcap").write_bytes(mcap(1))
+    (tmp_path / "session.json").write_text(text)
+    session = Session.open(tmp_path)
+    assert session.description is None
+    assert [message.sequence for message in session.messages()] == [1]
+
+
+def test_a_description_that_is_a_device_is_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "0001.mcap").write_bytes(mcap(1))
+    os.mkfifo(tmp_path / "session.json")
+    assert Session.open(tmp_path).description is None
 
 
 @pytest.mark.parametrize(
@@ -79,10 +80,10 @@ def test_what_is_no_session_says_why(content: bytes | None, words: str, tmp_path
     assert "\n" not in str(caught.value)
 
 
-def test_an_empty_directory_and_a_newer_format_are_refused(whole: tuple[bytes, list[int]], tmp_path: Path) -> None:
+def test_an_empty_directory_and_a_newer_format_are_refused(tmp_path: Path) -> None:
     with pytest.raises(NoSession, match=r"no 0001\.mcap"):
         Session.open(tmp_path)
-    (tmp_path / "0001.mcap").write_bytes(whole[0])
+    (tmp_path / "0001.mcap").write_bytes(mcap(1))
     (tmp_path / "session.json").write_text(
         '{"fleet": "fleet", "started": "", "host": "", "versions": {}, "format": 99}'
     )

@@ -1,0 +1,100 @@
+"""A file as our recorder writes it, small enough to damage it in every place; and what must hold for one that is."""
+
+import tracemalloc
+from dataclasses import dataclass
+from pathlib import Path
+
+import zenoh
+from mcap.reader import make_reader
+
+from fleet.recording.salvage import LIMIT
+from fleet.recording.segment import Segment
+from fleet.recording.session import NoSession, Recorded, Session
+from schemas import messages
+from schemas.gen import fleet_v1_pb2 as pb
+
+CHUNKS, PER_CHUNK = 5, 8
+MOST_MEMORY = 3 * LIMIT
+"""A chunk as it is in the file, uncompressed, and as messages."""
+
+
+@dataclass(frozen=True)
+class Original:
+    """A whole file."""
+
+    data: bytes
+    messages: tuple[Recorded, ...]
+    chunks: tuple[tuple[int, int], ...]
+    """Where each begins and ends."""
+
+    def until(self, at: int) -> list[Recorded]:
+        """The messages of the chunks that end before a byte."""
+        return [message for message in self.messages if self.chunks[self.chunk_of(message)][1] <= at]
+
+    def chunk_of(self, message: Recorded) -> int:
+        return self.messages.index(message) // PER_CHUNK
+
+
+def written(path: Path) -> Original:
+    """Write one: five chunks of three keys, of which the last comes with the second chunk only."""
+    segment = Segment(path, {"fleet": "fleet"})
+    number = 0
+    for chunk in range(CHUNKS):
+        for _ in range(PER_CHUNK):
+            number += 1
+            key, payload, encoding = (
+                ("fleet/red/sensor/range", pb.Range(range_m=number / 8), messages.encoding_of("fleet.v1.Range")),
+                ("fleet/red/state/link", pb.Link(state="online"), messages.encoding_of("fleet.v1.Link")),
+                ("fleet/blue/note", None, "application/json"),
+            )[number % (2 if chunk == 0 else 3)]
+            data = payload.SerializeToString() if payload is not None else b'{"number": %d}' % number
+            segment.add(key, data, zenoh.Encoding(encoding), None, None, 1_790_000_000_000_000_000 + number)
+        segment.flush()
+    segment.finish({})
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunks = tuple(
+        (each.chunk_start_offset, each.chunk_start_offset + each.chunk_length) for each in summary.chunk_indexes
+    )
+    session = Session.open(path)
+    session.check()
+    assert not session.damage_words
+    found = tuple(session.messages())
+    assert len(found) == len(set(found)) == CHUNKS * PER_CHUNK
+    assert len(chunks) == CHUNKS
+    return Original(path.read_bytes(), found, chunks)
+
+
+def judge(original: Original, data: bytes, first: int, path: Path) -> list[Recorded]:
+    """Hold a damaged copy, the same up to byte `first`, against what must be; what it shows."""
+    path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        session = Session.open(path)
+        session.check()
+        checked = session.damage_words
+        shown = list(session.messages())
+    except NoSession as refused:
+        checked, shown = str(refused), []
+        assert first < 8
+    finally:
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert peak < MOST_MEMORY
+    assert set(shown) <= set(original.messages), "nothing is made up"
+    assert set(original.until(first)) <= set(shown), "what comes before the damage is shown"
+    if data != original.data:
+        assert checked.startswith(str(path))
+        assert "\n" not in checked
+        if first >= 8:
+            assert "byte " in checked
+            assert all(0 <= at <= len(data) for at in places(checked)), checked
+    else:
+        assert not checked
+    return shown
+
+
+def places(words: str) -> list[int]:
+    """The offsets that a report names."""
+    return [int(part.partition(":")[0]) for part in words.split("byte ")[1:]]
