@@ -1,21 +1,27 @@
-"""Byte streams to a car: serial, TCP. Bytes only; what they mean is the protocol's."""
+"""Byte streams to a car: serial, TCP, Bluetooth LE. Bytes only; what they mean is the protocol's."""
 
 from gateway.link.base import BadUrl, Busy, CannotOpen, Link, LinkError, LinkLost
-from gateway.link.url import LinkUrl, SerialUrl, TcpUrl, parse_url
+from gateway.link.url import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl, parse_url
 
 __all__ = ["BadUrl", "Busy", "CannotOpen", "Link", "LinkError", "LinkLost", "LinkUrl", "open_link", "parse_url"]
 
 OPEN_TIMEOUT_S = 5.0
+BLE_TIMEOUT_S = 20.0
+"""A module advertises about once a second, and is seldom heard the first time; the fourth car needs 4 s to connect."""
 
 
-async def open_link(url: LinkUrl, *, timeout_s: float = OPEN_TIMEOUT_S) -> Link:
-    """Open the link; raises CannotOpen, whose text says what is wrong and what to do."""
+async def open_link(url: LinkUrl, *, timeout_s: float | None = None) -> Link:
+    """Open the link within this time; raises CannotOpen, whose text says what is wrong and what to do."""
     match url:
-        case SerialUrl():
+        case SerialUrl() | UsbUrl():
             from gateway.link.serial import open_serial
 
-            return await open_serial(url, timeout_s)
+            return await open_serial(url, OPEN_TIMEOUT_S if timeout_s is None else timeout_s)
         case TcpUrl():
             from gateway.link.tcp import open_tcp
 
-            return await open_tcp(url, timeout_s)
+            return await open_tcp(url, OPEN_TIMEOUT_S if timeout_s is None else timeout_s)
+        case BleUrl():
+            from gateway.link.ble import open_ble
+
+            return await open_ble(url, BLE_TIMEOUT_S if timeout_s is None else timeout_s)

@@ -1,4 +1,4 @@
-"""A serial port through pyserial: one thread opens and closes it, which can block; the loop reads and writes.
+"""A serial port through pyserial: one thread finds, opens and closes it, which can block; the loop reads and writes.
 
 Where the loop cannot watch a port (Windows), the thread reads it too; a reading is there sooner without that.
 A write never waits: a port has room for far more than one frame, so a port that does not take a frame whole and at
@@ -16,7 +16,8 @@ from typing import Final
 import serial
 
 from gateway.link.base import CLOSE_S, Busy, CannotOpen, Link, LinkLost
-from gateway.link.url import SerialUrl
+from gateway.link.url import SerialUrl, UsbUrl
+from gateway.link.usb import choose, plugged
 
 WRITE_TIMEOUT_S: Final = 0.25
 """Only where the port cannot be written without waiting (Windows)."""
@@ -39,10 +40,14 @@ _NOT_OPENED: Final[tuple[type[Exception], ...]] = (*_GONE, ValueError)
 _BUSY: Final = frozenset({errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK})
 
 
+_opening: Final[set[str]] = set()
+"""Ports that a thread is opening now."""
+
+
 class SerialLink(Link):
     """One open port. Made by `open_serial`."""
 
-    def __init__(self, url: SerialUrl, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, url: SerialUrl | UsbUrl, loop: asyncio.AbstractEventLoop) -> None:
         self._url = url
         self._loop = loop
         self._hold = threading.Lock()
@@ -71,9 +76,6 @@ class SerialLink(Link):
             raise CannotOpen(
                 f"{self._url}: the port did not open within {timeout_s:g} s: is the device there?"
             ) from None
-        except _NOT_OPENED as error:
-            kind = Busy if getattr(error, "errno", None) in _BUSY else CannotOpen
-            raise kind(why_not_open(self._url, error)) from None
 
     async def read(self) -> bytes:
         """The next bytes as they came; raises LinkLost."""
@@ -164,13 +166,12 @@ class SerialLink(Link):
 
     def _run(self) -> None:
         try:
-            # Not given to the constructor's open: `exclusive` locks it against a second gateway.
-            port = serial.Serial(
-                self._url.path, self._url.baud, timeout=None, write_timeout=WRITE_TIMEOUT_S, exclusive=_exclusive()
-            )
-        except _NOT_OPENED as error:
+            port = self._open_port()
+        except CannotOpen as error:
+            _opening.discard(str(self._url))
             self._tell(self._failed_to_open, error)
             return
+        _opening.discard(str(self._url))
         with self._hold:
             self._port = port
         self._tell(self._succeeded)
@@ -194,13 +195,25 @@ class SerialLink(Link):
                 port.close()
             self._tell(self._over, reason)
 
+    def _open_port(self) -> serial.Serial:
+        """Find the port, each time again, and open it; raises CannotOpen."""
+        path = self._url.path if isinstance(self._url, SerialUrl) else choose(self._url, plugged())
+        try:
+            # `exclusive` locks it against a second gateway.
+            return serial.Serial(
+                path, self._url.baud, timeout=None, write_timeout=WRITE_TIMEOUT_S, exclusive=_exclusive()
+            )
+        except _NOT_OPENED as error:
+            kind = Busy if getattr(error, "errno", None) in _BUSY else CannotOpen
+            raise kind(why_not_open(self._url, path, error)) from None
+
     def _tell(self, what: object, *arguments: object) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to tell
             self._loop.call_soon_threadsafe(what, *arguments)  # type: ignore[arg-type]  # a method of this class
 
     # ------------------------------------------------------------------ told by the thread, on the loop
 
-    def _failed_to_open(self, error: Exception) -> None:
+    def _failed_to_open(self, error: CannotOpen) -> None:
         if not self._opened.done():
             self._opened.set_exception(error)
             self._opened.exception()  # looked at even if `open` has timed out meanwhile
@@ -222,8 +235,11 @@ class SerialLink(Link):
             self._ended.set_result(None)
 
 
-async def open_serial(url: SerialUrl, timeout_s: float) -> Link:
-    """Open a serial port; raises CannotOpen."""
+async def open_serial(url: SerialUrl | UsbUrl, timeout_s: float) -> Link:
+    """Open a serial port; raises CannotOpen. A USB device is looked for at each opening."""
+    if str(url) in _opening:  # each further try would be one more thread that hangs
+        raise CannotOpen(f"{url}: the port still hangs in an earlier try to open it: unplug it, and plug it in again")
+    _opening.add(str(url))
     link = SerialLink(url, asyncio.get_running_loop())
     await link.open(timeout_s)
     return link
@@ -242,20 +258,21 @@ def _write_now(port: serial.Serial, data: bytes) -> int:
         return 0
 
 
-def why_not_open(url: SerialUrl, error: Exception) -> str:
-    """One line: what is wrong with the port, and what to do."""
+def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
+    """One line: what is wrong with the port at this path, and what to do."""
     code = getattr(error, "errno", None)
+    which = f"{url}: " if isinstance(url, SerialUrl) else f"{url}: {path}: "
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return f"{url}: there is no such port; {_ports()}"
+        return f"{which}there is no such port; {_ports()}"
     if code in (errno.EACCES, errno.EPERM):
-        return f"{url}: no permission; {_group(url.path)}"
+        return f"{which}no permission; {_group(path)}"
     if code in _BUSY:
-        return f"{url}: the port is in use by another program (a second gateway?): end that one first"
-    if code == errno.EISDIR or os.path.isdir(url.path):  # noqa: PTH112 - a device path, not a file to work with
-        return f"{url}: this is a directory, not a serial port; {_ports()}"
-    if not isinstance(error, ValueError) and os.path.exists(url.path):  # noqa: PTH110 - likewise
-        return f"{url}: this is not a serial port ({_cause(error)}); {_ports()}"
-    return f"{url}: the port cannot be opened ({_cause(error)}); {_ports()}"
+        return f"{which}the port is in use by another program (a second gateway?): end that one first"
+    if code == errno.EISDIR or os.path.isdir(path):  # noqa: PTH112 - a device path, not a file to work with
+        return f"{which}this is a directory, not a serial port; {_ports()}"
+    if not isinstance(error, ValueError) and os.path.exists(path):  # noqa: PTH110 - likewise
+        return f"{which}this is not a serial port ({_cause(error)}); {_ports()}"
+    return f"{which}the port cannot be opened ({_cause(error)}); {_ports()}"
 
 
 def _cause(error: Exception) -> str:
@@ -268,9 +285,7 @@ def _cause(error: Exception) -> str:
 
 
 def _ports() -> str:
-    from serial.tools import list_ports
-
-    found = sorted(port.device for port in list_ports.comports())
+    found = sorted(port.device for port in plugged())
     return f"there are: {', '.join(found)}" if found else "no serial port is plugged in"
 
 

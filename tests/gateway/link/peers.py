@@ -1,5 +1,9 @@
-"""The other ends of links, real ones: the master of a PTY, and a TCP server. Each does what a car's end can do."""
+"""The other ends of links: the master of a PTY, a TCP server, a module of a Bluetooth service in this process.
 
+Each does what a car's end can do. The link does not know: it goes through pyserial, a socket, bleak's BlueZ backend.
+"""
+
+import asyncio
 import contextlib
 import os
 import pty
@@ -11,7 +15,9 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 
 from gateway.link import LinkUrl
-from gateway.link.url import SerialUrl, TcpUrl
+from gateway.link.url import BleUrl, SerialUrl, TcpUrl
+
+SYSTEM_BUS = "DBUS_SYSTEM_BUS_ADDRESS"
 
 
 class Peer(ABC):
@@ -34,6 +40,10 @@ class Peer(ABC):
     @abstractmethod
     def revive(self) -> None:
         """Be there again, under the same URL."""
+
+    @abstractmethod
+    def stall(self) -> None:
+        """Take no more bytes, without hanging up."""
 
     @abstractmethod
     def close(self) -> None:
@@ -72,6 +82,9 @@ class PtyPeer(Peer):
         tty.setraw(slave)
         self._path.symlink_to(os.ttyname(slave))
         os.close(slave)
+
+    def stall(self) -> None:
+        pass  # nobody reads it: it will be full
 
     def close(self) -> None:
         self.die()
@@ -116,10 +129,55 @@ class TcpPeer(Peer):
     def revive(self) -> None:
         pass  # it listens all the time
 
+    def stall(self) -> None:
+        pass  # nobody reads it: it will be full
+
     def close(self) -> None:
         if self._peer is not None:
             self._peer.close()
         self._listener.close()
+
+
+class BlePeer(Peer):
+    """A module that a private BlueZ hears."""
+
+    def __init__(self) -> None:
+        from tests.support.bluez import FakeBluez, Module, free_address  # Linux only, as what it needs
+
+        self.module = Module(free_address(), "BT04")
+        self.bluez = FakeBluez(self.module)
+        self.url = BleUrl(self.module.address)
+        self._before = os.environ.get(SYSTEM_BUS)
+        os.environ[SYSTEM_BUS] = self.bluez.address
+
+    def send(self, data: bytes) -> None:
+        self.bluez.notify(self.module, data)
+
+    def receive(self, size: int) -> bytes:
+        return self.bluez.written(self.module, size)
+
+    def die(self) -> None:
+        self.bluez.switch(self.module, on=False)
+
+    def revive(self) -> None:
+        self.bluez.switch(self.module, on=True)
+
+    def stall(self) -> None:
+        self.module.takes = 0
+
+    def close(self) -> None:
+        self.bluez.close()
+        if self._before is None:
+            del os.environ[SYSTEM_BUS]
+        else:
+            os.environ[SYSTEM_BUS] = self._before
+
+
+async def settled() -> None:
+    """Wait until bleak has noticed that its bus is gone: it keeps one for as long as there is a loop."""
+    async with asyncio.timeout(20.0):
+        while others := asyncio.all_tasks() - {asyncio.current_task()}:
+            await asyncio.wait(others)
 
 
 def open_descriptors() -> dict[str, str]:

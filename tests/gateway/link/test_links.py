@@ -1,33 +1,52 @@
-"""One suite over every kind of link: a real PTY and a real TCP server at the other end."""
+"""One suite over every kind of link: a real PTY, a real TCP server, a BlueZ of our own behind bleak's own backend.
+
+Bluetooth is in it on Linux: elsewhere bleak talks to the system's own Bluetooth, and nothing could stand in for it.
+"""
 
 import asyncio
 import contextlib
 import gc
+import random
 import re
 import socket
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
 import pytest
 
-from gateway.link import Link, LinkLost, open_link
+from gateway.link import Busy, Link, LinkLost, open_link
 from gateway.link.tcp import TcpLink
 from gateway.link.url import TcpUrl
-from tests.gateway.link.peers import Peer, PtyPeer, TcpPeer, link_threads, open_descriptors
+from gateway.protocol.decode import Decoder
+from gateway.protocol.readings import Sensors
+from tests.gateway.link.peers import (
+    BlePeer,
+    Peer,
+    PtyPeer,
+    TcpPeer,
+    link_threads,
+    open_descriptors,
+    settled,
+)
 
 FRAME = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 PATIENCE_S = 20.0
 
 
-@pytest.fixture(params=["serial", "tcp"])
-def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
-    made: Peer = PtyPeer(tmp_path) if request.param == "serial" else TcpPeer()
+LINKS = ["serial", "tcp", *(["ble"] if sys.platform == "linux" else [])]
+
+
+@pytest.fixture(params=LINKS)
+async def peer(request: pytest.FixtureRequest, tmp_path: Path) -> AsyncIterator[Peer]:
+    made: Peer = {"serial": lambda: PtyPeer(tmp_path), "tcp": TcpPeer, "ble": BlePeer}[request.param]()
     yield made
     made.close()
+    if isinstance(made, BlePeer):
+        await settled()
 
 
 @pytest.fixture
@@ -88,6 +107,24 @@ async def test_byte_by_byte_and_slowly(link: Link, peer: Peer) -> None:
     await sender
 
 
+async def test_lossy_and_noisy(link: Link, peer: Peer) -> None:
+    """What comes is handed on as it came, and nothing is made up; the next good frame decodes."""
+    noise = random.Random(7)
+    sent, whole = b"", 0
+    for _ in range(40):
+        damaged = bytes(byte for byte in FRAME if noise.random() < 0.9)
+        junk = noise.randbytes(noise.randrange(60)).replace(b"$", b"").replace(b"#", b"")
+        for piece in (damaged, junk, FRAME):
+            peer.send(piece)
+            sent += piece
+        whole += 1
+    received = await read(link, len(sent))
+    assert received == sent
+    decoder = Decoder()
+    events = [event for at in range(0, len(received), 20) for event in decoder.feed(received[at : at + 20], 1.0)]
+    assert len([event for event in events if isinstance(event, Sensors)]) >= whole
+
+
 async def test_dying_in_the_middle_of_a_frame(link: Link, peer: Peer) -> None:
     peer.send(FRAME[:17])
     assert await read(link, 17) == FRAME[:17]
@@ -105,7 +142,7 @@ async def test_dying_in_the_middle_of_a_frame(link: Link, peer: Peer) -> None:
 async def test_what_came_before_the_end_is_still_read(peer: Peer) -> None:
     """Not so on a PTY: the system throws away what nobody had read when the port went."""
     link = await open_link(peer.url)
-    if isinstance(peer, TcpPeer):
+    if not isinstance(peer, PtyPeer):
         peer.send(FRAME)
         peer.die()
         assert await read(link, len(FRAME)) == FRAME
@@ -165,6 +202,7 @@ async def test_it_opens_again_after_every_kind_of_end(peer: Peer) -> None:
             peer.die()
 
 
+@pytest.mark.parametrize("peer", ["serial", "tcp"], indirect=True)  # radio cannot be held back: test_ble.py
 async def test_a_firehose_into_a_loop_that_does_not_read_is_held_back(link: Link, peer: Peer) -> None:
     """Whoever sends more than fits waits; what was taken is read in order, and then the rest."""
     total = 24 * 1024 * 1024 if isinstance(peer, TcpPeer) else 8 * 1024 * 1024
@@ -207,6 +245,7 @@ async def test_a_car_that_stops_reading_costs_the_link_not_the_loop(link: Link, 
     async def write() -> None:
         await link.write(FRAME * 20)
 
+    peer.stall()
     words = await until_lost(write)
     assert "takes no bytes" in words or "took " in words
     assert await lost(link) == words, "the first cause is kept, and whoever reads is told it"
@@ -215,7 +254,26 @@ async def test_a_car_that_stops_reading_costs_the_link_not_the_loop(link: Link, 
     await link.close()
 
 
+async def test_closing_ends_a_write_that_waits(link: Link, peer: Peer) -> None:
+    """Whatever it waits for, it is over with the link, and nothing follows a half frame."""
+    peer.stall()
+    writing = asyncio.create_task(until_lost(lambda: link.write(FRAME)))
+    for _ in range(5):
+        await asyncio.sleep(0)
+    await link.close()
+    await writing
+
+
+async def test_frames_from_several_writers_are_never_mixed(link: Link, peer: Peer) -> None:
+    frames = [b"$4WD,CLR%d,CLG%d,CLB%d#" % (100 + n, 110 + n, 120 + n) for n in range(20)]
+    await asyncio.gather(*(link.write(frame) for frame in frames))
+    assert peer.receive(sum(map(len, frames))) == b"".join(frames)
+
+
 async def test_nothing_is_left_behind(peer: Peer) -> None:
+    await (await open_link(peer.url)).close()  # what is kept for as long as there is a loop is there now
+    if isinstance(peer, TcpPeer):
+        peer.die()
     gc.collect()
     before = open_descriptors()
     for ending in ("close", "die", "die unread", "cancelled") * 5:
@@ -320,17 +378,15 @@ async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it(
     peer.close()
 
 
-async def test_a_serial_port_belongs_to_one_program(tmp_path: Path) -> None:
-    peer = PtyPeer(tmp_path)
-    link = await open_link(peer.url)
-    with pytest.raises(Exception, match="the port is in use by another program"):
+@pytest.mark.parametrize("peer", [each for each in LINKS if each != "tcp"], indirect=True)  # the car's to refuse
+async def test_it_belongs_to_one_program(link: Link, peer: Peer) -> None:
+    with pytest.raises(Busy, match="in use by another program"):
         await open_link(peer.url)
     await link.write(STOP)
     assert peer.receive(len(STOP)) == STOP
     await link.close()
     again = await open_link(peer.url)
     await again.close()
-    peer.close()
 
 
 async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:

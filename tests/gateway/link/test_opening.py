@@ -13,7 +13,7 @@ import serial
 
 from gateway.link import BadUrl, CannotOpen, open_link, parse_url
 from gateway.link.tcp import connect_first
-from gateway.link.url import LinkUrl, SerialUrl, TcpUrl
+from gateway.link.url import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
 from tests.gateway.link.peers import PtyPeer, link_threads
 
 
@@ -27,6 +27,22 @@ from tests.gateway.link.peers import PtyPeer, link_threads
         ("serial:///dev/ttyUSB0?baud=9600", SerialUrl("/dev/ttyUSB0"), "serial:///dev/ttyUSB0"),
         ("COM3", SerialUrl("COM3"), "serial://COM3"),
         ("serial://COM12", SerialUrl("COM12"), "serial://COM12"),
+        ("serial://?vid=1a86", UsbUrl(0x1A86), "serial://?vid=1a86"),
+        (
+            "serial://?vid=0x1A86&pid=0x7523&serial=A%20%231",
+            UsbUrl(0x1A86, 0x7523, "A #1"),
+            "serial://?vid=1a86&pid=7523&serial=A%20%231",
+        ),
+        ("serial:///?serial=ABC&baud=115200", UsbUrl(serial="ABC", baud=115200), "serial://?serial=ABC&baud=115200"),
+        ("serial://?vid=2341", UsbUrl(0x2341), "serial://?vid=2341"),
+        ("ble://aa:bb:cc:dd:ee:0f", BleUrl("AA:BB:CC:DD:EE:0F"), "ble://AA:BB:CC:DD:EE:0F"),
+        (
+            "ble://6e400001-b5a3-f393-e0a9-e50e24dcca9e",
+            BleUrl("6E400001-B5A3-F393-E0A9-E50E24DCCA9E"),
+            "ble://6E400001-B5A3-F393-E0A9-E50E24DCCA9E",
+        ),
+        ("ble://name=BT04", BleUrl(name="BT04"), "ble://name=BT04"),
+        ("BLE://name=My%20Car%2F1?", BleUrl(name="My Car/1?"), "ble://name=My%20Car%2F1%3F"),
         ("tcp://192.168.1.7:8888", TcpUrl("192.168.1.7", 8888), "tcp://192.168.1.7:8888"),
         ("tcp://car.local:1", TcpUrl("car.local", 1), "tcp://car.local:1"),
         ("tcp://[::1]:65535", TcpUrl("::1", 65535), "tcp://[::1]:65535"),
@@ -47,13 +63,28 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
         ("serial://", "it names no device"),
         ("serial:///", "it names no device"),
         ("serial://dev/ttyUSB0", "three slashes come before a device path"),
-        ("serial:///dev/ttyUSB0#x", "it names no device"),
+        ("serial:///dev/ttyUSB0#x", "a # is written %23"),
         ("serial:///dev/ttyUSB0?baud=fast", "baud=fast is not from 300 to 4000000"),
         ("serial:///dev/ttyUSB0?baud=", "baud= is not from"),
         ("serial:///dev/ttyUSB0?baud=0", "baud=0 is not from"),
         ("serial:///dev/ttyUSB0?baud=9600.0", "baud=9600.0 is not from"),
         ("serial:///dev/ttyUSB0?baud=" + "9" * 5000, "is not from 300 to 4000000"),
         ("serial:///dev/ttyUSB0?parity=odd", "parity is no option of a serial link"),
+        ("serial:///dev/ttyUSB0?vid=1a86", "it names a device path, and vid too"),
+        ("serial://?baud=9600", "it names no device"),
+        ("serial://?vid=6790&vid=1a86", "vid is given twice"),
+        ("serial://?vid=", "vid= is not four hexadecimal digits"),
+        ("serial://?vid=0x1a8", "vid=0x1a8 is not four hexadecimal digits"),
+        ("serial://?pid=29987", "pid=29987 is not four hexadecimal digits"),
+        ("serial://?pid=-001", "pid=-001 is not four"),
+        ("serial://?serial=", "serial= is empty"),
+        ("ble://", "it names no Bluetooth address, and no name="),
+        ("ble://BT04", "it names no Bluetooth address, and no name="),
+        ("ble://AA:BB:CC:DD:EE", "it names no Bluetooth address"),
+        ("ble://AA:BB:CC:DD:EE:FF/x", "it names no Bluetooth address"),
+        ("ble://name=", "a name has 1 to 248 bytes, and can be printed"),
+        ("ble://name=a%0Ab", "a name has 1 to 248 bytes, and can be printed"),
+        ("ble://name=" + "x" * 249, "a name has 1 to 248 bytes"),
         ("tcp://", "a host and a port from 1 to 65535 are needed"),
         ("tcp://host", "a host and a port"),
         ("tcp://:8888", "a host and a port"),
@@ -65,7 +96,6 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
         ("tcp://me@host:8888", "nothing may follow the port"),
         ("tcp://[::1:8888", "Invalid IPv6 URL"),
         ("http://host:80", "http:// is no kind of link"),
-        ("ble://00:11:22:33:44:55", "ble:// is not yet supported"),
         ("/dev/tty\nUSB0", "it has characters that cannot be printed"),
         ("/dev/tty\x00USB0", "it has characters that cannot be printed"),
         ("tcp://ho\nst:80", "it has characters that cannot be printed"),
@@ -77,7 +107,9 @@ def test_what_is_no_url_is_refused_with_what_is(text: str, why: str) -> None:
     words = str(caught.value)
     assert why in words
     assert words.endswith(
-        "give serial:///dev/ttyUSB0 (?baud=9600), a bare device path such as /dev/ttyUSB0 or COM3, or tcp://host:8888"
+        "give serial:///dev/ttyUSB0 (?baud=9600), a bare device path such as /dev/ttyUSB0 or COM3, "
+        "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://host:8888, "
+        "ble://AA:BB:CC:DD:EE:FF (on macOS the UUID that `gateway scan` shows), or ble://name=BT04"
     )
     assert "\n" not in words
 
@@ -182,7 +214,7 @@ ONLY_WHAT_IS_NEEDED = """
 import asyncio, sys
 from gateway.link import open_link, parse_url
 link = asyncio.run(open_link(parse_url(sys.argv[1])))
-print("serial" in sys.modules, "serial.tools" in sys.modules)
+print(*(name in sys.modules for name in ("serial", "serial.tools", "bleak")))
 """
 
 
@@ -191,8 +223,8 @@ def test_only_what_a_link_needs_is_imported(tmp_path: Path) -> None:
     peer = PtyPeer(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as server:
         for url, said in (
-            (TcpUrl("127.0.0.1", server.getsockname()[1]), "False False\n"),
-            (peer.url, "True False\n"),
+            (TcpUrl("127.0.0.1", server.getsockname()[1]), "False False False\n"),
+            (peer.url, "True False False\n"),
         ):
             done = subprocess.run(
                 [sys.executable, "-c", ONLY_WHAT_IS_NEEDED, str(url)],
@@ -203,6 +235,26 @@ def test_only_what_a_link_needs_is_imported(tmp_path: Path) -> None:
             )
             assert (done.stdout, done.stderr) == (said, "")
     peer.close()
+
+
+WITHOUT_BLEAK = """
+import sys
+sys.modules["bleak"] = None  # as if it were not installed
+from gateway.cli import main
+sys.argv[1:] = ["run", "--car", "red", "--link", "ble://AA:BB:CC:DD:EE:FF", "--retry"]
+main()
+"""
+
+
+def test_bluetooth_that_is_not_installed_is_one_line_and_nothing_is_started() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_BLEAK], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "gateway: link 'ble://AA:BB:CC:DD:EE:FF' needs Bluetooth, which is not installed: "
+        "pip install 'zenoh-car-fleet[ble]'\n"
+    )
 
 
 async def test_a_tcp_car_that_does_not_answer() -> None:

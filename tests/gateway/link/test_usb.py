@@ -1,0 +1,133 @@
+"""A USB device is found by what it says of itself, each time again: none, one, several, and after a replug."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+
+from gateway.link import CannotOpen, LinkLost, open_link, parse_url
+from gateway.link.url import SerialUrl, UsbUrl
+from gateway.link.usb import Plugged, choose
+from tests.gateway.link.peers import PtyPeer
+
+CH340 = Plugged("/dev/ttyUSB0", 0x1A86, 0x7523)
+UNO_1 = Plugged("/dev/ttyACM0", 0x2341, 0x0043, "7573")
+UNO_2 = Plugged("/dev/ttyACM1", 0x2341, 0x0043, "9912")
+BOARD = Plugged("/dev/ttyS0")
+THERE = [UNO_2, CH340, BOARD, UNO_1]
+FRAME = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
+
+Usb = Callable[..., None]
+
+
+@pytest.mark.parametrize(
+    ("url", "device"),
+    [
+        (UsbUrl(vid=0x1A86), "/dev/ttyUSB0"),
+        (UsbUrl(pid=0x7523), "/dev/ttyUSB0"),
+        (UsbUrl(serial="9912"), "/dev/ttyACM1"),
+        (UsbUrl(0x2341, 0x0043, "7573"), "/dev/ttyACM0"),
+    ],
+)
+def test_one_fits(url: UsbUrl, device: str) -> None:
+    assert choose(url, THERE) == device
+
+
+@pytest.mark.parametrize(
+    ("url", "there", "words"),
+    [
+        (
+            UsbUrl(0x1A86, serial="1"),
+            THERE[:3],
+            (
+                "serial://?vid=1a86&serial=1: no such USB device is plugged in; there are: /dev/ttyACM1 (2341:0043 "
+                "serial number 9912), /dev/ttyS0 (no USB device), /dev/ttyUSB0 (1a86:7523)"
+            ),
+        ),
+        (UsbUrl(0x1A86), [], "serial://?vid=1a86: no such USB device is plugged in; no serial port is plugged in"),
+        (
+            UsbUrl(0x2341, 0x0043),
+            THERE,
+            (
+                "serial://?vid=2341&pid=0043: 2 devices fit, /dev/ttyACM0 (2341:0043 serial number 7573), /dev/ttyACM1 "
+                "(2341:0043 serial number 9912): add a serial= that only one has, or give its device path"
+            ),
+        ),
+        (UsbUrl(1), [Plugged("/dev/x", 2, 3, "a\n\x1b[1m")], "there are: /dev/x (0002:0003 serial number a??[1m)"),
+    ],
+)
+def test_none_or_several_is_one_line(url: UsbUrl, there: list[Plugged], words: str) -> None:
+    with pytest.raises(CannotOpen) as caught:
+        choose(url, there)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Say which ports the system lists, in pyserial's own words: a PTY is in no such list."""
+
+    def listed(*ports: Plugged) -> None:
+        found = []
+        for port in ports:
+            info = ListPortInfo(port.device)
+            info.vid, info.pid, info.serial_number = port.vid, port.pid, port.serial
+            found.append(info)
+        monkeypatch.setattr(list_ports, "comports", lambda: found)
+
+    return listed
+
+
+async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: Path, plug: Usb) -> None:
+    (tmp_path / "ACM0").mkdir()
+    (tmp_path / "ACM1").mkdir()
+    first, second = PtyPeer(tmp_path / "ACM0"), PtyPeer(tmp_path / "ACM1")
+    url = parse_url("serial://?vid=2341&serial=7573")
+    plug(CH340, Plugged(path(first), 0x2341, 0x0043, "7573"))
+    link = await open_link(url)
+    first.die()
+    plug(CH340)
+    with pytest.raises(LinkLost, match="is gone: unplugged"):
+        await link.read()
+    with pytest.raises(CannotOpen, match="no such USB device is plugged in; there are: /dev/ttyUSB0"):
+        await open_link(url)
+    await link.close()
+    plug(Plugged(path(second), 0x2341, 0x0043, "7573"), CH340)
+    link = await open_link(url)
+    second.send(FRAME)
+    assert await link.read() == FRAME
+    await link.close()
+    second.close()
+
+
+async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> None:
+    gone = str(tmp_path / "ttyACM0")
+    plug(Plugged(gone, 1, 2, "3"))
+    with pytest.raises(CannotOpen) as caught:
+        await open_link(UsbUrl(serial="3"))
+    assert str(caught.value) == f"serial://?serial=3: {gone}: there is no such port; there are: {gone}"
+
+
+async def test_a_path_by_id_leads_to_the_port_that_the_device_has_now(tmp_path: Path) -> None:
+    """As /dev/serial/by-id: the link stays where it is, and points to another port; the first is still there, dead."""
+    peer = PtyPeer(tmp_path)
+    link = await open_link(peer.url)
+    peer.die()
+    with pytest.raises(LinkLost):
+        await link.read()
+    peer.revive()  # the old port is still open, so this is another
+    await link.close()
+    link = await open_link(peer.url)
+    peer.send(FRAME)
+    async with asyncio.timeout(20):
+        assert await link.read() == FRAME
+    await link.close()
+    peer.close()
+
+
+def path(peer: PtyPeer) -> str:
+    assert isinstance(peer.url, SerialUrl)
+    return peer.url.path

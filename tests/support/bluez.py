@@ -1,0 +1,464 @@
+"""A computer with Bluetooth, without any: a private system bus, and on it BlueZ and modules, for bleak's own backend.
+
+Whoever uses it has DBUS_SYSTEM_BUS_ADDRESS set to `address`. The bus is this program itself: it says who it is, takes
+match rules, hands calls to org.bluez and signals to whoever asked for them; so no dbus-daemon need be installed. BlueZ
+is what bleak's backend calls of it, with the limits that bite (measured on the real one): a piece longer than the MTU
+allows is refused, who is connected does not advertise, a connection outlives the program that made it.
+"""
+
+import asyncio
+import contextlib
+import io
+import itertools
+import os
+import struct
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from dbus_fast import Message, MessageType, Variant
+from dbus_fast._private.unmarshaller import Unmarshaller
+
+T = TypeVar("T")
+
+DBUS = "org.freedesktop.DBus"
+PROPERTIES = f"{DBUS}.Properties"
+OBJECTS = f"{DBUS}.ObjectManager"
+BLUEZ = "org.bluez"
+ADAPTER, DEVICE = f"{BLUEZ}.Adapter1", f"{BLUEZ}.Device1"
+SERVICE, CHARACTERISTIC = f"{BLUEZ}.GattService1", f"{BLUEZ}.GattCharacteristic1"
+HCI = "/org/bluez/hci0"
+PATIENCE_S = 20.0
+
+_names = itertools.count()
+
+
+def uuid(short: int) -> str:
+    """The 128 bits of a 16 bit UUID."""
+    return f"0000{short:04x}-0000-1000-8000-00805f9b34fb"
+
+
+FFE0 = ((uuid(0xFFE0), ((uuid(0xFFE1), ("notify", "write-without-response")),)),)
+SEPARATE = ((uuid(0xFFE0), ((uuid(0xFFE2), ("write",)), (uuid(0xFFE1), ("notify",)))),)
+TWO_SERVICES = (
+    (uuid(0xFFE5), ((uuid(0xFFE9), ("write-without-response",)),)),
+    (uuid(0xFFE0), ((uuid(0xFFE4), ("notify",)),)),
+)
+NORDIC = (
+    (
+        "6e400001-b5a3-f393-e0a9-e50e24dcca9e",
+        (
+            ("6e400003-b5a3-f393-e0a9-e50e24dcca9e", ("notify",)),
+            ("6e400002-b5a3-f393-e0a9-e50e24dcca9e", ("write", "write-without-response")),
+        ),
+    ),
+)
+BATTERY = ((uuid(0x180F), ((uuid(0x2A19), ("read", "notify")),)),)
+
+
+def free_address() -> str:
+    """An address that no other test on this computer has: links claim theirs from all programs."""
+    number = os.getpid() << 16 | next(_names) & 0xFFFF
+    return ":".join(f"{byte:02X}" for byte in number.to_bytes(6, "big"))
+
+
+class Refused(Exception):
+    """A D-Bus error: its name and words."""
+
+
+@dataclass(eq=False)
+class Module:
+    """A Bluetooth LE module, and what is wrong with it."""
+
+    address: str
+    name: str
+    gatt: tuple[tuple[str, tuple[tuple[str, tuple[str, ...]], ...]], ...] = FFE0
+    mtu: int = 23
+    on: bool = True
+    connects: bool = True
+    notifies: bool = True
+    takes: int | None = None
+    """Pieces that it still takes; then a write is never answered."""
+    refuses: int | None = None
+    """Pieces that it still takes; then a write is refused."""
+    known: bool = False
+    connected: bool = False
+    notified: set["_Caller"] = field(default_factory=set)
+    pieces: list[bytes] = field(default_factory=list)
+    """What was written, as it came."""
+    waiting: list[tuple["_Caller", Message]] = field(default_factory=list)
+    """Calls of Connect that are not answered yet."""
+
+    @property
+    def path(self) -> str:
+        return f"{HCI}/dev_{self.address.replace(':', '_')}"
+
+    def characteristics(self) -> Iterator[tuple[str, str, tuple[str, ...], str, str]]:
+        """Path, UUID, flags, and path and UUID of the service."""
+        number = 0x000C
+        for service, inside in self.gatt:
+            above = f"{self.path}/service{number:04x}"
+            for each, flags in inside:
+                number += 1
+                yield f"{above}/char{number:04x}", each, flags, above, service
+            number += 1
+
+
+class FakeBluez:
+    """The bus and BlueZ, in a thread of their own. What changes them may be called from any other thread."""
+
+    def __init__(self, *modules: Module) -> None:
+        name = f"car-fleet-bluez-{os.getpid()}-{next(_names)}"
+        self.address = f"unix:abstract={name}"
+        self.modules = list(modules)
+        self.powered = True
+        self.alive = True
+        """bluetoothd runs."""
+        self._callers: set[_Caller] = set()
+        self._changed = threading.Condition()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="bluez", daemon=True)
+        self._thread.start()
+        self._server = self._do(asyncio.start_unix_server(self._serve, path=f"\0{name}"))
+
+    def _do(self, work: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(PATIENCE_S)
+
+    # ------------------------------------------------------------------ what a test does
+
+    def notify(self, module: Module, data: bytes) -> None:
+        """Say this, in pieces as radio does; waits until the computer has taken it."""
+        self._do(self._notify(module, data))
+
+    def written(self, module: Module, size: int) -> bytes:
+        """Wait until so many bytes were written to it; take them."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: sum(map(len, module.pieces)) >= size, PATIENCE_S), module.pieces
+            data = b"".join(module.pieces)
+            module.pieces[:] = [data[size:]] if data[size:] else []
+            return data[:size]
+
+    def switch(self, module: Module, *, on: bool) -> None:
+        """Switch a module off, which ends its connection, or on again."""
+
+        async def work() -> None:
+            module.on = on
+            if not on and module.connected:
+                await self._hung_up(module)
+            await self._advertise()
+
+        self._do(work())
+
+    def kill(self) -> None:
+        """Kill bluetoothd: no signal tells of it, and its connections are gone."""
+
+        async def work() -> None:
+            self.alive = False
+
+        self._do(work())
+
+    def restart(self) -> None:
+        """Start bluetoothd again; it knows no device."""
+
+        async def work() -> None:
+            self.alive = True
+            for module in self.modules:
+                module.known = module.connected = False
+                module.notified.clear()
+            await self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [HCI, self._adapter()])
+
+        self._do(work())
+
+    def close(self) -> None:
+        """End the bus: every connection to it."""
+
+        async def work() -> None:
+            self._server.close()
+            for caller in list(self._callers):
+                caller.writer.close()
+            await asyncio.gather(*(caller.task for caller in self._callers))
+
+        self._do(work())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(PATIENCE_S)
+        self._loop.close()
+
+    # ------------------------------------------------------------------ the bus
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        caller = _Caller(f":1.{next(_names) + 1}", writer, task)
+        self._callers.add(caller)
+        try:
+            await _authenticate(reader, writer)
+            while True:
+                await self._called(caller, await _received(reader))
+        except (asyncio.IncompleteReadError, ConnectionError):
+            pass
+        finally:
+            self._callers.discard(caller)
+            for module in self.modules:
+                module.notified.discard(caller)  # and no more: it stays connected
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+
+    async def _called(self, caller: "_Caller", message: Message) -> None:
+        try:
+            if message.destination == DBUS:
+                signature, body = self._bus_call(caller, message)
+            elif message.destination == BLUEZ and self.alive:
+                answer = await self._bluez_call(caller, message)
+                if answer is None:
+                    return
+                signature, body = answer
+            else:
+                raise Refused(f"{DBUS}.Error.ServiceUnknown", f"The name {message.destination} was not provided")  # noqa: TRY301 - answered below
+        except Refused as error:
+            await caller.send(_error(message, *error.args))
+        else:
+            await caller.send(Message.new_method_return(message, signature, body))
+
+    def _bus_call(self, caller: "_Caller", message: Message) -> tuple[str, list[Any]]:
+        if message.member == "Hello":
+            return "s", [caller.name]
+        if message.member == "AddMatch":
+            rule = dict(part.split("=", 1) for part in message.body[0].split(","))
+            caller.rules.append({name: value.strip("'") for name, value in rule.items()})
+            return "", []
+        raise Refused(f"{DBUS}.Error.UnknownMethod", str(message.member))
+
+    async def _signal(self, path: str, interface: str, member: str, signature: str, body: list[Any]) -> None:
+        if not self.alive:
+            return
+        for caller in list(self._callers):
+            if caller.wants(path, interface, member, body):
+                await caller.send(
+                    Message(
+                        message_type=MessageType.SIGNAL,
+                        path=path,
+                        interface=interface,
+                        member=member,
+                        signature=signature,
+                        body=body,
+                    )
+                )
+
+    # ------------------------------------------------------------------ BlueZ
+
+    async def _bluez_call(self, caller: "_Caller", message: Message) -> tuple[str, list[Any]] | None:
+        if message.member == "GetManagedObjects":
+            return "a{oa{sa{sv}}}", [self._managed()]
+        if message.path == HCI:
+            return await self._adapter_call(caller, message)
+        for module in self.modules:
+            if module.known and message.path == module.path:
+                return await self._device_call(caller, message, module)
+            for path, _, flags, _, _ in module.characteristics():
+                if module.connected and message.path == path:
+                    return await self._characteristic_call(caller, message, module, flags)
+        raise Refused(f"{DBUS}.Error.UnknownObject", f"Method {message.member} with {message.path} doesn't exist")
+
+    async def _adapter_call(self, caller: "_Caller", message: Message) -> tuple[str, list[Any]]:
+        if message.member == "StartDiscovery":
+            caller.scans = True
+            await self._advertise()
+        elif message.member == "StopDiscovery":
+            caller.scans = False
+        elif message.member != "SetDiscoveryFilter":
+            raise Refused(f"{DBUS}.Error.UnknownMethod", str(message.member))
+        return "", []
+
+    async def _device_call(self, caller: "_Caller", message: Message, module: Module) -> tuple[str, list[Any]] | None:
+        if message.member == "Connect":
+            if not (module.on and module.connects):
+                module.waiting.append((caller, message))  # it tries for a very long time
+                return None
+            module.connected = True
+            await self._change(module.path, DEVICE, {"Connected": Variant("b", True)})
+            for path, interfaces in self._gatt(module).items():
+                await self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [path, interfaces])
+            await self._change(module.path, DEVICE, {"ServicesResolved": Variant("b", True)})
+        elif message.member == "Disconnect":
+            waiting, module.waiting = module.waiting, []
+            for who, what in waiting:
+                await who.send(_error(what, f"{BLUEZ}.Error.Failed", "Software caused connection abort"))
+            if module.connected:
+                await self._hung_up(module)
+        else:
+            raise Refused(f"{DBUS}.Error.UnknownMethod", str(message.member))
+        return "", []
+
+    async def _characteristic_call(
+        self, caller: "_Caller", message: Message, module: Module, flags: tuple[str, ...]
+    ) -> tuple[str, list[Any]] | None:
+        if message.member == "StartNotify":
+            if "notify" not in flags:
+                raise Refused(f"{BLUEZ}.Error.NotSupported", "Operation is not supported")
+            if not module.notifies:
+                return None
+            module.notified.add(caller)
+        elif message.member == "WriteValue":
+            value, options = message.body
+            if {"command": "write-without-response", "request": "write"}[options["type"].value] not in flags:
+                raise Refused(f"{BLUEZ}.Error.NotSupported", "Operation is not supported")
+            if len(value) > module.mtu - 3:
+                raise Refused(f"{BLUEZ}.Error.Failed", "Failed to initiate write")
+            if module.refuses is not None:
+                if module.refuses == 0:
+                    raise Refused(f"{BLUEZ}.Error.Failed", "Operation failed with ATT error: 0x0e")
+                module.refuses -= 1
+            if module.takes is not None:
+                if module.takes == 0:
+                    return None
+                module.takes -= 1
+            with self._changed:
+                module.pieces.append(bytes(value))
+                self._changed.notify_all()
+        else:
+            raise Refused(f"{DBUS}.Error.UnknownMethod", str(message.member))
+        return "", []
+
+    async def _notify(self, module: Module, data: bytes) -> None:
+        """BlueZ says it once for all, if anyone asked for notifications."""
+        for path, _, flags, _, _ in module.characteristics():
+            if "notify" in flags and module.connected and module.notified:
+                for start in range(0, len(data), module.mtu - 3):
+                    piece = data[start : start + module.mtu - 3]
+                    await self._change(path, CHARACTERISTIC, {"Value": Variant("ay", piece)})
+                return
+
+    async def _advertise(self) -> None:
+        """What is on and not connected is heard, by whoever scans."""
+        if not any(caller.scans for caller in self._callers):
+            return
+        for module in self.modules:
+            if module.on and not module.connected:
+                if not module.known:
+                    module.known = True
+                    body = [module.path, self._device(module)]
+                    await self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", body)
+                else:
+                    await self._change(module.path, DEVICE, {"RSSI": Variant("n", -50)})
+
+    async def _hung_up(self, module: Module) -> None:
+        module.connected = False
+        module.notified.clear()
+        gone = list(self._gatt(module))
+        off = {"ServicesResolved": Variant("b", False), "Connected": Variant("b", False)}
+        await self._change(module.path, DEVICE, off)
+        for path in reversed(gone):
+            await self._signal("/", OBJECTS, "InterfacesRemoved", "oas", [path, [SERVICE, CHARACTERISTIC]])
+
+    async def _change(self, path: str, interface: str, changed: dict[str, Variant]) -> None:
+        await self._signal(path, PROPERTIES, "PropertiesChanged", "sa{sv}as", [interface, changed, []])
+
+    def _managed(self) -> dict[str, Any]:
+        found: dict[str, Any] = {HCI: self._adapter()}
+        for module in self.modules:
+            if module.known:
+                found[module.path] = self._device(module)
+            if module.connected:
+                found |= self._gatt(module)
+        return found
+
+    def _adapter(self) -> dict[str, Any]:
+        return {
+            ADAPTER: {
+                "Address": Variant("s", "00:00:00:00:00:01"),
+                "Roles": Variant("as", ["central"]),
+                "Powered": Variant("b", self.powered),
+            }
+        }
+
+    def _device(self, module: Module) -> dict[str, Any]:
+        return {
+            DEVICE: {
+                "Address": Variant("s", module.address),
+                "Name": Variant("s", module.name),
+                "Alias": Variant("s", module.name),
+                "Adapter": Variant("o", HCI),
+                "Paired": Variant("b", False),
+                "Connected": Variant("b", module.connected),
+                "ServicesResolved": Variant("b", module.connected),
+                "UUIDs": Variant("as", [service for service, _ in module.gatt]),
+                "RSSI": Variant("n", -50),
+            }
+        }
+
+    def _gatt(self, module: Module) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for path, each, flags, above, service in module.characteristics():
+            found[above] = {
+                SERVICE: {
+                    "UUID": Variant("s", service),
+                    "Device": Variant("o", module.path),
+                    "Primary": Variant("b", True),
+                }
+            }
+            found[path] = {
+                CHARACTERISTIC: {
+                    "UUID": Variant("s", each),
+                    "Service": Variant("o", above),
+                    "Flags": Variant("as", list(flags)),
+                    "Notifying": Variant("b", bool(module.notified)),
+                    "MTU": Variant("q", module.mtu),
+                }
+            }
+        return found
+
+
+@dataclass(eq=False)
+class _Caller:
+    """One connection to the bus."""
+
+    name: str
+    writer: asyncio.StreamWriter
+    task: asyncio.Task[None]
+    rules: list[dict[str, str]] = field(default_factory=list)
+    scans: bool = False
+    serials: Callable[[], int] = field(default_factory=lambda: itertools.count(1).__next__)
+
+    def wants(self, path: str, interface: str, member: str, body: list[Any]) -> bool:
+        def fits(rule: dict[str, str]) -> bool:
+            under = rule.get("path_namespace", path)
+            return (
+                rule.get("interface", interface) == interface
+                and rule.get("member", member) == member
+                and (path == under or path.startswith(under + "/"))
+                and str(body[0]).startswith(rule.get("arg0path", ""))
+            )
+
+        return any(fits(rule) for rule in self.rules)
+
+    async def send(self, message: Message) -> None:
+        message.serial, message.sender = self.serials(), BLUEZ
+        self.writer.write(bytes(message._marshall(False)))
+        with contextlib.suppress(ConnectionError):
+            await self.writer.drain()
+
+
+async def _authenticate(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    await reader.readexactly(1)
+    while True:
+        line = (await reader.readuntil(b"\r\n")).strip()
+        if line == b"BEGIN":
+            return
+        answer = {b"AUTH": b"OK 0123456789abcdef0123456789abcdef", b"NEGOTIATE_UNIX_FD": b"AGREE_UNIX_FD"}
+        writer.write(answer.get(line.split()[0], b"ERROR") + b"\r\n")
+
+
+async def _received(reader: asyncio.StreamReader) -> Message:
+    """One message, by the lengths in its header (D-Bus specification, message format)."""
+    head = await reader.readexactly(16)
+    body, fields = struct.unpack("<4xI4xI" if head[:1] == b"l" else ">4xI4xI", head)
+    rest = await reader.readexactly(fields + -fields % 8 + body)
+    message = Unmarshaller(io.BytesIO(head + rest)).unmarshall()
+    assert message is not None
+    return message
+
+
+def _error(call: Message, name: str, words: str) -> Message:
+    return Message.new_error(call, name, words)
