@@ -102,6 +102,9 @@ def _no_output(error: OSError) -> int:
 
 
 def _one_line(error: click.ClickException) -> str:
+    if isinstance(error, click.BadParameter) and isinstance(error.param, click.Argument) and not error.param.metavar:
+        # What click would call it is the list of its choices, which the message has anyway.
+        error.param_hint = f"'{(error.param.name or '').upper()}'"
     return " ".join(error.format_message().split())
 
 

@@ -1,7 +1,7 @@
 """`fleet led, light, servo, arm, whistle, speed, fan, find`: what a car does once."""
 
 import re
-from typing import Any
+from typing import Any, Final
 
 import click
 
@@ -20,6 +20,10 @@ from fleet.verbs import (
 )
 from gateway.protocol.values import Light, SpeedStep
 
+_NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
+"""So that -1 is told what is allowed instead of being taken for an option."""
+_ARM_EXAMPLE: Final = "fleet arm red 90 90 45 120 90 30"
+
 
 class _Colour(click.ParamType[tuple[int, int, int]]):
     """Red, green and blue as `#rrggbb`."""
@@ -30,18 +34,28 @@ class _Colour(click.ParamType[tuple[int, int, int]]):
         """Three numbers, 0..255."""
         match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", str(value))
         if match is None:
-            self.fail(f"{value!r} is not allowed: six hexadecimal digits, as '#ff0010'", param, ctx)
+            self.fail(
+                f"{value!r} is not allowed: six hexadecimal digits, two each for red, green and blue, as '#ff0010'",
+                param,
+                ctx,
+            )
         return int(match[1], 16), int(match[2], 16), int(match[3], 16)
 
+    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:  # noqa: ARG002 - click's
+        """What helps who did not quote it."""
+        return "Six hexadecimal digits, in quotes: to a shell, what follows a bare # is a comment"
 
-def _servo(ctx: click.Context, _: click.Parameter, action: str) -> Request:
+
+def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> Request:
     """The request for what is asked of the servo named before; wrong use is found before anyone is asked."""
     servo = ctx.params["servo"]
-    if not re.fullmatch("[0-9]+", action):
+    if action is None or not re.fullmatch("[0-9]+", action):
         allowed = ("up", "down", "reset") if servo == "vertical" else ("left", "right", "reset")
+        words = f"servo {servo}: {', '.join(allowed)}{' or 0 to 180 degrees' if servo == 'front' else ''}"
+        if action is None:
+            raise click.BadParameter(f"name what to do with {words}, as: fleet servo red {servo} {allowed[0]}")
         if action not in allowed:
-            degrees = " or 0 to 180" if servo == "front" else ""
-            raise click.BadParameter(f"{action!r} is not allowed for servo {servo}: {', '.join(allowed)}{degrees}")
+            raise click.BadParameter(f"{action!r} is not allowed for {words}")
         return servo_request(servo, action)
     if servo != "front":
         raise click.BadParameter(f"{action!r} is not allowed: servo {servo} takes no degrees, only front does")
@@ -49,6 +63,17 @@ def _servo(ctx: click.Context, _: click.Parameter, action: str) -> Request:
         return servo_request(servo, deg=int(action))
     except ValueError as error:
         raise click.BadParameter(str(error)) from None
+
+
+def _arm(_: click.Context, __: click.Parameter, joints: tuple[str, ...]) -> Request:
+    """The request for six joints."""
+    needed = f"6 are needed, 0 to 180 degrees each, as: {_ARM_EXAMPLE}"
+    for number, joint in enumerate(joints, start=1):
+        if not re.fullmatch("[0-9]{1,3}", joint) or int(joint) > 180:
+            raise click.BadParameter(f"joint {number}, {joint!r}, is not allowed: {needed}")
+    if len(joints) != 6:
+        raise click.BadParameter(f"{len(joints)} joints given: {needed}")
+    return arm_request([int(joint) for joint in joints])
 
 
 @click.command(epilog="\b\nexample:\n  fleet led red '#ff0010'")
@@ -71,10 +96,13 @@ def light(client: FleetClient, cars: tuple[str, ...], light: str, *, as_json: bo
     carry_out(client, light_request(light), cars, as_json=as_json)
 
 
-@click.command(epilog="\b\nexamples:\n  fleet servo red front 90\n  fleet servo blue vertical up")
+@click.command(
+    epilog="\b\nexamples:\n  fleet servo red front 90\n  fleet servo blue vertical up",
+    context_settings=_NEGATIVE_NUMBERS,
+)
 @cars_argument
 @click.argument("servo", type=click.Choice(["front", "vertical", "horizontal"]))
-@click.argument("request", metavar="left|right|up|down|reset|DEG", callback=_servo)
+@click.argument("request", metavar="left|right|up|down|reset|DEG", callback=_servo, required=False)
 @json_option
 @with_client
 def servo(
@@ -92,14 +120,14 @@ def servo(
     carry_out(client, request, cars, as_json=as_json)
 
 
-@click.command(epilog="\b\nexample:\n  fleet arm red 90 90 45 120 90 30")
+@click.command(epilog=f"\b\nexample:\n  {_ARM_EXAMPLE}", context_settings=_NEGATIVE_NUMBERS)
 @cars_argument
-@click.argument("joints", type=click.IntRange(0, 180), nargs=6, metavar="J1 J2 J3 J4 J5 J6")
+@click.argument("request", nargs=-1, metavar="J1 J2 J3 J4 J5 J6", callback=_arm)
 @json_option
 @with_client
-def arm(client: FleetClient, cars: tuple[str, ...], joints: tuple[int, ...], *, as_json: bool) -> None:
+def arm(client: FleetClient, cars: tuple[str, ...], request: Request, *, as_json: bool) -> None:
     """Move the arm's six joints to 0..180 degrees each."""
-    carry_out(client, arm_request(joints), cars, as_json=as_json)
+    carry_out(client, request, cars, as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet whistle red")
