@@ -47,6 +47,8 @@ TOGETHER_S: Final = 0.2
 HEALTH_EVERY_S: Final = 1.0
 TURN_BYTES: Final = 1024
 """Bytes that are looked at before others get their turn, a stop above all; a car sends 960 a second."""
+FRESH_S: Final = 0.25
+"""Bytes that could not be looked at so soon are not looked at: what comes after them matters more."""
 FLOOD_OVER_S: Final = 10.0
 """A flood is told of again when it was over for so long."""
 _LEVELS: Final = {Level.INFO: logging.INFO, Level.WARNING: logging.WARNING, Level.ERROR: logging.ERROR}
@@ -107,6 +109,7 @@ class Car:
         self._wake = asyncio.Event()
         self._wake_at = now
         """Until when the writer sleeps, if nothing wakes it."""
+        self._hub_gone = asyncio.Event()
         self._ending = False
         self._stopped = asyncio.Event()
         self._alive_at = now
@@ -209,24 +212,29 @@ class Car:
         """Bytes to events, until the link is lost."""
         while True:
             data = await link.read()
-            now = self._loop.time()
+            came_at = now = self._loop.time()
             self._health.received(len(data), now)
-            verdict = self._control.mode.verdict
+            shown = self._shown
             for start in range(0, len(data), TURN_BYTES):
                 if start:
                     await asyncio.sleep(0)
+                    now = self._loop.time()
+                if now > came_at + FRESH_S:
+                    self._events(self._decoder.end())
+                    self._flood("flood_bytes", len(data) - start, now)
+                    break
                 self._events(self._decoder.feed(data[start : start + TURN_BYTES], now))
-            if self._control.mode.verdict is not verdict:
+            if self._shown != shown:
                 self._wake.set()
             self._wake_if_due(now)
 
-    def _left_out(self, now: float) -> None:
-        """A raw frame was not published: counted, and told of once for each flood."""
-        self._health.rejected("raw_not_published")
+    def _flood(self, counted_as: str, count: int, now: float) -> None:
+        """More came than can be told: counted, and said once for each flood."""
+        self._health.rejected(counted_as, count)
         if now >= self._flood_until:
             words = (
-                f"{self._settings.car} sends more than any car does: of its raw frames {RAW_PER_S:g} a second are "
-                "published, the rest is counted in state/link as raw_not_published (another device, or another baud rate?)"
+                f"{self._settings.car} sends more than any car does: {RAW_PER_S:g} raw frames a second are published, "
+                "and what is left out is counted in state/link (another device, or another baud rate?)"
             )
             self._log(Level.WARNING, "flood", words)
         self._flood_until = now + FLOOD_OVER_S
@@ -236,7 +244,7 @@ class Car:
         for event in events:
             confirmed = self._control.mode.confirmed
             if not self._out.event(event, wall_ns(event.at), confirmed, loaded=self._control.motors != "off"):
-                self._left_out(event.at)
+                self._flood("raw_not_published", 1, event.at)
             self._control.heard(event, self._loop.time())
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
@@ -266,6 +274,11 @@ class Car:
             timer = self._loop.call_at(min(self._wake_at, now + LONGEST_SLEEP_S), self._wake.set)
             await self._wake.wait()
             timer.cancel()
+
+    @property
+    def _shown(self) -> tuple[object, ...]:
+        """What a reading, or silence, may change of the states."""
+        return self._control.mode.verdict, self._control.mode.inferred, self._control.motors
 
     def _wake_if_due(self, now: float) -> None:
         """Wake the writer if it has something to do: for each reading, which seldom needs it, it would cost a third."""
@@ -471,16 +484,20 @@ class Car:
             if self._settings.parent not in (None, os.getppid()) and not self._ending:
                 self._log(Level.WARNING, "parent_gone", "the process that started this gateway has ended: ending, too")
                 self.stop()
+            if not self._bus.connected:
+                self._hub_gone.set()
+            shown = self._shown
             self._control.tick(now)
             self._wake_if_due(now)
             mode = self._control.mode
-            self._health.judge(
+            changed = self._health.judge(
                 now=now,
                 limit_s=mode.silence_limit(fan=bool(self._control.believed.fan)),
                 unheard_s=mode.unheard_s(now),
                 why_quiet=f"{mode.asked or 'an unknown mode'} is silent",
             )
-            self._out.states(self._control, self._health, now)
+            if changed or self._shown != shown or now >= next_health:
+                self._out.states(self._control, self._health, now)
             if now >= next_health:
                 next_health = now + HEALTH_EVERY_S
                 self._out.health(now, loop_lag_s=worst, bus_drops=self._doors.dropped)
@@ -488,15 +505,11 @@ class Car:
 
     async def _keep_hub(self) -> None:
         """Bring a hub back that is gone for half a second; jitter keeps a hundred gateways from trying at once."""
-        gone_since: float | None = None
         while True:
-            await asyncio.sleep(HUB_GONE_S / 2)
-            now = self._loop.time()
+            await self._hub_gone.wait()
+            await asyncio.sleep(HUB_GONE_S * (1 + random.random()))  # noqa: S311 - jitter, no secret
+            self._hub_gone.clear()
             if self._bus.connected:
-                gone_since = None
-                continue
-            gone_since = now if gone_since is None else gone_since
-            if now - gone_since < HUB_GONE_S * (1 + random.random()):  # noqa: S311 - jitter, no secret
                 continue
             try:
                 await asyncio.to_thread(bus.ensure_hub, self._bus.endpoint)

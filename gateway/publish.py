@@ -13,6 +13,7 @@ from typing import Any, Final
 import zenoh
 
 from gateway.control import battery
+from gateway.control.allowance import Allowance
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
 from gateway.control.records import CommandRecord, Level, LogRecord, Write
@@ -26,6 +27,9 @@ from schemas.gen import fleet_v1_pb2 as pb
 VERSION: Final = "0.1.0"
 STATE_EVERY_S: Final = 1.0
 """States are published on change and once a second (design.md, "Keys")."""
+RAW_PER_S: Final = 100.0
+RAW_AT_ONCE: Final = 1000.0
+"""Raw frames that are published: a car sends up to 27 a second (protocol.md); what a link held up comes at once."""
 _CLASSES: Final[dict[str, Any]] = {
     topic.name: messages.message_class(topic.message)
     for topic in topics.CAR_TOPICS
@@ -59,12 +63,16 @@ class Publications:
             self._publishers[topic.name] = opened.publisher(key, topic, car)
             if topic.family in ("sensor", "state"):
                 self._rings[topic.name] = Ring(RING if topic.family == "sensor" else 1)
+        self._raw = Allowance(RAW_PER_S, RAW_AT_ONCE)
         self._process = _Process()
 
     # ------------------------------------------------------------------ readings
 
-    def event(self, event: Event, stamp_ns: int, confirmed: Mode | None, *, loaded: bool) -> None:
-        """Publish what was measured in an event, then the event itself. `loaded`: motors may pull the battery down."""
+    def event(self, event: Event, stamp_ns: int, confirmed: Mode | None, *, loaded: bool) -> bool:
+        """Publish what was measured in an event, then its raw frame; False if there were too many of those.
+
+        `loaded`: motors may pull the battery down.
+        """
         published: list[str] = []
         verdict = ""
         match event:
@@ -87,11 +95,14 @@ class Publications:
                 verdict = "echo"
             case Rejected(cause=cause):
                 verdict = str(cause)
+        if not self._raw.take(1, event.at):
+            return False
         frame = _CLASSES["frame/rx"]()
         frame.data = event.raw
         frame.verdict = verdict
         frame.published.extend(published)
         self._publishers["frame/rx"].put(frame, stamp_ns)
+        return True
 
     def _sensors(
         self, event: Sensors, stamp_ns: int, confirmed: Mode | None, published: list[str], *, loaded: bool
@@ -318,10 +329,11 @@ class _Process:
 
 
 def _rss_mb() -> float:
-    statm = Path("/proc/self/statm")
-    if statm.exists():
-        pages = int(statm.read_text(encoding="ascii").split()[1])
-        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    try:
+        with open("/proc/self/statm", "rb") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except FileNotFoundError:
+        pass
     try:
         import resource
     except ImportError:  # Windows

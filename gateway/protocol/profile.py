@@ -5,6 +5,7 @@ Every number cites its row of protocol.md; the times are in `timing`. When to se
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from typing import Final
 
 from gateway.protocol.encode import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
@@ -77,6 +78,26 @@ RASPBERRY_PI_SPEED: Final = SpeedModel(start=50, increment=20, low=20, rebound=2
 # platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimetres
 _PI_VOLTAGE_V, _PI_GRAYSCALE = 8.4, 0
 _CONSTANTS: Final = (("battery", _PI_VOLTAGE_V), ("grayscale", float(_PI_GRAYSCALE)))
+
+
+_FIELDS: Final = {
+    "range": "range_cm",
+    "battery": "voltage_v",
+    "grayscale": "grayscale",
+    "line": "line",
+    "obstacle": "obstacle",
+    "light": "light",
+}
+"""Where a sensors frame has them."""
+
+
+@cache
+def _sure(candidates: tuple[Mode, ...]) -> frozenset[str]:
+    """What is measured whichever of these modes a frame comes from."""
+    sure = frozenset.intersection(*(_MEASURED.get(candidate, _ALL) for candidate in candidates))
+    if len(candidates) > 1 and Mode.FOLLOWING in candidates:
+        return sure - {"obstacle"}  # inverted in one of them
+    return sure
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,20 +187,10 @@ class Profile:
         The frame's text decides first; `mode` is the confirmed mode, or None, and only chooses among candidates.
         A rejected field is never measured. No echo is: it is the range's business to say so.
         """
-        candidates = self.resolved(event, mode)
-        sure = frozenset.intersection(*(_MEASURED.get(candidate, _ALL) for candidate in candidates))
-        if len(candidates) > 1 and Mode.FOLLOWING in candidates:
-            sure -= {"obstacle"}  # inverted in one of them
-        fields = {
-            "range": event.range_cm,
-            "battery": event.voltage_v,
-            "grayscale": event.grayscale,
-            "line": event.line,
-            "obstacle": event.obstacle,
-            "light": event.light,
-        }
-        filler = {name for name, value in self.constants if fields[name] == value and self._may_be_constant(event)}
-        return frozenset(name for name in sure - filler if fields[name] is not None)
+        there = {name for name in _sure(self.resolved(event, mode)) if getattr(event, _FIELDS[name]) is not None}
+        if self.constants and self._may_be_constant(event):
+            there -= {name for name, value in self.constants if getattr(event, _FIELDS[name]) == value}
+        return frozenset(there)
 
     def obstacle(self, event: Sensors, mode: Mode | None = None) -> tuple[bool, bool] | None:
         """Obstacle left, right, with the inversion of following undone; None if it is not measured here."""
