@@ -77,10 +77,9 @@ class Ear:
         """Send an unknown car's stop (protocol.md, stopping), and wait for a reading of mode 0."""
         assert self.link is not None
         self.probed = True
-        began = last = time.monotonic()
-        for index, step in enumerate(UNKNOWN.steps):
-            at = max(last + step.after_s if index else began, began + step.from_start_s)
-            await self.listen(at - time.monotonic())
+        last = time.monotonic()
+        for step in UNKNOWN.steps:
+            await self.listen(last + step.after_s - time.monotonic())
             if self.trouble is not None:
                 return
             data, last = encode(step.frame), time.monotonic()

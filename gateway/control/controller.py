@@ -308,7 +308,8 @@ class Controller:
                 pending.frames.append(General(Motion.STOP, speed=step))
             case Find():
                 whistle = General(Motion.STOP, whistle=True)
-                pending.frames.extend((whistle, ColorLed(255, 255, 255), whistle, self.believed.led))
+                blinks = (whistle, ColorLed(255, 255, 255), whistle, self.believed.led)
+                pending.frames.extend(frame for frame in blinks if self.profile.refusal(frame) is None)
         self._acts.append(pending)
         return self._queued(pending, now)
 

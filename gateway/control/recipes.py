@@ -28,12 +28,11 @@ class Gate(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame of a recipe, at the earliest so many seconds after the one before it, or after the recipe's first."""
+    """One frame of a recipe, at the earliest so many seconds after the one before it, however late that was."""
 
     frame: Frame
     gate: Gate = Gate.NOTHING
     after_s: float = 0.0
-    from_start_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +48,7 @@ class Recipe:
     @property
     def length_s(self) -> float:
         """From the first frame to the last, s, if nothing is waited for but what is certain."""
-        at = 0.0
-        for index, step in enumerate(self.steps):
-            at = max(at + step.after_s if index else 0.0, step.from_start_s)
-        return at
+        return sum(step.after_s for step in self.steps)
 
 
 _STOP: Final = General(Motion.STOP)
@@ -80,8 +76,8 @@ RECOVERY: Final = Recipe(
     (
         Step(Reset()),
         Step(_MANUAL, after_s=0.05),
-        Step(_MANUAL, from_start_s=SILENCE_S),
-        Step(_STOP, from_start_s=4.8),
+        Step(_MANUAL, after_s=SILENCE_S - 0.05),
+        Step(_STOP, after_s=REPEAT_S),
     ),
     confirmed=True,
 )
@@ -94,8 +90,8 @@ UNKNOWN: Final = Recipe(
         Step(_STOP, Gate.FLIGHT),
         Step(_MANUAL, after_s=0.06),
         Step(_STOP, after_s=REPEAT_S),
-        Step(_MANUAL, from_start_s=SILENCE_S),
-        Step(_STOP, from_start_s=4.8),
+        Step(_MANUAL, after_s=SILENCE_S - REPEAT_S - 0.06),
+        Step(_STOP, after_s=REPEAT_S),
     ),
     confirmed=True,
 )

@@ -77,8 +77,6 @@ class Running:
         """When the next step is due."""
         step = self.recipe.steps[self.index]
         due = self.began_at if self.first_at is None else self.last_at + step.after_s
-        if self.first_at is not None and step.from_start_s:
-            due = max(due, self.first_at + step.from_start_s)
         return max(due, pacing.ready_at(step.gate))
 
     @property

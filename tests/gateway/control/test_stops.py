@@ -150,8 +150,7 @@ def test_every_recipe_ends_alone_in_the_buffer() -> None:
     for situation in situations():
         for recipe in (stop.full(situation), stop.soft(situation)):
             last = recipe.steps[-1]
-            gap = last.from_start_s - recipe.steps[-2].from_start_s if last.from_start_s else last.after_s
-            assert gap >= recipes.REPEAT_S - 1e-9 or last.gate is recipes.Gate.ALONE, recipe
+            assert last.after_s >= recipes.REPEAT_S - 1e-9 or last.gate is recipes.Gate.ALONE, recipe
 
 
 def test_what_is_announced_is_never_less_than_what_is_waited_for() -> None:
