@@ -197,9 +197,13 @@ def driving(sim: Process, car: str = "red") -> bool:
 
 
 class TcpCar:
-    """A TCP server that knows nothing of us: it keeps what each receive brought, and sends what it is told to."""
+    """A TCP server that knows nothing of us: it keeps what each receive brought, and sends what it is told to.
 
-    def __init__(self) -> None:
+    `echoes`: it sends back all that comes.
+    """
+
+    def __init__(self, *, echoes: bool = False) -> None:
+        self._echoes = echoes
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.link = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
         self.received: list[bytes] = []
@@ -211,6 +215,16 @@ class TcpCar:
     def send(self, data: bytes) -> None:
         """Send to the last that connected."""
         self._peers[-1].sendall(data)
+
+    def pour(self, data: bytes, per_s: float, seconds: float) -> int:
+        """Send this over and over; how many bytes were taken."""
+        began, sent = time.monotonic(), 0
+        while (now := time.monotonic() - began) < seconds:
+            while sent < now * per_s and time.monotonic() < began + seconds:
+                self.send(data)
+                sent += len(data)
+            time.sleep(0.001)
+        return sent
 
     def close(self) -> None:
         """Hang up and end."""
@@ -237,3 +251,5 @@ class TcpCar:
         with contextlib.suppress(OSError):
             while data := peer.recv(4096):
                 self.received.append(data)
+                if self._echoes:
+                    peer.sendall(data)

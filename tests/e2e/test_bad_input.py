@@ -1,0 +1,184 @@
+"""What no car should send, at a real gateway: nothing dies, the memory is bounded, and the next good frame counts."""
+
+import itertools
+import os
+import random
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.processes import Fleet, Process, TcpCar, driving, wait_for
+
+MODE00 = b"$4WD,MODE00#"
+STOP = b"$0,0,0,0,0,0,0,0,0#"
+MEGABYTE = 1_000_000
+BOUND_MB = 25.0
+"""What a gateway may need for any amount of nonsense; measured 2 to 9."""
+RANDOM = random.Random(7).randbytes(MEGABYTE)
+NEVER_ENDING = b"$" + b"9" * MEGABYTE
+NUMBERS = itertools.count(100)
+
+
+def good_frame_counts(fleet: Fleet, send: Callable[[bytes], None]) -> None:
+    """The next good frame is a reading; one that is still in the nonsense need not be, so it is sent as a car would."""
+    distance = next(NUMBERS)
+    due = 0.0
+
+    def measured() -> Any:
+        nonlocal due
+        if time.monotonic() >= due:
+            send(b"#$4WD,CSB%d.00,PV7.91,GS5,LF0000,HW00,GM11#" % distance)
+            due = time.monotonic() + 1.0
+        readings = fleet.get("fleet/red/sensor/range")
+        return readings and round(readings[0].range_m * 100) == distance
+
+    wait_for(measured, "a reading")
+
+
+@pytest.fixture
+def gateway(fleet: Fleet, tcp_car: TcpCar) -> Process:
+    started = fleet.gateway(tcp_car.link)
+    wait_for(lambda: MODE00 in tcp_car.received, "it is on the link")
+    good_frame_counts(fleet, tcp_car.send)
+    return started
+
+
+@pytest.mark.parametrize(
+    ("nonsense", "causes"),
+    [(RANDOM, {"no_start", "truncated", "unknown_word"}), (NEVER_ENDING, {"overlong", "no_start"})],
+    ids=["random", "a frame that never ends"],
+)
+def test_a_megabyte_of_nonsense(
+    fleet: Fleet, tcp_car: TcpCar, gateway: Process, nonsense: bytes, causes: set[str]
+) -> None:
+    before_mb = gateway.rss_mb()
+    tcp_car.send(nonsense)
+    good_frame_counts(fleet, tcp_car.send)
+    wait_for(lambda: fleet.state("link").rx_bytes > MEGABYTE, "it says how much came")
+    link = fleet.state("link")
+    assert causes <= set(link.rejects)
+    assert sum(link.rejects.values()) > 1000
+    assert gateway.rss_mb() < before_mb + BOUND_MB
+    assert gateway.popen.poll() is None
+    assert "Traceback" not in gateway.stderr
+
+
+def test_a_car_that_echoes_everything_says_nothing(fleet: Fleet) -> None:
+    car = TcpCar(echoes=True)
+    try:
+        gateway = fleet.gateway(car.link)
+        frames: list[Any] = []
+        fleet.bus.subscribe("fleet/red/frame/rx", lambda sample: frames.append(sample.message()))
+        wait_for(lambda: len(car.received) == 4, "a whole recovery")
+        wait_for(lambda: frames and frames[-1].data == STOP, "its last echo")
+        assert {frame.verdict for frame in frames} == {"echo"}
+        assert not fleet.get("fleet/red/sensor/*")
+        assert fleet.state("safety").motors == "unknown", "an echo confirms nothing"
+        assert fleet.state("mode").inferred == "unknown"
+
+        def known() -> bool:
+            good_frame_counts(fleet, car.send)
+            return bool(fleet.state("safety").motors == "off")
+
+        wait_for(known, "a reading confirms")
+        assert gateway.popen.poll() is None
+    finally:
+        car.close()
+
+
+def test_a_device_that_comes_back_as_another_number(fleet: Fleet, tmp_path: Path) -> None:
+    """Its by-id path, a symlink, is what stays."""
+    sim, (link,) = fleet.simulate(f"red:arduino:pty:{tmp_path / 'by-id'}")
+    fleet.gateway(link)
+    fleet.ready()
+    assert fleet.ask("drive", motion="forward", duration_s=10)["status"] in ("sent", "queued")
+    wait_for(lambda: driving(sim), "it drives")
+    before = (tmp_path / "by-id").readlink()
+    sim.say({"car": "red", "fault": "link_drop"})
+    wait_for(lambda: fleet.state("link").state == "lost", "lost")
+    taken = os.openpty()  # somebody else is plugged in, and gets its number
+    try:
+        sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
+        wait_for(lambda: not driving(sim), "it is stopped")
+        assert (tmp_path / "by-id").readlink() != before
+        fleet.ready()
+        assert fleet.state("link").reconnects == 1
+    finally:
+        for end in taken:
+            os.close(end)
+
+
+A_CLOCK_THAT_JUMPS = """
+import signal, time
+true, jumped = time.time_ns, [0]
+time.time_ns = lambda: true() + jumped[0]
+time.time = lambda: time.time_ns() / 1e9
+for number, hours in ((signal.SIGUSR1, 24), (signal.SIGUSR2, -24)):
+    signal.signal(number, lambda *_, hours=hours: jumped.__setitem__(0, jumped[0] + hours * 3600 * 10**9))
+from gateway.cli import main
+main()
+"""
+
+
+def test_a_wall_clock_that_jumps_changes_no_motion(fleet: Fleet) -> None:
+    """What moves and stops a car is counted on the monotonic clock; the wall clock only stamps, and dates commands."""
+    sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
+    gateway = fleet.start("-c", A_CLOCK_THAT_JUMPS, "run", "--car", "red", "--link", link, "--platform", "raspberry_pi")
+    fleet.ready()
+    for number in (signal.SIGUSR1, signal.SIGUSR2, signal.SIGUSR2):
+        fleet.ready()  # the stop of the round before is complete
+        stamp_s = fleet.state("health").stamp.seconds
+        answer = fleet.ask("drive", motion="forward", duration_s=1.0)
+        assert answer["status"] in ("sent", "queued"), answer
+        wait_for(lambda: driving(sim), "it drives")
+        os.kill(gateway.pid, number)
+        wait_for(
+            lambda stamp_s=stamp_s: abs(fleet.state("health").stamp.seconds - stamp_s) > 80_000, "the clock has jumped"
+        )
+        wait_for(lambda: not driving(sim), "it stops when its time is over", 5.0)
+        assert fleet.ask("drive", motion="back", duration_s=10)["status"] in ("sent", "queued"), "undated is fresh"
+        wait_for(lambda: driving(sim), "it drives back")
+        asked = {"asked": f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())}"}
+        assert fleet.ask("stop", kind="person", **asked)["status"] in ("sent", "queued"), "a stop is never stale"
+        wait_for(lambda: not driving(sim), "it stands")
+    fleet.ready()
+    # A day behind the others: what they date is from the future, and never stale.
+    dated = {"asked": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
+    assert fleet.ask("drive", motion="forward", **dated)["status"] in ("sent", "queued")
+    for ahead_s in (-10_000, 80_000):
+        os.kill(gateway.pid, signal.SIGUSR1)
+        wait_for(
+            lambda more_s=ahead_s: fleet.state("health").stamp.seconds > time.time() + more_s, "it has jumped again"
+        )
+    answer = fleet.ask("drive", motion="forward", **dated)
+    assert (answer["status"], answer["reason"]) == ("rejected", "stale")
+    assert gateway.popen.poll() is None
+    assert "Traceback" not in gateway.stderr
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM11#" * 500, b"$" * 20_000, RANDOM[:20_000]],
+    ids=["readings", "starts", "random"],
+)
+def test_a_firehose_of_10_megabytes_a_second(fleet: Fleet, tcp_car: TcpCar, gateway: Process, nonsense: bytes) -> None:
+    before_mb = gateway.rss_mb()
+    published = []
+    fleet.bus.subscribe("fleet/red/frame/rx", lambda _: published.append(1))
+    began = time.monotonic()
+    assert tcp_car.pour(nonsense, 10 * MEGABYTE, 1.0) > 0
+    asked_at, written = time.monotonic(), len(tcp_car.received)
+    assert fleet.ask("stop", kind="person")["status"] in ("sent", "queued")
+    assert time.monotonic() - asked_at < 2.0, "it answers in between"
+    wait_for(lambda: len(tcp_car.received) > written, "a stop is written")
+    assert gateway.rss_mb() < before_mb + BOUND_MB
+    good_frame_counts(fleet, tcp_car.send)
+    wait_for(lambda: fleet.state("link").rejects["raw_not_published"] > 1000, "it says how much was left out")
+    assert len(published) < 1000 + 100 * (time.monotonic() - began) + 100, "the raw frames too are bounded"
+    assert gateway.stderr.count("sends more than any car does") == 1
+    assert gateway.popen.poll() is None
+    assert "Traceback" not in gateway.stderr
