@@ -134,17 +134,20 @@ class BleLink(Link):
     async def _use(self, device: BLEDevice) -> None:
         """Connect to it, and listen; raises CannotOpen."""
         self._claim = self._claim or _claim(self._url, device.address)
-        self._client = BleakClient(device, self._disconnected)
+        client = BleakClient(device, self._disconnected)
+        self._stage = (
+            f"{device.address} is there, but does not connect: is a phone or another computer connected to it?"
+        )
         try:
-            await self._listen(self._client, device.address)
+            await client.connect()
+            self._client = client  # now, and not before, it is to be disconnected: a failed connect cleans up itself
+            await self._listen(client, device.address)
         except CannotOpen:
             raise
         except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, it is not open
             raise CannotOpen(f"{self._url}: no connection, {_cause(error)}") from None
 
     async def _listen(self, client: BleakClient, address: str) -> None:
-        self._stage = f"{address} is there, but does not connect: is a phone or another computer connected to it?"
-        await client.connect()
         chosen = choose(client.services)
         if chosen is None:
             there = _listed(sorted(service.uuid for service in client.services)) or "none"

@@ -111,7 +111,7 @@ def parse_url(text: str) -> LinkUrl:
 
 
 def _serial(text: str, netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:
-    fields = parse_qs(query, keep_blank_values=True)
+    fields = parse_qs(query.replace("+", "%2B"), keep_blank_values=True)  # a + is a +, not a blank
     if unknown := sorted(fields.keys() - {"baud", *_USB_FIELDS}):
         raise _bad(text, f"{', '.join(unknown)} is no option of a serial link")
     if twice := sorted(name for name, values in fields.items() if len(values) > 1):

@@ -78,13 +78,16 @@ class Module:
     on: bool = True
     connects: bool = True
     notifies: bool = True
+    leaves: bool = True
+    """It can be disconnected; else that is never answered."""
     takes: int | None = None
     """Pieces that it still takes; then a write is never answered."""
     refuses: int | None = None
     """Pieces that it still takes; then a write is refused."""
     known: bool = False
     connected: bool = False
-    notified: set["_Caller"] = field(default_factory=set)
+    notified: set[tuple["_Caller", str]] = field(default_factory=set)
+    """Who asked for the notifications of which characteristic."""
     pieces: list[bytes] = field(default_factory=list)
     """What was written, as it came."""
     waiting: list[tuple["_Caller", Message]] = field(default_factory=list)
@@ -200,7 +203,8 @@ class FakeBluez:
         finally:
             self._callers.discard(caller)
             for module in self.modules:
-                module.notified.discard(caller)  # and no more: it stays connected
+                module.notified = {asked for asked in module.notified if asked[0] is not caller}
+                # and no more: it stays connected
             writer.close()
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
@@ -282,6 +286,8 @@ class FakeBluez:
                 await self._signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", [path, interfaces])
             await self._change(module.path, DEVICE, {"ServicesResolved": Variant("b", True)})
         elif message.member == "Disconnect":
+            if not module.leaves:
+                return None
             waiting, module.waiting = module.waiting, []
             for who, what in waiting:
                 await who.send(_error(what, f"{BLUEZ}.Error.Failed", "Software caused connection abort"))
@@ -299,7 +305,7 @@ class FakeBluez:
                 raise Refused(f"{BLUEZ}.Error.NotSupported", "Operation is not supported")
             if not module.notifies:
                 return None
-            module.notified.add(caller)
+            module.notified.add((caller, str(message.path)))
         elif message.member == "WriteValue":
             value, options = message.body
             if {"command": "write-without-response", "request": "write"}[options["type"].value] not in flags:
@@ -323,12 +329,10 @@ class FakeBluez:
 
     async def _notify(self, module: Module, data: bytes) -> None:
         """BlueZ says it once for all, if anyone asked for notifications."""
-        for path, _, flags, _, _ in module.characteristics():
-            if "notify" in flags and module.connected and module.notified:
-                for start in range(0, len(data), module.mtu - 3):
-                    piece = data[start : start + module.mtu - 3]
-                    await self._change(path, CHARACTERISTIC, {"Value": Variant("ay", piece)})
-                return
+        for path in {path for _, path in module.notified}:
+            for start in range(0, len(data), module.mtu - 3):
+                piece = data[start : start + module.mtu - 3]
+                await self._change(path, CHARACTERISTIC, {"Value": Variant("ay", piece)})
 
     async def _advertise(self) -> None:
         """What is on and not connected is heard, by whoever scans."""
@@ -403,7 +407,7 @@ class FakeBluez:
                     "UUID": Variant("s", each),
                     "Service": Variant("o", above),
                     "Flags": Variant("as", list(flags)),
-                    "Notifying": Variant("b", bool(module.notified)),
+                    "Notifying": Variant("b", any(path == asked for _, asked in module.notified)),
                     "MTU": Variant("q", module.mtu),
                 }
             }

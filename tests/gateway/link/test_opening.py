@@ -29,9 +29,9 @@ from tests.gateway.link.peers import PtyPeer, link_threads
         ("serial://COM12", SerialUrl("COM12"), "serial://COM12"),
         ("serial://?vid=1a86", UsbUrl(0x1A86), "serial://?vid=1a86"),
         (
-            "serial://?vid=0x1A86&pid=0x7523&serial=A%20%231",
-            UsbUrl(0x1A86, 0x7523, "A #1"),
-            "serial://?vid=1a86&pid=7523&serial=A%20%231",
+            "serial://?vid=0x1A86&pid=0x7523&serial=A%20%231+",
+            UsbUrl(0x1A86, 0x7523, "A #1+"),
+            "serial://?vid=1a86&pid=7523&serial=A%20%231%2B",
         ),
         ("serial:///?serial=ABC&baud=115200", UsbUrl(serial="ABC", baud=115200), "serial://?serial=ABC&baud=115200"),
         ("serial://?vid=2341", UsbUrl(0x2341), "serial://?vid=2341"),

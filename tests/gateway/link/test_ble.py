@@ -1,0 +1,276 @@
+"""What only Bluetooth LE does: modules of several kinds, pieces, names, a service that hangs, dies or remembers."""
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+
+import pytest
+
+from gateway.link import Busy, CannotOpen, Link, LinkLost, ble, open_link
+from gateway.link.url import BleUrl
+from tests.gateway.link.peers import BlePeer, open_descriptors, settled
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's; elsewhere bleak asks the system")
+
+if sys.platform == "linux":
+    from tests.support.bluez import BATTERY, FFE0, NORDIC, SEPARATE, TWO_SERVICES, Module, free_address
+
+LED = b"$4WD,CLR255,CLG128,CLB100#"
+READING = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+async def peer() -> AsyncIterator[BlePeer]:
+    made = BlePeer()
+    yield made
+    made.close()
+    await settled()
+
+
+@pytest.fixture
+async def link(peer: BlePeer) -> AsyncIterator[Link]:
+    opened = await open_link(peer.url)
+    yield opened
+    await opened.close()
+
+
+async def read(link: Link, size: int) -> bytes:
+    data = b""
+    async with asyncio.timeout(PATIENCE_S):
+        while len(data) < size:
+            data += await link.read()
+    return data
+
+
+async def refused(peer: BlePeer, url: BleUrl | None = None, timeout_s: float = PATIENCE_S) -> str:
+    url = url or BleUrl(peer.module.address)
+    async with asyncio.timeout(PATIENCE_S):
+        with pytest.raises(CannotOpen) as caught:
+            await open_link(url, timeout_s=timeout_s)
+    words = str(caught.value)
+    assert words.startswith(f"{url}")
+    assert "\n" not in words
+    return words
+
+
+@pytest.mark.parametrize("gatt", [FFE0, SEPARATE, TWO_SERVICES, NORDIC, BATTERY + FFE0], ids=str)
+async def test_each_kind_of_module(peer: BlePeer, gatt: tuple[object, ...]) -> None:
+    peer.module.gatt = gatt  # type: ignore[assignment]  # as the constants are
+    link = await open_link(peer.url)
+    await link.write(LED)
+    assert peer.module.pieces == [LED[:20], LED[20:]]
+    peer.send(READING)
+    assert await read(link, len(READING)) == READING
+    await link.close()
+
+
+async def test_a_frame_goes_in_pieces_of_what_the_module_takes(peer: BlePeer) -> None:
+    """The fake refuses a longer one, as BlueZ does."""
+    for mtu, pieces in ((23, [LED[:20], LED[20:]]), (28, [LED[:25], LED[25:]]), (185, [LED])):
+        peer.module.mtu = mtu
+        link = await open_link(peer.url)
+        await link.write(LED)
+        assert peer.module.pieces == pieces
+        peer.module.pieces.clear()
+        await link.close()
+
+
+@pytest.mark.parametrize("fault", ["refuses", "takes"])
+async def test_a_write_that_fails_in_the_middle_loses_the_link_and_nothing_follows(
+    link: Link, peer: BlePeer, fault: str
+) -> None:
+    setattr(peer.module, fault, 1)
+    waiting = [asyncio.create_task(link.write(LED)) for _ in range(3)]
+    errors = await asyncio.gather(*waiting, return_exceptions=True)
+    assert all(isinstance(error, LinkLost) for error in errors), errors
+    setattr(peer.module, fault, None)
+    assert len({str(error) for error in errors}) == 1, "the first cause is kept"
+    with pytest.raises(LinkLost):
+        await link.write(LED)
+    with pytest.raises(LinkLost):
+        await link.read()
+    assert peer.module.pieces == [LED[:20]]
+
+
+async def test_a_write_that_is_cancelled_in_the_middle_loses_the_link(link: Link, peer: BlePeer) -> None:
+    peer.module.takes = 1
+    writing = asyncio.create_task(link.write(LED))
+    await asyncio.to_thread(peer.receive, 20)
+    writing.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await writing
+    with pytest.raises(LinkLost, match="takes no bytes"):
+        await link.write(LED)
+
+
+async def test_by_name(peer: BlePeer) -> None:
+    peer.bluez.modules += [Module(free_address(), "BT05"), Module(free_address(), "Watch", BATTERY)]
+    link = await open_link(BleUrl(name="BT04"))
+    peer.send(READING)
+    assert await read(link, len(READING)) == READING
+    await link.close()
+    words = await refused(peer, BleUrl(name="BT4"), timeout_s=1.0)
+    assert "no such device was heard: is it on, in range, and no phone connected to it? There are: " in words
+    assert f"{peer.module.address} (BT04), {peer.bluez.modules[1].address} (BT05) (waited 1 s)" in words
+
+
+async def test_of_several_with_one_name_none_is_taken(peer: BlePeer) -> None:
+    """One of them is connected, by another gateway: it is not heard, and counts."""
+    first = await open_link(peer.url)
+    other = Module(free_address(), "BT04")
+    peer.bluez.modules.append(other)
+    words = await refused(peer, BleUrl(name="BT04"))
+    assert words.endswith(
+        f"2 devices have this name: give the address of one, ble://{peer.module.address}, ble://{other.address}"
+    )
+    await first.close()
+
+
+async def test_a_module_that_does_not_connect(peer: BlePeer) -> None:
+    peer.module.connects = False
+    words = await refused(peer, timeout_s=1.0)
+    assert f"{peer.module.address} is there, but does not connect: is a phone or another computer" in words
+    assert not peer.module.waiting, "the try was ended"
+    peer.module.connects = True
+    await (await open_link(peer.url)).close()
+
+
+async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """BlueZ answers neither Connect nor Disconnect, for which bleak would wait for ever."""
+    monkeypatch.setattr(ble, "DISCONNECT_S", 0.2)
+    peer.module.connects = peer.module.leaves = False
+    await refused(peer, timeout_s=0.5)
+    peer.module.connects = True
+    link = await open_link(peer.url)
+    async with asyncio.timeout(PATIENCE_S):
+        await link.close()
+    with pytest.raises(LinkLost, match="was closed"):
+        await link.read()
+
+
+async def test_a_module_whose_notifications_do_not_begin(peer: BlePeer) -> None:
+    peer.module.notifies = False
+    assert "is connected, but its notifications do not begin" in await refused(peer, timeout_s=1.0)
+    assert not peer.module.connected, "it can be found again"
+
+
+async def test_a_device_that_is_no_uart(peer: BlePeer) -> None:
+    peer.module.gatt = BATTERY
+    assert f"it has no UART service that is known (FFE0, Nordic's), but: {BATTERY[0][0]}" in await refused(peer)
+    assert not peer.module.connected
+
+
+async def test_no_bluetooth(peer: BlePeer) -> None:
+    peer.bluez.kill()
+    words = await refused(peer)
+    assert "Bluetooth cannot be used, [org.freedesktop.DBus.Error.ServiceUnknown] " in words
+    assert words.endswith("is there an adapter, is it on, and does the system's Bluetooth service run?")
+
+
+async def test_an_adapter_that_is_off(peer: BlePeer) -> None:
+    peer.bluez.powered = False
+    assert "No powered Bluetooth adapters found" in await refused(peer)
+
+
+async def test_no_system_bus(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", "unix:path=/nonexistent/bus")
+    assert "Bluetooth cannot be used, [Errno 2] No such file or directory" in await refused(peer)
+
+
+KILLED = """
+import asyncio, os, signal, sys
+from gateway.link import open_link, parse_url
+async def main():
+    await open_link(parse_url(sys.argv[1]))
+    os.kill(os.getpid(), signal.SIGKILL)
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize("named", [False, True])
+async def test_after_a_gateway_was_killed_its_module_is_still_connected_and_is_taken_over(
+    peer: BlePeer, *, named: bool
+) -> None:
+    """It does not advertise then, so a scan alone would never find it again."""
+    done = await asyncio.to_thread(
+        subprocess.run, [sys.executable, "-c", KILLED, str(peer.url)], env=os.environ, timeout=60, check=False
+    )
+    assert done.returncode == -9
+    assert peer.module.connected
+    link = await open_link(BleUrl(name="BT04") if named else peer.url)
+    peer.send(READING)
+    assert await read(link, len(READING)) == READING
+    await link.close()
+    assert not peer.module.connected
+
+
+async def test_a_service_that_dies_is_noticed_by_the_next_write_and_found_again(peer: BlePeer) -> None:
+    """No callback tells, and bleak goes on to say that it is connected, with the service's next life too."""
+    link = await open_link(peer.url)
+    peer.bluez.kill()
+    with pytest.raises(LinkLost, match=r"is gone: .*ServiceUnknown"):
+        await link.write(LED)
+    await link.close()
+    await refused(peer, timeout_s=5.0)
+    peer.bluez.restart()
+    link = await open_link(peer.url)
+    peer.send(READING)
+    assert await read(link, len(READING)) == READING
+    await link.close()
+
+
+async def test_a_service_that_died_unnoticed(peer: BlePeer) -> None:
+    """Its next life has no such connection, though bleak remembers one."""
+    link = await open_link(peer.url)
+    peer.bluez.kill()
+    peer.bluez.restart()
+    await link.close()
+    link = await open_link(peer.url)
+    await link.write(LED)
+    assert peer.receive(len(LED)) == LED
+    await link.close()
+
+
+async def test_more_than_is_read_ends_the_link_and_is_bounded(link: Link, peer: BlePeer) -> None:
+    """Radio cannot be held back. What had come is still read, then the cause is told."""
+    size = ble.HELD_BYTES + 20_000
+    peer.module.mtu = 515
+    await asyncio.to_thread(peer.send, b"x" * size)
+
+    async def write_on() -> None:
+        while True:
+            await link.write(LED)
+
+    async with asyncio.timeout(PATIENCE_S):
+        with pytest.raises(LinkLost, match="sends more than is read: 65536 bytes wait"):
+            await write_on()
+        assert ble.HELD_BYTES < len(await link.read()) <= ble.HELD_BYTES + 512
+        with pytest.raises(LinkLost, match="sends more than is read"):
+            await link.read()
+
+
+async def test_opening_that_is_given_up_leaves_nothing(peer: BlePeer) -> None:
+    await (await open_link(peer.url)).close()
+    before = open_descriptors()
+    given_up = 0
+    for turns in range(0, 60, 3):
+        opening = asyncio.create_task(open_link(peer.url))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        opening.cancel()
+        try:
+            await (await opening).close()  # it was faster
+        except asyncio.CancelledError:
+            given_up += 1
+        assert not peer.module.waiting
+    assert given_up
+    async with asyncio.timeout(PATIENCE_S):
+        while len(open_descriptors()) > len(before):  # the other ends are in this process too
+            await asyncio.sleep(0.01)
+    link = await open_link(peer.url)
+    with pytest.raises(Busy):
+        await open_link(peer.url)
+    await link.close()
