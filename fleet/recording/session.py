@@ -160,4 +160,4 @@ class Session:
             return
         yield from salvage.messages()
         if salvage.damage:
-            self.damage.setdefault(segment, salvage.words)
+            self.damage[segment] = salvage.words

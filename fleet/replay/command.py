@@ -52,7 +52,9 @@ def replay(session: Path, save: Path | None) -> None:  # fmt: skip
 def _refuse_target(save: Path, segments: Iterable[Path]) -> None:
     """A recording or a device is not to be overwritten."""
     if save.suffix != ".rrd":
-        raise click.UsageError(f"--save {save}: Rerun opens files that end in .rrd: name it {save.stem}.rrd")
+        raise click.UsageError(
+            f"--save {save}: Rerun opens files that end in .rrd: name it {save.stem.strip('.') or 'out'}.rrd"
+        )
     if save.exists() and not save.is_file():
         raise click.UsageError(f"--save {save}: this is no file: name one that ends in .rrd")
     for segment in segments:
@@ -78,6 +80,8 @@ def _rescue(session: "Session", out: Path) -> "Session":
 
 
 def _export(session: "Session", out: Path) -> None:
+    # Rerun has a log of its own, which would stand between our lines; it reads this when it is imported.
+    os.environ.setdefault("RUST_LOG", "off")
     from fleet.replay.to_rerun import ExportFailed, export
 
     try:

@@ -4,8 +4,10 @@ Every message goes into the .rrd as it was; lenses add what the viewer draws. No
 """
 
 import os
+import shutil
 import sys
 import tempfile
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -77,9 +79,14 @@ def export(session: Session, out: Path) -> Counter[str]:
         recording.send_blueprint(blueprint.layout(contents, _ground(lines)), make_active=False, make_default=True)
         recording.disconnect()
         try:
-            rrc.RrdReader(whole).store()  # its writer tells nobody of a full disk; a cut file has no index
-        except RuntimeError as error:
-            raise ExportFailed(f"{out} could not be written: {error}") from None
+            # Its writer tells nobody of a full disk; a cut file has no index, of which its reader warns besides.
+            with warnings.catch_warnings(action="ignore"):
+                rrc.RrdReader(whole).store()
+        except (RuntimeError, ValueError):
+            free = shutil.disk_usage(out.parent).free
+            raise ExportFailed(
+                f"{out} could not be written whole: {free} bytes are free there, {session.path} may need more"
+            ) from None
         whole.replace(out)
     return held
 

@@ -205,6 +205,7 @@ def test_what_was_described_in_a_lost_chunk_is_said(original: Original, tmp_path
     assert shown
     assert {message.key for message in shown} == {"fleet/blue/note"}
     session = Session.open(path)
+    session.check()
     list(session.messages())
     assert "described in what is lost" in session.damage_words
 

@@ -181,6 +181,28 @@ def test_a_recording_or_a_device_is_not_overwritten(made: tuple[Path, Counter[st
     assert made[0].read_bytes() == before
 
 
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_full_disk_is_said_in_our_words_only(
+    made: tuple[Path, Counter[str]], tmp_path: Path, *, damaged: bool
+) -> None:
+    source, out = tmp_path / "x.mcap", tmp_path / "out.rrd"
+    data = made[0].read_bytes()
+    source.write_bytes(data[:-20] if damaged else data)
+    code = (
+        "import resource; from fleet.cli import main;"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({2 * len(data)}, {2 * len(data)})); main()"
+    )
+    command = [sys.executable, "-c", code, "replay", str(source), "--save", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    assert done.returncode == 1
+    said = done.stderr.splitlines()
+    assert len(said) == 1 + damaged, done.stderr
+    assert ("is cut" in said[0]) == damaged
+    assert f"{out} could not be written whole" in said[-1]
+    assert "bytes are free" in said[-1]
+    assert list(tmp_path.iterdir()) == [source], "nothing is left behind"
+
+
 def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
