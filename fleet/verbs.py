@@ -14,7 +14,8 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 R = TypeVar("R")
 
-LONGEST_DRIVE_S: Final = 10.0
+LONGEST_DRIVE_S: Final = 3600.0
+"""No gateway allows more; each allows 10 s unless it was started with a longer `--longest-drive`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +31,7 @@ class Request:
 
 
 def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = False) -> Request:
-    """Hold a motion for `duration_s` (more than 0, at most 10 s); `wait`: until the drive is over."""
+    """Hold a motion for `duration_s` (at most 10 s, or what its gateway allows); `wait`: until the drive is over."""
     if not (math.isfinite(duration_s) and 0 < duration_s <= LONGEST_DRIVE_S):
         raise ValueError(
             f"duration {duration_s:g} s is not allowed: more than 0 and at most {LONGEST_DRIVE_S:g} s; "
@@ -131,7 +132,9 @@ class Verbs(ABC, Generic[R]):
     def _do(self, request: Request) -> R: ...
 
     def drive(self, motion: str, duration_s: float = 0.5, *, wait: bool = False) -> R:
-        """Hold `forward, back, left, right, spin_left, spin_right` for `duration_s` (at most 10 s); `stop` releases.
+        """Hold `forward, back, left, right, spin_left, spin_right` for `duration_s`; `stop` releases.
+
+        At most 10 s, unless the gateway was started with a longer `--longest-drive`.
 
         Returns when the motion was sent; with `wait`, when the drive is over.
         """

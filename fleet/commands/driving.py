@@ -28,7 +28,14 @@ examples:
 )
 @cars_argument
 @click.argument("motion", type=click.Choice([str(motion) for motion in Motion]))
-@click.option("--for", "duration_s", type=Seconds(), default="500ms", show_default=True, help="How long; at most 10s.")
+@click.option(
+    "--for",
+    "duration_s",
+    type=Seconds(),
+    default="500ms",
+    show_default=True,
+    help="How long; at most 10s, or what the car's gateway allows.",
+)
 @json_option
 @with_client
 def drive(client: FleetClient, cars: tuple[str, ...], motion: str, duration_s: float, *, as_json: bool) -> None:

@@ -98,9 +98,9 @@ def test_whoever_goes_while_driving_leaves_no_car_driving(cars: Cars) -> None:
     assert time.monotonic() - began < 9, "it stopped because the drive's time was over"
 
 
-@pytest.mark.parametrize("duration_s", [0, -1, 10.01, float("nan"), float("inf")])
+@pytest.mark.parametrize("duration_s", [0, -1, 3600.01, float("nan"), float("inf")])
 def test_a_drive_out_of_range_is_refused_here(client: FleetClient, duration_s: float) -> None:
-    with pytest.raises(ValueError, match="more than 0 and at most 10 s"):
+    with pytest.raises(ValueError, match="more than 0 and at most 3600 s"):
         client.car("red").drive("forward", duration_s)
 
 
