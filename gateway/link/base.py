@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from typing import Final
 
 CLOSE_S: Final = 1.0
-"""How long `close` waits for a port or a peer; one that is not done then is left to itself, or cut."""
+"""How long `close` waits for a port or a peer (Bluetooth: 4 s); one that is not done then is left to itself, or cut."""
 
 
 class LinkError(Exception):
@@ -36,8 +36,11 @@ class Link(ABC):
 
     @abstractmethod
     async def write(self, data: bytes) -> None:
-        """Hand over these bytes whole, in one write of their own, without waiting; raises LinkLost."""
+        """Hand over these bytes whole, with nothing between them; raises LinkLost.
+
+        Serial and TCP: in one write of their own, and without waiting. Bluetooth: in pieces, and within a second.
+        """
 
     @abstractmethod
     async def close(self) -> None:
-        """Let go of the port within CLOSE_S; a pending read raises LinkLost. Never raises; may be called again."""
+        """Let go of the port within CLOSE_S; what is pending raises LinkLost. Never raises; may be called again."""

@@ -58,6 +58,7 @@ class SerialLink(Link):
         self._paused = False
         self._closing = threading.Event()
         self._lost: str | None = None
+        self._stuck = False
         self._opened: asyncio.Future[None] = loop.create_future()
         self._ended: asyncio.Future[None] = loop.create_future()
         # A daemon: opening or closing a port can block (a Bluetooth tty does), and must not keep the process.
@@ -105,6 +106,7 @@ class SerialLink(Link):
             raise self._lose(f"{self._url} is gone: {_cause(error)}") from None
         if written is None:
             raise self._lose(f"{self._url} is gone: unplugged")  # the thread knows, and is about to say so
+        self._stuck = written != len(data)
         if written == 0 and data:
             raise self._lose(f"{self._url} takes no bytes: unplugged, or stuck?")
         if written != len(data):
@@ -191,6 +193,10 @@ class SerialLink(Link):
         finally:
             with self._hold:
                 self._port = None
+            if self._stuck:
+                # What it never took must not reach the car later; and closing would wait for it, 30 s on a UART.
+                with contextlib.suppress(*_GONE):
+                    port.reset_output_buffer()
             with contextlib.suppress(*_GONE):
                 port.close()
             self._tell(self._over, reason)

@@ -1,6 +1,7 @@
 """What only Bluetooth LE does: modules of several kinds, pieces, names, a service that hangs, dies or remembers."""
 
 import asyncio
+import gc
 import os
 import subprocess
 import sys
@@ -269,6 +270,7 @@ async def test_opening_that_is_given_up_leaves_nothing(peer: BlePeer) -> None:
     assert given_up
     async with asyncio.timeout(PATIENCE_S):
         while len(open_descriptors()) > len(before):  # the other ends are in this process too
+            gc.collect()
             await asyncio.sleep(0.01)
     link = await open_link(peer.url)
     with pytest.raises(Busy):

@@ -16,8 +16,9 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
 import pytest
+import serial
 
-from gateway.link import Busy, Link, LinkLost, open_link
+from gateway.link import Busy, CannotOpen, Link, LinkLost, open_link
 from gateway.link.tcp import TcpLink
 from gateway.link.url import TcpUrl
 from gateway.protocol.decode import Decoder
@@ -400,5 +401,46 @@ async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:
     assert not pending.done()
     peer.send(b"$")
     assert await pending == b"$"
+    await link.close()
+    peer.close()
+
+
+async def test_what_a_stuck_port_never_took_does_not_reach_the_car_later(tmp_path: Path) -> None:
+    peer = PtyPeer(tmp_path)
+    link = await open_link(peer.url)
+    await until_lost(lambda: link.write(FRAME))
+    await link.close()
+    again = await open_link(peer.url)
+    await again.write(STOP)
+    assert peer.receive(len(STOP)) == STOP
+    await again.close()
+    peer.close()
+
+
+async def test_a_port_that_hangs_in_opening_is_tried_by_one_thread_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No device that anyone may have here hangs in opening, as a Bluetooth tty can: pyserial's open is held up."""
+    peer = PtyPeer(tmp_path)
+    hangs = threading.Event()
+    opening = serial.Serial.open
+
+    def held_up(port: serial.Serial) -> None:
+        assert hangs.wait(PATIENCE_S)
+        opening(port)
+
+    monkeypatch.setattr(serial.Serial, "open", held_up)
+    with pytest.raises(CannotOpen, match=r"the port did not open within 0.1 s: is the device there\?"):
+        await open_link(peer.url, timeout_s=0.1)
+    for _ in range(3):
+        with pytest.raises(CannotOpen, match="still hangs in an earlier try to open it: unplug it"):
+            await open_link(peer.url, timeout_s=0.1)
+    threads = link_threads()
+    assert len(threads) == 1
+    hangs.set()
+    await asyncio.to_thread(threads[0].join, PATIENCE_S)
+    link = await open_link(peer.url)
+    await link.write(STOP)
+    assert peer.receive(len(STOP)) == STOP
     await link.close()
     peer.close()
