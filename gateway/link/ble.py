@@ -186,10 +186,10 @@ class BleLink(Link):
                 if not pieces.done():
                     self._lose(f"{self._url} takes no bytes: out of range, or stuck?")
                     await asyncio.wait({pieces})
-            if pieces.cancelled():
+            if not pieces.cancelled() and (error := pieces.exception()) is not None:
+                self._lose(f"{self._url} is gone: {_cause(error)}")
+            if self._lost is not None:  # also if it went out whole: who reads was told that the link is gone
                 raise LinkLost(self._lost)
-            if (error := pieces.exception()) is not None:
-                raise self._lose(f"{self._url} is gone: {_cause(error)}") from None
 
     async def _write_pieces(self, data: bytes) -> None:
         assert self._client is not None

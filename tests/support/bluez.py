@@ -13,6 +13,7 @@ import itertools
 import os
 import struct
 import threading
+import tty
 from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -92,6 +93,8 @@ class Module:
     """What was written, as it came."""
     waiting: list[tuple["_Caller", Message]] = field(default_factory=list)
     """Calls of Connect that are not answered yet."""
+    uart: int | None = None
+    """The descriptor of a car's serial port, to which it hands on what is written."""
 
     @property
     def path(self) -> str:
@@ -119,6 +122,7 @@ class FakeBluez:
         self.alive = True
         """bluetoothd runs."""
         self._callers: set[_Caller] = set()
+        self._wires: list[asyncio.Task[None]] = []
         self._changed = threading.Condition()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="bluez", daemon=True)
@@ -153,6 +157,22 @@ class FakeBluez:
 
         self._do(work())
 
+    def wire(self, module: Module, port: str) -> None:
+        """Solder a module to a (simulated) car's serial port: both ways, from now on."""
+
+        async def work() -> None:
+            uart = module.uart = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            tty.setraw(uart)
+            said = asyncio.Queue[bytes]()
+            self._loop.add_reader(uart, lambda: said.put_nowait(os.read(uart, 4096)))
+            self._wires.append(asyncio.ensure_future(self._hand_on(module, said)))
+
+        self._do(work())
+
+    async def _hand_on(self, module: Module, said: asyncio.Queue[bytes]) -> None:
+        while True:
+            await self._notify(module, await said.get())
+
     def kill(self) -> None:
         """Kill bluetoothd: no signal tells of it, and its connections are gone."""
 
@@ -177,6 +197,12 @@ class FakeBluez:
         """End the bus: every connection to it."""
 
         async def work() -> None:
+            for wire in self._wires:
+                wire.cancel()
+            for module in self.modules:
+                if module.uart is not None:
+                    self._loop.remove_reader(module.uart)
+                    os.close(module.uart)
             self._server.close()
             for caller in list(self._callers):
                 caller.writer.close()
@@ -320,6 +346,9 @@ class FakeBluez:
                 if module.takes == 0:
                     return None
                 module.takes -= 1
+            if module.uart is not None:
+                os.write(module.uart, value)
+                return "", []
             with self._changed:
                 module.pieces.append(bytes(value))
                 self._changed.notify_all()

@@ -1,0 +1,85 @@
+"""A whole gateway over Bluetooth LE: a simulated car on the UART of a module that a private BlueZ hears."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.gateway.link.peers import BlePeer
+from tests.support.ports import free_endpoint
+from tests.support.processes import Fleet, Process, driving, wait_for
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's; elsewhere bleak asks the system")
+
+
+@pytest.fixture
+def peer() -> Iterator[BlePeer]:
+    made = BlePeer()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, peer: BlePeer) -> Iterator[Fleet]:
+    """Its processes are told of the private bus, which must outlive them."""
+    started = Fleet(free_endpoint(), tmp_path)
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def sim(fleet: Fleet, peer: BlePeer) -> Process:
+    """A simulated car, wired to the module."""
+    simulated, (link,) = fleet.simulate("red:arduino:pty")
+    peer.bluez.wire(peer.module, link.removeprefix("serial://"))
+    return simulated
+
+
+def drive(fleet: Fleet, sim: Process) -> None:
+    answer = fleet.ask("drive", motion="forward", duration_s=10, sender="mia", kind="person")
+    assert answer["status"] in ("sent", "queued"), answer
+    wait_for(lambda: driving(sim), "it drives")
+
+
+def test_it_drives_and_stops(fleet: Fleet, peer: BlePeer, sim: Process) -> None:
+    gateway = fleet.gateway(str(peer.url))
+    fleet.ready()
+    drive(fleet, sim)
+    answer = fleet.ask("stop", sender="mia", kind="person")
+    assert answer["status"] in ("sent", "queued"), answer
+    wait_for(lambda: not driving(sim), "it stands")
+    assert fleet.ask("led", r=255, g=128, b=100)["status"] in ("sent", "queued"), "26 bytes: two pieces"
+    drive(fleet, sim)
+    assert gateway.end() == 0, gateway.stderr
+    assert not driving(sim), "a gateway that ends stops its car first"
+    assert not peer.module.connected
+
+
+def test_out_of_range_while_it_drives(fleet: Fleet, peer: BlePeer, sim: Process) -> None:
+    fleet.gateway(str(peer.url))
+    fleet.ready()
+    drive(fleet, sim)
+    peer.die()
+    wait_for(lambda: fleet.state("link").state == "lost", "it is said")
+    assert "the Bluetooth connection ended" in fleet.state("link").reason
+    assert fleet.state("safety").motors == "unknown"
+    assert driving(sim)
+    peer.revive()
+    wait_for(lambda: not driving(sim), "stopped when it is back")
+    fleet.ready()
+
+
+def test_a_killed_gateways_successor_takes_the_module_over_and_stops_the_car(
+    fleet: Fleet, peer: BlePeer, sim: Process
+) -> None:
+    gateway = fleet.gateway(str(peer.url))
+    fleet.ready()
+    drive(fleet, sim)
+    gateway.kill()
+    gateway.wait()
+    assert peer.module.connected
+    assert driving(sim)
+    fleet.gateway(str(peer.url))
+    wait_for(lambda: not driving(sim), "stopped by the next")
+    fleet.ready()
