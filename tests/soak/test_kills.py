@@ -1,13 +1,24 @@
 """What tests/e2e kills and cuts once, many times and with nothing added for a busy machine: `make soak` runs alone."""
 
+import random
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tests.support.authority import want_for_ever
 from tests.support.flooding import FLIGHT_S, PER_S, flood
-from tests.support.kills import DOINGS, MORE_DOINGS, OPERATORS, Took, cut_links, kill_gateways, kill_operators
+from tests.support.kills import (
+    DOINGS,
+    MORE_DOINGS,
+    OPERATORS,
+    Took,
+    cut_links,
+    kill_gateways,
+    kill_operators,
+    stop_in_every_mode,
+)
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet
 
@@ -77,3 +88,24 @@ def test_a_minute_of_10000_drives_a_second(tmp_path: Path) -> None:
     assert max(found.rss_mb) < found.rss_mb[0] + 20.0
     assert not found.drove_on_s, "nobody has let go"
     assert max(found.stopped_s) < FLIGHT_S + 0.05
+
+
+@pytest.mark.soak
+def test_five_stops_in_every_mode(tmp_path: Path) -> None:
+    for fleet in fleets(tmp_path, 1):
+        found = stop_in_every_mode(fleet, rounds=5, moments=random.Random(4))
+    print(f"\n{'stop in':24} {'took, of what was announced'}")
+    for what, took in found.items():
+        print(f"{what:24} {', '.join(str(each) for each in took)}")
+    assert all(len(took) == 5 for took in found.values())
+    assert not [f"{what}: {each}" for what, took in found.items() for each in took if each.late]
+    assert not [
+        what for what, took in found.items() for each in took if each.took_s > 4.0 and what != "obstacle_avoidance"
+    ]
+
+
+@pytest.mark.soak
+def test_a_coordinator_never_moves_a_stopped_car(tmp_path: Path) -> None:
+    killed = ["gateway", "coordinator", "gateway and coordinator"] * 4
+    for fleet in fleets(tmp_path, 1):
+        assert want_for_ever(fleet, tmp_path, killed) == []

@@ -3,6 +3,7 @@
 Nothing is judged here: each function says what was measured and what is allowed.
 """
 
+import random
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -230,4 +231,52 @@ def cut_links(fleet: Fleet, directory: Path) -> dict[str, Took]:
     finally:
         reset.close()
         stuck.close()
+    return found
+
+
+# ---------------------------------------------------------------------- stops, in real time
+
+STOPPED: Final = {
+    "manual": "arduino",
+    "tracking": "arduino",
+    "obstacle_avoidance": "arduino",
+    "color_led": "arduino",
+    "light_seeking": "stm32",
+    "following": "stm32",
+    "raspberry_pi": "raspberry_pi",
+}
+"""A car for each mode, and one that knows only mode 0."""
+
+
+def stop_in_every_mode(fleet: Fleet, rounds: int, moments: random.Random) -> dict[str, list[Took]]:
+    """Ask `stop` at random moments, in each mode: how long the motors went on, and what the answer had announced."""
+    cars = {what: f"car{number}" for number, what in enumerate(STOPPED)}
+    judges = {what: Judge.follow(fleet.bus, car) for what, car in cars.items()}
+    specs = (f"{car}:{STOPPED[what]}:tcp" for what, car in cars.items())
+    _, links = fleet.simulate(*specs, truth=True)
+    for (what, car), link in zip(cars.items(), links, strict=True):
+        fleet.gateway(link, car=car, platform=STOPPED[what])
+    found: dict[str, list[Took]] = {what: [] for what in cars}
+    for _ in range(rounds):
+        for what, car in cars.items():
+            fleet.ready(car)
+            if MODE_DIGITS.get(what):
+                assert fleet.ask("mode", car, mode=what)["status"] in ("sent", "queued"), what
+        for what, judge in judges.items():
+            if MODE_DIGITS.get(what):
+                wait_for(lambda judge=judge, what=what: judge.modes[-1][1] == what, f"a car is in {what}")
+            else:
+                fleet.ask("drive", cars[what], motion="forward", duration_s=10)
+                wait_for(lambda judge=judge: judge.driving, f"{what} drives")
+        time.sleep(3.6 + moments.random())  # whatever was opened has opened
+        asked = {}
+        for what, car in cars.items():
+            at_ns = time.time_ns()
+            answer = fleet.ask("stop", car, sender="ann", kind="person")
+            assert answer["status"] in ("sent", "queued"), what
+            asked[what] = at_ns, answer["worst_case_s"]
+            time.sleep(moments.random() / 3)
+        for what, (at_ns, worst_case_s) in asked.items():
+            found[what].append(Took(judges[what].wait_off(at_ns, watched_s=5.0), worst_case_s))
+            assert judges[what].modes[-1][1] == "manual", what
     return found

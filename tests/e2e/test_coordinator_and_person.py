@@ -1,0 +1,10 @@
+"""A coordinator that wants a mode for ever never moves a car that a person has stopped, over restarts of both."""
+
+from pathlib import Path
+
+from tests.support.authority import want_for_ever
+from tests.support.processes import Fleet
+
+
+def test_a_stopped_car_stays_stopped_over_restarts_of_gateway_and_coordinator(fleet: Fleet, tmp_path: Path) -> None:
+    assert want_for_ever(fleet, tmp_path, ["gateway and coordinator"]) == []

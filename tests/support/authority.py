@@ -1,0 +1,55 @@
+"""A coordinator that wants a mode for ever, and a person who has stopped the car: both are killed, again and again."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from fleet.client import FleetClient
+from tests.support.judge import Judge
+from tests.support.processes import Fleet, Process, wait_for
+
+PLAN = "cars: {red: tracking}\n"
+
+
+def want_for_ever(fleet: Fleet, directory: Path, killed: Sequence[str]) -> list[float]:
+    """When motors went on after the person's stop was complete, s: never. `killed`: what is, round by round."""
+    plan = directory / "plan.yaml"
+    plan.write_text(PLAN, encoding="utf-8")
+
+    def coordinate() -> Process:
+        return fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(plan), "--json")
+
+    def decided(process: Process, mode: str | None) -> None:
+        while process.line()["mode"] != mode:
+            pass
+
+    judge = Judge.follow(fleet.bus)
+    _, (link,) = fleet.simulate("red:arduino:pty", truth=True)
+    gateway = fleet.gateway(link)
+    coordinator = coordinate()
+    wait_for(lambda: judge.modes and judge.modes[-1][1] == "tracking", "the coordinator has its mode")
+    with FleetClient(fleet.endpoint, sender="mia", kind="person") as person:
+        assert person.car("red").stop().ok
+    held_ns = judge.heard_ns
+    for victims in killed:
+        if "gateway" in victims:
+            gateway.kill()
+            gateway.wait()
+            gateway = fleet.gateway(link)
+        if "coordinator" in victims:
+            coordinator.kill()
+            coordinator.wait()
+            coordinator = coordinate()
+        fleet.ready()
+        # It has seen the car stand, and knows that it may not.
+        decided(coordinator, None)
+        wait_for(lambda: fleet.state("safety").HasField("hold"), "it is on hold")
+        # Nor does it help to ask past the policy.
+        answer = fleet.ask("mode", mode="tracking", kind="coordinator", sender="coordinator-x")
+        assert (answer["status"], answer["reason"]) == ("rejected", "held"), answer
+        assert judge.modes[-1][1] == "manual"
+    moved = judge.on_after(held_ns)
+    # And it would still have it: the end of the hold is all that it needs.
+    with FleetClient(fleet.endpoint, sender="mia", kind="person") as person:
+        assert person.car("red").resume().ok
+    wait_for(lambda: judge.modes[-1][1] == "tracking", "the coordinator has its mode again")
+    return moved
