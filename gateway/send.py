@@ -192,5 +192,5 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
     if frame is None or (isinstance(frame, General) and moves(frame)):
         lines.append(f"stop it: {again} '{_STOP}'")
         if profile.stop_style is not StopStyle.RASPBERRY_PI:
-            lines.append(f"     or: {again} '{_MANUAL}', obeyed in every mode, but not known to a Raspberry Pi car")
+            lines.append(f"     or: {again} '{_MANUAL}', obeyed in every mode, but a Raspberry Pi car knows none")
     return lines

@@ -1,0 +1,125 @@
+"""`gateway send` as a process: what reaches a car, what is refused and why, what it says the car may do then."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from gateway.protocol.profile import parse_platform
+from gateway.protocol.values import Mode
+from gateway.send import why_not
+from tests.gateway.conftest import Command
+from tests.support.processes import TcpCar, driving, wait_for
+
+STOP = "$0,0,0,0,0,0,0,0,0#"
+RUN = "$1,0,0,0,0,0,0,0,0#"
+
+
+def test_a_car_drives_until_it_is_stopped_as_it_says(simulate: Callable[..., Any], command: Command) -> None:
+    sim, [link] = simulate("red:arduino:pty")
+    wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["mode"] == "manual", "the car has started")
+    done = command("send", "--link", link, "--wait", "1", RUN)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == [
+        f"sent {RUN} to {link}",
+        "cars do not answer; `gateway monitor` shows what it says",
+        "it drives (forward) until it is told otherwise, also when the link is gone",
+        f"stop it: gateway send --link {link} '{STOP}'",
+        f"     or: gateway send --link {link} '$4WD,MODE00#', obeyed in every mode, but a Raspberry Pi car knows none",
+    ]
+    wait_for(lambda: driving(sim), "the car drives")
+    done = command("send", "--link", link, STOP)
+    assert "its motors are off, if it is in mode 0" in done.stdout
+    wait_for(lambda: not driving(sim), "the car stands")
+
+
+def test_a_mode_is_opened_and_closed_as_it_says(simulate: Callable[..., Any], command: Command) -> None:
+    sim, [link] = simulate("red:arduino:pty")
+    done = command("send", "--link", link, "--platform", "arduino", "--wait", "1", "$4WD,MODE21#")
+    assert done.returncode == 0
+    assert f"stop it, and back to mode 0: gateway send --link {link} '$4WD,MODE00#'" in done.stdout
+    wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["mode"] == "tracking", "the car tracks")
+    assert command("send", "--link", link, "--wait", "4", "$4WD,MODE00#").returncode == 0
+    wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["mode"] == "manual", "the car is in mode 0")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        # What a shell makes of '$0,...' and '$4WD,...' in double quotes.
+        ("bash,0,1,0,0,0,0,0,0#", "put the frame in single quotes, '$0,0,1,0,0,0,0,0,0#'"),
+        ("/usr/bin/zsh,0,1,0,0,0,0,0,0#", "put the frame in single quotes, '$0,0,1,0,0,0,0,0,0#'"),
+        (",0,1,0,0,0,0,0,0", "put the frame in single quotes, '$<digit>,0,1,0,0,0,0,0,0#'"),
+        ("WD,MODE00#", "put the frame in single quotes, '$4WD,MODE00#'"),
+        ("stop", "a frame begins with '$'"),
+        ("$0,0,1,0,0,0,0,0,0", "a frame ends with '#': '$0,0,1,0,0,0,0,0,0#'?"),
+        ("$0,0,1,0,0,0,0,0#", "it has 8 of the nine places"),
+        ("$5,0,0,0,0,0,0,0,0#", "place 1 (motion) is '5', allowed are 0..4"),
+        ("$0,0,1,7,0,0,0,0,0#", "place 4 (speed) is '7', allowed are 0..2"),
+        ("$0,0,1,0,,0,0,0,0#", "place 5 (servo) is '', allowed are 0..8"),
+        ("$0,0,0,0,1,0,0,0,1#", "a servo is moved (place 5) and reset (place 9) at once"),
+        ("$4WD,PTZ181#", "it is not in the table"),
+        ("$4WD,MODE01#", "mode 0 is not opened; '$4WD,MODE00#' closes"),
+    ],
+)
+def test_why_a_text_is_no_frame(text: str, words: str) -> None:
+    assert words in why_not(text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["bash,0,1,0,0,0,0,0,0#"], "single quotes"),
+        (["$4WD,PTZ90#"], "cars of an unknown platform do not know the pan/tilt frame"),
+        (["$4WD,MODE21#", "--platform", "raspberry_pi"], "mode tracking cannot be opened on raspberry_pi cars"),
+        (["#"], "do not know a lone '#'"),
+        (["\u20ac"], "'\u20ac' is no byte"),
+        (["", "--raw"], "frame '' is empty"),
+        ([STOP, "--platform", "pi"], "'pi' is not known"),
+        ([STOP, "--wait", "-1"], "--wait -1: a number of seconds from 0 to 60"),
+        ([STOP, "--wait", "nan"], "--wait nan: a number of seconds from 0 to 60"),
+        ([STOP, "--link", "ws://x"], "ws:// is no kind of link"),
+    ],
+)
+def test_what_is_not_sent_opens_no_link(command: Command, arguments: list[str], words: str) -> None:
+    done = command("send", "--link", "/dev/nope", *arguments)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert words in done.stderr
+    assert done.stdout == ""
+
+
+def test_a_link_that_cannot_be_had_is_one_line(command: Command) -> None:
+    done = command("send", "--link", "/dev/nope", STOP)
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert "there is no such port" in done.stderr
+
+
+def test_a_tcp_car_that_nothing_could_stop_is_not_set_going(command: Command) -> None:
+    car = TcpCar()
+    try:
+        for more in ([], ["--platform", "raspberry_pi"]):
+            done = command("send", "--link", car.link, *more, RUN)
+            assert done.returncode == 2
+            assert "nothing can stop the car" in done.stderr
+        assert car.connections == 0
+        done = command("send", "--link", car.link, STOP)
+        assert done.returncode == 0
+        assert "note: tcp://" in done.stderr
+        assert command("send", "--link", car.link, "--platform", "arduino", RUN).returncode == 0
+        assert command("send", "--link", car.link, "--raw", "$9,junk").returncode == 0
+        wait_for(lambda: len(car.received) == 3, "all have come")
+        assert car.received == [STOP.encode(), RUN.encode(), b"$9,junk"]
+    finally:
+        car.close()
+
+
+def test_every_mode_has_its_words(command: Command) -> None:
+    from gateway.protocol.encode import ModeOpen
+    from gateway.send import aftermath
+
+    for mode in set(Mode) - {Mode.MANUAL}:
+        words = "\n".join(aftermath(ModeOpen(mode), parse_platform("arduino"), "/dev/my port"))
+        assert f"opening mode {mode}" in words
+        assert "gateway send --link '/dev/my port' '$4WD,MODE00#'" in words
