@@ -6,8 +6,8 @@ Knows frames and times, not commands; what is to be written is decided by the co
 from typing import Final
 
 from gateway.control.recipes import REPEAT_S, Gate
-from gateway.protocol.encode import Frame, General
-from gateway.protocol.profile import Profile, StopStyle
+from gateway.protocol.encode import ArmSet, Frame, General
+from gateway.protocol.profile import Platform, Profile, StopStyle
 
 FLIGHT_S: Final = 0.06
 """A frame is in flight for 0.06 s or its block, whichever is longer (protocol.md): a report may be under way."""
@@ -28,12 +28,14 @@ class Pacing:
 
     def __init__(self, profile: Profile) -> None:
         self._profile = profile
+        self._slow_fan_unsure = profile.kind is Platform.UNKNOWN
         self.reset()
 
     def reset(self) -> None:
         """The link is new: nothing of ours is on it, and nothing is known."""
         self._written_at = float("-inf")
         self._block_s = 0.0
+        self._sure_s = 0.0
         self._before_s = 0.0
         self._read_by = float("-inf")
         self._heard_at = float("-inf")
@@ -45,6 +47,8 @@ class Pacing:
         self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_S, self.block_until))
         self._written_at = now
         self._block_s = self._profile.block_s(frame)
+        unsure = isinstance(frame, ArmSet) or (isinstance(frame, General) and frame.fan and self._slow_fan_unsure)
+        self._sure_s = 0.0 if unsure else self._block_s
 
     def heard(self, at: float) -> None:
         """A mode-0 reading has come: the car has ranged, and reads what waits."""
@@ -81,8 +85,8 @@ class Pacing:
         return self._read_by + self._block_s
 
     def blocked_at(self, now: float) -> bool:
-        """The last frame's block runs, and no ranging, in which that frame would lie unread."""
-        return self._block_s > FLIGHT_S and self.clear_at(now) and now < self.block_until
+        """The last frame's block runs, not only perhaps, and no ranging, in which that frame would lie unread."""
+        return self._sure_s > FLIGHT_S and self.clear_at(now) and now < self.block_until
 
     def clear_at(self, now: float) -> bool:
         """Nothing of ours can be unread when the next frame is written that waits for those in flight."""

@@ -1,0 +1,145 @@
+"""A controller and a simulated car to which anything happens, and again and again a stop: its motors are the judge."""
+
+import random
+from dataclasses import dataclass
+
+from gateway.control.records import EmergencyStop, Phase, Resume, Sender, SetMode, Stop
+from gateway.protocol.values import Mode
+from gateway.sim.core.raspberry_pi import Transport
+from tests.fuzz.controller import PLATFORMS, SENDERS, anything
+from tests.support.stops import WORLDS, Seen, state_of
+from tests.support.virtual import Pair
+
+LIFE = 60
+"""So many steps until another car in another world is taken."""
+WATCHED_S = 9.0
+RESTORED_S = 22.0
+
+
+@dataclass
+class Fuzzed:
+    """What was done."""
+
+    steps: int = 0
+    stops: int = 0
+    states: frozenset[str] = frozenset()
+    """In which a stop was asked."""
+
+
+class Driven:
+    """One car after another. `step` does one thing; `stop` judges."""
+
+    def __init__(self, seed: int) -> None:
+        self.moments = random.Random(seed)
+        self.asked = 0
+        self._another()
+
+    def _another(self) -> None:
+        moments = self.moments
+        platform = moments.choice(PLATFORMS)
+        known = platform if platform != "unknown" else moments.choice(["arduino", "raspberry_pi"])
+        self.world = moments.choice(list(WORLDS))
+        self.pair = Pair(
+            known.partition("+")[0],
+            seed=moments.randrange(10**6),
+            world=WORLDS[self.world](),
+            told=platform,
+            transport=Transport.SERIAL,
+            start_s=2.0,
+        )
+        self.pair.connect()
+        self.linked = True
+
+    def step(self) -> None:
+        """One thing happens."""
+        moments, pair = self.moments, self.pair
+        chance = moments.random()
+        if not self.linked and chance < 0.5:
+            pair.run(2 * moments.random(), linked=False)
+            pair.connect()
+            self.linked = True
+        elif chance < 0.45:
+            self._ask()
+        elif chance < 0.85:
+            pair.run(moments.choice([0.01, 0.06, 0.1, 0.3, 0.7, 1.2, 3.0]), linked=self.linked)
+        elif chance < 0.89:
+            pair.cut = moments.randrange(1, 20)
+        elif chance < 0.91 and self.linked:
+            pair.lose()
+            self.linked = False
+        elif chance < 0.93:
+            pair.deaf_until = pair.now + 3 * moments.random()
+        elif chance < 0.95:
+            self._stall(2 * moments.random())
+        elif chance < 0.97:
+            pair.control.sender_alive(moments.choice(SENDERS).name, alive=moments.random() < 0.5, now=pair.now)
+        elif chance < 0.98:
+            for event in pair.decoder.feed(moments.randbytes(moments.randrange(40)).replace(b"$", b""), pair.now):
+                pair.control.heard(event, pair.now)
+        elif chance < 0.985:
+            pair.car.brown_out(pair.now)
+        self._see_cut()
+
+    def _see_cut(self) -> None:
+        """A write was cut: control knows that the link is gone."""
+        if self.linked and pair_lost(self.pair):
+            self.linked = False
+
+    def _stall(self, gap_s: float) -> None:
+        """The loop sleeps; the car does not."""
+        self.pair.now += gap_s
+        self.pair.control.stalled(gap_s, self.pair.now)
+
+    def _ask(self) -> None:
+        what = anything(self.moments)
+        if self.world != "echo" and what == SetMode(Mode.OBSTACLE_AVOIDANCE):
+            return  # without an echo the car is deaf there for ever
+        if isinstance(what, Resume | EmergencyStop):
+            what = Resume(tuple(estop.id for estop in self.pair.control.safety.estops))
+        self.asked += 1
+        self.pair.ask(what, sender=self.moments.choice(SENDERS), identity=f"f{self.asked}")
+
+    def stop(self) -> Seen | None:
+        """A stop now: off for good within what is announced. None if the link is down, which it says."""
+        pair, moments = self.pair, self.moments
+        pair.cut = None
+        if not self.linked:
+            assert pair.ask(Stop(), verb="stop").status is Phase.REJECTED
+            return None
+        state, asked_at = state_of(pair), pair.now
+        self.asked += 1
+        identity = f"f{self.asked}"
+        answer = pair.ask(Stop(), verb="stop", sender=moments.choice(SENDERS), identity=identity)
+        pair.run(RESTORED_S if "restored" in state else WATCHED_S)
+        off_s = max(0.0, pair.off_for_good_at() - asked_at)
+        assert off_s <= answer.worst_case_s, f"{state}: off after {off_s:.3f} s, announced {answer.worst_case_s:.3f} s"
+        last = pair.phases(identity)[-1]
+        return Seen("fuzz", self.asked, state, answer.worst_case_s, off_s, off_s, 0.0, pair.control.motors, last)
+
+
+def pair_lost(pair: Pair) -> bool:
+    """Whether control was told that the link is gone."""
+    return not pair.control._link_open
+
+
+def run(seed: int, steps: int, *, stop_every: int = 12) -> Fuzzed:
+    """So many steps, with a stop now and then."""
+    driven, done, states = Driven(seed), Fuzzed(), set()
+    sender = Sender("fuzz")
+    for number in range(steps):
+        try:
+            driven.step()
+            if driven.moments.random() < 1 / stop_every:
+                seen = driven.stop()
+                if seen is not None:
+                    done.stops += 1
+                    states.add(seen.state)
+                driven.pair.ask(Resume(), sender=sender)
+        except Exception as error:
+            name = driven.pair.control.profile.name
+            error.add_note(f"seed {seed}, step {number}, {name}, {driven.world}: {driven.pair.sent[-8:]}")
+            raise
+        if number % LIFE == LIFE - 1:
+            driven._another()
+    done.steps, done.states = steps, frozenset(states)
+    return done
