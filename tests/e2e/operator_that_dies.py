@@ -23,8 +23,8 @@ with bus.Bus.open() as opened:
     if watched == "token":
         opened.token(keys.operator_token("fleet", f"stick-{car}"))
         time.sleep(0.3)  # what it does after this is watched
-    asked = {"motion": "forward", "duration_s": float(duration_s), "sender": f"stick-{car}", "kind": "person"}
-    drive = json.dumps(asked).encode()
+    who = {"sender": f"stick-{car}", "kind": "person"}
+    drive = json.dumps({"motion": "forward", "duration_s": float(duration_s)} | who).encode()
     for number in range(1, 100_000):
         if how == "stream":
             opened.put_command(keys.command_key("fleet", car, "drive"), drive, messages.JSON, number)
@@ -34,4 +34,4 @@ with bus.Bus.open() as opened:
             time.sleep(3600)
         if also and number == 10:
             verb, fields = also
-            ask(opened, verb, fields.encode())
+            ask(opened, verb, json.dumps(json.loads(fields) | who).encode())

@@ -9,11 +9,11 @@ from tests.support.processes import Fleet
 
 
 def test_a_flood_of_drives(fleet: Fleet) -> None:
-    found = flood(fleet, seconds=4.0, stops=3)
+    found = flood(fleet, seconds=4.0, stops=2)
     assert found.published > 10_000
     assert min(found.apart_s) > FLIGHT_S - 0.001, "the next frame waits until the last is no more in flight"
     wire = b"".join(data for _, data in found.frames)
     assert wire.count(b"$") == wire.count(b"#") == len(found.apart_s) + 1, "what is on the wire is what was told"
-    assert len(found.stopped_s) == 3
+    assert len(found.stopped_s) == 2
     assert max(found.stopped_s) < FLIGHT_S + BUSY_S, found.stopped_s
     assert max(found.rss_mb) < found.rss_mb[0] + 30.0, found.rss_mb

@@ -16,7 +16,8 @@ FLOOD: Final = Path(__file__).parents[1] / "e2e" / "flood.py"
 WARM_S: Final = 2.0
 FLIGHT_S: Final = 0.06
 """protocol.md: a frame without a block of its own is in flight so long."""
-MODE00: Final = b"$4WD,MODE00#"
+STOPS: Final = (b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#")
+"""What a stop may begin with."""
 
 
 @dataclass
@@ -54,10 +55,12 @@ def flood(fleet: Fleet, *, seconds: float, stops: int) -> Flooded:
         for number in range(stops):
             time.sleep(max(0.0, first_at + number * seconds / stops - time.monotonic()))
             found.rss_mb.append(gateway.rss_mb())
+            if number:
+                fleet.ready()  # a stop that still ran would be joined
             asked_ns = time.time_ns()
             assert fleet.ask("stop", sender="ann", kind="person")["status"] in ("sent", "queued")
             on_wire = wait_for(
-                lambda at=asked_ns: [when for when, data in tap.passed if when > at and data == MODE00], "a stop"
+                lambda at=asked_ns: [when for when, data in tap.passed if when > at and data in STOPS], "a stop"
             )
             found.stopped_s.append((on_wire[0] - asked_ns) / 1e9)
             first_ns = first_ns or asked_ns

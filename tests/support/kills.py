@@ -122,7 +122,7 @@ class Doing:
             fleet.ask("drive", self.car, motion="forward", duration_s=10)
             wait_for(lambda: judge.driving, f"{self.car} drives")
             if self.what != "driving":
-                fleet.ask("servo", self.car, servo="front", deg=40)
+                assert fleet.ask("servo", self.car, servo="front", deg=40)["status"] in ("sent", "queued")
             return
         mode = self.what.removeprefix("opening ")
         fleet.ask("mode", self.car, mode=mode)
