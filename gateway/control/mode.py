@@ -23,8 +23,8 @@ RUNNING_SILENCE_S: Final = 1.0
 MIXED_S: Final = 0.5
 """So soon after a reading of another mode, one may be that mode's, damaged (no checksum); three running are not."""
 
-BLOCKS: Final = 64
-"""So many frames explain a silence at most; more than a car can obey within the longest silence that they explain."""
+BLOCKS: Final = 256
+"""So many frames explain a silence at most: a car that is made to whistle without a pause reports nothing meanwhile."""
 
 
 class Verdict(StrEnum):

@@ -1,0 +1,182 @@
+"""Normal running of a car for hours of virtual time, and every alarm that was raised meanwhile: each is a false one."""
+
+import random
+from collections.abc import Callable
+
+from gateway.control.link_health import LinkHealth, LinkState
+from gateway.control.mode import Verdict
+from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, Reason, SetMode, Stop, What
+from gateway.protocol.encode import ColorLed, General, Ptz
+from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.sim.core.raspberry_pi import Transport
+from tests.support.truth import WORLDS
+from tests.support.virtual import Pair
+
+LOOK_S = 0.2
+"""How often a gateway looks at its states."""
+SETTLED_S = 2.5
+"""What is written sooner after a mode was left may be lost in the block of closing it: no alarm is false then."""
+ALARMS = frozenset(
+    {"mode_contradicted", "platform_contradicted", "unheard", "no_answer", "answers_again", "not_stopped"}
+)
+EXPECTED = frozenset({Reason.SUPERSEDED, Reason.EXPIRED, Reason.QUEUE_FULL, Reason.UNSUPPORTED, Reason.WRONG_MODE})
+"""What may become of a command without anything being wrong."""
+MOTIONS = tuple(motion for motion in Motion if motion is not Motion.STOP)
+
+
+class Run:
+    """One car that nothing happens to, its link watched as a gateway watches it."""
+
+    def __init__(
+        self,
+        world: str,
+        seed: int,
+        *,
+        platform: str = "arduino",
+        told: str | None = None,
+        transport: Transport = Transport.SERIAL,
+    ) -> None:
+        self.world = world
+        # Whether the fan runs is not known of an unknown platform that is silent, so each of its stops gives up.
+        self.acts = tuple(act for act in MANUAL if act is not _fan or told != "unknown")
+        self.moments = random.Random(seed)
+        self.pair = Pair(platform, seed=seed, world=WORLDS[world](), told=told, transport=transport, start_s=2.0)
+        self.health = LinkHealth()
+        self.alarms: list[str] = []
+        self.commands = 0
+        advance = self.pair.car.advance
+
+        def counted(now: float) -> list[tuple[float, bytes]]:
+            pieces = advance(now)
+            for at, data in pieces:
+                self.health.received(len(data), at)
+            return pieces
+
+        self.pair.car.advance = counted  # type: ignore[method-assign]  # the wire has no other handle
+        self.health.up(self.pair.now)
+        self.pair.ready()
+        self.pair.logs.clear()
+
+    def run(self, seconds: float) -> None:
+        """Let time pass, and look."""
+        end = self.pair.now + seconds
+        while self.pair.now < end:
+            self.pair.run(min(LOOK_S, max(end - self.pair.now, 1e-3)))
+            self.look()
+
+    def look(self) -> None:
+        """Note what is wrong."""
+        pair, mode = self.pair, self.pair.control.mode
+        self.health.judge(
+            now=pair.now,
+            limit_s=mode.silence_limit(fan=bool(pair.control.believed.fan)),
+            unheard_s=mode.unheard_s(pair.now),
+            why_quiet="silent",
+        )
+        if self.health.state in (LinkState.STALE, LinkState.LOST):
+            self._alarm(f"link {self.health.state}: {self.health.reason}")
+        if mode.verdict is Verdict.CONTRADICTED:
+            self._alarm(f"{mode.asked} contradicted: {mode.evidence}")
+        for log in pair.logs:
+            if log.code in ALARMS:
+                self._alarm(f"{log.code}: {log.words}")
+        for record in pair.records:
+            failed = record.phase is Phase.FAILED or (record.reason is not None and record.reason not in EXPECTED)
+            if failed:
+                self._alarm(f"{record.command.verb} {record.phase}: {record.words}")
+        pair.logs.clear()
+        pair.records.clear()
+        del pair.sent[:-6]
+
+    def ask(self, what: What) -> None:
+        """Give a command."""
+        self.commands += 1
+        self.pair.ask(what, verb=type(what).__name__)
+        self.look()
+
+    def go(self, mode: Mode) -> None:
+        """Bring the car to a mode and see it there."""
+        self.ask(SetMode(mode))
+        end = self.pair.now + 20.0
+        while self.pair.car.truth.mode is not mode:
+            assert self.pair.now < end, f"{mode} was not reached"
+            self.run(LOOK_S)
+        self.run(SETTLED_S)
+
+    def _alarm(self, words: str) -> None:
+        if len(self.alarms) < 20:
+            self.alarms.append(f"at {self.pair.now:.1f} s {words}; {self.pair.car.truth}")
+
+
+def _drives(run: Run) -> None:
+    for _ in range(run.moments.randint(1, 4)):
+        run.ask(Drive(run.moments.choice(MOTIONS), 0.3 + 2.0 * run.moments.random()))
+        run.run(2.5 * run.moments.random())
+
+
+def _joystick(run: Run) -> None:
+    """A drive every 0.1 s, the motion now and then another."""
+    motion = Motion.FORWARD
+    for _ in range(run.moments.randint(5, 80)):
+        if run.moments.random() < 0.2:
+            motion = run.moments.choice(MOTIONS)
+        run.ask(Drive(motion, 0.5))
+        run.run(0.1)
+
+
+def _acts(run: Run) -> None:
+    """One-shots of each kind, as fast as the queue takes them or slower."""
+    one_shots: tuple[What, ...] = (
+        Act(General(Motion.STOP, whistle=True)),
+        Act(Ptz(run.moments.randint(0, 180))),
+        Act(General(Motion.STOP, servo=run.moments.choice((ServoAction.FRONT_LEFT, ServoAction.FRONT_RESET)))),
+        Act(ColorLed(*(run.moments.randint(0, 255) for _ in range(3)))),
+        Act(General(Motion.STOP, light=run.moments.choice((Light.RED, Light.GREEN, Light.BLUE)))),
+        ChangeSpeed(run.moments.choice((SpeedStep.UP, SpeedStep.DOWN))),
+        Find(),
+    )
+    for _ in range(run.moments.randint(1, 25)):
+        run.ask(run.moments.choice(one_shots))
+        run.run(run.moments.choice((0.0, 0.35, 1.0)) + 0.01)
+
+
+def _whistles(run: Run) -> None:
+    """Whistles without a pause for half a minute: the loop of the car hardly turns."""
+    for _ in range(80):
+        run.ask(Act(General(Motion.STOP, whistle=True)))
+        run.run(0.36)
+
+
+def _fan(run: Run) -> None:
+    """The fan on for a while, in mode 0 and perhaps into a mode and back."""
+    run.ask(Fan())
+    run.run(1.5 + 40.0 * run.moments.random())
+    if run.moments.random() < 0.3:
+        run.ask(Drive(run.moments.choice(MOTIONS), 1.0))
+        run.run(5.0 * run.moments.random())
+    run.ask(Fan())
+    run.run(2.5)
+
+
+def _stops(run: Run) -> None:
+    for _ in range(run.moments.randint(1, 6)):
+        run.ask(Stop())
+        run.run(4.0 * run.moments.random())
+
+
+MANUAL: tuple[Callable[[Run], None], ...] = (_drives, _joystick, _acts, _whistles, _fan, _stops)
+
+
+def normal(run: Run, mode: Mode, seconds: float) -> None:
+    """The car lives in a mode, and comes back to mode 0 now and then for what only works there."""
+    end = run.pair.now + seconds
+    for_ever = mode is Mode.OBSTACLE_AVOIDANCE and run.world == "no-echo"  # protocol.md: deaf for ever
+    while run.pair.now < end:
+        run.moments.choice(run.acts)(run)
+        run.run(10.0 * run.moments.random())
+        if mode is Mode.MANUAL:
+            continue
+        run.go(mode)
+        run.run(max(end - run.pair.now, 10.0) if for_ever else 5.0 + 120.0 * run.moments.random())
+        if not for_ever:
+            run.go(Mode.MANUAL)
