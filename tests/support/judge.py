@@ -28,6 +28,8 @@ class Judge:
     frames: list[tuple[int, str, bytes]] = field(default_factory=list)
     """When, why, and what."""
     modes: list[tuple[int, str]] = field(default_factory=list)
+    opened: list[int] = field(default_factory=list)
+    """When a gateway had opened its link."""
     heard_ns: int = 0
     """The newest truth."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -38,6 +40,7 @@ class Judge:
         judge = cls(car)
         bus.subscribe(f"fleet/{car}/sim/truth", judge._truth)
         bus.subscribe(f"fleet/{car}/frame/tx", judge._frame)
+        bus.subscribe(f"fleet/{car}/event/log", judge._log)
         return judge
 
     @property
@@ -84,3 +87,9 @@ class Judge:
         frame: Any = sample.message()
         with self._lock:
             self.frames.append((stamp_ns(frame), frame.why, frame.data))
+
+    def _log(self, sample: Sample) -> None:
+        event: Any = sample.message()
+        if event.name == f"{self.car} link_open":
+            with self._lock:
+                self.opened.append(event.timestamp.seconds * 1_000_000_000 + event.timestamp.nanos)
