@@ -1,20 +1,21 @@
 """What there is that could be a car: serial ports and Bluetooth LE devices. Nothing is opened or connected to here."""
 
 import asyncio
-from collections.abc import Iterable
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Final
 
-from gateway.link import BadUrl, parse_url
+from gateway.link.url import BleUrl, LinkUrl, SerialUrl, UsbUrl
 
+if TYPE_CHECKING:
+    from bleak.backends.scanner import AdvertisementData
+    from serial.tools.list_ports_common import ListPortInfo
+
+_SHORT: Final = re.compile(r"0000([0-9a-f]{4})-0000-1000-8000-00805f9b34fb")
 BY_ID: Final = Path("/dev/serial/by-id")
-_UART_SERVICES: Final = {
-    "0000ffe0-0000-1000-8000-00805f9b34fb": "FFE0",
-    "6e400001-b5a3-f393-e0a9-e50e24dcca9e": "Nordic UART",
-}
-"""protocol.md, framing: the services of the usual UART-over-BLE modules."""
 _START_S: Final = 5.0
 """A Bluetooth stack that has not begun to scan by then never will."""
 
@@ -34,7 +35,7 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class BleDevice:
-    """A Bluetooth LE device that advertises. `uart`: the UART service that it names, as cars' modules do."""
+    """A Bluetooth LE device that advertises. `uart`: the UART service among its own, as cars' modules have."""
 
     address: str
     url: str
@@ -52,8 +53,7 @@ def serial_ports() -> list[Port]:
     """The serial ports of this computer, by name."""
     from serial.tools import list_ports
 
-    lasting = by_id(BY_ID)
-    return [_port(found, lasting.get(found.device)) for found in sorted(list_ports.comports())]
+    return described(list_ports.comports(), by_id(BY_ID))
 
 
 def by_id(directory: Path) -> dict[str, str]:
@@ -64,35 +64,36 @@ def by_id(directory: Path) -> dict[str, str]:
         return {}
 
 
-def _port(found: Any, lasting: str | None) -> Port:
-    vid = None if found.vid is None else f"{found.vid:04x}"
-    urls = [f"serial://?vid={vid}&serial={quote(found.serial_number, safe='')}"] if vid and found.serial_number else []
-    urls += [path for path in (lasting, found.device) if path]
-    return Port(
-        device=found.device,
-        url=_first_allowed(urls),
-        description="" if found.description in (None, "n/a", found.name) else found.description,
-        by_id=lasting,
-        vid=vid,
-        pid=None if found.pid is None else f"{found.pid:04x}",
-        serial_number=found.serial_number,
-    )
-
-
-def _first_allowed(urls: Iterable[str]) -> str:
-    """The first that `--link` takes."""
-    for text in urls:
-        try:
-            return str(parse_url(text))
-        except BadUrl:
-            continue
-    raise AssertionError("a device path is a URL")
+def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> list[Port]:
+    """The ports that pyserial found, each with the URL that names it best; `lasting` as `by_id` gives it."""
+    ports = sorted(found)
+    same = Counter((port.vid, port.serial_number) for port in ports)
+    result = []
+    for port in ports:
+        url: LinkUrl = SerialUrl(lasting.get(port.device, port.device))
+        # Some makers give every device one serial number, and some devices are several ports.
+        if port.vid is not None and port.serial_number and same[port.vid, port.serial_number] == 1:
+            url = UsbUrl(vid=port.vid, serial=port.serial_number)
+        result.append(
+            Port(
+                device=port.device,
+                url=str(url),
+                description="" if port.description in (None, "n/a", port.name) else port.description,
+                by_id=lasting.get(port.device),
+                vid=None if port.vid is None else f"{port.vid:04x}",
+                pid=None if port.pid is None else f"{port.pid:04x}",
+                serial_number=port.serial_number,
+            )
+        )
+    return result
 
 
 async def ble_devices(seconds: float) -> list[BleDevice]:
     """The devices that advertise within this time, likely cars first; raises NoBluetooth."""
     try:
         from bleak import BleakScanner
+
+        from gateway.link.ble import UART_SERVICES
     except ImportError:
         raise NoBluetooth(
             "Bluetooth was not looked at: pip install 'zenoh-car-fleet[ble]' adds what that takes"
@@ -105,11 +106,14 @@ async def ble_devices(seconds: float) -> list[BleDevice]:
     except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, the ports are still shown
         words = " ".join(str(error).split()) or type(error).__name__
         raise NoBluetooth(f"Bluetooth was not looked at: {words}: is there an adapter, and is it on?") from None
-    devices = [_device(address, device.name, heard) for address, (device, heard) in found.items()]
+    devices = [_device(address, device.name, heard, UART_SERVICES) for address, (device, heard) in found.items()]
     return sorted(devices, key=lambda device: (device.uart is None, -(device.rssi or -999), device.address))
 
 
-def _device(address: str, name: str | None, heard: Any) -> BleDevice:
+def _device(address: str, name: str | None, heard: "AdvertisementData", uarts: Sequence[str]) -> BleDevice:
     services = tuple(service.lower() for service in heard.service_uuids)
-    uart = next((_UART_SERVICES[service] for service in services if service in _UART_SERVICES), None)
-    return BleDevice(address, f"ble://{address}", heard.local_name or name, heard.rssi, services, uart)
+    uart = next((service for service in services if service in uarts), None)
+    if uart is not None and (short := _SHORT.fullmatch(uart)):
+        uart = short[1].upper()
+    url = str(BleUrl(address=address.upper()))
+    return BleDevice(address, url, heard.local_name or name, heard.rssi, services, uart)

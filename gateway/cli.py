@@ -53,7 +53,12 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     run.add_argument("--car", required=True, help="its name: a-z, 0-9, _ and -, at most 32")
-    run.add_argument("--link", required=True, help="serial:///dev/ttyUSB0, a bare device path, or tcp://host:8888")
+    run.add_argument(
+        "--link",
+        required=True,
+        help="/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04 "
+        "(`gateway scan` shows them)",
+    )
     run.add_argument("--platform", default="unknown", help="arduino, stm32, raspberry_pi; +arm, +imu (default unknown)")
     run.add_argument("--fleet", default=DEFAULT_FLEET, help="fleet name, the first part of every key (default fleet)")
     run.add_argument(

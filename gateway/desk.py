@@ -13,7 +13,7 @@ from gateway.link import BadUrl, LinkError, LinkUrl
 from gateway.link.url import TcpUrl
 from gateway.protocol.profile import Profile, parse_platform
 
-LINK_HELP: Final = "serial:///dev/ttyUSB0, a bare device path, or tcp://host:8888"
+LINK_HELP: Final = "/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04"
 PLATFORM_HELP: Final = "arduino, stm32, raspberry_pi; +arm, +imu (default unknown)"
 _ODD: Final = re.compile(r"[^ -\[\]-~]")
 _COLOURS: Final = {"red": "31", "yellow": "33", "cyan": "36", "dim": "2"}

@@ -3,10 +3,12 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
-from gateway.protocol.profile import Profile
+from gateway.protocol.profile import Platform, Profile, parse_platform
 from gateway.protocol.readings import ArmReading, Echo, Event, ImuReading, Reject, Rejected, Sensors
+
+PLATFORMS: Final = {kind: parse_platform(kind) for kind in Platform if kind is not Platform.UNKNOWN}
 
 
 @dataclass(slots=True)
@@ -20,6 +22,8 @@ class Tally:
     rejects: Counter[str] = field(default_factory=Counter)
     modes: Counter[str] = field(default_factory=Counter)
     contradictions: Counter[str] = field(default_factory=Counter)
+    excluded: set[Platform] = field(default_factory=set)
+    """Platforms that do not send what was heard."""
 
     def count(self, event: Event, profile: Profile) -> None:
         """Take an event in."""
@@ -29,6 +33,7 @@ class Tally:
                 self.modes[" or ".join(event.candidates)] += 1
                 self.rejects.update(reject.cause for reject in event.rejects)
                 self.contradictions.update(profile.contradictions(event))
+                self.excluded |= {kind for kind, each in PLATFORMS.items() if each.contradictions(event)}
             case ArmReading():
                 self.kinds["arm"] += 1
                 self.rejects.update(reject.cause for reject in event.rejects)
@@ -38,6 +43,11 @@ class Tally:
                 self.kinds["echo"] += 1
             case Rejected():
                 self.rejects[event.cause] += 1
+
+    @property
+    def platforms(self) -> tuple[Platform, ...]:
+        """The platforms that send such sensors frames; none if none has come."""
+        return tuple(kind for kind in PLATFORMS if self.modes and kind not in self.excluded)
 
     @property
     def readings(self) -> int:
@@ -60,6 +70,7 @@ class Tally:
             "frames": dict(self.kinds),
             "rejects": dict(self.rejects),
             "modes": dict(self.modes),
+            "platforms": list(self.platforms),
             "contradictions": dict(self.contradictions),
             "bytes": self.bytes,
             "seconds": round(self.seconds, 3),
@@ -77,7 +88,7 @@ class Tally:
             heard += f", {self.rejects.total()} rejected ({causes})"
         if self.modes:
             modes = ", ".join(mode if len(self.modes) == 1 else f"{mode} {n}" for mode, n in self.modes.most_common())
-            heard += f"; mode by their shape: {modes}"
+            heard += f"; mode by their shape: {modes}; platform: {' or '.join(self.platforms) or 'none that is known'}"
         elif not self.frames:
             heard += ": no car of this protocol, or another baud rate"
         for words, count in self.contradictions.most_common():

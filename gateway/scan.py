@@ -182,7 +182,7 @@ class _Scan:
             yield f"  likely a car: it has the Bluetooth service {device.uart}; not connected to"
             yield f"  --link '{device.url}'"
         if others := len(self._devices) - len(likely):
-            yield f"{others} other Bluetooth devices (--json lists them)"
+            yield f"{others} other Bluetooth device{'' if others == 1 else 's'} (--json lists them)"
 
 
 async def _all(probing: "asyncio.Future[list[None]]") -> None:

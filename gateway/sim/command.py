@@ -22,6 +22,10 @@ PARENT_EVERY_S: Final = 0.1
 LINE_LIMIT: Final = 65536
 
 EPILOG: Final = """\
+examples:
+  gateway sim --car red:arduino:pty
+  gateway sim --car red:arduino:pty --car blue:raspberry_pi:tcp://127.0.0.1:8888 --fault red:link_drop@5+2
+
 Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gateway run --link`. A plain pty that comes
 back after a link_drop has another name, so its line is printed again; pty:PATH keeps its name.
 Faults, one JSON object a line on stdin, each answered by one line on stdout:

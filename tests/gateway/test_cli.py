@@ -1,0 +1,48 @@
+"""The `gateway` command as a whole: help, wrong use, and what `gateway run` does not pay for."""
+
+import subprocess
+import sys
+
+import pytest
+
+from gateway.cli import COMMANDS
+from tests.gateway.conftest import Command
+
+
+def test_the_help_names_every_command(command: Command) -> None:
+    done = command("--help")
+    assert done.returncode == 0
+    for name, (_, words) in COMMANDS.items():
+        assert f"    {name:<10}{words}" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["run", *COMMANDS])
+def test_every_command_has_examples(command: Command, name: str) -> None:
+    done = command(name, "--help")
+    assert done.returncode == 0
+    assert f"gateway {name} --" in done.stdout
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["--car", "red"], ["run"], ["send"], ["monitor", "--fast"]])
+def test_wrong_use_is_told(command: Command, arguments: list[str]) -> None:
+    done = command(*arguments)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith("gateway")
+    assert done.stdout == ""
+
+
+def test_run_imports_none_of_the_other_commands() -> None:
+    """It is started a hundred times."""
+    program = (
+        "import sys; sys.argv = ['gateway', 'run', '--car', 'red', '--link', 'nothing']\n"
+        "import gateway.cli\n"
+        "try: gateway.cli.main()\n"
+        "finally: print(*sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    imported = set(done.stdout.split())
+    assert "gateway.link" in imported
+    assert not imported & {f"gateway.{name}" for name in ("sim", "scan", "monitor", "send", "desk", "capture", "heard")}
+    assert not imported & {"asyncio", "bleak", "serial"}
