@@ -206,7 +206,7 @@ class Profile:
             return ()
         candidates = event.candidates
         found: list[str] = []
-        if not self.modes.issuperset(candidates):
+        if self.modes.isdisjoint(candidates):
             found.append(f"a reading of mode {' or '.join(candidates)}, which {self._these} do not have")
         if candidates != (Mode.MANUAL,):
             return tuple(found)

@@ -1,0 +1,126 @@
+"""Which program runs on the car, by its bytes: told and contradicted, or looked for and settled."""
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.control.platform import RUNNING, PlatformTruth
+from gateway.protocol.decode import SILENCE_S, Decoder
+from gateway.protocol.profile import parse_platform
+from gateway.protocol.readings import Event
+from gateway.protocol.values import Mode
+from gateway.sim.core.cars import build
+from tests.support.truth import WORLDS, frame_of
+from tests.support.vectors import ids, rows, wire
+
+CASES = rows("platform_truth")
+ARDUINO = "$4WD,CSB57.24,PV7.91,GS214,LF1011,HW01,GM10#"
+PI = "$4WD,CSB57,PV8.4,GS0,LF1011,HW01,GM10#"
+TRACKING = "$4WD,CSB0,PV8,GS0,LF0110,HW00,GM00#"
+ARM = "$4WD,J190,J290,J390,J490,J590,J690#"
+
+
+def event_of(text: str) -> Event:
+    decoder = Decoder()
+    return (decoder.feed(wire(text), 1.0) + decoder.tick(1.0 + SILENCE_S))[0]
+
+
+def hear(truth: PlatformTruth, *frames: str) -> list[str]:
+    return [words for frame in frames for words in truth.heard(event_of(frame))]
+
+
+@pytest.mark.parametrize("row", CASES, ids=ids(CASES))
+def test_what_is_heard_and_what_follows(row: dict[str, str]) -> None:
+    """Vectors: frames in turn, each so many times; what is contradicted then, and the platform that `auto` has."""
+    auto = PlatformTruth(parse_platform("unknown"), auto=True)
+    told = {name: PlatformTruth(parse_platform(name)) for name in ("arduino", "stm32", "raspberry_pi", "unknown")}
+    events: dict[str, list[str]] = {name: [] for name in told}
+    for part in row["heard"].split(" "):
+        count, _, frame = part.partition("x")
+        for _ in range(int(count)):
+            hear(auto, frame)
+            for name, truth in told.items():
+                events[name] += hear(truth, frame)
+    assert auto.profile.name == row["auto"]
+    assert row["evidence"] in auto.evidence[0]
+    for name, truth in told.items():
+        expected = [words for words in row.get(name, "").split("; ") if words]
+        assert len(truth.contradictions) == len(expected), truth.contradictions
+        assert all(words in " ".join(truth.contradictions) for words in expected)
+        assert set(truth.contradictions) <= set(truth.evidence)
+        assert set(truth.contradictions) <= set(events[name])
+        assert len(events[name]) == len(set(events[name])), "each is told once"
+        assert truth.profile.name == name, "what was told is kept"
+
+
+def test_a_contradiction_is_told_when_it_first_stands_and_ends_when_three_readings_do_not_show_it() -> None:
+    truth = PlatformTruth(parse_platform("stm32"))
+    assert not hear(truth, PI, PI)
+    assert hear(truth, PI) == list(truth.contradictions) != []
+    assert not hear(truth, PI, PI, ARDUINO, ARDUINO)
+    assert truth.contradictions
+    assert not hear(truth, ARDUINO)
+    assert not truth.contradictions
+
+
+def test_readings_of_another_mode_say_nothing_of_mode_0() -> None:
+    truth = PlatformTruth(parse_platform("arduino"))
+    hear(truth, PI, PI, *[TRACKING] * 30)
+    assert hear(truth, PI)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(RUNNING, 9), st.sampled_from([PI, TRACKING, "$4WD,CSB57,PV7.9,GS3,LF1011,HW01,GM10#"]))
+    )
+)
+def test_one_damaged_frame_never_contradicts(bursts: list[tuple[int, str]]) -> None:
+    truth = PlatformTruth(parse_platform("arduino"))
+    auto = PlatformTruth(parse_platform("unknown"), auto=True)
+    hear(auto, *[ARDUINO] * RUNNING)
+    for good, damaged in bursts:
+        assert not hear(truth, *[ARDUINO] * good, damaged)
+        hear(auto, *[ARDUINO] * good, damaged)
+    assert truth.evidence == ()
+    assert auto.profile.name == "arduino"
+
+
+def test_auto_adds_the_options_that_it_hears() -> None:
+    truth = PlatformTruth(parse_platform("unknown"), auto=True)
+    hear(truth, ARM, ARM, ARM)
+    assert truth.profile.name == "unknown+arm"
+    hear(truth, *[ARDUINO] * RUNNING)
+    assert truth.profile.name == "arduino+arm"
+
+
+def test_a_car_that_is_neither_is_treated_as_unknown() -> None:
+    truth = PlatformTruth(parse_platform("unknown"), auto=True)
+    hear(truth, *[ARDUINO] * RUNNING)
+    assert truth.profile.name == "arduino"
+    hear(truth, *[PI] * RUNNING)
+    assert truth.profile.name == "unknown"
+    assert truth.evidence[0].startswith("both ")
+    hear(truth, *[ARDUINO] * 9, *[PI] * 9)
+    assert truth.profile.name == "unknown", "it does not flip"
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("platform", ["arduino", "stm32", "raspberry_pi"])
+def test_the_simulated_cars_are_found_and_contradict_nothing_of_their_own(platform: str, world: str) -> None:
+    for mode in Mode:
+        car = build(platform, WORLDS[world](), 0, random.Random(3), options=frozenset({"arm"}))
+        told = PlatformTruth(parse_platform(f"{platform}+arm"))
+        auto = PlatformTruth(parse_platform("unknown"), auto=True)
+        decoder = Decoder()
+        car.feed(frame_of(mode), 0.0)
+        for tenth in range(300):
+            for at, data in car.advance(tenth / 10):
+                for event in decoder.feed(data, at):
+                    assert not told.heard(event)
+                    auto.heard(event)
+        silent = mode in (Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED) and platform != "raspberry_pi"
+        running = mode is not Mode.MANUAL and platform != "raspberry_pi"
+        kind = "unknown" if silent else "raspberry_pi" if platform == "raspberry_pi" else "arduino"
+        assert auto.profile.name == kind + ("" if running else "+arm")
