@@ -1,6 +1,5 @@
 """The URLs that name a link."""
 
-import importlib.util
 import re
 from dataclasses import dataclass
 from typing import Final
@@ -162,7 +161,9 @@ def _ble(text: str, rest: str) -> BleUrl:
         url = BleUrl(address=rest.upper())
         if _BLE_ADDRESS.fullmatch(rest.upper()) is None:
             raise _bad(text, "it names no Bluetooth address, and no name=")
-    if importlib.util.find_spec("bleak") is None:
+    from importlib.util import find_spec
+
+    if find_spec("bleak") is None:
         raise BadUrl(f"link {text!r} needs Bluetooth, which is not installed: pip install 'zenoh-car-fleet[ble]'")
     return url
 

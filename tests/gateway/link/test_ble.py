@@ -15,8 +15,17 @@ from tests.gateway.link.peers import BlePeer, open_descriptors, settled
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's; elsewhere bleak asks the system")
 
+KINDS = {}
 if sys.platform == "linux":
     from tests.support.bluez import BATTERY, FFE0, NORDIC, SEPARATE, TWO_SERVICES, Module, free_address
+
+    KINDS = {
+        "FFE1": FFE0,
+        "FFE1 and FFE2, written with response": SEPARATE,
+        "FFE4, and FFE9 in another service": TWO_SERVICES,
+        "Nordic": NORDIC,
+        "behind another that notifies": BATTERY + FFE0,
+    }
 
 LED = b"$4WD,CLR255,CLG128,CLB100#"
 READING = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
@@ -57,7 +66,7 @@ async def refused(peer: BlePeer, url: BleUrl | None = None, timeout_s: float = P
     return words
 
 
-@pytest.mark.parametrize("gatt", [FFE0, SEPARATE, TWO_SERVICES, NORDIC, BATTERY + FFE0], ids=str)
+@pytest.mark.parametrize("gatt", KINDS.values(), ids=KINDS)
 async def test_each_kind_of_module(peer: BlePeer, gatt: tuple[object, ...]) -> None:
     peer.module.gatt = gatt  # type: ignore[assignment]  # as the constants are
     link = await open_link(peer.url)
@@ -144,6 +153,7 @@ async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: py
     monkeypatch.setattr(ble, "DISCONNECT_S", 0.2)
     peer.module.connects = peer.module.leaves = False
     await refused(peer, timeout_s=0.5)
+    assert not [task for task in asyncio.all_tasks() if "BleLink" in repr(task)], "nothing goes on in secret"
     peer.module.connects = True
     link = await open_link(peer.url)
     async with asyncio.timeout(PATIENCE_S):
