@@ -63,6 +63,8 @@ class Settings:
     car: str
     url: LinkUrl
     profile: Profile
+    auto: bool
+    """Find out which platform the car is; `profile` is the unknown one."""
     fleet: str
     state_dir: Path
     retry: bool
@@ -93,7 +95,9 @@ class Car:
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
         self._store = Store(settings.state_dir, settings.fleet, settings.car)
-        self._control = Controller(settings.car, settings.profile, kept=self._store.load(time.time_ns()))
+        self._control = Controller(
+            settings.car, settings.profile, auto=settings.auto, kept=self._store.load(time.time_ns())
+        )
         self._saved = self._control.safety.kept
         self._passing_on: set[asyncio.Task[None]] = set()
         self._came = asyncio.Event()
@@ -120,7 +124,7 @@ class Car:
         Raises AlreadyServed (see doors.py), and LinkError if the link cannot be opened at the start.
         """
         now = self._loop.time()
-        self._out.health(now, loop_lag_s=0.0, bus_drops=0)
+        self._publish_health(now, 0.0)
         self._out.states(self._control, self._health, now)
         self._doors.attach(
             self._loop,
@@ -246,6 +250,7 @@ class Car:
             if not self._out.event(event, wall_ns(event.at), confirmed, loaded=self._control.motors != "off"):
                 self._flood("raw_not_published", 1, event.at)
             self._control.heard(event, self._loop.time())
+            self._out.profile = self._control.profile
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.rejected(event.cause)
@@ -500,8 +505,12 @@ class Car:
                 self._out.states(self._control, self._health, now)
             if now >= next_health:
                 next_health = now + HEALTH_EVERY_S
-                self._out.health(now, loop_lag_s=worst, bus_drops=self._doors.dropped)
+                self._publish_health(now, worst)
                 worst = 0.0
+
+    def _publish_health(self, now: float, lag_s: float) -> None:
+        evidence = self._control.platform.evidence
+        self._out.health(now, loop_lag_s=lag_s, bus_drops=self._doors.dropped, platform_evidence=evidence)
 
     async def _keep_hub(self) -> None:
         """Bring a hub back that is gone for half a second; jitter keeps a hundred gateways from trying at once."""

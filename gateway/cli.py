@@ -59,7 +59,9 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         help="/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04 "
         "(`gateway scan` shows them)",
     )
-    run.add_argument("--platform", default="unknown", help="arduino, stm32, raspberry_pi; +arm, +imu (default unknown)")
+    run.add_argument(
+        "--platform", default="auto", help="arduino, stm32, raspberry_pi, unknown; +arm, +imu (default auto: found out)"
+    )
     run.add_argument("--fleet", default=DEFAULT_FLEET, help="fleet name, the first part of every key (default fleet)")
     run.add_argument(
         "--connect", metavar="ENDPOINT", help="the bus, tcp/HOST:PORT (default FLEET_ENDPOINT, or loopback)"
@@ -80,12 +82,12 @@ def _run(arguments: argparse.Namespace) -> int:
     parent = os.getppid() if arguments.with_parent else None
     from gateway.doors import AlreadyServed, Doors
     from gateway.link import BadUrl, LinkError, parse_url
-    from gateway.protocol.profile import parse_platform
+    from gateway.protocol.profile import parse_told
     from schemas.bus import BadEndpoint, Bus, BusError
 
     try:
         car, fleet = check_name(arguments.car), check_name(arguments.fleet, "fleet name")
-        url, profile = parse_url(arguments.link), parse_platform(arguments.platform)
+        url, (profile, auto) = parse_url(arguments.link), parse_told(arguments.platform)
     except (BadKey, BadUrl, ValueError) as error:
         return _failed(str(error), 2)
     longest_s = arguments.longest_drive
@@ -104,7 +106,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
             state_dir = Path(arguments.state_dir) if arguments.state_dir else default_directory()
-            settings = Settings(car, url, profile, fleet, state_dir, arguments.retry, longest_s, parent)
+            settings = Settings(car, url, profile, auto, fleet, state_dir, arguments.retry, longest_s, parent)
             stopped = asyncio.run(serve(settings, opened, doors))
     except BadEndpoint as error:
         return _failed(str(error), 2)

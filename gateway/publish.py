@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,7 +51,8 @@ class Publications:
     def __init__(self, opened: bus.Bus, fleet: str, car: str, profile: Profile, url: str) -> None:
         self._fleet = fleet
         self._car = car
-        self._profile = profile
+        self.profile = profile
+        """What the car is treated as; its readings are filler or not accordingly."""
         self._url = url
         self._publishers: dict[str, bus.Publisher] = {}
         self._rings: dict[str, Ring] = {}
@@ -107,7 +109,7 @@ class Publications:
     def _sensors(
         self, event: Sensors, stamp_ns: int, confirmed: Mode | None, published: list[str], *, loaded: bool
     ) -> None:
-        measured = self._profile.measured(event, confirmed)
+        measured = self.profile.measured(event, confirmed)
         if "range" in measured and event.range_cm is not None:
             message = _CLASSES["sensor/range"]()
             message.no_echo = event.range_cm == 0
@@ -128,7 +130,7 @@ class Publications:
             message = _CLASSES["sensor/line"]()
             message.left_outer, message.left_inner, message.right_inner, message.right_outer = event.line
             self._reading("sensor/line", message, stamp_ns, published)
-        if "obstacle" in measured and (obstacle := self._profile.obstacle(event, confirmed)) is not None:
+        if "obstacle" in measured and (obstacle := self.profile.obstacle(event, confirmed)) is not None:
             message = _CLASSES["sensor/obstacle"]()
             message.left, message.right = obstacle
             self._reading("sensor/obstacle", message, stamp_ns, published)
@@ -213,16 +215,16 @@ class Publications:
                 _fill_safety(message, control, now)
         self._put_state(name, message, now)
 
-    def health(self, now: float, *, loop_lag_s: float, bus_drops: int) -> None:
+    def health(self, now: float, *, loop_lag_s: float, bus_drops: int, platform_evidence: Iterable[str]) -> None:
         """Publish what the gateway's process does."""
         message = _CLASSES["state/health"]()
         self._process.fill(message, now)
         message.host = socket.gethostname()
         message.link = self._url
         message.version = VERSION
-        message.platform = self._profile.name
-        message.platform_evidence.extend(self._profile.not_observed)
-        message.capabilities.extend(sorted(self._profile.capabilities))
+        message.platform = self.profile.name
+        message.platform_evidence.extend(platform_evidence)
+        message.capabilities.extend(sorted(self.profile.capabilities))
         message.loop_lag_s = loop_lag_s
         message.bus_drops = bus_drops
         self._put_state("state/health", message, now)

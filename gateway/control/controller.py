@@ -7,7 +7,7 @@ one frame on its way.
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from gateway.control import arbiter, recipes, stop
@@ -16,6 +16,7 @@ from gateway.control.ledger import Ledger, Pending
 from gateway.control.mode import MANUAL_SILENCE_S, ModeTruth, Verdict
 from gateway.control.outbox import Pacing
 from gateway.control.recipes import Recipe
+from gateway.control.platform import PlatformTruth
 from gateway.control.records import (
     Act,
     Answer,
@@ -74,9 +75,10 @@ class _Held:
 class Controller:
     """One car's control. See the module's docstring for how it is driven."""
 
-    def __init__(self, car: str, profile: Profile, *, kept: Kept | None = None) -> None:
+    def __init__(self, car: str, profile: Profile, *, auto: bool = False, kept: Kept | None = None) -> None:
         self.car = car
         self.profile = profile
+        self.platform = PlatformTruth(profile, auto=auto)
         self.mode = ModeTruth(profile)
         self.pacing = Pacing(profile)
         self.believed = Believed(profile)
@@ -154,6 +156,9 @@ class Controller:
         self._link_open = self._was_open = True
         self._gave_up = self._unheard = False
         self.known = False
+        if self.platform.auto:  # another car may have been plugged in
+            self.platform = PlatformTruth(self.platform.told, auto=True)
+            self._treat_as(self.platform.told)
         self.pacing.reset()
         self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
 
@@ -176,6 +181,8 @@ class Controller:
 
     def heard(self, event: Event, now: float) -> None:
         """Take an event of the decoder as evidence."""
+        for words in self.platform.heard(event):
+            self._ledger.log(Level.WARNING, "platform_contradicted", f"{self.car}: {words}", now)
         if not isinstance(event, Sensors):
             return
         before = self.mode.verdict
@@ -200,8 +207,21 @@ class Controller:
         elif running.frames_sent and event.at > running.last_at + UNDER_WAY_S:
             self._finish(running, now)
 
+    def _settle(self, now: float) -> None:
+        """Treat the car as what its bytes have shown it to be; between stops only, each of which is one platform's."""
+        if self.platform.profile is self.profile or not self.known or self._running is not None:
+            return
+        self._treat_as(self.platform.profile)
+        words = f"{self.car} is treated as {self.profile.name} from now on: {self.platform.evidence[0]}"
+        self._ledger.log(Level.INFO, "platform_settled", words, now)
+
+    def _treat_as(self, profile: Profile) -> None:
+        self.profile = self.mode.profile = self.pacing.profile = profile
+        self.believed = replace(self.believed, profile=profile)
+
     def tick(self, now: float) -> None:
         """Weigh silence; called a few times a second."""
+        self._settle(now)
         before = self.mode.verdict
         if self._link_open and self.known and self._running is None:
             self._weigh_silence(now)

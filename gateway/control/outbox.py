@@ -27,7 +27,7 @@ class Pacing:
     """
 
     def __init__(self, profile: Profile) -> None:
-        self._profile = profile
+        self.profile = profile
         self._slow_fan_unsure = profile.kind is Platform.UNKNOWN
         self.reset()
 
@@ -46,7 +46,7 @@ class Pacing:
         self._before_s = max(self._before_s, self._block_s) if now < self._read_by else 0.0
         self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_S, self.block_until))
         self._written_at = now
-        self._block_s = self._profile.block_s(frame)
+        self._block_s = self.profile.block_s(frame)
         unsure = isinstance(frame, ArmSet) or (isinstance(frame, General) and frame.fan and self._slow_fan_unsure)
         self._sure_s = 0.0 if unsure else self._block_s
 
@@ -104,7 +104,7 @@ class Pacing:
 
     def act_at(self, frame: Frame) -> float:
         """From when on a frame that acts once may be written."""
-        if self._profile.stop_style is StopStyle.RASPBERRY_PI and not isinstance(frame, General):
+        if self.profile.stop_style is StopStyle.RASPBERRY_PI and not isinstance(frame, General):
             return max(self.flight_until, self.buffer_until)  # in one receive behind another it kills the program
         return self.flight_until
 

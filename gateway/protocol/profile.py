@@ -177,14 +177,20 @@ class Profile:
         return RATE_HZ.get(mode, 0.0)
 
     def resolved(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
-        """The modes this frame can come from. `mode`, if confirmed otherwise, only chooses among the candidates."""
+        """The modes this frame may come from.
+
+        `mode`, the confirmed one, chooses among the candidates; a frame of none but other modes may be one of `mode`
+        with a byte damaged, until three of them have contradicted it.
+        """
         candidates = event.candidates
-        return (mode,) if mode in candidates else candidates
+        if mode is None:
+            return candidates
+        return (mode,) if mode in candidates else (*candidates, mode)
 
     def measured(self, event: Sensors, mode: Mode | None = None) -> frozenset[str]:
         """Which of range, battery, grayscale, line, obstacle, light are measurements here, in every candidate mode.
 
-        The frame's text decides first; `mode` is the confirmed mode, or None, and only chooses among candidates.
+        The frame's text decides first; `mode` is the confirmed mode, or None (see `resolved`).
         A rejected field is never measured. No echo is: it is the range's business to say so.
         """
         there = {name for name in _sure(self.resolved(event, mode)) if getattr(event, _FIELDS[name]) is not None}
@@ -246,6 +252,18 @@ class Profile:
     @staticmethod
     def _known(words: frozenset[Light] | frozenset[Mode] | frozenset[ServoAction]) -> str:
         return f"they know {', '.join(sorted(words))}" if words else "they know none"
+
+
+AUTO: Final = "auto"
+
+
+def parse_told(text: str) -> tuple[Profile, bool]:
+    """As `parse_platform`, and whether to find out: `auto` begins as `unknown`, and settles on what the bytes show."""
+    auto = text.partition("+")[0] == AUTO
+    try:
+        return parse_platform(text.replace(AUTO, Platform.UNKNOWN, 1) if auto else text), auto
+    except ValueError as error:
+        raise ValueError(f"{error}; or auto, to find out") from None
 
 
 def parse_platform(text: str) -> Profile:
