@@ -26,6 +26,7 @@ from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
 VERSION: Final = "0.1.0"
+_STATM: Final = Path("/proc/self/statm")
 STATE_EVERY_S: Final = 1.0
 """States are published on change and once a second (design.md, "Keys")."""
 RAW_PER_S: Final = 100.0
@@ -332,8 +333,8 @@ class _Process:
 
 def _rss_mb() -> float:
     try:
-        with open("/proc/self/statm", "rb") as file:
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        pages = int(_STATM.read_bytes().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
     except FileNotFoundError:
         pass
     try:

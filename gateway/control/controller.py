@@ -15,8 +15,8 @@ from gateway.control.believed import Believed
 from gateway.control.ledger import Ledger, Pending
 from gateway.control.mode import MANUAL_SILENCE_S, ModeTruth, Verdict
 from gateway.control.outbox import Pacing
-from gateway.control.recipes import Recipe
 from gateway.control.platform import PlatformTruth
+from gateway.control.recipes import Recipe
 from gateway.control.records import (
     Act,
     Answer,
