@@ -51,13 +51,8 @@ class Tally:
 
     @property
     def readings(self) -> int:
-        """Good frames that a car has sent: no echoes."""
-        return self.frames - self.kinds["echo"]
-
-    @property
-    def frames(self) -> int:
-        """Good frames."""
-        return self.kinds.total()
+        """Good frames of a car; an echo of ours is none."""
+        return self.kinds.total() - self.kinds["echo"]
 
     @property
     def seconds(self) -> float:
@@ -78,18 +73,20 @@ class Tally:
 
     def words(self) -> str:
         """One line for a person."""
-        heard = f"{self.frames} frames in {self.seconds:.1f} s"
-        if self.seconds and self.frames:
-            heard += f" ({self.frames / self.seconds:.1f}/s)"
+        heard = f"{self.readings} frames in {self.seconds:.1f} s"
+        if self.seconds and self.readings:
+            heard += f" ({self.readings / self.seconds:.1f}/s)"
         if not self.bytes:
             return f"{heard}: nothing came. Is the car on? In some modes, and while its fan runs, it is silent"
         if self.rejects:
             causes = ", ".join(f"{cause} {count}" for cause, count in self.rejects.most_common())
             heard += f", {self.rejects.total()} rejected ({causes})"
+        if self.kinds["echo"]:
+            heard += f", {self.kinds['echo']} echoes of what was sent"
         if self.modes:
             modes = ", ".join(mode if len(self.modes) == 1 else f"{mode} {n}" for mode, n in self.modes.most_common())
             heard += f"; mode by their shape: {modes}; platform: {' or '.join(self.platforms) or 'none that is known'}"
-        elif not self.frames:
+        elif not self.readings and not self.kinds["echo"]:
             heard += ": no car of this protocol, or another baud rate"
         for words, count in self.contradictions.most_common():
             heard += f"; {count} times against the platform: {words}"

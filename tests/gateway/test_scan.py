@@ -36,6 +36,7 @@ class Stranger:
         self.link = f"serial://{os.ttyname(self._device)}"
         self.received = b""
         self.says = b""
+        self.echoes = False
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._live)
         os.set_blocking(self._controller, False)
@@ -50,7 +51,10 @@ class Stranger:
     def _live(self) -> None:
         while not self._ended.wait(0.1):
             with contextlib.suppress(BlockingIOError):
-                self.received += os.read(self._controller, 4096)
+                data = os.read(self._controller, 4096)
+                self.received += data
+                if self.echoes:
+                    os.write(self._controller, data)
             if self.says:
                 os.write(self._controller, self.says)
 
@@ -106,23 +110,27 @@ def test_a_probe_asks_only_what_is_silent_or_in_a_mode(
 ) -> None:
     sim, links = simulate("red:arduino:pty", "blue:arduino:pty")
     red, blue = links
-    silent, other = stranger(), stranger()
+    silent, other, loop = stranger(), stranger(), stranger()
     other.says = b"G28 ok\n"
+    loop.echoes = True
     done = command("send", "--link", blue, "--platform", "arduino", "--wait", "1", "$4WD,MODE31#")
     assert done.returncode == 0
     wait_for(lambda: sim.say({"car": "blue", "ask": "truth"})["mode"] == "obstacle_avoidance", "it avoids obstacles")
-    found, done = _scan(command, *links, silent.link, other.link, more=("--seconds", "5", "--probe"))
+    found, done = _scan(command, *links, silent.link, other.link, loop.link, more=("--seconds", "5", "--probe"))
     assert done.returncode == 0
     assert {link: each["probed"] for link, each in found.items()} == {
         red: False,
         blue: True,
         silent.link: True,
         other.link: False,
+        loop.link: True,
     }
-    assert f"within 4.8 s to {blue}, {silent.link}: a car there stops, and goes to mode 0" in done.stderr
+    assert f"within 4.8 s to {blue}, {silent.link}, {loop.link}: a car there stops, and goes to mode 0" in done.stderr
     assert found[blue]["verdict"] == "car"
     assert "it answered the probe in mode 0" in found[blue]["words"]
     assert found[silent.link]["verdict"] == "silent"
+    assert (found[loop.link]["verdict"], found[loop.link]["frames"]) == ("other", {"echo": len(UNKNOWN_STOP)})
+    assert "echoes of what was sent" in found[loop.link]["words"]
     assert re.findall(rb"\$[^#]*#", silent.received) == UNKNOWN_STOP
     assert other.received == b""
     assert sim.say({"car": "blue", "ask": "truth"})["mode"] == "manual"
