@@ -218,7 +218,6 @@ def test_bad_commands_are_answered_and_nothing_dies(fleet: Fleet, tcp_car: TcpCa
         ("drive", {"motion": "forward", "duration_s": "NaN"}, "bad_value"),
         ("mode", {"mode": "tracking"}, "unsupported"),
         ("jump", {}, "unsupported"),
-        ("lease", {}, "unsupported"),
         ("led", {"r": 1, "g": 2, "b": 300}, "bad_value"),
         ("light", {"light": "yellow"}, "unsupported"),
     ]:
