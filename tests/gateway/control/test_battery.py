@@ -1,10 +1,12 @@
 """What a battery voltage means; 6.4 V empty to 8.4 V full (protocol.md, readings)."""
 
+import random
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.battery import BatteryLevel, charge, level
+from gateway.control.battery import HOLD_S, LOW_V, Action, Battery, BatteryLevel, Policy, charge, level
 
 
 @pytest.mark.parametrize(
@@ -26,8 +28,8 @@ def test_level_and_charge(voltage_v: float, expected: BatteryLevel, share: float
     assert charge(voltage_v, loaded=False) == (pytest.approx(share), 0.15)
 
 
-def test_under_load_the_estimate_is_worse_not_other() -> None:
-    assert charge(7.4, loaded=True) == (pytest.approx(0.5), pytest.approx(0.35))
+def test_under_load_the_estimate_is_of_the_voltage_at_rest_and_less_sure() -> None:
+    assert charge(7.4, loaded=True) == (pytest.approx(0.6), pytest.approx(0.25))
 
 
 @given(st.floats(0, 12), st.booleans())
@@ -35,3 +37,86 @@ def test_always_a_share_and_an_error(voltage_v: float, loaded: bool) -> None:
     share, error = charge(voltage_v, loaded=loaded)
     assert 0 <= share <= 1
     assert 0 < error <= 1
+
+
+def hear(battery: Battery, *voltages: float, loaded: bool = False, from_s: float = 0.0) -> list[float]:
+    """One reading a second; when the level changed."""
+    start = max(battery.heard_at + 1.0, from_s)
+    return [
+        start + second
+        for second, voltage_v in enumerate(voltages)
+        if battery.heard(voltage_v, loaded=loaded, now=start + second)
+    ]
+
+
+def test_nothing_measured_is_no_level_and_refuses_nothing() -> None:
+    battery = Battery()
+    assert (battery.level, battery.action, battery.refusal, battery.words) == (None, None, "", "")
+
+
+@pytest.mark.parametrize(
+    ("voltage_v", "expected", "action", "refuses"),
+    [(8.0, "ok", None, False), (6.9, "low", Action.WARN, False), (6.5, "critical", Action.REFUSE, True)],
+)
+def test_the_first_reading_says_where_it_stands(
+    voltage_v: float, expected: str, action: Action | None, refuses: bool
+) -> None:
+    battery = Battery()
+    assert battery.heard(voltage_v, loaded=False, now=0.0) is (expected != "ok")
+    assert (battery.level, battery.action, bool(battery.refusal)) == (expected, action, refuses)
+
+
+def test_a_level_changes_when_it_has_held_and_not_by_one_reading() -> None:
+    battery = Battery()
+    assert not hear(battery, 7.2, 6.9, 6.9, 7.1, 6.9, 6.9, 6.9, 6.9, 6.9)
+    assert hear(battery, 6.9)
+    assert battery.level is BatteryLevel.LOW
+    assert not hear(battery, *[7.1] * 60), "not above the hysteresis"
+    assert hear(battery, *[7.2] * 6)
+    assert battery.level is BatteryLevel.OK
+
+
+def test_critical_leads_back_over_low() -> None:
+    battery = Battery()
+    hear(battery, 6.5, *[6.8] * 9)
+    assert battery.level is BatteryLevel.LOW
+    assert "battery low: 6.80 V, charge 20% +- 15%" in battery.words
+
+
+def test_the_sag_of_a_drive_changes_nothing_nor_does_what_recovers_after_it() -> None:
+    battery = Battery()
+    hear(battery, *[7.15] * 10)
+    for _ in range(20):
+        assert not hear(battery, *[6.85] * 30, loaded=True)
+        assert not hear(battery, 6.9, 6.95, 6.99, 7.0)
+        assert not hear(battery, *[7.1] * 30)
+    assert battery.level is BatteryLevel.OK
+
+
+def test_what_is_low_under_any_load_is_low_also_while_driving() -> None:
+    battery = Battery()
+    hear(battery, 7.5)
+    assert hear(battery, *[6.5] * 20, loaded=True)
+    assert battery.level is BatteryLevel.LOW
+
+
+@given(st.integers(0, 2**32))
+def test_noise_around_a_threshold_does_not_flap(seed: int) -> None:
+    moments = random.Random(seed)
+    battery = Battery()
+    changes = hear(battery, *(LOW_V + 0.14 * (moments.random() - 0.5) for _ in range(600)))
+    assert len(changes) <= 2
+
+
+def test_a_policy_may_stop_or_only_warn() -> None:
+    assert Policy(critical=Action.STOP).action(BatteryLevel.CRITICAL) is Action.STOP
+    warns = Battery(Policy(critical=Action.WARN))
+    warns.heard(6.0, loaded=False, now=0.0)
+    assert (warns.action, warns.refusal) == (Action.WARN, "")
+    refuses = Battery(Policy(low=Action.REFUSE))
+    refuses.heard(6.9, loaded=False, now=0.0)
+    assert refuses.refusal.startswith("battery low: 6.90 V, charge 25% +- 15%: charge it")
+
+
+def test_the_hold_outlasts_a_few_readings() -> None:
+    assert HOLD_S > 3.0, "a report comes every one to two seconds"
