@@ -300,6 +300,7 @@ class Car:
         self._control.stalled(now - self._alive_at - TICK_S, now)
         self._events(self._decoder.tick(now))
         while (link := self._link) is not None and (write := self._control.poll(self._loop.time())) is not None:
+            self._decoder.sent(write.data, self._loop.time())  # an echo may be there before the write returns
             try:
                 await link.write(write.data)
             except LinkLost as error:
@@ -311,7 +312,6 @@ class Car:
                 return
             now = self._loop.time()
             self._control.wrote(write, now)
-            self._decoder.sent(write.data, now)
             self._health.wrote(len(write.data), now)
             self._out.written(write, time.time_ns(), whole=True)
 

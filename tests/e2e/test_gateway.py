@@ -53,7 +53,7 @@ RECORDED: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
     ),
     (b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#", {"line": {"left_outer": True, "left_inner": False}}),  # tracking
     (b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM10#", {"light": {"left": True, "right": False}}),  # light seeking
-    (b"$4WD,CSB120,PV8.3,GS000,LF0000,HW01,GM00", {"obstacle": {"left": True, "right": False}}),  # following
+    (b"$4WD,CSB120,PV8.3,GS000,LF0000,HW01,GM00", {}),  # following, of which mode 0 was confirmed: a damaged byte?
     (
         b"$4WD,CSB2000,PV7.91,GS5,LF0201,HW00,GM11#",  # two of its fields are out of range
         {
@@ -102,7 +102,7 @@ OF_A_RASPBERRY_PI: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
 @pytest.mark.parametrize(
     ("platform", "recording", "known", "connected", "stopped"),
     [
-        ("arduino+arm+imu", RECORDED, LAST, [b"#", MODE00, MODE00, STOP], [MODE00, STOP]),
+        ("arduino+arm+imu", RECORDED, LAST, [b"#", MODE00, MODE00, STOP], [STOP, MODE00, STOP]),
         ("raspberry_pi", OF_A_RASPBERRY_PI, b"", [STOP, STOP, STOP], [STOP, STOP, STOP]),
     ],
     ids=["arduino", "raspberry_pi"],
