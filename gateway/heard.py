@@ -1,14 +1,13 @@
-"""What has come over one link: counts, and what each event says, for a person and for a script. Nothing is inferred."""
+"""What has come over one link: counts, and what each event says, for a person and for a script; its mode is not judged."""
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
-from gateway.protocol.profile import Platform, Profile, parse_platform
+from gateway.control.platform import PlatformTruth
+from gateway.protocol.profile import Profile, parse_platform
 from gateway.protocol.readings import ArmReading, Echo, Event, ImuReading, Reject, Rejected, Sensors
-
-PLATFORMS: Final = {kind: parse_platform(kind) for kind in Platform if kind is not Platform.UNKNOWN}
 
 
 @dataclass(slots=True)
@@ -22,18 +21,17 @@ class Tally:
     rejects: Counter[str] = field(default_factory=Counter)
     modes: Counter[str] = field(default_factory=Counter)
     contradictions: Counter[str] = field(default_factory=Counter)
-    excluded: set[Platform] = field(default_factory=set)
-    """Platforms that do not send what was heard."""
+    looked_for: PlatformTruth = field(default_factory=lambda: PlatformTruth(parse_platform("unknown"), auto=True))
 
     def count(self, event: Event, profile: Profile) -> None:
-        """Take an event in."""
+        """Take an event in; `profile`: what the car was said to be."""
+        self.looked_for.heard(event)
         match event:
             case Sensors():
                 self.kinds["sensors"] += 1
                 self.modes[" or ".join(event.candidates)] += 1
                 self.rejects.update(reject.cause for reject in event.rejects)
                 self.contradictions.update(profile.contradictions(event))
-                self.excluded |= {kind for kind, each in PLATFORMS.items() if each.contradictions(event)}
             case ArmReading():
                 self.kinds["arm"] += 1
                 self.rejects.update(reject.cause for reject in event.rejects)
@@ -43,11 +41,6 @@ class Tally:
                 self.kinds["echo"] += 1
             case Rejected():
                 self.rejects[event.cause] += 1
-
-    @property
-    def platforms(self) -> tuple[Platform, ...]:
-        """The platforms that send such sensors frames; none if none has come."""
-        return tuple(kind for kind in PLATFORMS if self.modes and kind not in self.excluded)
 
     @property
     def readings(self) -> int:
@@ -65,7 +58,8 @@ class Tally:
             "frames": dict(self.kinds),
             "rejects": dict(self.rejects),
             "modes": dict(self.modes),
-            "platforms": list(self.platforms),
+            "platform": self.looked_for.profile.name,
+            "platform_evidence": self.looked_for.evidence[0],
             "contradictions": dict(self.contradictions),
             "bytes": self.bytes,
             "seconds": round(self.seconds, 3),
@@ -85,7 +79,7 @@ class Tally:
             heard += f", {self.kinds['echo']} echoes of what was sent"
         if self.modes:
             modes = ", ".join(mode if len(self.modes) == 1 else f"{mode} {n}" for mode, n in self.modes.most_common())
-            heard += f"; mode by their shape: {modes}; platform: {' or '.join(self.platforms) or 'none that is known'}"
+            heard += f"; mode by their shape: {modes}; platform: {self.looked_for.evidence[0]}"
         elif not self.readings and not self.kinds["echo"]:
             heard += ": no car of this protocol, or another baud rate"
         for words, count in self.contradictions.most_common():

@@ -30,8 +30,9 @@ Opening a serial port can reset an Arduino that is on a USB cable. A port that a
 Bluetooth devices are only listed, not connected to. A TCP car is never looked for: the connection ends its program.
 --probe stops a car and closes whatever mode it is in. Ports that send something else are not probed."""
 
-SECONDS: Final = 5.0
-"""An Arduino that was reset by opening its port has started after two, and in mode 0 a car reports once in one."""
+SECONDS: Final = 6.0
+"""An Arduino that was reset by opening its port has started after two; in mode 0 a car reports once in one, and three
+readings show its platform."""
 _LEAST_S, _MOST_S = 0.5, 120.0
 _TICK_S: Final = 0.5
 
