@@ -1,4 +1,4 @@
-"""What has come over one link: counts, and what each event says, for a person and for a script; its mode is not judged."""
+"""What has come over one link: counts, and what each event says, for a person and for a script. No mode is judged."""
 
 from collections import Counter
 from collections.abc import Sequence
