@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final, Self
 
-from schemas import messages
+from schemas import messages, topics
 from schemas.bus import Sample
 
 QUEUE_LIMIT: Final = 1024
@@ -25,6 +25,15 @@ class Reading:
     """When its publisher had it, UTC: the message's own stamp, else the time Zenoh put on it."""
     value: Any
     """The protobuf message, e.g. `fleet.v1.Range`; optional fields that were not measured are not set."""
+
+    def age_s(self, now: datetime | None = None) -> float:
+        """How old it is, s, by this machine's clock; at least 0, since clocks differ."""
+        return max(0.0, ((now or datetime.now(UTC)) - self.time).total_seconds())
+
+    def stale(self, now: datetime | None = None) -> bool:
+        """Whether it is too old to say how things are (`stale_after_s` of its topic)."""
+        topic = topics.of_key(self.key)
+        return topic is not None and topic.stale_after_s is not None and self.age_s(now) > topic.stale_after_s
 
     def as_dict(self) -> dict[str, Any]:
         """The message in protobuf's JSON mapping, with the field names of the .proto."""

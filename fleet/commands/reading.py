@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any, Final
 
 import click
@@ -33,11 +32,11 @@ _COLUMNS: Final = ("car", "link", "mode", "verdict", "motion", "hold", "battery"
 def list_cars(client: FleetClient, *, as_json: bool) -> None:
     """The cars on the bus: link, mode and how sure that is, motion, who holds the car, battery."""
     cars = client.cars()
-    said: dict[str, dict[str, Any]] = {car: {} for car in cars}
+    said: dict[str, dict[str, Reading]] = {car: {} for car in cars}
     for reading in client.get("*/*/*"):  # one query: a gateway that hangs is waited for once
         key = keys.parse(reading.key)
         if key is not None:
-            said.setdefault(key.car, {})[key.topic] = reading.value
+            said.setdefault(key.car, {})[key.topic] = reading
     if not said:
         raise click.ClickException(f"no car of fleet {client.fleet} is on the bus at {client.bus.endpoint}")
     rows = [_row(car, values) for car, values in sorted(said.items())]
@@ -53,7 +52,9 @@ def list_cars(client: FleetClient, *, as_json: bool) -> None:
         click.echo("  ".join(cells[name].ljust(widths[name]) for name in _COLUMNS).rstrip())
 
 
-def _row(car: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def _row(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
+    values = {topic: reading.value for topic, reading in readings.items()}
+    measured = readings.get("sensor/battery")
     link, mode, motion = (values.get(f"state/{name}") for name in ("link", "mode", "motion"))
     safety, battery = values.get("state/safety"), values.get("sensor/battery")
     return {
@@ -68,15 +69,21 @@ def _row(car: str, values: Mapping[str, Any]) -> dict[str, Any]:
         "motors": safety.motors if safety else None,
         "battery_v": battery.voltage_v if battery else None,
         "battery_level": battery.level if battery else None,
+        "battery_age_s": round(measured.age_s(), 3) if measured else None,
+        "stale": sorted(topic for topic, reading in readings.items() if reading.stale()),
     }
 
 
 def _shown(name: str, row: Mapping[str, Any]) -> str:
     if name == "battery":
-        return "-" if row["battery_v"] is None else f"{row['battery_v']:.2f} V {row['battery_level']}"
+        if row["battery_v"] is None:
+            return "-"
+        age = f", {row['battery_age_s']:.0f} s old" if "sensor/battery" in row["stale"] else ""
+        return f"{row['battery_v']:.2f} V {row['battery_level']}{age}"
     if name == "hold" and row["estops"]:
         return f"e-stop {' '.join(row['estops'])}"
-    return str(row[name]) if row[name] else "-"
+    old = " (stale)" if name in ("link", "mode", "motion") and f"state/{name}" in row["stale"] else ""
+    return f"{row[name]}{old}" if row[name] else "-"
 
 
 @click.command(
@@ -135,7 +142,8 @@ def _warn_if_missing(expression: str, cars: Sequence[str]) -> None:
 
 def _json(reading: Reading) -> str:
     time = reading.time.isoformat(timespec="microseconds").replace("+00:00", "Z")
-    return json.dumps({"key": reading.key, "time": time, "value": reading.as_dict()})
+    age_s, stale = round(reading.age_s(), 3), reading.stale()
+    return json.dumps({"key": reading.key, "time": time, "age_s": age_s, "stale": stale, "value": reading.as_dict()})
 
 
 def _line(reading: Reading, width: int = 0) -> str:
@@ -146,9 +154,8 @@ def _line(reading: Reading, width: int = 0) -> str:
         for name, value in reading.as_dict().items()
         if name not in _HEADER and value not in ("", [], {})
     ]
-    age_s = max(0.0, (datetime.now(UTC) - reading.time).total_seconds())
-    stale = topic is not None and topic.stale_after_s is not None and age_s > topic.stale_after_s
-    return f"{reading.key:<{width}}  {'  '.join(fields)}  {age_s:.1f} s ago{' (stale)' if stale else ''}"
+    age = f"{reading.age_s():.1f} s ago{' (stale)' if reading.stale() else ''}"
+    return f"{reading.key:<{width}}  {'  '.join(fields)}  {age}"
 
 
 def _value(value: object) -> str:

@@ -159,6 +159,26 @@ def test_list_says_how_each_car_is(cars: Cars) -> None:
     assert table[3][-2:] == ["V", "ok"]
 
 
+def test_a_reading_of_an_hour_ago_is_not_shown_as_if_it_were_so_now(cars: Cars) -> None:
+    """In tracking only the line is measured: the battery's last reading ages."""
+    assert run(cars.endpoint, "mode", "red", "tracking").returncode == 0
+    try:
+
+        def old() -> dict[str, Any] | None:
+            row: dict[str, Any] = lines(run(cars.endpoint, "list", "--json"))[2]
+            return row if "sensor/battery" in row["stale"] else None
+
+        row = wait_for(old, "red's battery has not been measured for 3 s", 20.0)
+        assert row["battery_age_s"] > 3
+        assert "state/link" not in row["stale"]
+        assert run(cars.endpoint, "list").stdout.splitlines()[3].endswith(" s old")
+        (battery,) = lines(run(cars.endpoint, "get", "red/sensor/battery", "--json"))
+        assert battery["stale"] is True
+        assert run(cars.endpoint, "get", "red/sensor/battery").stdout.endswith(" s ago (stale)\n")
+    finally:
+        run(cars.endpoint, "mode", "red", "manual")
+
+
 def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
     done = run(cars.endpoint, "get", "red")
     assert done.returncode == 0
@@ -166,7 +186,9 @@ def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
     assert "voltage_v=7." in battery
     assert " V  " in battery
     (reading,) = lines(run(cars.endpoint, "get", "red/sensor/range", "--json"))
-    assert list(reading) == ["key", "time", "value"]
+    assert list(reading) == ["key", "time", "age_s", "stale", "value"]
+    assert 0 <= reading["age_s"] < 3
+    assert reading["stale"] is False
     assert reading["key"] == "fleet/red/sensor/range"
     assert reading["time"].endswith("Z")
     assert datetime.fromisoformat(reading["time"]).year > 2000

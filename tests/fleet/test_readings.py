@@ -2,12 +2,12 @@
 
 import asyncio
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
 from fleet.aio import AsyncWatch
-from fleet.readings import QUEUE_LIMIT, Watch, reading_of
+from fleet.readings import QUEUE_LIMIT, Reading, Watch, reading_of
 from schemas import messages
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
@@ -28,6 +28,15 @@ def test_a_reading_has_the_time_of_its_stamp_else_the_time_on_the_bus() -> None:
     assert reading.time == datetime.fromtimestamp(1_600_000_000, UTC).replace(microsecond=123_456)
     assert (reading.key, reading.value.range_m) == (KEY, 0.5)
     assert reading_of(sample(1)).time == datetime.fromtimestamp(1_700_000_000, UTC)
+
+
+def test_a_reading_is_stale_when_its_topic_says_so_and_is_never_from_the_future() -> None:
+    reading = reading_of(sample(1))
+    for age_s, stale in ((-5.0, False), (0.0, False), (2.9, False), (3.1, True)):
+        now = reading.time + timedelta(seconds=age_s)
+        assert (reading.age_s(now), reading.stale(now)) == (max(0.0, age_s), stale)
+    event = Reading("fleet/red/event/command", reading.time, reading.value)
+    assert not event.stale(reading.time + timedelta(days=1)), "what has happened does not expire"
 
 
 def test_what_was_not_measured_is_not_in_the_value() -> None:
