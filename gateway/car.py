@@ -13,7 +13,7 @@ import os
 import random
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +21,7 @@ import zenoh
 
 from gateway import requests
 from gateway.control import backoff
+from gateway.control.battery import Policy
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
 from gateway.control.records import Answer, Command, EmergencyStop, Level, LogRecord, Phase, Resume
@@ -69,6 +70,7 @@ class Settings:
     state_dir: Path
     retry: bool
     """Keep trying when the first attempt to open the link fails."""
+    battery: Policy = field(default_factory=Policy)
     longest_drive_s: float = requests.LONGEST_DRIVE_S
     parent: int | None = None
     """Process id of the starter, with which this ends."""
@@ -96,7 +98,11 @@ class Car:
         now = self._loop.time()
         self._store = Store(settings.state_dir, settings.fleet, settings.car)
         self._control = Controller(
-            settings.car, settings.profile, auto=settings.auto, kept=self._store.load(time.time_ns())
+            settings.car,
+            settings.profile,
+            auto=settings.auto,
+            kept=self._store.load(time.time_ns()),
+            battery_policy=settings.battery,
         )
         self._saved = self._control.safety.kept
         self._passing_on: set[asyncio.Task[None]] = set()
@@ -106,7 +112,7 @@ class Car:
         self._decoder = Decoder()
         self._flood_until = now
         self._link: Link | None = None
-        self._out = Publications(opened, settings.fleet, settings.car, settings.profile, str(settings.url))
+        self._out = Publications(opened, settings.fleet, settings.car, self._control, str(settings.url))
         self._asked: list[_Asked] = []
         self._sent: set[str] = set()
         """Ids of commands whose first frame went out since the last answers."""

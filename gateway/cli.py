@@ -72,6 +72,13 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     run.add_argument(
         "--longest-drive", metavar="S", type=float, default=10.0, help="longest duration_s of a drive (default 10 s)"
     )
+    for level, default, words in (("low", "warn", "below 7.0 V"), ("critical", "refuse", "below 6.6 V")):
+        run.add_argument(
+            f"--battery-{level}",
+            choices=("warn", "refuse", "stop"),
+            default=default,
+            help=f"{level} battery ({words}): warn, refuse new drives and modes, or stop (default {default})",
+        )
     run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
     run.add_argument(
         "--with-parent", action="store_true", help="stop the car and end when the process that started this ends"
@@ -102,11 +109,23 @@ def _run(arguments: argparse.Namespace) -> int:
             from pathlib import Path
 
             from gateway.car import Settings, serve
+            from gateway.control.battery import Action, Policy
             from gateway.store import default_directory
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
             state_dir = Path(arguments.state_dir) if arguments.state_dir else default_directory()
-            settings = Settings(car, url, profile, auto, fleet, state_dir, arguments.retry, longest_s, parent)
+            settings = Settings(
+                car,
+                url,
+                profile,
+                auto,
+                fleet,
+                state_dir,
+                arguments.retry,
+                battery=Policy(Action(arguments.battery_low), Action(arguments.battery_critical)),
+                longest_drive_s=longest_s,
+                parent=parent,
+            )
             stopped = asyncio.run(serve(settings, opened, doors))
     except BadEndpoint as error:
         return _failed(str(error), 2)

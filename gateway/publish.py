@@ -19,7 +19,6 @@ from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
 from gateway.control.records import CommandRecord, Level, LogRecord, Write
 from gateway.history import RING, BadRange, Ring
-from gateway.protocol.profile import Profile
 from gateway.protocol.readings import ArmReading, Echo, Event, ImuReading, Rejected, Sensors
 from gateway.protocol.values import Mode
 from schemas import bus, keys, messages, topics
@@ -49,11 +48,12 @@ def wall_ns(at: float) -> int:
 class Publications:
     """Publishers, latest values and rings of one car."""
 
-    def __init__(self, opened: bus.Bus, fleet: str, car: str, profile: Profile, url: str) -> None:
+    def __init__(self, opened: bus.Bus, fleet: str, car: str, control: Controller, url: str) -> None:
         self._fleet = fleet
         self._car = car
-        self.profile = profile
+        self.profile = control.profile
         """What the car is treated as; its readings are filler or not accordingly."""
+        self._battery = control.battery
         self._url = url
         self._publishers: dict[str, bus.Publisher] = {}
         self._rings: dict[str, Ring] = {}
@@ -121,7 +121,7 @@ class Publications:
             message = _CLASSES["sensor/battery"]()
             message.voltage_v = event.voltage_v
             message.charge, message.charge_error = battery.charge(event.voltage_v, loaded=loaded)
-            message.level = battery.level(event.voltage_v)
+            message.level = self._battery.level or battery.level(event.voltage_v)
             self._reading("sensor/battery", message, stamp_ns, published)
         if "grayscale" in measured and event.grayscale is not None:
             message = _CLASSES["sensor/grayscale"]()

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from gateway.control import arbiter, recipes, stop
+from gateway.control.battery import Action, Battery, BatteryLevel, Policy
 from gateway.control.believed import Believed
 from gateway.control.ledger import Ledger, Pending
 from gateway.control.mode import MANUAL_SILENCE_S, ModeTruth, Verdict
@@ -75,11 +76,20 @@ class _Held:
 class Controller:
     """One car's control. See the module's docstring for how it is driven."""
 
-    def __init__(self, car: str, profile: Profile, *, auto: bool = False, kept: Kept | None = None) -> None:
+    def __init__(
+        self,
+        car: str,
+        profile: Profile,
+        *,
+        auto: bool = False,
+        kept: Kept | None = None,
+        battery_policy: Policy | None = None,
+    ) -> None:
         self.car = car
         self.profile = profile
         self.platform = PlatformTruth(profile, auto=auto)
         self.mode = ModeTruth(profile)
+        self.battery = Battery(battery_policy or Policy())
         self.pacing = Pacing(profile)
         self.believed = Believed(profile)
         self.safety = Safety.restored(kept or Kept())
@@ -196,6 +206,8 @@ class Controller:
             return
         if event.range_cm is not None:
             self.pacing.heard(event.at)
+        if event.voltage_v is not None and "battery" in self.profile.measured(event, self.mode.confirmed):
+            self._weigh_battery(event.voltage_v, now)
         if now > self.believed.fan_at + FAN_SETTLED_S and self.profile.stop_style is not StopStyle.RASPBERRY_PI:
             self.believed.fan = False  # protocol.md: a car whose fan runs sends no readings
         running = self._running
@@ -218,6 +230,18 @@ class Controller:
     def _treat_as(self, profile: Profile) -> None:
         self.profile = self.mode.profile = self.pacing.profile = profile
         self.believed = replace(self.believed, profile=profile)
+
+    def _weigh_battery(self, voltage_v: float, now: float) -> None:
+        """Tell of a level that has changed, and stop the car if it should be stopped at that level."""
+        if not self.battery.heard(voltage_v, loaded=self.motors != "off", now=now):
+            return
+        level, words = self.battery.level, f"{self.car}: {self.battery.words}"
+        grave = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
+        self._ledger.log(grave.get(level or BatteryLevel.OK, Level.INFO), f"battery_{level}", words, now)
+        if self.battery.action is Action.STOP and not self.at_rest:
+            self._halt(words, now)
+            if self._link_open and not self._closing:
+                self._begin(self._full(now), Why.STOP, now)
 
     def tick(self, now: float) -> None:
         """Weigh silence; called a few times a second."""
@@ -617,7 +641,7 @@ class Controller:
             estops=self.safety.estops,
             ended=self.safety.ended,
             lease=self.safety.leased(now),
-            battery="",
+            battery=self.battery.refusal,
             fan=self.believed.fan,
             queued=len(self._acts),
         )
