@@ -44,7 +44,7 @@ RECORDED: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
         b"$4WD,CSB0.00,PV6.5,GS1023,LF0000,HW10,GM01#",
         {
             "range": {"no_echo": True, "range_m": 0.0},
-            "battery": {"voltage_v": 6.5, "level": "critical"},
+            "battery": {"voltage_v": 6.5, "level": "ok"},  # one reading does not make a level
             "grayscale": {"raw": 1023},
             "line": {"left_outer": False},
             "obstacle": {"left": True, "right": False},
