@@ -96,10 +96,10 @@ UNKNOWN: Final = Recipe(
     confirmed=True,
 )
 
-# The same where a frame of ours may lie in the buffer and mode 0 is certain: `MODE00` in one string with a servo frame
-# would open a mode. General stops stop every platform there; `MODE00` comes last, alone.
-UNKNOWN_BEHIND: Final = Recipe(
-    "unknown_platform_behind",
+# The same where mode 0 is certain: there general stops stop every platform, behind whatever frame of ours is unread.
+# `MODE00` comes last, alone: in one string with a stop it would undo it, with a servo frame it would open a mode.
+UNKNOWN_MANUAL: Final = Recipe(
+    "unknown_platform_manual",
     3,
     (
         Step(_STOP, Gate.FLIGHT),

@@ -10,7 +10,7 @@ from gateway.control.recipes import Recipe
 from gateway.control.records import Why
 from gateway.protocol.encode import Frame
 from gateway.protocol.profile import Profile, StopStyle
-from gateway.protocol.timing import FRAME_S, MODE_TURN_S, mode_open_s
+from gateway.protocol.timing import FRAME_S, MODE_TURN_S
 from gateway.protocol.values import Mode
 
 WIRE_S: Final = 0.02  # protocol.md: 20 ms of wire for a frame of 19 bytes at 960 B/s
@@ -144,10 +144,9 @@ def full(situation: Situation) -> Recipe:
     style = situation.profile.stop_style
     if not situation.known or style is StopStyle.RASPBERRY_PI:
         return recovery(situation.profile)
-    behind = situation.manual and not situation.clear
     if style is StopStyle.UNKNOWN:
-        return recipes.UNKNOWN_BEHIND if behind else recipes.UNKNOWN
-    return recipes.FULL_BEHIND if behind else recipes.FULL
+        return recipes.UNKNOWN_MANUAL if situation.manual else recipes.UNKNOWN
+    return recipes.FULL_BEHIND if situation.manual and not situation.clear else recipes.FULL
 
 
 def soft(situation: Situation) -> Recipe:
@@ -176,12 +175,9 @@ def worst_s(recipe: Recipe, situation: Situation, pacing: Pacing, now: float) ->
         return max(alone_s, block_s) + (ranging_s if situation.manual else situation.turn_s) + WIRE_S
     if recipe is recipes.RECOVERY:
         return RECOVERY_WORST_S + _AVOIDING_S
-    if recipe is recipes.UNKNOWN and not situation.known:
+    if recipe is recipes.UNKNOWN:
         # No string that its frames make, with half of any frame before them, opens a mode that its second part misses.
         return recipes.SILENCE_S + _AVOIDING_S + WIRE_S
-    if recipe is recipes.UNKNOWN:
-        # A stop and a `MODE00` in one string: neither works, it beeps as if mode 0 was opened, then takes the third.
-        return max(flight_s + FRAME_S, block_s) + ranging_s + mode_open_s(Mode.MANUAL) + WIRE_S
     one = recipe in (recipes.SOFT, recipes.FULL_BEHIND) or (situation.clear and situation.known)
     twice_s = 0.0 if one else FRAME_S  # the second of two general stops: the first may end half a frame, or be lost
     return max(flight_s + twice_s + lost_s, block_s) + ranging_s + WIRE_S

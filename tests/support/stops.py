@@ -167,6 +167,17 @@ def opening(mode: Mode) -> Load:
     return load
 
 
+def last_moment(mode: Mode) -> Load:
+    """About the end of its block, when it is not sure any more that the stop comes before the first turn."""
+
+    def load(pair: Pair, moments: random.Random) -> None:
+        pair.ask(SetMode(mode))
+        pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), 9.0)
+        pair.run(pair.control.pacing.block_from - pair.now - 0.2 + 0.25 * moments.random())
+
+    return load
+
+
 def inside(mode: Mode) -> Load:
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(SetMode(mode))
@@ -264,6 +275,7 @@ def _cases() -> Iterable[Case]:
         for name, load in MOVING:
             yield Case(name, load, "stm32", world)
     yield Case(f"inside-{Mode.TRACKING}", inside(Mode.TRACKING), world="black", where=on_black)
+    yield Case(f"opening-{AVOIDANCE}-at-its-end", last_moment(AVOIDANCE), world="pen", where=in_a_pen)
     yield Case(f"inside-{AVOIDANCE}", inside(AVOIDANCE), world="pen", where=in_a_pen)
     yield Case(f"closing-{AVOIDANCE}", closing(AVOIDANCE), world="pen", where=in_a_pen)
     yield Case(f"inside-{Mode.FOLLOWING}", inside(Mode.FOLLOWING), world="wall", where=before_a_wall)

@@ -115,7 +115,7 @@ def certain(situation: stop.Situation) -> bool:
 # protocol.md, stopping: the first row that fits.
 FULL: tuple[tuple[Callable[[stop.Situation], bool], recipes.Recipe], ...] = (
     (lambda it: it.profile.stop_style is StopStyle.RASPBERRY_PI, recipes.PI),
-    (lambda it: it.profile.kind is Platform.UNKNOWN and certain(it) and not it.clear, recipes.UNKNOWN_BEHIND),
+    (lambda it: it.profile.kind is Platform.UNKNOWN and certain(it), recipes.UNKNOWN_MANUAL),
     (lambda it: it.profile.kind is Platform.UNKNOWN, recipes.UNKNOWN),
     (lambda it: not it.known, recipes.RECOVERY),
     (lambda it: certain(it) and not it.clear, recipes.FULL_BEHIND),
@@ -162,5 +162,5 @@ def test_what_is_announced_is_never_less_than_what_is_waited_for() -> None:
             for recipe in (stop.full(situation), stop.soft(situation)):
                 worst_s = stop.worst_s(recipe, situation, pacing, 100.0)
                 assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stop.WIRE_S
-                possible = situation.known and situation.mode in situation.profile.modes
+                possible = not situation.contradicted and situation.known and situation.mode in situation.profile.modes
                 assert worst_s <= LONGEST_S or situation.turn_s > 1.0 or not possible, (situation, recipe)
