@@ -90,7 +90,7 @@ class Pacing:
 
     def clear_at(self, now: float) -> bool:
         """Nothing of ours can be unread when the next frame is written that waits for those in flight."""
-        return self.buffer_until <= max(now, self.flight_until)
+        return self._read_by <= max(now, self.ready_at(Gate.FLIGHT))
 
     def ready_at(self, gate: Gate) -> float:
         """From when on a frame that waits for `gate` may be written."""
@@ -98,7 +98,7 @@ class Pacing:
             case Gate.NOTHING:
                 return float("-inf")
             case Gate.FLIGHT:
-                return self.flight_until
+                return self._written_at + max(FLIGHT_S, self._sure_s)  # it may lie in a block, if there is one
             case Gate.ALONE:
                 return self.buffer_until
 

@@ -6,7 +6,7 @@ from typing import Final
 from gateway.control import recipes
 from gateway.control.ledger import Pending
 from gateway.control.outbox import Pacing
-from gateway.control.recipes import Recipe
+from gateway.control.recipes import Gate, Recipe
 from gateway.control.records import Why
 from gateway.protocol.encode import Frame
 from gateway.protocol.profile import Profile, StopStyle
@@ -164,7 +164,7 @@ def worst_s(recipe: Recipe, situation: Situation, pacing: Pacing, now: float) ->
     What it waits for + the rest of the block it meets + the wire; and where its first frames may be lost, because a
     frame of ours lies unread in the car's buffer, the wait until the one that is alone there.
     """
-    flight_s = max(pacing.flight_until - now, 0.0)
+    flight_s = max(pacing.ready_at(Gate.FLIGHT) - now, 0.0)
     block_s = max(pacing.block_until - now, 0.0)
     ranging_s = FRAME_S if situation.blocked else situation.profile.mode_turn_s(Mode.MANUAL)
     lost_s = 0.0 if situation.clear else recipes.REPEAT_S
@@ -172,7 +172,9 @@ def worst_s(recipe: Recipe, situation: Situation, pacing: Pacing, now: float) ->
         alone_s = max(pacing.buffer_until - now, 0.0)
         if not situation.manual and now + alone_s + IN_TIME_S < pacing.block_from:
             return block_s + WIRE_S  # it lies in the buffer when the opening ends, and is obeyed before the first turn
-        return max(alone_s, block_s) + (ranging_s if situation.manual else situation.turn_s) + WIRE_S
+        if not situation.manual:
+            return max(alone_s, block_s) + situation.turn_s + WIRE_S
+        return max(alone_s + ranging_s, block_s + FRAME_S) + WIRE_S
     if recipe is recipes.RECOVERY:
         return RECOVERY_WORST_S + _AVOIDING_S
     if recipe is recipes.UNKNOWN:
@@ -180,4 +182,6 @@ def worst_s(recipe: Recipe, situation: Situation, pacing: Pacing, now: float) ->
         return recipes.SILENCE_S + _AVOIDING_S + WIRE_S
     one = recipe in (recipes.SOFT, recipes.FULL_BEHIND) or (situation.clear and situation.known)
     twice_s = 0.0 if one else FRAME_S  # the second of two general stops: the first may end half a frame, or be lost
+    if situation.clear:
+        return max(flight_s + twice_s + ranging_s, block_s + FRAME_S) + WIRE_S
     return max(flight_s + twice_s + lost_s, block_s) + ranging_s + WIRE_S
