@@ -2,8 +2,11 @@
 
 import signal
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from fleet.client import FleetClient
 from schemas import bus
@@ -16,6 +19,9 @@ rules:
   - when: {car: green, reading: state/motion, field: motion, equals: spin_left}
     then: {car: red, mode: light_seeking}
 """
+
+
+STARTED: list[Process] = []
 
 
 class Lines:
@@ -33,7 +39,17 @@ class Lines:
 
 def coordinator(cars: Cars, path: Path, plan: str = PLAN) -> Process:
     path.write_text(plan, encoding="utf-8")
-    return cars.start("-m", "fleet.cli", "coordinate", "--plan", str(path), "--json")
+    process = cars.start("-m", "fleet.cli", "coordinate", "--plan", str(path), "--json")
+    STARTED.append(process)
+    return process
+
+
+@pytest.fixture(autouse=True)
+def none_outlives_its_test() -> Iterator[None]:
+    """There is one at a time: that of a test that failed would fail all that follow."""
+    yield
+    while STARTED:
+        STARTED.pop().end()
 
 
 def truth(cars: Cars, car: str) -> str:

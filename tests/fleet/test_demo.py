@@ -22,6 +22,7 @@ def test_every_check_of_the_demo_holds(tmp_path: Path) -> None:
         check=False,
         timeout=110,
     )
+    assert done.stdout, done.stderr
     said = json.loads(done.stdout)
     assert said["ok"], done.stderr
     assert done.returncode == 0
