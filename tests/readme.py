@@ -1,18 +1,24 @@
 """The generated parts of README.md: `python -m tests.readme` writes them, tests/test_readme.py compares them."""
 
+import csv
 import subprocess
 import sys
 from pathlib import Path
 
 from google.protobuf.descriptor import FieldDescriptor
 
+from gateway.control.controller import STALL_S
+from gateway.control.recipes import REPEAT_S
+from gateway.control.senders import PAUSE_S, SENDER_GONE_S
+from gateway.requests import LONGEST_DRIVE_S
 from schemas import messages, topics
+from tests.support import vectors
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 _COMMON = {"sender", "kind", "id", "asked", "take", "ttl_s"}
 _ABOUT = {
-    "drive": "hold a motion for `duration_s` (0.5 s by default, at most 10), then stop",
+    "drive": "hold a motion for `duration_s` (0.5 s by default, at most 10 or what its gateway allows), then stop",
     "mode": "bring the car into a mode; `manual` closes whatever is open",
     "led": "the colour LED, 0..255 each",
     "light": "the light's colour, or `off`",
@@ -22,9 +28,9 @@ _ABOUT = {
     "speed": "one step `up` or `down`: cars know no absolute speed",
     "fan": "toggle; `on` or `off` while its state is known",
     "stop": "stop, and hold the car against the coordinator",
-    "estop": "as stop; this version latches nothing",
-    "resume": "end the hold",
-    "lease": "not in this version",
+    "estop": "stop, and refuse everything until it is resumed by its id; `scope` is car or fleet",
+    "resume": "end the e-stops of these ids; without ids, the hold",
+    "lease": "reserve the car for a moment, or give it back",
     "find": "blink and beep, without moving",
 }
 
@@ -75,7 +81,179 @@ def any_client() -> str:
     return "```python\n" + (ROOT / "tests" / "e2e" / "any_client.py").read_text(encoding="utf-8").strip() + "\n```"
 
 
-PARTS = {"topics": topic_table, "verbs": verb_table, "help": help_text, "any_client": any_client}
+_STATES = {
+    "manual, nothing unread": "driving or at rest",
+    "manual, a frame may be unread": "the same, just after another command",
+    "manual, in a block of ours": "a whistle or a servo is under way",
+    "in a mode that reads pins": "tracking, light seeking, following, infrared remote",
+    "in color_led": "colour LED mode",
+    "in obstacle_avoidance": "obstacle avoidance, in a pen at worst",
+    "opening": "a mode is being opened (the longest)",
+    "link just restored": "the link has just come back, after half of any frame",
+    "raspberry_pi": "a Raspberry Pi car (the longest)",
+    "unknown platform": "a car whose platform is not known (the longest)",
+}
+"""What the states of the distribution of stops are called here; of several rows that begin so it is the longest."""
+
+
+def stops() -> list[dict[str, str]]:
+    """The distribution of stops that `make bench` wrote."""
+    with (ROOT / "tests" / "vectors" / "stops.tsv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file, delimiter="\t"))
+
+
+def _longest(name: str, column: str) -> float:
+    """Of the rows of this name."""
+    grouped = name in ("opening", "raspberry_pi", "unknown platform")
+    named = [row for row in stops() if row["state"] == name]
+    begun = [row for row in stops() if row["state"].startswith(name)]
+    found = [row for row in begun if not row["state"].endswith(("restored", "under way"))] if grouped else named
+    return max(float(row[column]) for row in found)
+
+
+def stop_table() -> str:
+    """How long a stop takes, by what the car is doing."""
+    rows = ["| the car is | in the middle | worst seen | longest announced |", "|---|---|---|---|"]
+    for name, words in _STATES.items():
+        middle, worst, announced = (_longest(name, column) for column in ("p50_s", "worst_s", "announced_s"))
+        rows.append(f"| {words} | {middle:.2f} s | {worst:.2f} s | {announced:.2f} s |")
+    return "\n".join(rows)
+
+
+def mode_table() -> str:
+    """Which pairs of mode asked and true mode are told apart, and how soon."""
+    groups: dict[tuple[str, str, str], dict[str, list[str]]] = {}
+    for row in vectors.rows("mode_truth"):
+        key = (row["verdict"], row["by"], row["within_s"])
+        groups.setdefault(key, {}).setdefault(row["asked"], []).append(row["true"])
+    everything = {each["true"] for each in vectors.rows("mode_truth")}
+    rows = ["| asked | in truth | verdict | by | within |", "|---|---|---|---|---|"]
+    for (verdict, by, within), pairs in groups.items():
+        alike: dict[tuple[str, ...], list[str]] = {}
+        for asked, true in pairs.items():
+            every = set(true) == everything - {asked}
+            others = ("any other",) if every else tuple("the same" if each == asked else each for each in true)
+            alike.setdefault(others, []).append(asked)
+        for others, asked in alike.items():
+            limit = (
+                "never" if within == "-" and verdict == "assumed" else "its first" if within == "-" else f"{within} s"
+            )
+            rows.append(f"| {', '.join(asked)} | {', '.join(others)} | {verdict} | {by} | {limit} |".replace("_", " "))
+    return "\n".join(rows)
+
+
+def failure_table() -> str:
+    """Each failure: what the car does, how long, what is seen. Its times are the code's, and the table of stops'."""
+    middle, worst = (_longest("manual, nothing unread", column) for column in ("p50_s", "worst_s"))
+    driving = f"{middle:.2f} s, at worst {worst:.1f} s"
+    restored = _longest("link just restored", "worst_s")
+    rows = ["| what happens | what the car does | for how long | what you see |", "|---|---|---|---|"]
+    for what, does, long, see in (
+        (
+            "You let go, or a drive's time is over",
+            "stops; the stop is sent again, alone, later",
+            f"{driving} after that; again after {REPEAT_S:g} s",
+            "`complete` on `event/command`",
+        ),
+        (
+            "Somebody says `stop`",
+            "stops, and is on hold; a stick that is leaned on is not heard before it was let go",
+            f"see below; the stick {PAUSE_S:g} s",
+            "`worst_case_s` in the answer, `complete` when the motors are off for good",
+        ),
+        (
+            "The program that drives is killed",
+            "drives on until its command's time is over, or its token has been gone",
+            f"`duration_s` (0.5 s by default, {LONGEST_DRIVE_S:g} s at most) or {SENDER_GONE_S:g} s, what is over first, "
+            "and the stop",
+            "the drive ends as `expired`: its sender is gone",
+        ),
+        (
+            "The gateway's loop stalls while the car drives",
+            "drives on; is stopped first when the loop runs again",
+            f"noticed from {STALL_S:g} s on",
+            "`stalled` on `event/log`",
+        ),
+        (
+            "The gateway is killed",
+            "**keeps its last motion**: it has no dead-man timer",
+            f"until a gateway is back, and then its stop: {restored:.1f} s at worst, mostly less than 0.1 s",
+            "its token is gone, it is missing in `fleet list`; `motors: unknown` until it was stopped",
+        ),
+        (
+            "The link is cut, or the car is out of range",
+            "**keeps its last motion**",
+            f"until the link is back (tried again within a second), and then its stop: {restored:.1f} s at worst",
+            "`state/link` `lost` with the reason, `motors: unknown`, commands refused as `link_down`",
+        ),
+        (
+            "The link hangs, and says nothing",
+            "keeps its last motion; is stopped when it is heard again",
+            "noticed after 3 s of silence that nothing explains",
+            "`stale`, `motors: unknown`, `unheard` on `event/log`",
+        ),
+        (
+            "A Raspberry Pi car loses its TCP client",
+            "**its program dies; it keeps its last motion, and nothing can reach it**",
+            "until somebody picks it up",
+            "`lost`, connection refused, and words that say so",
+        ),
+        (
+            "The car resets (brownout)",
+            "stops: it boots in mode 0",
+            "at once",
+            "a mode that was open is `contradicted`, see below; in mode 0 nothing shows it",
+        ),
+        (
+            "Somebody uses the car's infrared remote, or its app",
+            "what they want",
+            "as long as they do",
+            "if that changes its mode: `contradicted`, see below",
+        ),
+        (
+            "The hub is killed",
+            "a drive lapses, modes go on; a gateway starts the hub again",
+            "about a second",
+            "one gap in everything; nobody need do anything",
+        ),
+        (
+            "The coordinator is killed",
+            "keeps its mode",
+            "until somebody changes it",
+            "no more `@coordinator/decision`",
+        ),
+        (
+            "The battery runs low",
+            "goes on; below 6.6 V no new drive or mode is taken (`--battery-critical`)",
+            "a level must show for 5 s: motors pull the voltage down",
+            "`sensor/battery` `level`, `battery_low` on `event/log`, commands refused as `battery_low`",
+        ),
+        (
+            "The wrong platform was told",
+            "may ignore what it is sent, or worse",
+            "three readings running show it",
+            "`platform_contradicted` on `event/log`, and `state/health`",
+        ),
+        (
+            "Nonsense comes instead of readings",
+            "what it did before",
+            "-",
+            "counted by cause in `state/link`; a flood is cut off and counted as `raw_not_published`, `flood_bytes`",
+        ),
+    ):
+        rows.append(f"| {what} | {does} | {long} | {see} |")
+    return "\n".join(rows)
+
+
+PARTS = {
+    "topics": topic_table,
+    "verbs": verb_table,
+    "failures": failure_table,
+    "stops": stop_table,
+    "modes": mode_table,
+    "help": help_text,
+    "any_client": any_client,
+}
 
 
 def generated(text: str) -> str:

@@ -14,6 +14,7 @@ BENCHMARKS = {
     "commands": "commands",
     "load": "load",
     "start": "starting",
+    "stops": "stops",
     "record": "recording",
     "replay": "replaying",
 }
@@ -25,7 +26,7 @@ def _row(one: Measured) -> str:
         slack = f" + {one.slack:g} {one.unit}" if one.slack else ""
         verdict = f"{f'{one.goal:g} x{slack}':13} {'met' if one.met else 'MISSED'}"
     numbers = f"{one.ours_median:8.2f} {one.floor_median:8.2f} {one.unit:3} {one.ratio:6.2f} x"
-    return f"{one.name:33} {numbers}   {verdict}".rstrip()
+    return f"{one.name:54} {numbers}   {verdict}".rstrip()
 
 
 def main() -> int:
@@ -39,7 +40,7 @@ def main() -> int:
         parser.error(f"there is no benchmark {', '.join(unknown)}: allowed are {', '.join(BENCHMARKS)}")
     if not arguments.json:
         print(f"Python {platform.python_version()}, {platform.machine()}; medians of {RUNS} runs, in turns")
-        print(f"{'':33} {'ours':>8} {'floor':>8} {'':3} {'ratio':>8}   {'goal':13}", flush=True)
+        print(f"{'':54} {'ours':>8} {'floor':>8} {'':3} {'ratio':>8}   {'goal':13}", flush=True)
     for name in arguments.names or BENCHMARKS:
         for one in importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run():
             print(json.dumps(one.to_dict()) if arguments.json else _row(one), flush=True)
