@@ -164,8 +164,7 @@ def failure_table() -> str:
         (
             "The program that drives is killed",
             "drives on until its command's time is over, or its token has been gone",
-            f"`duration_s` (0.5 s by default, {LONGEST_DRIVE_S:g} s at most) or {SENDER_GONE_S:g} s, what is over first, "
-            "and the stop",
+            f"`duration_s` (0.5 s unless asked, {LONGEST_DRIVE_S:g} s at most) or {SENDER_GONE_S:g} s, and the stop",
             "the drive ends as `expired`: its sender is gone",
         ),
         (
