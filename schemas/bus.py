@@ -34,6 +34,8 @@ ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
 
 _ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
 _LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})
+_HISTORY_S: Final = 0.5
+"""The longest that a watch waits for what is there already: for a token that goes in this very moment."""
 
 _QOS: Final[dict[Qos, dict[str, Any]]] = {
     Qos.READING: {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA},
@@ -289,6 +291,9 @@ class Bus:
     def __init__(self, session: zenoh.Session, endpoint: str) -> None:
         self._session = session
         self._kept: list[Any] = []
+        self._lock = threading.Lock()
+        self._alive: dict[str, set[str]] = {}
+        """By watched expression."""
         self.endpoint = endpoint
         self.boot_id = os.urandom(16).hex()
 
@@ -369,18 +374,38 @@ class Bus:
 
     def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
         """The tokens alive now."""
+        # While a watch is told what is there already, Zenoh answers a get for the same tokens with some or none.
+        with self._lock:
+            if expression in self._alive:
+                return sorted(self._alive[expression])
         replies = self._session.liveliness().get(expression, timeout=timeout_s)
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
-    def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> zenoh.Subscriber[None]:
-        """Call back with (key, alive) for every token there is and every change, on a Zenoh thread."""
+    def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> None:
+        """Call back with (key, alive) for every token there is and every change, on a Zenoh thread, until closed."""
+        awaited = set(self.tokens(expression))
+        alive: set[str] = set()
+        told = threading.Event()
+
+        def tell(sample: zenoh.Sample) -> None:
+            key, came = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            with self._lock:
+                (alive.add if came else alive.discard)(key)
+                awaited.discard(key)
+            callback(key, came)
+            if not awaited:
+                told.set()
+
         subscriber = self._session.liveliness().declare_subscriber(
             expression,
-            lambda sample: callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT),
+            tell,
             history=True,
         )
         self._kept.append(subscriber)
-        return subscriber
+        if awaited:
+            told.wait(_HISTORY_S)
+        with self._lock:
+            self._alive[expression] = alive
 
     def query(
         self,

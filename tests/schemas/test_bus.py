@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -91,6 +92,19 @@ def test_tokens_come_and_go(endpoint: str) -> None:
             assert watcher.tokens("fleet/*") == ["fleet/red"]
         wait_for(lambda: seen == [("fleet/red", True), ("fleet/red", False)])
         assert watcher.tokens("fleet/*") == []
+
+
+def test_who_watches_tokens_sees_all_of_them_when_it_asks_at_once(endpoint: str) -> None:
+    """Zenoh answers for a watch from what has come so far: a coordinator was told that there was no car."""
+    there = {"fleet/red", "fleet/green", "fleet/blue"}
+    with bus.Bus.open(endpoint) as cars:
+        for token in there:
+            cars.token(token)
+        for _ in range(40):
+            with bus.Bus.open(endpoint) as watcher, ThreadPoolExecutor(3) as pool:
+                watcher.watch_tokens("fleet/*", lambda key, alive: None)
+                asked = [pool.submit(watcher.tokens, "fleet/*") for _ in range(9)]
+                assert all(set(each.result()) == there for each in asked)
 
 
 def test_a_hub_is_started_once_and_ends_by_itself() -> None:
