@@ -8,9 +8,11 @@ from typing import Final
 from gateway.control.recipes import REPEAT_S, Gate
 from gateway.protocol.encode import ArmSet, Frame, General
 from gateway.protocol.profile import Platform, Profile, StopStyle
+from gateway.protocol.values import ServoAction
 
 FLIGHT_S: Final = 0.06
 """A frame is in flight for 0.06 s or its block, whichever is longer (protocol.md): a report may be under way."""
+FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 AWAKE_S: Final = 0.6
 """A car that has just reported ranges again no sooner than 0.85 s later (protocol.md: once a second in mode 0); what is
 written within this time of a reading is read at once, with 0.25 s left for the link's own delays."""
@@ -28,7 +30,6 @@ class Pacing:
 
     def __init__(self, profile: Profile) -> None:
         self.profile = profile
-        self._slow_fan_unsure = profile.kind is Platform.UNKNOWN
         self.reset()
 
     def reset(self) -> None:
@@ -47,8 +48,14 @@ class Pacing:
         self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_S, self.block_until))
         self._written_at = now
         self._block_s = self.profile.block_s(frame)
-        unsure = isinstance(frame, ArmSet) or (isinstance(frame, General) and frame.fan and self._slow_fan_unsure)
-        self._sure_s = 0.0 if unsure else self._block_s
+        self._sure_s = self._block_s if self._surely_blocks(frame) else 0.0
+
+    def _surely_blocks(self, frame: Frame) -> bool:
+        """Whether its block has a row in protocol.md for this platform, and is not only allowed for."""
+        if isinstance(frame, General):
+            slow = frame.servo is None or frame.servo in FRONT_SERVO
+            return slow and not (frame.fan and self.profile.kind is Platform.UNKNOWN)
+        return not isinstance(frame, ArmSet)
 
     def heard(self, at: float) -> None:
         """A mode-0 reading has come: the car has ranged, and reads what waits."""
@@ -86,7 +93,8 @@ class Pacing:
 
     def blocked_at(self, now: float) -> bool:
         """The last frame's block runs, not only perhaps, and no ranging, in which that frame would lie unread."""
-        return self._sure_s > FLIGHT_S and self.clear_at(now) and now < self.block_until
+        running = self._sure_s > FLIGHT_S and now < self._written_at + self._sure_s
+        return running and self._before_s == 0.0 and self.clear_at(now)
 
     def clear_at(self, now: float) -> bool:
         """Nothing of ours can be unread when the next frame is written that waits for those in flight."""

@@ -61,7 +61,9 @@ class Running:
     last_at: float = float("-inf")
     retries: int = 0
     worst_at: float = float("-inf")
-    """When the motors are off at the latest."""
+    """When the motors are off at the latest, if no step is late."""
+    due: float = float("inf")
+    """When the next step is due, as last asked."""
 
     @property
     def frames_sent(self) -> bool:
@@ -77,7 +79,8 @@ class Running:
         """When the next step is due."""
         step = self.recipe.steps[self.index]
         due = self.began_at if self.first_at is None else self.last_at + step.after_s
-        return max(due, pacing.ready_at(step.gate))
+        self.due = max(due, pacing.ready_at(step.gate))
+        return self.due
 
     @property
     def obeyed_at(self) -> float:
@@ -86,7 +89,7 @@ class Running:
 
     def worst_s(self, now: float) -> float:
         """How long it takes from now on, at worst."""
-        worst_at = self.worst_at
+        worst_at = self.worst_at + (0.0 if self.frames_sent else max(0.0, now - self.due))
         if self.recipe in (recipes.RECOVERY, recipes.RETRY) and self.frames_sent:
             # Should all its frames have been read at the wrong place, in one string, it tries again.
             worst_at = max(worst_at, self.last_at + recipes.CONFIRM_S + _AVOIDING_S)
@@ -107,6 +110,7 @@ class Running:
 
     def stepped(self, now: float) -> bool:
         """A step's frame was written; True if it was the first."""
+        self.worst_at += max(0.0, now - self.due)  # a loop that slept
         first = self.first_at is None
         if first:
             self.first_at = now

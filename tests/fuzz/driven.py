@@ -3,9 +3,10 @@
 import random
 from dataclasses import dataclass
 
-from gateway.control.records import EmergencyStop, Phase, Resume, Sender, SetMode, Stop
+from gateway.control.records import Act, EmergencyStop, Find, Phase, Resume, Sender, SetMode, Stop
 from gateway.protocol.values import Mode
-from gateway.sim.core.raspberry_pi import Transport
+from gateway.sim.core.arduino import ArduinoCar
+from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
 from tests.fuzz.controller import PLATFORMS, SENDERS, anything
 from tests.support.stops import WORLDS, Seen, state_of
 from tests.support.virtual import Pair
@@ -49,6 +50,9 @@ class Driven:
         )
         self.pair.connect()
         self.linked = True
+        # Half a named frame kills a Raspberry Pi's program, whatever follows it: no stop can help against that.
+        self.cuts = moments.random() < 0.5
+        self.named = not self.cuts or not isinstance(self.pair.car, RaspberryPiCar)
 
     def step(self) -> None:
         """One thing happens."""
@@ -62,7 +66,7 @@ class Driven:
             self._ask()
         elif chance < 0.85:
             pair.run(moments.choice([0.01, 0.06, 0.1, 0.3, 0.7, 1.2, 3.0]), linked=self.linked)
-        elif chance < 0.89:
+        elif chance < 0.89 and self.cuts:
             pair.cut = moments.randrange(1, 20)
         elif chance < 0.91 and self.linked:
             pair.lose()
@@ -96,6 +100,8 @@ class Driven:
             return  # without an echo the car is deaf there for ever
         if isinstance(what, Resume | EmergencyStop):
             what = Resume(tuple(estop.id for estop in self.pair.control.safety.estops))
+        if isinstance(what, Find | Act) and not self.named:
+            return
         self.asked += 1
         self.pair.ask(what, sender=self.moments.choice(SENDERS), identity=f"f{self.asked}")
 
@@ -111,10 +117,17 @@ class Driven:
         identity = f"f{self.asked}"
         answer = pair.ask(Stop(), verb="stop", sender=moments.choice(SENDERS), identity=identity)
         pair.run(RESTORED_S if "restored" in state else WATCHED_S)
+        if wedged(pair):
+            return None
         off_s = max(0.0, pair.off_for_good_at() - asked_at)
         assert off_s <= answer.worst_case_s, f"{state}: off after {off_s:.3f} s, announced {answer.worst_case_s:.3f} s"
         last = pair.phases(identity)[-1]
         return Seen("fuzz", self.asked, state, answer.worst_case_s, off_s, off_s, 0.0, pair.control.motors, last)
+
+
+def wedged(pair: Pair) -> bool:
+    """The one string that no frame of protocol.md's recovery clears (test_stops.py, "in_one_millisecond")."""
+    return isinstance(pair.car, ArduinoCar) and pair.car._string.startswith("4WD")
 
 
 def pair_lost(pair: Pair) -> bool:

@@ -60,6 +60,26 @@ def test_avoiding_without_an_echo_the_car_is_deaf_with_its_motors_braked() -> No
         assert pair.control.motors == "unknown", "it is not heard"
 
 
+@pytest.mark.xfail(reason="protocol.md's recovery has no frame that clears this string; a colour frame alone would")
+def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
+    """A half frame, and the ranging ends when of recovery's `MODE00` only the `$` has come.
+
+    The `$` goes with the half frame's string, and `4WD,MODE00#` stays: not at its place for a MODE frame, unknown as
+    any other, never cleared, and whatever follows is added to it. The car reports as always, so nothing is noticed.
+    """
+    pair = Pair(world=World.open_field(), start_s=2.0).ready()
+    pair.until(lambda: not pair.car.truth.blocked, 3.0)
+    pair.until(lambda: pair.car.truth.blocked, 3.0)
+    wakes_at = pair.car.next_event()
+    pair.cut = 9
+    pair.ask(Drive(Motion.FORWARD, 5.0))
+    pair.run(wakes_at - 0.05 - 0.0016 - pair.now, linked=False)
+    pair.connect()
+    pair.run(20.0)
+    assert pair.control.motors == "off"
+    assert pair.off_for_good_at() < pair.now
+
+
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
 @pytest.mark.parametrize("world", [World.room, World.open_field], ids=["echo", "no-echo"])
 def test_a_drive_that_is_over_stops_the_car_softly(platform: str, world: Callable[[], World]) -> None:
