@@ -15,7 +15,7 @@ from gateway.control.battery import Action, Battery, BatteryLevel, Policy
 from gateway.control.believed import Believed
 from gateway.control.ledger import Ledger, Pending
 from gateway.control.mode import MANUAL_SILENCE_S, ModeTruth, Verdict
-from gateway.control.outbox import Pacing
+from gateway.control.outbox import FLIGHT_S, Pacing
 from gateway.control.platform import PlatformTruth
 from gateway.control.recipes import Recipe
 from gateway.control.records import (
@@ -114,6 +114,8 @@ class Controller:
         self._mode_sent: tuple[Pending, float] | None = None
         """A mode whose effect has not been seen yet, and when its frame went out."""
         self._senders = Senders()
+        self._left_at = self._left_until = float("-inf")
+        """When the frame was written that leaves a mode, and when the car has left it at the latest."""
 
     # ------------------------------------------------------------------ what is known
 
@@ -204,6 +206,8 @@ class Controller:
             return
         if event.signature is not Mode.MANUAL:
             return
+        if event.at > self._left_at + UNDER_WAY_S:
+            self._left_until = float("-inf")
         if event.range_cm is not None:
             self.pacing.heard(event.at)
         if event.voltage_v is not None and "battery" in self.profile.measured(event, self.mode.confirmed):
@@ -396,7 +400,7 @@ class Controller:
         self._expire(now)
         if self._running is not None:
             return self._step(now)
-        if not self.known or now < self.pacing.flight_until:
+        if not self.known or now < self._ready_at:
             return None
         held = self._held
         if held is not None and not held.pending.sent:
@@ -413,6 +417,10 @@ class Controller:
     def wrote(self, write: Write, now: float) -> None:
         """The frame that `poll` returned was handed to the link."""
         source, self._source = self._source, None
+        if isinstance(write.frame, ModeClose) and not self._manual:
+            # A turn of the mode that is left may be deaf for longer than the closing takes; only a stop may meet it.
+            deaf_until = max(now, self.pacing.block_until) + self._for_stop(now).turn_s
+            self._left_at, self._left_until = now, deaf_until + self.profile.block_s(write.frame) + FLIGHT_S
         self.pacing.wrote(write.frame, now)
         self._note_frame(write.frame, now)
         match source:
@@ -450,13 +458,13 @@ class Controller:
             times.append(self._running.wake_at(self.pacing))
         elif self.known:
             if self._acts:
-                times.append(self.pacing.act_at(self._acts[0].frames[0]))
+                times.append(max(self.pacing.act_at(self._acts[0].frames[0]), self._left_until))
             if self._held is not None and not self._held.pending.sent:
-                times.append(self.pacing.flight_until)
+                times.append(self._ready_at)
             if self._opening is not None:
-                times.append(self.pacing.open_at(now) if self.at_rest else self.pacing.flight_until)
+                times.append(max(self.pacing.open_at(now), self._left_until) if self.at_rest else self._ready_at)
             if self.believed.repeat:
-                times.append(self.pacing.repeat_at)
+                times.append(max(self.pacing.repeat_at, self._left_until))
         return max(now, min(times, default=float("inf")))
 
     # ------------------------------------------------------------------ how long a stop takes
@@ -796,12 +804,17 @@ class Controller:
         if self._link_open and self._running is None and not self.at_rest:
             self._begin(self._soft(now), Why.STOP, now)
 
+    @property
+    def _ready_at(self) -> float:
+        """From when on a frame that is no stop's may be written."""
+        return max(self.pacing.flight_until, self._left_until)
+
     def _free_at(self, now: float) -> float:
         """When the car can take a motion, as far as it is known."""
         running = self._running
         if running is None or running.recipe.rank == recipes.SOFT.rank:
-            return self.pacing.flight_until
-        return max(running.over_at(self.pacing, now), self.pacing.flight_until)
+            return self._ready_at
+        return max(running.over_at(self.pacing, now), self._ready_at)
 
     # ------------------------------------------------------------------ what waits or is held ends
 

@@ -652,3 +652,18 @@ def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
         pair.ask(ChangeSpeed(step))
         pair.run(0.5)
         assert pair.car.truth.speed == pair.control.believed.speed
+
+
+@pytest.mark.parametrize("mode", [Mode.COLOR_LED, Mode.OBSTACLE_AVOIDANCE, Mode.TRACKING])
+def test_what_is_asked_while_a_mode_is_left_is_not_lost(mode: Mode) -> None:
+    for seed in range(12):
+        pair = Pair("arduino", seed=seed).ready()
+        pair.ask(SetMode(mode))
+        pair.run(6.0 + 2.0 * random.Random(seed).random())
+        pair.ask(SetMode(Mode.MANUAL))
+        control = pair.control
+        pair.until(lambda control=control: control._running is None, 20.0)  # type: ignore[misc]  # bound at once
+        before = pair.car.truth.fan
+        pair.ask(Fan())
+        pair.run(7.0)
+        assert pair.car.truth.fan is not before, seed
