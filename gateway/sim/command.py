@@ -1,38 +1,61 @@
-"""`gateway sim`: arguments, the line per car, faults from stdin and from the command line, a clean end."""
+"""`gateway sim`: arguments, the line per car, what is scheduled on the command line, a clean end.
+
+What comes in on stdin while it runs is channel.py's part.
+"""
 
 import argparse
 import asyncio
-import contextlib
-import json
+import math
 import os
 import signal
 import sys
-import threading
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
+from gateway import capture
+from gateway.sim.channel import obey, say
+from gateway.sim.core.played import Played
 from gateway.sim.core.world import World
+from gateway.sim.faults import Fault, Scheduled, parse_fault, parse_press, targets
 from gateway.sim.links import LinkError
 from gateway.sim.shell import SimCar, Simulation
-from gateway.sim.spec import BadSpec, CarSpec, Scheduled, check_hit, fault_of, parse_cars, parse_fault
+from gateway.sim.spec import BadSpec, CarSpec, ReplaySpec, parse_cars, parse_replay, refuse_twins
 from schemas import keys
 
 WORLDS: Final = {"room": World.room, "open": World.open_field}
 PARENT_EVERY_S: Final = 0.1
-LINE_LIMIT: Final = 65536
+RATES: Final = (0.01, 100.0)
 
 EPILOG: Final = """\
-examples:
-  gateway sim --car red:arduino:pty
-  gateway sim --car red:arduino:pty --car blue:raspberry_pi:tcp://127.0.0.1:8888 --fault red:link_drop@5+2
+Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gateway run --link`. A link that comes back
+under another name is printed again: a plain pty after each link_drop; pty:PATH keeps its name.
 
-Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gateway run --link`. A plain pty that comes
-back after a link_drop has another name, so its line is printed again; pty:PATH keeps its name.
-Faults, one JSON object a line on stdin, each answered by one line on stdout:
-  {"car": "red", "fault": "link_drop", "for_s": 2}   gone for 2 s; without for_s until one with for_s 0
-  {"car": "red", "fault": "garbage", "bytes": 200}   noise to the host; "to": "car" for the other way
-  {"car": "red", "fault": "brownout"}                the car resets; without "car" every car is hit
-  {"car": "red", "ask": "truth"}                     what is so: mode, motors, pose, ...
+faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may be repeated):
+  --fault red:link_drop@5+2             gone for 2 s; without +2 until it is ended
+  --fault red:rename@5+2                comes back as another device: pty:PATH points to a new one, a plain pty and TCP
+                                        have a new link; ,path=/tmp/other: back at that path instead
+  --fault red:cut_write@5+2,bytes=7     of the next frame to the car 7 bytes come through, then the link is gone for 2 s
+  --fault red:slow@5+10,factor=0.1      both ways at a tenth of 960 bytes/s, byte by byte
+  --fault red:lossy@5+10,share=0.2      a fifth of the bytes is lost; ,to=car or ,to=host: one way only
+  --fault red:stuck@5+10                stops reading: writes block (pty), or pile up in the system's buffers (TCP)
+  --fault red:deaf@5+10                 takes what is written and drops it
+  --fault red:mute@5+10                 hears and obeys, nothing comes from it
+  --fault red:echo@5+10                 sends back all that comes, and obeys it
+  --fault red:firehose@5+10,rate=1e6    random bytes/s besides its readings; ,of=frame: a frame that never ends
+  --fault red:garbage@5+200             200 random bytes to the host; ,to=car: the other way
+  --fault brownout@10                   resets; without a name every car is hit
+faults on stdin, one JSON object a line, each answered by one line on stdout; "for_s": 0 ends what lasts (rename and
+cut_write end as link_drop does); without "for_s" it lasts until then:
+  {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}
+infrared remote, which only an Arduino or STM32 car in mode remote_control obeys; buttons: forward, back, left, right,
+spin_left, spin_right, stop, whistle, faster, slower; a motion holds until the next button:
+  --ir red:forward@5                    or on stdin {"car": "red", "ir": "forward"}
+what is so:
+  {"car": "red", "ask": "truth"}        mode, motors, pose, ...; of a replay: bytes sent and ignored, rounds
+replay: a file that `gateway monitor --raw` kept plays as a car, with its timing; what is written to it is ignored. Over
+TCP it begins when a host connects, over a pty at once:
+  gateway sim --replay red.raw:red:tcp --loop --rate 2
 """
 
 
@@ -46,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--car",
         action="append",
-        required=True,
+        default=[],
         metavar="NAME:PLATFORM:LINK",
         help="PLATFORM: arduino, stm32 or raspberry_pi, with +arm, +imu; LINK: pty, pty:PATH or tcp://HOST:PORT",
     )
@@ -61,9 +84,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--fault",
         action="append",
         default=[],
-        metavar="[CAR:]FAULT@S[+AMOUNT]",
-        help="red:link_drop@5+2, red:garbage@3+200, brownout@10; seconds after the start",
+        metavar="[CAR:]FAULT@S[+AMOUNT][,FIELD=VALUE]",
+        help="what happens S seconds after the start, see below",
     )
+    parser.add_argument(
+        "--ir", action="append", default=[], metavar="[CAR:]BUTTON@S", help="a button of the infrared remote is pressed"
+    )
+    parser.add_argument(
+        "--replay",
+        action="append",
+        default=[],
+        metavar="FILE[:NAME[:LINK]]",
+        help="a capture as a car (default: replay, on a pty)",
+    )
+    parser.add_argument("--loop", action="store_true", help="play captures over and over, 1 s between two rounds")
+    parser.add_argument("--rate", type=float, metavar="FACTOR", help="play captures so many times as fast (default: 1)")
     parser.add_argument("--fleet", default=keys.DEFAULT_FLEET, help="fleet that the truth is published under")
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="hub for the truth (default: FLEET_ENDPOINT, else loopback)"
@@ -76,21 +111,55 @@ def run(args: argparse.Namespace) -> int:
     """Run until SIGINT or SIGTERM; the exit code."""
     try:
         specs = parse_cars(args.car)
-        faults = [parse_fault(text) for text in args.fault]
-        check_hit([spec.name for spec in specs], [scheduled.fault for scheduled in faults])
+        replays = [parse_replay(text) for text in args.replay]
+        everyone: list[CarSpec | ReplaySpec] = [*specs, *replays]
+        refuse_twins(everyone)
+        scheduled = [*map(parse_fault, args.fault), *map(parse_press, args.ir)]
+        for each in scheduled:
+            targets(everyone, each.act)
+        captures = _captures(replays, args)
         keys.check_name(args.fleet, "fleet name")
         endpoint = None if args.no_truth else _endpoint(args.connect)
     except (BadSpec, keys.BadKey) as error:
         return _fail(str(error), 2)
     try:
-        asyncio.run(_serve(specs, faults, args, endpoint))
+        asyncio.run(_serve(specs, captures, scheduled, args, endpoint))
     except LinkError as error:
         return _fail(str(error), 1)
     return 0
 
 
-def _fail(words: str, code: int) -> int:
+def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[tuple[ReplaySpec, Played]]:
+    """The files, read whole: what is wrong with one is said before anything is opened. Raises BadSpec."""
+    if not replays and not args.car:
+        raise BadSpec("nothing to simulate: give --car NAME:PLATFORM:LINK or --replay FILE")
+    if not replays and (args.loop or args.rate is not None):
+        raise BadSpec("--loop and --rate are for captures: give --replay FILE as well")
+    rate = 1.0 if args.rate is None else args.rate
+    if not math.isfinite(rate) or not RATES[0] <= rate <= RATES[1]:
+        raise BadSpec(f"rate {rate!r} is not allowed: a number from {RATES[0]:g} to {RATES[1]:g}")
+    found = []
+    for spec in replays:
+        try:
+            pieces = [(piece.at, piece.data) for piece in capture.read(Path(spec.path))]
+        except capture.BadCapture as error:
+            raise BadSpec(str(error)) from None
+        except OSError as error:
+            raise BadSpec(f"{spec.path}: {error.strerror}: write FILE[:NAME[:LINK]]") from None
+        except ValueError as error:  # a NUL in the path
+            raise BadSpec(f"{spec.path!r} is no path: {error}") from None
+        if not pieces:
+            raise BadSpec(f"{spec.path}: the capture has no bytes to play")
+        found.append((spec, Played(pieces, rate=rate, loop=args.loop)))
+    return found
+
+
+def _complain(words: str) -> None:
     sys.stderr.write(f"gateway sim: {words}\n")
+
+
+def _fail(words: str, code: int) -> int:
+    _complain(words)
     return code
 
 
@@ -103,38 +172,41 @@ def _endpoint(argument: str | None) -> str:
         raise BadSpec(str(error)) from None
 
 
-def _say(line: dict[str, object]) -> None:
-    # Whoever reads may have gone; the cars go on.
-    with contextlib.suppress(BrokenPipeError):
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
-
-
 async def _serve(
-    specs: Sequence[CarSpec], faults: Sequence[Scheduled], args: argparse.Namespace, endpoint: str | None
+    specs: Sequence[CarSpec],
+    replays: Sequence[tuple[ReplaySpec, Played]],
+    scheduled: Sequence[Scheduled],
+    args: argparse.Namespace,
+    endpoint: str | None,
 ) -> None:
     loop = asyncio.get_running_loop()
     parent = os.getppid()
     ended = asyncio.Event()
     _on_signals(loop, ended)
-    simulation = Simulation(specs, seed=args.seed, world=WORLDS[args.world]())
+    simulation = Simulation(specs, seed=args.seed, world=WORLDS[args.world](), replays=replays)
+    for car in simulation.cars.values():
+        car.failed = lambda failed, error: _complain(f"car {failed.spec.name}: {error}")
     await simulation.start()
-    tasks = [loop.create_task(_strike(simulation, scheduled)) for scheduled in faults]
+    tasks = [loop.create_task(_strike(simulation, each)) for each in scheduled]
     if endpoint is not None:
         from gateway.sim.truth import TruthPublisher
 
         tasks.append(loop.create_task(TruthPublisher(simulation, endpoint, args.fleet).run()))
     if args.with_parent:
         tasks.append(loop.create_task(_watch_parent(parent, ended)))
-    lines: asyncio.Queue[bytes] = asyncio.Queue()
-    tasks.append(loop.create_task(_obey(simulation, lines)))
+
+    def end(done: "asyncio.Task[None]") -> None:
+        if not done.cancelled() and done.exception() is not None:
+            ended.set()
+
     for task in tasks:
-        task.add_done_callback(lambda done: None if done.cancelled() or done.exception() is None else ended.set())
+        task.add_done_callback(end)
     try:
-        for spec in specs:
-            _introduce(simulation.cars[spec.name])
-            simulation.cars[spec.name].moved = _introduce
-        threading.Thread(target=_read_lines, args=(loop, lines), daemon=True).start()
+        for car in simulation.cars.values():
+            _introduce(car)
+            car.moved, car.ended = _introduce, _take_leave
+        tasks.append(loop.create_task(obey(simulation)))
+        tasks[-1].add_done_callback(end)
         await ended.wait()
     finally:
         for task in tasks:
@@ -147,7 +219,14 @@ async def _serve(
 
 
 def _introduce(car: SimCar) -> None:
-    _say({"car": car.spec.name, "platform": car.spec.platform_words, "link": car.url})
+    if isinstance(car.spec, CarSpec):
+        say({"car": car.spec.name, "platform": car.spec.platform_words, "link": car.url})
+    else:
+        say({"car": car.spec.name, "replay": car.spec.path, "link": car.url})
+
+
+def _take_leave(car: SimCar) -> None:
+    say({"car": car.spec.name, "replay": "ended"})
 
 
 def _on_signals(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
@@ -160,82 +239,16 @@ def _on_signals(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
 
 async def _strike(simulation: Simulation, scheduled: Scheduled) -> None:
     await asyncio.sleep(scheduled.at_s)
+    if not isinstance(scheduled.act, Fault):
+        simulation.press(scheduled.act)
+        return
     try:
-        await simulation.inflict(scheduled.fault)
+        await simulation.inflict(scheduled.act)
     except LinkError as error:
-        _fail(str(error), 1)
+        _complain(str(error))
 
 
 async def _watch_parent(parent: int, ended: asyncio.Event) -> None:
     while os.getppid() == parent:  # noqa: ASYNC110 - the system tells of a dead parent in no other portable way
         await asyncio.sleep(PARENT_EVERY_S)
     ended.set()
-
-
-def _read_lines(loop: asyncio.AbstractEventLoop, lines: "asyncio.Queue[bytes]") -> None:
-    """Stdin may be a pipe, a terminal, a file or nothing, so a thread reads it; its end ends nothing.
-
-    `os.read` instead of the buffered stdin: a daemon thread that holds that one's lock breaks the interpreter's end.
-    """
-    if hasattr(signal, "pthread_sigmask"):
-        # Reading a terminal from the background would stop the whole process.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})
-    rest = b""
-    while True:
-        try:
-            data = os.read(0, 4096)
-        except OSError:
-            return
-        if not data:
-            return
-        *whole, rest = (rest + data).split(b"\n")
-        rest = rest[-LINE_LIMIT:]
-        try:
-            for line in whole:
-                loop.call_soon_threadsafe(lines.put_nowait, line)
-        except RuntimeError:  # the loop has ended
-            return
-
-
-async def _obey(simulation: Simulation, lines: "asyncio.Queue[bytes]") -> None:
-    while True:
-        line = await lines.get()
-        if line.strip():
-            _say(await _answer(simulation, line))
-
-
-async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
-    try:
-        fields = json.loads(line)
-        if isinstance(fields, dict) and fields.get("ask") == "truth":
-            return _truth(simulation, fields.get("car"))
-        fault = fault_of(fields)
-        return {"ok": True, "fault": fault.kind.value, "cars": await simulation.inflict(fault)}
-    except ValueError as error:  # BadSpec, and whatever is no JSON
-        words = str(error) if isinstance(error, BadSpec) else f"no JSON: {error}"
-    except LinkError as error:
-        words = str(error)
-    return {"ok": False, "error": words}
-
-
-def _truth(simulation: Simulation, name: object) -> dict[str, object]:
-    car = simulation.cars.get(name) if isinstance(name, str) else None
-    if car is None:
-        raise BadSpec(f"car {name!r} is not simulated here: use {', '.join(simulation.cars)}")
-    truth, pose = car.truth, car.pose
-    return {
-        "ok": True,
-        "car": name,
-        "mode": truth.mode.value,
-        "motor_left": truth.motor_left,
-        "motor_right": truth.motor_right,
-        "blocked": truth.blocked,
-        "fan": truth.fan,
-        "led": truth.led,
-        "servo": truth.servo,
-        "speed": truth.speed,
-        "alive": truth.alive,
-        "x_m": pose.x_m,
-        "y_m": pose.y_m,
-        "heading_rad": pose.heading_rad,
-    }

@@ -57,7 +57,15 @@ class SimLink(Protocol):
         ...
 
     def hold(self, *, on: bool) -> None:
-        """Stop or resume taking bytes from the host."""
+        """Stop or resume taking bytes from the host, which may go on until the system's buffers are full."""
+        ...
+
+    def stick(self, *, on: bool) -> None:
+        """Take nothing more, as a device that has stopped reading; a host's writes wait where the system lets them."""
+        ...
+
+    def rename(self, path: str | None) -> None:
+        """Be another device when `up` comes next, at another path if one is given; raises LinkError."""
         ...
 
     async def close(self) -> None:
@@ -71,6 +79,7 @@ class PtySimLink:
     def __init__(self, owner: Owner, path: str | None) -> None:
         try:
             import pty
+            import termios
             import tty
         except ImportError:
             raise LinkError(
@@ -78,11 +87,14 @@ class PtySimLink:
             ) from None
         self._openpty: Callable[[], tuple[int, int]] = pty.openpty
         self._setraw: Callable[[int], object] = tty.setraw
+        self._tcflow: Callable[[int, int], object] = termios.tcflow
+        self._flow_on, self._flow_off = termios.TCOON, termios.TCOOFF
         self._owner = owner
         self._path = Path(path) if path else None
         self._master = self._slave = -1
+        self._next: tuple[int, int] | None = None
         self._name = ""
-        self._reading = False
+        self._reading = self._held = self._stuck = False
 
     @property
     def url(self) -> str:
@@ -91,10 +103,8 @@ class PtySimLink:
 
     async def up(self) -> None:
         """Open a new terminal, and point the symlink at it."""
-        try:
-            self._master, self._slave = self._openpty()
-        except OSError as error:
-            raise LinkError(f"no pseudo terminal to be had: {error.strerror}") from None
+        self._master, self._slave = self._next or self._open()
+        self._next = None
         # Our own hold on the slave keeps the terminal and its raw mode while no host has it open.
         self._setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -105,7 +115,15 @@ class PtySimLink:
             except LinkError:
                 await self.down()
                 raise
-        self.hold(on=False)
+        self._held = False
+        self._settle()
+        self._tcflow(self._slave, self._flow_off if self._stuck else self._flow_on)
+
+    def _open(self) -> tuple[int, int]:
+        try:
+            return self._openpty()
+        except OSError as error:
+            raise LinkError(f"no pseudo terminal to be had: {error.strerror}") from None
 
     def _point(self, path: Path) -> None:
         """A symlink to a device may be replaced (a killed simulator leaves one), anything else may not."""
@@ -129,14 +147,40 @@ class PtySimLink:
 
     def hold(self, *, on: bool) -> None:
         """Stop or resume reading; a host that goes on writing blocks after some kilobytes."""
-        if self._master < 0 or on != self._reading:
+        self._held = on
+        self._settle()
+
+    def stick(self, *, on: bool) -> None:
+        """As with flow control: a host's next write blocks at once."""
+        self._stuck = on
+        self._settle()
+        if self._master >= 0:
+            self._tcflow(self._slave, self._flow_off if on else self._flow_on)
+
+    def _settle(self) -> None:
+        reading = not (self._held or self._stuck)
+        if self._master < 0 or reading == self._reading:
             return
         loop = asyncio.get_running_loop()
-        if on:
-            loop.remove_reader(self._master)
-        else:
+        if reading:
             loop.add_reader(self._master, self._readable)
-        self._reading = not on
+        else:
+            loop.remove_reader(self._master)
+        self._reading = reading
+
+    def rename(self, path: str | None) -> None:
+        """The next terminal is opened while this one still has its number, so that it gets another."""
+        if path is not None:
+            new = Path(path)
+            if new != self._path and (new.exists() or new.is_symlink()):
+                raise LinkError(f"{path} is there already: name another path")
+            if not new.parent.is_dir():
+                raise LinkError(f"no symlink can be made at {path}: its directory is not there")
+        if self._next is None:
+            self._next = self._open()
+        if path is not None:
+            self._unlink()
+            self._path = Path(path)
 
     def send(self, data: bytes) -> None:
         """A UART does not wait: what does not fit is lost."""
@@ -152,12 +196,18 @@ class PtySimLink:
         os.close(self._master)
         os.close(self._slave)
         self._master = self._slave = -1
+        self._unlink()
+
+    def _unlink(self) -> None:
         if self._path is not None and self._path.is_symlink() and str(self._path.readlink()) == self._name:
             self._path.unlink(missing_ok=True)
 
     async def close(self) -> None:
         """The same: its symlink goes with it."""
         await self.down()
+        for end in self._next or ():
+            os.close(end)
+        self._next = None
 
 
 class TcpSimLink:
@@ -168,6 +218,8 @@ class TcpSimLink:
         self._host = host
         self._port = port
         self._server: asyncio.Server | None = None
+        self._next: socket.socket | None = None
+        self._held = self._stuck = False
         self._transport: asyncio.Transport | None = None
 
     @property
@@ -180,16 +232,35 @@ class TcpSimLink:
         if self._server is not None:
             return
         loop = asyncio.get_running_loop()
+        taken, self._next = self._next, None
         try:
-            self._server = await loop.create_server(
-                lambda: _Client(self), self._host, self._port, reuse_address=os.name == "posix"
-            )
+            if taken is not None:
+                self._server = await loop.create_server(lambda: _Client(self), sock=taken)
+            else:
+                self._server = await loop.create_server(
+                    lambda: _Client(self), self._host, self._port, reuse_address=os.name == "posix"
+                )
         except OSError as error:
-            words = error.strerror or str(error)
-            raise LinkError(
-                f"cannot listen on {self._host}:{self._port}: {words}; name another port, or 0 for any free one"
-            ) from None
+            raise self._cannot_listen(self._port, error) from None
         self._port = self._server.sockets[0].getsockname()[1]
+
+    def _cannot_listen(self, port: int, error: OSError) -> LinkError:
+        words = error.strerror or str(error)
+        return LinkError(f"cannot listen on {self._host}:{port}: {words}; name another port, or 0 for any free one")
+
+    def rename(self, path: str | None) -> None:
+        """Another port, taken while this one is still in use."""
+        if path is not None:
+            raise LinkError(f"{path} is not for a TCP link: it has no path")
+        if self._next is None:
+            family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
+            self._next = socket.socket(family, socket.SOCK_STREAM)
+            try:
+                self._next.bind((self._host, 0))
+            except OSError as error:
+                self._next.close()
+                self._next = None
+                raise self._cannot_listen(0, error) from None
 
     def joined(self, transport: asyncio.Transport) -> bool:
         """Whether this host is the one; a second is sent away."""
@@ -197,6 +268,8 @@ class TcpSimLink:
             return False
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._transport = transport
+        self._held = False
+        self._settle()
         self._owner.connected()
         return True
 
@@ -217,8 +290,17 @@ class TcpSimLink:
 
     def hold(self, *, on: bool) -> None:
         """Stop or resume reading."""
+        self._held = on
+        self._settle()
+
+    def stick(self, *, on: bool) -> None:
+        """The systems at both ends go on taking some hundred kilobytes; all of it arrives when it is over."""
+        self._stuck = on
+        self._settle()
+
+    def _settle(self) -> None:
         if self._transport is not None:
-            if on:
+            if self._held or self._stuck:
                 self._transport.pause_reading()
             else:
                 self._transport.resume_reading()
@@ -239,6 +321,9 @@ class TcpSimLink:
     async def close(self) -> None:
         """The same."""
         await self.down()
+        if self._next is not None:
+            self._next.close()
+            self._next = None
 
 
 class _Client(asyncio.BufferedProtocol):

@@ -35,13 +35,14 @@ class TruthPublisher:
         try:
             self._bus = await self._open(loop)
             topic = TOPICS["sim/truth"]
-            for name, car in self._simulation.cars.items():
+            cars = {name: car for name, car in self._simulation.cars.items() if car.truth is not None}
+            for name, car in cars.items():
                 key = keys.topic_key(self._fleet, name, topic.name)
                 self._publishers[name] = self._bus.publisher(key, topic, name)
                 car.watchers.append(self._put)
             due = loop.time()
             while True:
-                for car in self._simulation.cars.values():
+                for car in cars.values():
                     self._put(car)
                 # From one origin, so that the rate does not drift; a stalled loop does not catch up.
                 due = max(due + PERIOD_S, loop.time())
@@ -83,6 +84,8 @@ class TruthPublisher:
 
     def _put(self, car: SimCar) -> None:
         truth, pose = car.firmware.truth, car.pose
+        if truth is None or pose is None:
+            return
         message = fleet_v1_pb2.Truth(
             x_m=pose.x_m,
             y_m=pose.y_m,

@@ -22,6 +22,7 @@ from gateway.sim.core.firmware import (
     bits,
     motion,
 )
+from gateway.sim.core.remote import SIGNS, Button
 
 TX_BUFFER: Final = 64
 STRING_LIMIT: Final = 512
@@ -62,6 +63,7 @@ class ArduinoCar(Firmware):
         self._string = ""
         self._started = False
         self._complete = False
+        self._pressed = None
         self._speed = START_SPEED
         self._colour_position = 0
         # Loop time until each thing that mode 0 sends; the options' frames lie between the reports so that none blocks.
@@ -97,8 +99,7 @@ class ArduinoCar(Firmware):
                 case 6:
                     yield from self._following()
                 case _:
-                    # Row "remote control": only the infrared remote drives now.
-                    yield Wait(inf, wakes=True)
+                    yield from self._remote()
 
     # From the host.
 
@@ -132,6 +133,7 @@ class ArduinoCar(Firmware):
 
     def _mode_frame(self, text: str) -> Program:
         """The digits are read at places 9 and 10 of the string, whatever stands there."""
+        self._pressed = None
         if text[10:11] == "0":
             self._drive(0, 0)
             self._mode = 0
@@ -150,10 +152,9 @@ class ArduinoCar(Firmware):
         if text[5:6] == "1":
             yield from self._busy(WHISTLE_S)
         if text[7:8] == "1":
-            self._speed = min(255, self._speed + 50)
+            self._faster()
         elif text[7:8] == "2":
-            slower = self._speed - 50
-            self._speed = 100 if slower < 50 else slower
+            self._slower()
         if text[9:10] == "1":
             yield from self._turn_servo(180)
         elif text[9:10] == "2":
@@ -164,6 +165,13 @@ class ArduinoCar(Firmware):
         if text[17:18] == "1":
             yield from self._turn_servo(90)
         self._drive(left * self._speed, right * self._speed)
+
+    def _faster(self) -> None:
+        self._speed = min(255, self._speed + 50)
+
+    def _slower(self) -> None:
+        slower = self._speed - 50
+        self._speed = 100 if slower < 50 else slower
 
     def _named_frame(self, text: str) -> Generator[Wait, None, bool]:
         """Whether the frame was known."""
@@ -232,6 +240,34 @@ class ArduinoCar(Firmware):
             yield Wait(self._now + len(frame) / self._rate)
         else:
             yield from self._print(frame)
+
+    # Mode 1.
+
+    def press(self, button: Button, now: float) -> bool:
+        """Only mode 1 looks at the receiver, which keeps one button while the program is busy."""
+        self._run(now)
+        if self._mode != 1 or self._pressed is not None:
+            return False
+        self._pressed = button
+        self._run(now)
+        return True
+
+    def _remote(self) -> Program:
+        """Row "remote control": the infrared remote drives, nobody else."""
+        yield Wait(inf, wakes=True)
+        button, self._pressed = self._pressed, None
+        match button:
+            case None:
+                pass
+            case Button.WHISTLE:
+                yield from self._busy(WHISTLE_S)
+            case Button.FASTER:
+                self._faster()
+            case Button.SLOWER:
+                self._slower()
+            case _:
+                left, right = SIGNS[button]
+                self._drive(left * self._speed, right * self._speed)
 
     # The other modes. They set the speed for themselves and leave it so: what mode 0 has afterwards is theirs.
 

@@ -12,6 +12,7 @@ from math import ceil, inf
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from gateway.protocol.values import Mode
+from gateway.sim.core.remote import Button
 
 BYTES_PER_S: Final = 960.0
 """9600 baud, 8N1: ten bits a byte (protocol.md, "Framing")."""
@@ -161,6 +162,8 @@ class Firmware:
         """(time, left, right) of every change of the motors, oldest first."""
         self.lost_bytes = 0
         """Bytes that found the receive buffer full."""
+        self._pressed: Button | None = None
+        """A button of the remote that the program has not looked at."""
         self._program = self._main()
         self._wait = Wait(now)
 
@@ -225,6 +228,11 @@ class Firmware:
         self._run(now)
         return self._body.pose(now)
 
+    def press(self, button: Button, now: float) -> bool:  # noqa: ARG002 - for cars that have a receiver
+        """A button of the infrared remote is pressed; whether the car obeys it."""
+        self._run(now)
+        return False
+
     # Faults.
 
     def drop_link(self, now: float) -> None:
@@ -266,7 +274,7 @@ class Firmware:
         if not self._alive:
             return inf
         if self._wait.wakes:
-            if self._buffer:
+            if self._buffer or self._pressed is not None:
                 return self._now
             if self._arrivals:
                 return min(self._wait.until, self._arrivals[0][0])

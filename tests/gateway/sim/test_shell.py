@@ -16,9 +16,11 @@ from typing import Any
 import pytest
 import serial
 
+from gateway.sim.core.line import Way
+from gateway.sim.faults import Fault, FaultKind
 from gateway.sim.links import LinkError
 from gateway.sim.shell import Simulation
-from gateway.sim.spec import Fault, FaultKind, parse_cars
+from gateway.sim.spec import parse_cars
 from schemas.bus import Bus, Sample
 from tests.gateway.sim.strangers import MODE00, RUN, STOP, opening
 
@@ -206,11 +208,11 @@ async def test_a_second_host_is_sent_away(pair: Simulation) -> None:
 
 async def test_garbage_reaches_the_host_and_the_car(pair: Simulation) -> None:
     with serial.Serial(pair.cars["red"].url.removeprefix("serial://"), timeout=0) as port:
-        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=300))
+        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=300, ways=(Way.TO_HOST,)))
         data = bytearray()
         await until(lambda: data.extend(port.read(4096)) or len(data) >= 300, "noise")
         assert len(set(data)) > 50
-        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=50, to_car=True))
+        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=50, ways=(Way.TO_CAR,)))
 
 
 async def test_a_port_in_use_and_a_path_in_use(tmp_path: Path) -> None:
@@ -346,7 +348,7 @@ BAD = [
     ([], 2, "--car"),
     (["--car", "Red:arduino:pty"], 2, "a-z"),
     (["--car", "red:arduino:pty", "--car", "red:arduino:pty"], 2, "two cars have the name red"),
-    (["--car", "red:arduino:pty", "--fault", "melt@1"], 2, "link_drop, garbage, brownout"),
+    (["--car", "red:arduino:pty", "--fault", "melt@1"], 2, "link_drop, rename, cut_write"),
     (["--car", "red:arduino:pty", "--fault", "blue:brownout@1"], 2, "'blue' is not simulated here"),
     (["--car", "red:arduino:pty", "--fleet", "No"], 2, "fleet name"),
     (["--car", "red:arduino:pty", "--connect", "nonsense"], 2, "endpoint 'nonsense'"),

@@ -1,20 +1,8 @@
-"""What a user may write, and the one-line errors for what not."""
+"""What a user may write to describe a car, and the one-line errors for what not."""
 
 import pytest
 
-from gateway.sim.spec import (
-    BadSpec,
-    CarSpec,
-    Fault,
-    FaultKind,
-    PtyLink,
-    Scheduled,
-    TcpLink,
-    fault_of,
-    parse_car,
-    parse_cars,
-    parse_fault,
-)
+from gateway.sim.spec import BadSpec, CarSpec, PtyLink, ReplaySpec, TcpLink, parse_car, parse_cars, parse_replay
 
 GOOD_CARS = [
     ("red:arduino:pty", CarSpec("red", "arduino", frozenset(), PtyLink())),
@@ -63,54 +51,32 @@ def test_bad_cars(texts: list[str], words: str) -> None:
     assert "\n" not in str(error.value)
 
 
-GOOD_FAULTS = [
-    ("red:link_drop@5+2", Scheduled(5.0, Fault(FaultKind.LINK_DROP, "red", 2.0))),
-    ("link_drop@0.5", Scheduled(0.5, Fault(FaultKind.LINK_DROP))),
-    ("red:garbage@3+200", Scheduled(3.0, Fault(FaultKind.GARBAGE, "red", bytes=200))),
-    ("brownout@10", Scheduled(10.0, Fault(FaultKind.BROWNOUT))),
+REPLAYS = [
+    ("red.raw", ReplaySpec("replay", "red.raw", PtyLink())),
+    ("red.raw:red", ReplaySpec("red", "red.raw", PtyLink())),
+    ("/a/b:c.raw:red", ReplaySpec("red", "/a/b:c.raw", PtyLink())),
+    ("red.raw:red:pty:/tmp/red", ReplaySpec("red", "red.raw", PtyLink("/tmp/red"))),
+    ("red.raw:red:tcp", ReplaySpec("red", "red.raw", TcpLink())),
+    ("red.raw:red:tcp://127.0.0.1:80", ReplaySpec("red", "red.raw", TcpLink("127.0.0.1", 80))),
 ]
 
 
-@pytest.mark.parametrize(("text", "scheduled"), GOOD_FAULTS)
-def test_scheduled_faults(text: str, scheduled: Scheduled) -> None:
-    assert parse_fault(text) == scheduled
+@pytest.mark.parametrize(("text", "spec"), REPLAYS)
+def test_replays(text: str, spec: ReplaySpec) -> None:
+    assert parse_replay(text) == spec
 
 
-BAD_SCHEDULES = [
-    ("link_drop", "[CAR:]FAULT@SECONDS"),
-    ("link_drop@-1", "[CAR:]FAULT@SECONDS"),
-    ("link_drop@x", "[CAR:]FAULT@SECONDS"),
-    ("melt@1", "link_drop, garbage, brownout"),
-    ("brownout@1+2", "takes no amount"),
-    ("garbage@1+0", "1 to 100000"),
-    ("link_drop@1+9999999", "0 to 86400"),
-    ("link_drop@9999999", "86400"),
-]
-
-
-@pytest.mark.parametrize(("text", "words"), BAD_SCHEDULES)
-def test_bad_scheduled_faults(text: str, words: str) -> None:
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "FILE[:NAME[:LINK]]"),
+        ("x:" + "a" * 33, "1 to 32"),
+        ("x:-a", "a-z"),
+        ("x:red:tcp://h:99999", "tcp://HOST:PORT"),
+    ],
+)
+def test_bad_replays(text: str, words: str) -> None:
     with pytest.raises(BadSpec) as error:
-        parse_fault(text)
+        parse_replay(text)
     assert words in str(error.value)
-
-
-BAD_FAULTS: list[tuple[object, str]] = [
-    ([], "one JSON object"),
-    ({}, "link_drop, garbage, brownout"),
-    ({"fault": 3}, "link_drop, garbage, brownout"),
-    ({"fault": "brownout", "for_s": 2}, "'for_s'"),
-    ({"fault": "link_drop", "for_s": "2"}, "0 to 86400"),
-    ({"fault": "link_drop", "for_s": float("nan")}, "0 to 86400"),
-    ({"fault": "link_drop", "for_s": True}, "0 to 86400"),
-    ({"fault": "garbage", "bytes": 10**9}, "1 to 100000"),
-    ({"fault": "garbage", "to": "moon"}, "host or car"),
-    ({"fault": "garbage", "car": 7}, "car 7"),
-]
-
-
-@pytest.mark.parametrize(("fields", "words"), BAD_FAULTS)
-def test_bad_faults(fields: object, words: str) -> None:
-    with pytest.raises(BadSpec) as error:
-        fault_of(fields)
-    assert words in str(error.value)
+    assert "\n" not in str(error.value)

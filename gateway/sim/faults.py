@@ -1,0 +1,256 @@
+"""What a user writes to do something to a simulated car: faults and presses of the infrared remote, checked. Pure.
+
+What each fault does is the part of core/line.py, links.py and shell.py.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from gateway.sim.core.line import Flood, Way
+from gateway.sim.core.remote import Button
+from gateway.sim.spec import BadSpec, CarSpec, PtyLink, ReplaySpec
+
+GARBAGE_LIMIT: Final = 100_000
+LIMIT_S: Final = 86_400.0
+FLOOD_LIMIT: Final = 10_000_000.0
+CUT_LIMIT: Final = 256
+
+
+class FaultKind(StrEnum):
+    """What can be done to a car or its link."""
+
+    LINK_DROP = "link_drop"
+    RENAME = "rename"
+    CUT_WRITE = "cut_write"
+    SLOW = "slow"
+    LOSSY = "lossy"
+    STUCK = "stuck"
+    DEAF = "deaf"
+    MUTE = "mute"
+    ECHO = "echo"
+    FIREHOSE = "firehose"
+    GARBAGE = "garbage"
+    BROWNOUT = "brownout"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault; no `car` means every car. Fields that a kind does not have keep their defaults and mean nothing."""
+
+    kind: FaultKind
+    car: str | None = None
+    for_s: float | None = None
+    """How long, s; 0 ends it now; None: until the same kind comes with 0 (a link that is gone: link_drop)."""
+    bytes: int = 0
+    """How many bytes of garbage, or of the next frame before the cut."""
+    ways: tuple[Way, ...] = tuple(Way)
+    """Which ways of the link `lossy` and `garbage` hit."""
+    factor: float = 1.0
+    """Speed of a slow link as a part of 960 bytes/s."""
+    share: float = 0.0
+    """Part of the bytes that a lossy link loses."""
+    rate: float = 0.0
+    """Bytes/s of a firehose; what the host does not read in time is lost."""
+    flood: Flood = Flood.NOISE
+    path: str | None = None
+    """Where a renamed pseudo terminal comes back; None: the path stays, the device behind it is another."""
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """A press of a button of the remote; without `car` every car sees it."""
+
+    button: Button
+    car: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scheduled:
+    """What the command line says will happen, s after the start."""
+
+    at_s: float
+    act: Fault | Press
+
+
+def targets(cars: Sequence[CarSpec | ReplaySpec], act: Fault | Press) -> list[str]:
+    """The names of the cars that this is for; raises BadSpec if it is for one that is not here or cannot have it."""
+    names = [car.name for car in cars]
+    if act.car is not None and act.car not in names:
+        raise BadSpec(f"car {act.car!r} is not simulated here: use {', '.join(names)}")
+    chosen = [car for car in cars if act.car in (None, car.name)]
+    if isinstance(act, Press) or act.kind is FaultKind.BROWNOUT:
+        what = "ir" if isinstance(act, Press) else act.kind.value
+        simulated = [car.name for car in chosen if isinstance(car, CarSpec)]
+        if not simulated:
+            raise BadSpec(f"{what} needs a simulated car, a replay only repeats its bytes")
+        return simulated
+    if act.path is not None:
+        if act.car is None or not isinstance(chosen[0].link, PtyLink) or chosen[0].link.path is None:
+            raise BadSpec(f"path {act.path!r} is not allowed: only with the name of a car whose link is pty:PATH")
+        others = [car.name for car in cars if isinstance(car.link, PtyLink) and car.link.path == act.path]
+        if [name for name in others if name != act.car]:
+            raise BadSpec(f"path {act.path!r} is not allowed: car {others[0]} has it")
+    return [car.name for car in chosen]
+
+
+_WAYS: Final[Mapping[str, tuple[Way, ...]]] = {
+    "host": (Way.TO_HOST,),
+    "car": (Way.TO_CAR,),
+    "both": tuple(Way),
+}
+_FIELDS: Final[Mapping[FaultKind, Mapping[str, object]]] = {
+    FaultKind.LINK_DROP: {"for_s": None},
+    FaultKind.RENAME: {"for_s": 1.0, "path": None},
+    FaultKind.CUT_WRITE: {"for_s": None, "bytes": 5},
+    FaultKind.SLOW: {"for_s": None, "factor": 0.1},
+    FaultKind.LOSSY: {"for_s": None, "share": 0.1, "to": "both"},
+    FaultKind.STUCK: {"for_s": None},
+    FaultKind.DEAF: {"for_s": None},
+    FaultKind.MUTE: {"for_s": None},
+    FaultKind.ECHO: {"for_s": None},
+    FaultKind.FIREHOSE: {"for_s": None, "rate": 1e6, "of": "noise"},
+    FaultKind.GARBAGE: {"bytes": 100, "to": "host"},
+    FaultKind.BROWNOUT: {},
+}
+"""The fields of each kind with what they are when they are left out."""
+_RANGES: Final = {
+    "for_s": (0.0, LIMIT_S),
+    "factor": (0.001, 1.0),
+    "share": (0.0, 1.0),
+    "rate": (1.0, FLOOD_LIMIT),
+}
+
+
+def fault_of(fields: object) -> Fault:
+    """A fault from the JSON object of the control channel; raises BadSpec."""
+    if not isinstance(fields, dict):
+        raise BadSpec('write one JSON object a line, for example {"car": "red", "fault": "link_drop", "for_s": 2}')
+    try:
+        kind = FaultKind(str(fields.get("fault")))
+    except ValueError:
+        raise BadSpec(f"fault {fields.get('fault')!r} is not allowed: use {', '.join(FaultKind)}") from None
+    known = _FIELDS[kind]
+    _check_words(fields, {"fault", "car"}, set(known), kind)
+    given: dict[str, object] = {**known, **fields}
+    numbers = {
+        word: _number(word, given[word], *_RANGES[word])
+        for word in known.keys() & _RANGES.keys()
+        if (word, given[word]) != ("for_s", None)
+    }
+    count, path = 0, given.get("path")
+    if "bytes" in known:
+        low, high = (0, CUT_LIMIT) if kind is FaultKind.CUT_WRITE else (1, GARBAGE_LIMIT)
+        count = int(_number("bytes", given["bytes"], low, high))
+    if path is not None and (not isinstance(path, str) or not path):
+        raise BadSpec(f"path {path!r} is not allowed: write where the symlink is to be made")
+    ways = ["host", "car"] if kind is FaultKind.GARBAGE else list(_WAYS)
+    to = _choice("to", given["to"], ways) if "to" in known else "both"
+    flood = Flood(_choice("of", given["of"], list(Flood))) if "of" in known else Flood.NOISE
+    return Fault(
+        kind,
+        _car(fields),
+        for_s=numbers.get("for_s"),
+        bytes=count,
+        ways=_WAYS[to],
+        factor=numbers.get("factor", 1.0),
+        share=numbers.get("share", 0.0),
+        rate=numbers.get("rate", 0.0),
+        flood=flood,
+        path=path,
+    )
+
+
+def press_of(fields: Mapping[str, object]) -> Press:
+    """A press from the JSON object of the control channel; raises BadSpec."""
+    _check_words(fields, {"ir", "car"}, set(), "ir")
+    return Press(_button(fields.get("ir")), _car(fields))
+
+
+def _button(word: object) -> Button:
+    return Button(_choice("button", word, list(Button)))
+
+
+def _check_words(fields: Mapping[str, object], own: set[str], known: set[str], what: str) -> None:
+    for word in fields.keys() - own - known:
+        raise BadSpec(f"field {word!r} is not allowed in {what}: use {', '.join(sorted({'car'} | known))}")
+
+
+def _car(fields: Mapping[str, object]) -> str | None:
+    car = fields.get("car")
+    if car is not None and not isinstance(car, str):
+        raise BadSpec(f"car {car!r} is not allowed: write a car's name, or leave it out for all")
+    return car
+
+
+def _choice(what: str, value: object, allowed: list[str]) -> str:
+    if isinstance(value, str) and value in allowed:
+        return value
+    raise BadSpec(f"{what} {value!r} is not allowed: use {', '.join(allowed[:-1])} or {allowed[-1]}")
+
+
+def _number(what: str, value: object, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise BadSpec(f"{what} {value!r} is not allowed: a number from {low:.12g} to {high:.12g}")
+    return float(value)
+
+
+_SCHEDULED: Final = re.compile(
+    r"(?:(?P<car>[^:@]+):)?(?P<word>[a-z_]+)@(?P<at>\d+(?:\.\d+)?)(?:\+(?P<amount>\d+(?:\.\d+)?))?(?P<more>(?:,[^,]*)*)"
+)
+_FIELD: Final = re.compile(r"(?P<word>[a-z_]+)=(?P<value>.+)")
+
+
+def parse_fault(text: str) -> Scheduled:
+    """[CAR:]FAULT@SECONDS[+AMOUNT][,FIELD=VALUE...]; the amount is `for_s`, of garbage `bytes`; raises BadSpec."""
+    match = _SCHEDULED.fullmatch(text)
+    if match is None:
+        raise BadSpec(
+            f"fault {text!r} is not allowed: write [CAR:]FAULT@SECONDS[+AMOUNT][,FIELD=VALUE...], for example "
+            "red:link_drop@5+2 (gone for 2 s), red:lossy@3+10,share=0.2 (for 10 s), brownout@10"
+        )
+    fields: dict[str, object] = {"fault": match["word"]}
+    if match["car"]:
+        fields["car"] = match["car"]
+    if match["amount"]:
+        if match["word"] == FaultKind.BROWNOUT:
+            raise BadSpec(f"fault {text!r} is not allowed: brownout takes no amount")
+        fields["bytes" if match["word"] == FaultKind.GARBAGE else "for_s"] = float(match["amount"])
+    try:
+        for part in filter(None, match["more"].split(",")):
+            word, value = _field(part)
+            fields[word] = value
+        return Scheduled(_at(match["at"]), fault_of(fields))
+    except BadSpec as error:
+        raise BadSpec(f"fault {text!r}: {error}") from None
+
+
+def parse_press(text: str) -> Scheduled:
+    """[CAR:]BUTTON@SECONDS; raises BadSpec."""
+    match = _SCHEDULED.fullmatch(text)
+    if match is None or match["amount"] or match["more"]:
+        raise BadSpec(f"ir {text!r} is not allowed: write [CAR:]BUTTON@SECONDS, for example red:forward@5")
+    try:
+        return Scheduled(_at(match["at"]), Press(_button(match["word"]), match["car"]))
+    except BadSpec as error:
+        raise BadSpec(f"ir {text!r}: {error}") from None
+
+
+def _at(text: str) -> float:
+    at = float(text)
+    if not math.isfinite(at) or at > LIMIT_S:
+        raise BadSpec(f"at most {LIMIT_S:g} s after the start")
+    return at
+
+
+def _field(text: str) -> tuple[str, object]:
+    pair = _FIELD.fullmatch(text)
+    if pair is None:
+        raise BadSpec(f"{text!r} is not allowed: write FIELD=VALUE, for example factor=0.1")
+    try:
+        return pair["word"], float(pair["value"])
+    except ValueError:
+        return pair["word"], pair["value"]
