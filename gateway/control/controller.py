@@ -65,8 +65,6 @@ class _Held:
     motion: Motion
     pending: Pending
     expires_at: float
-    watched: bool
-    """Its sender had a liveliness token when it asked: losing it ends the motion."""
 
     @property
     def sender(self) -> Sender:
@@ -556,12 +554,11 @@ class Controller:
                 f"{self.car} is busy for {free_at - now:.1f} s more, longer than this drive's {drive.duration_s:g} s"
             )
             return self._reject(pending, Reason.EXPIRED, words, now)
-        watched = self._senders.watched(sender.name)
         if held is not None and held.motion is drive.motion and held.sender == sender:
             return self._drive_on(held, pending, now + drive.duration_s, now)
         words = f"{drive.motion} by {sender.name}"
         self._close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        self._held = _Held(drive.motion, pending, now + drive.duration_s, watched)
+        self._held = _Held(drive.motion, pending, now + drive.duration_s)
         if held is not None and held.motion is drive.motion and held.pending.sent:
             self._ledger.sent(pending, now, "the motion is held on")
             return Answer(Phase.SENT, words="the motion is held on")
@@ -781,7 +778,7 @@ class Controller:
     # ------------------------------------------------------------------ time
 
     def _held_until(self, held: _Held) -> float:
-        return min(held.expires_at, self._senders.lost_at(held.sender.name)) if held.watched else held.expires_at
+        return min(held.expires_at, self._senders.lost_at(held.sender.name))
 
     def _expire(self, now: float) -> None:
         held = self._held

@@ -30,18 +30,17 @@ class Senders:
         self._tokens[name] = None
 
     def vanished(self, name: str, now: float, *, driving: bool) -> None:
-        """The sender's token is gone; of who does not drive nothing need be remembered."""
-        if driving:
+        """The sender's token is gone; of who does not drive, or never had one, nothing need be remembered."""
+        if driving and name in self._tokens:
             self._tokens[name] = now
         else:
             self._tokens.pop(name, None)
 
-    def watched(self, name: str) -> bool:
-        """Whether the sender has a token now."""
-        return self._tokens.get(name, 0.0) is None
-
     def lost_at(self, name: str) -> float:
-        """When the sender counts as lost; inf while its token is there."""
+        """When the sender counts as lost; inf while its token is there, or if it never was.
+
+        A token need not be there before the first drive is: the bus may deliver them the other way round.
+        """
         gone_at = self._tokens.get(name)
         return float("inf") if gone_at is None else gone_at + SENDER_GONE_S
 

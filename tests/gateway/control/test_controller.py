@@ -227,6 +227,19 @@ def test_a_sender_that_is_away_for_a_second_is_lost(desk: Desk) -> None:
     assert desk.records[-1].words == "its sender mia is gone"
 
 
+def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Desk) -> None:
+    desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
+    desk.run(0.01)
+    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.run(1.0)
+    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    gone = desk.now
+    desk.run(3.0)
+    assert round(desk.sent[-2][0] - gone, 3) == 1.0
+    assert desk.frames[-2:] == [STOP, STOP]
+    assert desk.records[-1].words == "its sender mia is gone"
+
+
 def test_a_sender_without_a_token_is_not_watched(desk: Desk) -> None:
     desk.ask(Drive(Motion.FORWARD, 5.0), PERSON)
     desk.control.sender_alive("mia", alive=False, now=desk.now)
