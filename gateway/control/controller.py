@@ -482,6 +482,8 @@ class Controller:
         if isinstance(command.what, EmergencyStop):
             estop = Estop(command.id, sender.name, command.what.why, command.asked_ns, command.what.fleet_wide)
             until = f"latched as {self.safety.latch(estop).id} until it is resumed"
+            why = f": {estop.why}" if estop.why else ""
+            self._ledger.log(Level.ERROR, "estop", f"{self.car}: e-stop by {sender.name}{why}; {until}", now)
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not Kind.COORDINATOR:
             self.safety.held_by(sender.name, command.asked_ns)
