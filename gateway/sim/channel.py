@@ -85,7 +85,14 @@ def _truth(simulation: Simulation, name: object) -> dict[str, object]:
     if truth is None or pose is None:
         assert isinstance(car.firmware, Played)
         sent, ignored, rounds = car.firmware.sent_bytes, car.firmware.ignored_bytes, car.firmware.rounds
-        return {"ok": True, "car": name, "sent_bytes": sent, "ignored_bytes": ignored, "rounds": rounds}
+        return {
+            "ok": True,
+            "car": name,
+            "sent_bytes": sent,
+            "ignored_bytes": ignored,
+            "rounds": rounds,
+            "lost_bytes": car.lost_bytes,
+        }
     return {
         "ok": True,
         "car": name,
@@ -101,4 +108,5 @@ def _truth(simulation: Simulation, name: object) -> dict[str, object]:
         "x_m": pose.x_m,
         "y_m": pose.y_m,
         "heading_rad": pose.heading_rad,
+        "lost_bytes": car.lost_bytes,
     }

@@ -106,6 +106,11 @@ class SimCar:
         return self._link.url
 
     @property
+    def lost_bytes(self) -> dict[str, int]:
+        """What faults of the link have lost so far, to the car and to the host."""
+        return {way.value: count for way, count in self._line.lost_bytes.items()}
+
+    @property
     def truth(self) -> Truth | None:
         """What is so now; None for a capture."""
         self._pump()

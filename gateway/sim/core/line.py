@@ -66,8 +66,8 @@ class _Lane:
             kept = b""
         elif now < self.lossy_until:
             kept = bytes(byte for byte in data if self._rng.random() >= self.share)
-        room = self._limit - self.waiting
-        kept = kept[: int(min(len(kept), room))]
+        if now < self.slow_until or self.waiting:
+            kept = kept[: int(min(len(kept), self._limit - self.waiting))]
         self.lost_bytes += len(data) - len(kept)
         at = max(now, self.pieces[-1][0] if self.pieces else now)
         if now < self.slow_until:
@@ -182,9 +182,9 @@ class Line:
         if self._flood_at < self._flood_until:
             end = min(now, self._flood_until)
             # A host that was busy finds at most a second's worth: nobody has kept the rest.
-            count = int(min(end - self._flood_at, 1.0) * self._flood_rate)
-            if count or end == self._flood_until:
-                self._flood_at = end
+            since = max(self._flood_at, end - 1.0)
+            count = int((end - since) * self._flood_rate + 1e-6)
+            self._flood_at = end if end == self._flood_until else since + count / self._flood_rate
             if count:
                 out.append(self._flooding(count))
         return out
