@@ -57,6 +57,9 @@ class World:
         self.line = tuple(line)
         """A closed polyline; empty for none."""
         self.lamps = tuple(lamps)
+        # What is asked for a thousand times a second of simulated time is worked out once.
+        self._rays = tuple((x1, y1, x2 - x1, y2 - y1, hypot(x2 - x1, y2 - y1)) for x1, y1, x2, y2 in self.walls)
+        self._touching = tuple((wall, _reach(wall, RADIUS_M)) for wall in self.walls)
         self._near: dict[tuple[int, int], list[Segment]] = {}
         self._length = 0.0
         for (x1, y1), (x2, y2) in zip(self.line, (*self.line[1:], *self.line[:1]), strict=True):
@@ -101,21 +104,22 @@ class World:
         """Distance to the first wall; `steepest`: least cosine to its normal that sends something back."""
         dx, dy = cos(angle), sin(angle)
         best: tuple[float, float] | None = None
-        for x1, y1, x2, y2 in self.walls:
-            wx, wy = x2 - x1, y2 - y1
+        for x1, y1, wx, wy, length in self._rays:
             cross = dx * wy - dy * wx
             if abs(cross) < 1e-12:
                 continue
             along = ((x1 - x) * wy - (y1 - y) * wx) / cross
             share = ((x1 - x) * dy - (y1 - y) * dx) / cross
             if along >= 0 and 0 <= share <= 1 and (best is None or along < best[0]):
-                best = (along, abs(cross) / hypot(wx, wy))
+                best = (along, abs(cross) / length)
         return None if best is None or best[1] < steepest else best[0]
 
     def push_out(self, x: float, y: float) -> Point:
         """The nearest place at which a car does not overlap a wall."""
-        for x1, y1, x2, y2 in self.walls:
-            fx, fy = _foot(x, y, (x1, y1, x2, y2))
+        for wall, (low_x, low_y, high_x, high_y) in self._touching:
+            if not (low_x < x < high_x and low_y < y < high_y):
+                continue
+            fx, fy = _foot(x, y, wall)
             away = hypot(x - fx, y - fy)
             if 0 < away < RADIUS_M:
                 x, y = fx + (x - fx) * RADIUS_M / away, fy + (y - fy) * RADIUS_M / away
@@ -246,6 +250,12 @@ def _loop(half_x: float, half_y: float, radius: float) -> list[Point]:
             angle = radians(start + 90 * part / 12)
             points.append((cx + radius * cos(angle), cy + radius * sin(angle)))
     return points
+
+
+def _reach(segment: Segment, away: float) -> Segment:
+    """The rectangle outside which nothing is within `away` of a segment: low x, low y, high x, high y."""
+    x1, y1, x2, y2 = segment
+    return min(x1, x2) - away, min(y1, y2) - away, max(x1, x2) + away, max(y1, y2) + away
 
 
 def _foot(x: float, y: float, segment: Segment) -> Point:
