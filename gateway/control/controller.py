@@ -37,6 +37,7 @@ from gateway.control.records import (
     SetMode,
     Stop,
     TakeLease,
+    What,
     Why,
     Write,
 )
@@ -120,14 +121,15 @@ class Controller:
     @property
     def motors(self) -> str:
         """`off` only after a stop that is complete; `unknown` while the car's state is."""
-        if not self.known or self._unheard:
+        if not self.known or self._unheard or self.mode.verdict is Verdict.CONTRADICTED:
             return "unknown"
         return "on" if self.believed.motors_on else "off"
 
     @property
     def motion(self) -> Motion | None:
         """The motion that was sent last; None while the car's state is unknown."""
-        return self.believed.motion if self.known else None
+        sure = self.known and self.mode.verdict is not Verdict.CONTRADICTED
+        return self.believed.motion if sure else None
 
     @property
     def owner(self) -> str:
@@ -326,10 +328,14 @@ class Controller:
         if halted:
             words = f"{self.car} was stopped: let go for {PAUSE_S:g} s (or send stop), then drive again"
             return self._reject(pending, Reason.HELD, words, now)
+        busy = self._too_busy(what, now)
+        if busy:  # what is refused takes no lease and ends no hold
+            return self._reject(pending, Reason.EXPIRED, busy, now)
         self._ledger.accepted(command)
         if arbiter.needs(what).lease:
             self._lease(command, now)
-        if command.sender.kind is not Kind.COORDINATOR and isinstance(what, Drive | SetMode):
+        moves = isinstance(what, SetMode) or (isinstance(what, Drive) and what.motion is not Motion.STOP)
+        if moves and command.sender.kind is not Kind.COORDINATOR:  # letting go hands the car to nobody
             self._end_hold(command.sender, now)
         match what:
             case Drive(Motion.STOP):
@@ -548,14 +554,15 @@ class Controller:
             self._release(Phase.COMPLETE, None, f"released by {sender.name}", now)
         return self._done(pending, f"{self.car} is free", now)
 
+    def _too_busy(self, what: What, now: float) -> str:
+        """Why a drive would be over before it could begin; empty if it would not."""
+        free_at = self._free_at(now)
+        if not isinstance(what, Drive) or what.motion is Motion.STOP or now + what.duration_s > free_at:
+            return ""
+        return f"{self.car} is busy for {free_at - now:.1f} s more, longer than this drive's {what.duration_s:g} s"
+
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
         sender, held = pending.command.sender, self._held
-        free_at = self._free_at(now)
-        if now + drive.duration_s <= free_at:
-            words = (
-                f"{self.car} is busy for {free_at - now:.1f} s more, longer than this drive's {drive.duration_s:g} s"
-            )
-            return self._reject(pending, Reason.EXPIRED, words, now)
         if held is not None and held.motion is drive.motion and held.sender == sender:
             return self._drive_on(held, pending, now + drive.duration_s, now)
         words = f"{drive.motion} by {sender.name}"

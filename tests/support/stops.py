@@ -66,15 +66,15 @@ class Flickering(World):
         room = echoing()
         super().__init__(room.walls, room.line, room.lamps)
         self._chance = random.Random(seed)
-        self._rays = 0
+        self._asked = 0
         self._silent = False
 
     def ray(self, x: float, y: float, angle: float, steepest: float = 0.0) -> float | None:
         if steepest != SONAR_STEEPEST:  # the infrared sensors
             return super().ray(x, y, angle, steepest)
-        if self._rays == 0:
+        if self._asked == 0:
             self._silent = self._chance.random() < 0.5
-        self._rays = (self._rays + 1) % len(SONAR_CONE)
+        self._asked = (self._asked + 1) % len(SONAR_CONE)
         return None if self._silent else super().ray(x, y, angle, steepest)
 
 

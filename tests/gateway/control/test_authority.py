@@ -18,7 +18,7 @@ from gateway.control.records import (
 from gateway.control.safety import Estop, Kept
 from gateway.protocol.encode import ColorLed
 from gateway.protocol.values import Mode, Motion
-from tests.gateway.control.desk import COORDINATOR, MODE00, PERSON, RUN, SCRIPT, STOP, Desk
+from tests.gateway.control.desk import COORDINATOR, MODE00, PERSON, RUN, SCRIPT, STOP, TRACKING, Desk
 
 SENT, QUEUED, REJECTED, SUPERSEDED = Phase.SENT, Phase.QUEUED, Phase.REJECTED, Phase.SUPERSEDED
 FORWARD = Drive(Motion.FORWARD, 5.0)
@@ -220,3 +220,27 @@ def test_a_single_drive_is_no_stream(desk: Desk) -> None:
     desk.ask(Stop(), PERSON)
     desk.run(2.0)
     assert desk.ask(FORWARD, SCRIPT).status is QUEUED
+
+
+# ---------------------------------------------------------------------- what ends no hold
+
+
+def test_a_drive_that_is_refused_and_a_stick_that_is_let_go_end_no_hold(desk: Desk) -> None:
+    desk.ask(FORWARD, SCRIPT)
+    desk.ask(Stop(), PERSON)
+    desk.run(0.1)
+    assert desk.ask(Drive(Motion.FORWARD, 0.5), SCRIPT).reason is Reason.EXPIRED, "the stop takes longer"
+    assert desk.control.hold is not None
+    assert desk.control.safety.lease is None or desk.control.safety.lease.holder == SCRIPT
+    desk.run(3.0)
+    desk.ask(Drive(Motion.STOP), SCRIPT, streamed=True)
+    desk.ask(Drive(Motion.STOP), PERSON)
+    assert desk.control.hold is not None
+    assert desk.ask(SetMode(Mode.TRACKING), COORDINATOR).reason is Reason.HELD
+
+
+def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Desk) -> None:
+    for _ in range(4):
+        desk.run(0.3, reports=False)
+        desk.hear(TRACKING)
+    assert (desk.control.motors, desk.control.motion) == ("unknown", None)

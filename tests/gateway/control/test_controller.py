@@ -328,7 +328,7 @@ def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Desk) -> Non
     assert desk.control.hold is not None, "only a drive, a mode or resume end it"
 
 
-@pytest.mark.parametrize("what", [FORWARD, Drive(Motion.STOP), SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), Resume()])
+@pytest.mark.parametrize("what", [FORWARD, SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), Resume()])
 @pytest.mark.parametrize("sender", [PERSON, SCRIPT], ids=["person", "script"])
 def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Desk, what: What, sender: Sender) -> None:
     desk.ask(Stop(), PERSON)

@@ -20,7 +20,7 @@ from gateway.sim.core.world import World
 from tests.support.stops import AVOIDANCE, CASES, LONGEST_S, RESTORED, Case, Seen, inside, play
 from tests.support.virtual import Pair
 
-MOMENTS = 10
+MOMENTS = 6
 
 
 def judge(seen: Seen) -> None:
