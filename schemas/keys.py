@@ -10,6 +10,7 @@ _NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
 COORDINATOR: Final = "@coordinator"
 RECORDER: Final = "@recorder"
+SUPERVISOR: Final = "@supervisor"
 OPERATOR: Final = "@operator"
 
 
@@ -67,7 +68,8 @@ def operator_token(fleet: str, sender: str) -> str:
 
 def recorded(fleet: str) -> tuple[str, ...]:
     """What a recorder subscribes to: `**` does not match chunks that begin with @."""
-    return (f"{fleet}/**", f"{fleet}/{COORDINATOR}/**", f"{fleet}/{RECORDER}/**", f"{fleet}/*/@cmd/drive")
+    services = (f"{fleet}/{service}/**" for service in (COORDINATOR, RECORDER, SUPERVISOR))
+    return (f"{fleet}/**", *services, f"{fleet}/*/@cmd/drive")
 
 
 def expand(expression: str, fleet: str = DEFAULT_FLEET) -> str:

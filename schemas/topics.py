@@ -217,6 +217,16 @@ SERVICE_TOPICS: Final = (
         {"bytes": "B", "free_bytes": "B"},
         entity="recorder",
     ),
+    Topic(
+        "@supervisor/status",
+        "fleet.v1.Supervision",
+        "the processes of `fleet up`",
+        Qos.STATE,
+        1.0,
+        _STATE,
+        {"uptime_s": "s"},
+        entity="supervisor",
+    ),
 )
 
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({topic.name: topic for topic in CAR_TOPICS + SERVICE_TOPICS})

@@ -544,6 +544,79 @@ class Recording(_message.Message):
     missed: _containers.ScalarMap[str, int]
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., bytes: _Optional[int] = ..., messages: _Optional[int] = ..., drops: _Optional[_Mapping[str, int]] = ..., free_bytes: _Optional[int] = ..., error: _Optional[str] = ..., missed: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
+class Supervised(_message.Message):
+    __slots__ = ("name", "kind", "state", "pid", "restarts", "since_s", "words")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    RESTARTS_FIELD_NUMBER: _ClassVar[int]
+    SINCE_S_FIELD_NUMBER: _ClassVar[int]
+    WORDS_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    kind: str
+    state: str
+    pid: int
+    restarts: int
+    since_s: float
+    words: str
+    def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., since_s: _Optional[float] = ..., words: _Optional[str] = ...) -> None: ...
+
+class Supervision(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "state", "host", "pid", "uptime_s", "fleet_file", "directory", "processes", "became")
+    class BecameEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    HOST_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_S_FIELD_NUMBER: _ClassVar[int]
+    FLEET_FILE_FIELD_NUMBER: _ClassVar[int]
+    DIRECTORY_FIELD_NUMBER: _ClassVar[int]
+    PROCESSES_FIELD_NUMBER: _ClassVar[int]
+    BECAME_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    state: str
+    host: str
+    pid: int
+    uptime_s: float
+    fleet_file: str
+    directory: str
+    processes: _containers.RepeatedCompositeFieldContainer[Supervised]
+    became: _containers.ScalarMap[str, str]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., state: _Optional[str] = ..., host: _Optional[str] = ..., pid: _Optional[int] = ..., uptime_s: _Optional[float] = ..., fleet_file: _Optional[str] = ..., directory: _Optional[str] = ..., processes: _Optional[_Iterable[_Union[Supervised, _Mapping]]] = ..., became: _Optional[_Mapping[str, str]] = ...) -> None: ...
+
+class DownCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ...) -> None: ...
+
+class ReloadCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ...) -> None: ...
+
 class DriveCommand(_message.Message):
     __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "motion", "duration_s")
     SENDER_FIELD_NUMBER: _ClassVar[int]

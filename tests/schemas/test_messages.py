@@ -8,7 +8,11 @@ from google.protobuf import descriptor_pb2
 from schemas import messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
-NAMES = sorted({topic.message for topic in topics.TOPICS.values()} | set(topics.COMMANDS.values()) | {topics.RESULT})
+SERVICES = {"fleet.v1.DownCommand", "fleet.v1.ReloadCommand"}
+"""What the fleet's own services take."""
+NAMES = sorted(
+    {topic.message for topic in topics.TOPICS.values()} | set(topics.COMMANDS.values()) | {topics.RESULT} | SERVICES
+)
 
 
 @pytest.mark.parametrize("name", NAMES)

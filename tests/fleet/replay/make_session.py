@@ -140,6 +140,8 @@ def make(path: Path, seconds: int = 20, writer: type[Writer] = Writer) -> Counte
             pb.Recording(state="recording", bytes=second * 30_000, messages=second * 100),
             second,
         )
+        supervised = pb.Supervised(name="red", kind="gateway", state="running", pid=4711)
+        made.put("fleet/@supervisor/status", pb.Supervision(state="running", processes=[supervised]), second)
     made.close()
     return made.counts
 
