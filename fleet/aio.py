@@ -1,4 +1,4 @@
-"""AsyncFleetClient and AsyncCar: the client of client.py for asyncio, with the same names.
+"""Fleet and Car for asyncio: the client of client.py with the same names, each call to be awaited.
 
 The blocking calls run in threads; a watch is an asynchronous iterator fed through a bounded hand-over.
 """
@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Coroutine, Iterable, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Self
 
-from fleet.client import FleetClient
+from fleet import client
 from fleet.outcome import Outcome
 from fleet.readings import QUEUE_LIMIT, Reading, reading_of
 from fleet.verbs import Request, Verbs
@@ -16,20 +16,20 @@ from schemas import keys, messages
 from schemas.bus import Handover, Sample
 
 
-class AsyncFleetClient:
-    """`async with AsyncFleetClient() as client`; see FleetClient for what each does and raises."""
+class Fleet:
+    """`async with Fleet() as fleet`; see fleet.client.Fleet for what each does and raises."""
 
     def __init__(
         self,
         endpoint: str | None = None,
-        fleet: str = keys.DEFAULT_FLEET,
+        name: str = keys.DEFAULT_FLEET,
         *,
         sender: str | None = None,
         kind: str = "script",
         start_hub: bool = False,
     ) -> None:
-        self._open = lambda: FleetClient(endpoint, fleet, sender=sender, kind=kind, start_hub=start_hub)
-        self._client: FleetClient | None = None
+        self._open = lambda: client.Fleet(endpoint, name, sender=sender, kind=kind, start_hub=start_hub)
+        self._client: client.Fleet | None = None
 
     async def __aenter__(self) -> Self:
         self._client = await asyncio.to_thread(self._open)
@@ -39,28 +39,28 @@ class AsyncFleetClient:
         await asyncio.to_thread(self.sync.close)
 
     @property
-    def sync(self) -> FleetClient:
+    def sync(self) -> client.Fleet:
         """The client underneath."""
         if self._client is None:
-            raise RuntimeError("use the client inside `async with`")
+            raise RuntimeError("use the fleet inside `async with`")
         return self._client
 
     async def cars(self) -> list[str]:
         """The cars whose gateway is on the bus."""
         return await asyncio.to_thread(self.sync.cars)
 
-    def car(self, name: str) -> "AsyncCar":
+    def car(self, name: str) -> "Car":
         """One car, there or not."""
-        return AsyncCar(self, keys.check_name(name))
+        return Car(self, keys.check_name(name))
 
     async def get(self, expression: str) -> list[Reading]:
         """The latest value under every key that matches."""
         return await asyncio.to_thread(self.sync.get, expression)
 
     @asynccontextmanager
-    async def watch(self, expression: str) -> AsyncIterator["AsyncWatch"]:
-        """Readings as they are published: `async with client.watch("red") as stream: async for reading in stream`."""
-        stream = AsyncWatch()
+    async def watch(self, expression: str) -> AsyncIterator["Watch"]:
+        """Readings as they are published: `async with fleet.watch("red") as stream: async for reading in stream`."""
+        stream = Watch()
         subscriber = self.sync.bus.subscribe(self.sync.expression(expression), stream.hand_over)
         try:
             yield stream
@@ -84,22 +84,22 @@ class AsyncFleetClient:
         return await asyncio.to_thread(self.sync.ask, request, cars)
 
 
-class AsyncCar(Verbs[Coroutine[Any, Any, Outcome]]):
-    """One car of an AsyncFleetClient: `await client.car("red").drive("forward", 2.0)`."""
+class Car(Verbs[Coroutine[Any, Any, Outcome]]):
+    """One car of an Fleet: `await fleet.car("red").drive("forward", 2.0)`."""
 
-    def __init__(self, client: AsyncFleetClient, name: str) -> None:
+    def __init__(self, fleet: Fleet, name: str) -> None:
         super().__init__(name)
-        self._client = client
+        self._fleet = fleet
 
     async def get(self, topic: str = "sensor/*") -> list[Reading]:
         """The latest readings of this car."""
-        return await self._client.get(f"{self.name}/{topic}")
+        return await self._fleet.get(f"{self.name}/{topic}")
 
     async def _do(self, request: Request) -> Outcome:
-        return (await self._client.ask(request, [self.name]))[0]
+        return (await self._fleet.ask(request, [self.name]))[0]
 
 
-class AsyncWatch:
+class Watch:
     """Readings as they come; a reader that is too slow loses the oldest."""
 
     def __init__(self) -> None:

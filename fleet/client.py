@@ -1,4 +1,4 @@
-"""FleetClient and Car: the operator's side of the bus, for scripts, the command line, the console and the coordinator.
+"""Fleet and Car: the operator's side of the bus, for scripts, the command line, the console and the coordinator.
 
 Asks and waits. What a command is lies in verbs.py, what became of it in outcome.py; the same for asyncio is aio.py.
 """
@@ -38,7 +38,7 @@ def default_sender() -> str:
     return re.sub(r"[^A-Za-z0-9_.@-]", "-", f"{user}@{socket.gethostname()}-{os.getpid()}").lstrip("@")
 
 
-class FleetClient:
+class Fleet:
     """One operator on the bus; use it with `with`. Its methods may be called from several threads.
 
     While it is open it holds the token `<fleet>/@operator/<sender>`: when that is lost, gateways stop what it drives.
@@ -48,16 +48,16 @@ class FleetClient:
     def __init__(
         self,
         endpoint: str | None = None,
-        fleet: str = keys.DEFAULT_FLEET,
+        name: str = keys.DEFAULT_FLEET,
         *,
         sender: str | None = None,
         kind: str = "script",
         start_hub: bool = False,
     ) -> None:
-        self.fleet = keys.check_name(fleet, "fleet name")
+        self.name = keys.check_name(name, "fleet name")
         self.sender = sender or default_sender()
         self.kind = kind
-        token = keys.operator_token(self.fleet, self.sender)
+        token = keys.operator_token(self.name, self.sender)
         self.bus = Bus.open(endpoint, start_hub=start_hub)
         self._inboxes: dict[str, queue.Queue[_Item]] = {}
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
@@ -65,7 +65,7 @@ class FleetClient:
         """Command events that were lost because nobody took them in time."""
         try:
             self.bus.token(token)
-            self.bus.subscribe(keys.topic_key(self.fleet, "*", "event/command"), self._event)
+            self.bus.subscribe(keys.topic_key(self.name, "*", "event/command"), self._event)
         except BaseException:
             self.close()
             raise
@@ -87,7 +87,7 @@ class FleetClient:
 
     def cars(self) -> list[str]:
         """The cars whose gateway is on the bus, by name."""
-        return [token.rpartition("/")[2] for token in self.bus.tokens(keys.car_token(self.fleet, "*"))]
+        return [token.rpartition("/")[2] for token in self.bus.tokens(keys.car_token(self.name, "*"))]
 
     def car(self, name: str) -> "Car":
         """One car, there or not; raises keys.BadKey for a bad name."""
@@ -95,7 +95,7 @@ class FleetClient:
 
     def expression(self, expression: str) -> str:
         """A short form (`red`, `*/sensor/battery`) written out; raises keys.BadKey."""
-        return canon(keys.expand(expression, self.fleet))
+        return canon(keys.expand(expression, self.name))
 
     def get(self, expression: str) -> list[Reading]:
         """The latest value under every key that matches, sorted by key; short forms as on the command line."""
@@ -171,7 +171,7 @@ class FleetClient:
         words = f"{target} gave no answer: its gateway went away or failed"
         try:
             answers = self.bus.query(
-                keys.command_key(self.fleet, target, verb),
+                keys.command_key(self.name, target, verb),
                 payload=payload,
                 encoding=messages.encoding_of(topics.COMMANDS[verb]),
                 timeout_s=ANSWER_S,
@@ -203,18 +203,18 @@ class FleetClient:
 
 
 class Car(Verbs[Outcome]):
-    """One car of a FleetClient: `client.car("red").drive("forward", 2.0)`."""
+    """One car of a Fleet: `fleet.car("red").drive("forward", 2.0)`."""
 
-    def __init__(self, client: FleetClient, name: str) -> None:
+    def __init__(self, fleet: Fleet, name: str) -> None:
         super().__init__(name)
-        self._client = client
+        self._fleet = fleet
 
     def get(self, topic: str = "sensor/*") -> list[Reading]:
         """The latest readings of this car."""
-        return self._client.get(f"{self.name}/{topic}")
+        return self._fleet.get(f"{self.name}/{topic}")
 
     def _do(self, request: Request) -> Outcome:
-        return self._client.ask(request, [self.name])[0]
+        return self._fleet.ask(request, [self.name])[0]
 
 
 class _Over:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import zenoh
 
-from fleet.client import FleetClient
+from fleet.client import Fleet
 from fleet.outcome import Outcome
 from fleet.policy.decide import CarPicture, Decision, Picture, Seen, decide
 from fleet.policy.plan import Plan
@@ -56,7 +56,7 @@ class Coordinator:
     `decided` hears of every decision that changed, `failed` of a command that was not carried out.
     """
 
-    client: FleetClient
+    client: Fleet
     plan: Plan
     decided: Callable[[Decision], None]
     failed: Callable[[str], None]
@@ -73,7 +73,7 @@ class Coordinator:
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Coordinate until `ended` says so; raises AnotherCoordinator. The cars keep their modes afterwards."""
-        bus, fleet = self.client.bus, self.client.fleet
+        bus, fleet = self.client.bus, self.client.name
         token = f"{fleet}/{keys.COORDINATOR}"
         if bus.tokens(token):
             raise AnotherCoordinator(self._named(self._others()))
@@ -226,7 +226,7 @@ class Coordinator:
     # ------------------------------------------------------------------ there is only one; and the hub
 
     def _others(self) -> list[str]:
-        operators = self.client.bus.tokens(f"{self.client.fleet}/{keys.OPERATOR}/*")
+        operators = self.client.bus.tokens(f"{self.client.name}/{keys.OPERATOR}/*")
         names = [token.rpartition("/")[2] for token in operators]
         return sorted(name for name in names if name.startswith(SENDER) and name != self.client.sender)
 
@@ -238,7 +238,7 @@ class Coordinator:
 
     def _named(self, others: list[str]) -> str:
         who = ", ".join(others) or "one that does not say who it is"
-        return f"fleet {self.client.fleet} has a coordinator already ({who}): stop that one first"
+        return f"fleet {self.client.name} has a coordinator already ({who}): stop that one first"
 
     def _see_to_hub(self, linked_at: float, now: float) -> float:
         """Without a link for a while: see that there is a hub."""
@@ -252,7 +252,7 @@ class Coordinator:
 
     def _publisher(self, name: str) -> Callable[[Any], None]:
         topic = topics.TOPICS[f"{keys.COORDINATOR}/{name}"]
-        publisher = self.client.bus.publisher(f"{self.client.fleet}/{topic.name}", topic, keys.COORDINATOR)
+        publisher = self.client.bus.publisher(f"{self.client.name}/{topic.name}", topic, keys.COORDINATOR)
 
         def publish(message: Any) -> None:
             self._published[name, getattr(message, "subject", "")] = (publisher, message)

@@ -20,7 +20,7 @@ from typing import IO, Any, Final
 
 import click
 
-from fleet.client import FleetClient
+from fleet.client import Fleet
 from fleet.commands.common import sigterm_interrupts
 from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
@@ -154,7 +154,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
             )
         )
         session = Path(_line(recorder, "recorder")["session"])
-        client = stack.enter_context(FleetClient(run.endpoint, sender="demo", kind="person"))
+        client = stack.enter_context(Fleet(run.endpoint, sender="demo", kind="person"))
         watcher = stack.enter_context(bus.Bus.open(run.endpoint))
         watcher.subscribe(f"{keys.DEFAULT_FLEET}/**", run.witness)
         simulator, links = _simulator(run, stack, session)
@@ -180,7 +180,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
 # ---------------------------------------------------------------- the job
 
 
-def _act(run: Demo, stack: ExitStack, client: FleetClient, simulator: "subprocess.Popen[str]", session: Path) -> None:
+def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Popen[str]", session: Path) -> None:
     run.say("three gateways bring their cars to a known state")
     ready = run.until(lambda: _motors(client) == dict.fromkeys(CARS, "off") and run.truth.keys() == CARS.keys())
     run.check("cars ready", f"motors {_motors(client)}", ok=ready)
@@ -268,12 +268,12 @@ def _act(run: Demo, stack: ExitStack, client: FleetClient, simulator: "subproces
     run.check("coordinator ends", f"exit code {code}", ok=code == 0)
 
 
-def _state(client: FleetClient, car: str, name: str) -> Any:
+def _state(client: Fleet, car: str, name: str) -> Any:
     found = client.get(f"{car}/state/{name}")
     return found[0].value if found else messages.message_class(f"fleet.v1.{name.capitalize()}")()
 
 
-def _motors(client: FleetClient) -> dict[str, str]:
+def _motors(client: Fleet) -> dict[str, str]:
     return {reading.key.split("/")[1]: reading.value.motors for reading in client.get("*/state/safety")}
 
 

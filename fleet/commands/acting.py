@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import click
 
-from fleet.client import FleetClient
+from fleet.client import Fleet
 from fleet.commands.common import carry_out, cars_argument, json_option, with_client
 from fleet.verbs import (
     Request,
@@ -81,7 +81,7 @@ def _arm(_: click.Context, __: click.Parameter, joints: tuple[str, ...]) -> Requ
 @click.argument("colour", type=_Colour())
 @json_option
 @with_client
-def led(client: FleetClient, cars: tuple[str, ...], colour: tuple[int, int, int], *, as_json: bool) -> None:
+def led(client: Fleet, cars: tuple[str, ...], colour: tuple[int, int, int], *, as_json: bool) -> None:
     """Set the colour LED."""
     carry_out(client, led_request(*colour), cars, as_json=as_json)
 
@@ -91,7 +91,7 @@ def led(client: FleetClient, cars: tuple[str, ...], colour: tuple[int, int, int]
 @click.argument("light", type=click.Choice([str(light) for light in Light]))
 @json_option
 @with_client
-def light(client: FleetClient, cars: tuple[str, ...], light: str, *, as_json: bool) -> None:
+def light(client: Fleet, cars: tuple[str, ...], light: str, *, as_json: bool) -> None:
     """Set the light."""
     carry_out(client, light_request(light), cars, as_json=as_json)
 
@@ -106,7 +106,7 @@ def light(client: FleetClient, cars: tuple[str, ...], light: str, *, as_json: bo
 @json_option
 @with_client
 def servo(
-    client: FleetClient,
+    client: Fleet,
     cars: tuple[str, ...],
     servo: str,  # noqa: ARG001 - it is in the request already
     request: Request,
@@ -125,7 +125,7 @@ def servo(
 @click.argument("request", nargs=-1, metavar="J1 J2 J3 J4 J5 J6", callback=_arm)
 @json_option
 @with_client
-def arm(client: FleetClient, cars: tuple[str, ...], request: Request, *, as_json: bool) -> None:
+def arm(client: Fleet, cars: tuple[str, ...], request: Request, *, as_json: bool) -> None:
     """Move the arm's six joints to 0..180 degrees each."""
     carry_out(client, request, cars, as_json=as_json)
 
@@ -134,7 +134,7 @@ def arm(client: FleetClient, cars: tuple[str, ...], request: Request, *, as_json
 @cars_argument
 @json_option
 @with_client
-def whistle(client: FleetClient, cars: tuple[str, ...], *, as_json: bool) -> None:
+def whistle(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
     """Sound once."""
     carry_out(client, whistle_request(), cars, as_json=as_json)
 
@@ -144,7 +144,7 @@ def whistle(client: FleetClient, cars: tuple[str, ...], *, as_json: bool) -> Non
 @click.argument("step", type=click.Choice([str(step) for step in SpeedStep]))
 @json_option
 @with_client
-def speed(client: FleetClient, cars: tuple[str, ...], step: str, *, as_json: bool) -> None:
+def speed(client: Fleet, cars: tuple[str, ...], step: str, *, as_json: bool) -> None:
     """One step faster or slower: cars know no absolute speed."""
     carry_out(client, speed_request(step), cars, as_json=as_json)
 
@@ -154,7 +154,7 @@ def speed(client: FleetClient, cars: tuple[str, ...], step: str, *, as_json: boo
 @click.argument("state", type=click.Choice(["on", "off"]), required=False)
 @json_option
 @with_client
-def fan(client: FleetClient, cars: tuple[str, ...], state: str | None, *, as_json: bool) -> None:
+def fan(client: Fleet, cars: tuple[str, ...], state: str | None, *, as_json: bool) -> None:
     """Toggle the fan; `on` and `off` only while the gateway knows its state."""
     carry_out(client, fan_request(state), cars, as_json=as_json)
 
@@ -163,6 +163,6 @@ def fan(client: FleetClient, cars: tuple[str, ...], state: str | None, *, as_jso
 @cars_argument
 @json_option
 @with_client
-def find(client: FleetClient, cars: tuple[str, ...], *, as_json: bool) -> None:
+def find(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
     """Make cars blink and beep, without moving."""
     carry_out(client, find_request(), cars, as_json=as_json)

@@ -11,7 +11,7 @@ from typing import Any, Final, Never
 
 import click
 
-from fleet.client import FleetClient
+from fleet.client import Fleet
 from fleet.outcome import NO_ANSWER, Outcome
 from fleet.verbs import LONGEST_DRIVE_S, Request
 from schemas import keys
@@ -44,7 +44,7 @@ def with_client(function: _Function) -> _Function:
     @bus_options
     @functools.wraps(function)
     def command(*args: Any, connect: str | None, fleet: str, **options: Any) -> Any:
-        with FleetClient(connect, fleet, kind="person") as client:
+        with Fleet(connect, fleet, kind="person") as client:
             return function(client, *args, **options)
 
     return command
@@ -95,7 +95,7 @@ class Seconds(click.ParamType[float]):
 cars_argument = click.argument("cars", type=Cars(), metavar="CAR[,CAR...]")
 
 
-def carry_out(client: FleetClient, request: Request, cars: Iterable[str], *, as_json: bool) -> None:
+def carry_out(client: Fleet, request: Request, cars: Iterable[str], *, as_json: bool) -> None:
     """Ask the cars, say for each what became of it, and end with the exit code that says whether all was done."""
     end_with(client.ask(request, cars), as_json=as_json)
 

@@ -9,7 +9,7 @@ from types import FrameType
 
 import click
 
-from fleet.client import FleetClient, default_sender
+from fleet.client import Fleet, default_sender
 from fleet.commands.common import bus_options, json_option
 from fleet.coordinator import SENDER, AnotherCoordinator, Coordinator
 from fleet.policy.decide import Decision
@@ -49,9 +49,7 @@ def coordinate(path: Path, connect: str | None, fleet: str, *, with_parent: bool
     def decided(decision: Decision) -> None:
         click.echo(_json(decision) if as_json else _line(decision))
 
-    with FleetClient(
-        connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True
-    ) as client:
+    with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True) as client:
         try:
             Coordinator(client, plan, decided, lambda words: click.echo(f"fleet: {words}", err=True)).run(
                 lambda: stop.is_set() or parent not in (None, os.getppid())

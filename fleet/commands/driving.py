@@ -2,7 +2,7 @@
 
 import click
 
-from fleet.client import FleetClient
+from fleet.client import Fleet
 from fleet.commands.common import (
     INTERRUPTED,
     Cars,
@@ -38,7 +38,7 @@ examples:
 )
 @json_option
 @with_client
-def drive(client: FleetClient, cars: tuple[str, ...], motion: str, duration_s: float, *, as_json: bool) -> None:
+def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, as_json: bool) -> None:
     """Hold a motion for a time, then stop; stays until the drive is over. Ctrl-C stops the car."""
     with sigterm_interrupts():
         try:
@@ -59,7 +59,7 @@ example:
 @click.argument("mode", type=click.Choice([str(mode) for mode in Mode]))
 @json_option
 @with_client
-def mode(client: FleetClient, cars: tuple[str, ...], mode: str, *, as_json: bool) -> None:
+def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, as_json: bool) -> None:
     """Bring cars into a mode; `manual` ends whatever they do by themselves."""
     carry_out(client, mode_request(mode), cars, as_json=as_json)
 
@@ -73,7 +73,7 @@ examples:
 @click.argument("cars", type=Cars(), nargs=-1, metavar="[CAR...]")
 @json_option
 @with_client
-def stop(client: FleetClient, cars: tuple[tuple[str, ...], ...], *, as_json: bool) -> None:
+def stop(client: Fleet, cars: tuple[tuple[str, ...], ...], *, as_json: bool) -> None:
     """Stop these cars, or all, and hold them against the coordinator until someone drives or resumes them."""
     _some(client, client.ask(stop_request(), _flat(cars)), as_json=as_json)
 
@@ -88,7 +88,7 @@ examples:
 @click.option("--why", default="", help="What happened, for the record.")
 @json_option
 @with_client
-def estop(client: FleetClient, cars: tuple[tuple[str, ...], ...], why: str, *, as_json: bool) -> None:
+def estop(client: Fleet, cars: tuple[tuple[str, ...], ...], why: str, *, as_json: bool) -> None:
     """Emergency stop of these cars, or of the whole fleet."""
     request = estop_request(why, "car" if cars else "fleet")
     _some(client, client.ask(request, _flat(cars)), as_json=as_json)
@@ -109,7 +109,7 @@ examples:
 @json_option
 @with_client
 def resume(
-    client: FleetClient, cars: tuple[tuple[str, ...], ...], ids: tuple[str, ...], *, estops: bool, as_json: bool
+    client: Fleet, cars: tuple[tuple[str, ...], ...], ids: tuple[str, ...], *, estops: bool, as_json: bool
 ) -> None:
     """End the hold of cars: the coordinator may use them again. With --id or --estops, end their e-stops.
 
@@ -131,7 +131,7 @@ def resume(
     end_with(outcomes, as_json=as_json)
 
 
-def _in_force(client: FleetClient, car: str) -> list[str]:
+def _in_force(client: Fleet, car: str) -> list[str]:
     """The ids of the e-stops in force on a car."""
     return [estop.id for reading in client.get(f"{car}/state/safety") for estop in reading.value.estops]
 
@@ -148,7 +148,7 @@ def _flat(cars: tuple[tuple[str, ...], ...]) -> list[str] | None:
     return [car for some in cars for car in some] or None
 
 
-def _some(client: FleetClient, outcomes: list[Outcome], *, as_json: bool) -> None:
+def _some(client: Fleet, outcomes: list[Outcome], *, as_json: bool) -> None:
     if not outcomes:
-        raise click.ClickException(f"no car of fleet {client.fleet} is on the bus at {client.bus.endpoint}")
+        raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
     end_with(outcomes, as_json=as_json)

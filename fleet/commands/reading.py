@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import click
 
-from fleet.client import FleetClient
+from fleet.client import Fleet
 from fleet.commands.common import json_option, with_client
 from fleet.readings import Reading
 from schemas import keys, topics
@@ -29,7 +29,7 @@ _COLUMNS: Final = ("car", "link", "mode", "verdict", "motion", "hold", "battery"
 @click.command("list", epilog="\b\nexample:\n  fleet list --json")
 @json_option
 @with_client
-def list_cars(client: FleetClient, *, as_json: bool) -> None:
+def list_cars(client: Fleet, *, as_json: bool) -> None:
     """The cars on the bus: link, mode and how sure that is, motion, who holds the car, battery."""
     cars = client.cars()
     said: dict[str, dict[str, Reading]] = {car: {} for car in cars}
@@ -38,7 +38,7 @@ def list_cars(client: FleetClient, *, as_json: bool) -> None:
         if key is not None:
             said.setdefault(key.car, {})[key.topic] = reading
     if not said:
-        raise click.ClickException(f"no car of fleet {client.fleet} is on the bus at {client.bus.endpoint}")
+        raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
     rows = [_row(car, values) for car, values in sorted(said.items())]
     if as_json:
         for row in rows:
@@ -92,7 +92,7 @@ def _shown(name: str, row: Mapping[str, Any]) -> str:
 @click.argument("keyexpr", callback=_checked)
 @json_option
 @with_client
-def get(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:
+def get(client: Fleet, keyexpr: str, *, as_json: bool) -> None:
     """The latest value of every reading that matches KEYEXPR; `red` is every sensor of red, * is any one part."""
     readings = client.get(keyexpr)
     if not readings:
@@ -103,13 +103,13 @@ def get(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:
         click.echo(_json(reading) if as_json else _line(reading, width))
 
 
-def _what_there_is(client: FleetClient, expression: str) -> str:
+def _what_there_is(client: Fleet, expression: str) -> str:
     """The readings of the car that was meant, or else the cars."""
     cars = client.cars()
     key = keys.parse(expression)
     if key is not None and key.car in cars:
-        begin = len(f"{client.fleet}/{key.car}/")
-        found = [reading.key[begin:] for reading in client.get(f"{client.fleet}/{key.car}/*/*")]
+        begin = len(f"{client.name}/{key.car}/")
+        found = [reading.key[begin:] for reading in client.get(f"{client.name}/{key.car}/*/*")]
         return f"{key.car} has {', '.join(found)}" if found else f"{key.car} says nothing"
     return f"the cars on the bus are: {', '.join(cars)}" if cars else "there is no car on the bus"
 
@@ -120,7 +120,7 @@ def _what_there_is(client: FleetClient, expression: str) -> str:
 @click.argument("keyexpr", callback=_checked)
 @json_option
 @with_client
-def watch(client: FleetClient, keyexpr: str, *, as_json: bool) -> None:
+def watch(client: Fleet, keyexpr: str, *, as_json: bool) -> None:
     """Readings that match KEYEXPR as they are published, until Ctrl-C."""
     _warn_if_missing(client.expression(keyexpr), client.cars())
     told = 0

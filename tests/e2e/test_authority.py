@@ -2,7 +2,7 @@
 
 import time
 
-from fleet.client import FleetClient
+from fleet.client import Fleet as Client
 from tests.support.processes import Fleet, driving, wait_for
 
 
@@ -47,7 +47,7 @@ def test_an_e_stop_of_one_car_is_its_own(fleet: Fleet) -> None:
     for car, link in (("red", red), ("blue", blue)):
         fleet.gateway(link, car=car)
         fleet.ready(car)
-    with FleetClient(fleet.endpoint, sender="mia", kind="person") as client:
+    with Client(fleet.endpoint, sender="mia", kind="person") as client:
         (outcome,) = client.estop(["red"], "smoke")
         assert outcome.ok
         assert client.car("blue").drive("forward").ok
@@ -62,7 +62,7 @@ def test_the_next_command_line_need_not_wait_for_the_last_ones_lease(fleet: Flee
     fleet.gateway(red)
     fleet.ready()
     for sender in ("mia-1", "mia-2", "mia-3"):
-        with FleetClient(fleet.endpoint, sender=sender, kind="person") as client:
+        with Client(fleet.endpoint, sender=sender, kind="person") as client:
             assert client.car("red").drive("forward", 0.2, wait=True).ok
             assert fleet.state("safety").lease.holder == sender
         wait_for(lambda: not fleet.state("safety").HasField("lease"), "given back")

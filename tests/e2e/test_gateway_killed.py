@@ -5,7 +5,7 @@ The simulator's truth is the judge, with its own stamps. Many times over, and st
 
 from pathlib import Path
 
-from fleet.client import FleetClient
+from fleet.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.kills import BUSY_S, cut_links, kill_gateways
 from tests.support.processes import Fleet, wait_for
@@ -32,7 +32,7 @@ def test_a_raspberry_pi_car_whose_gateway_was_killed_drives_on_and_it_is_said(fl
     fleet.ask("drive", motion="forward", duration_s=10)
     wait_for(lambda: judge.driving, "it drives")
     gateway.kill()
-    with FleetClient(fleet.endpoint, sender="mia", kind="person") as client:
+    with Client(fleet.endpoint, sender="mia", kind="person") as client:
         wait_for(lambda: not client.cars(), "its gateway is gone")
         outcome = client.car("red").stop()
         assert not outcome.ok

@@ -1,4 +1,4 @@
-"""FleetClient, sync and async, against real gateways of simulated cars, and against gateways that do not answer."""
+"""Fleet, sync and async, against real gateways of simulated cars, and against gateways that do not answer."""
 
 import asyncio
 import threading
@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from fleet.aio import AsyncFleetClient
-from fleet.client import FleetClient
+from fleet.aio import Fleet as AsyncFleet
+from fleet.client import Fleet
 from fleet.verbs import led_request
 from schemas import keys, messages, topics
 from schemas.bus import BadEndpoint, Bus, NoFleet, reply
@@ -22,29 +22,29 @@ from tests.support.processes import driving, wait_for
 
 
 @pytest.fixture
-def client(cars: Cars) -> Iterator[FleetClient]:
-    with FleetClient(cars.endpoint, sender="ann", kind="person") as opened:
+def client(cars: Cars) -> Iterator[Fleet]:
+    with Fleet(cars.endpoint, sender="ann", kind="person") as opened:
         yield opened
 
 
-def test_the_cars_are_those_with_a_token(client: FleetClient) -> None:
+def test_the_cars_are_those_with_a_token(client: Fleet) -> None:
     assert client.cars() == ["blue", "green", "red"]
 
 
-def test_a_command_is_carried_out_and_seen_in_the_car(client: FleetClient, cars: Cars) -> None:
+def test_a_command_is_carried_out_and_seen_in_the_car(client: Fleet, cars: Cars) -> None:
     outcome = client.car("red").led(255, 0, 16)
     assert (outcome.ok, outcome.phase) == (True, "sent")
     wait_for(lambda: cars.sim.say({"car": "red", "ask": "truth"})["led"] == "#ff0010", "the LED is so")
 
 
-def test_a_drive_that_is_waited_for_ends_complete_and_not_before_its_time(client: FleetClient, cars: Cars) -> None:
+def test_a_drive_that_is_waited_for_ends_complete_and_not_before_its_time(client: Fleet, cars: Cars) -> None:
     outcome = client.car("green").drive("forward", 0.7, wait=True)
     assert (outcome.ok, outcome.phase) == (True, "complete")
     assert outcome.took_s >= 0.7
     wait_for(lambda: not driving(cars.sim, "green"), "green stands")
 
 
-def test_a_stop_supersedes_a_drive_and_is_waited_for_until_it_is_complete(client: FleetClient, cars: Cars) -> None:
+def test_a_stop_supersedes_a_drive_and_is_waited_for_until_it_is_complete(client: Fleet, cars: Cars) -> None:
     ended: list[object] = []
     drive = threading.Thread(target=lambda: ended.append(client.car("blue").drive("forward", 10, wait=True)))
     drive.start()
@@ -57,14 +57,14 @@ def test_a_stop_supersedes_a_drive_and_is_waited_for_until_it_is_complete(client
     assert [(each.ok, each.phase) for each in ended] == [(False, "superseded")]  # type: ignore[attr-defined]  # Outcome
 
 
-def test_one_stop_reaches_every_car(client: FleetClient) -> None:
+def test_one_stop_reaches_every_car(client: Fleet) -> None:
     outcomes = client.stop()
     assert [(each.car, each.ok, each.phase) for each in outcomes] == [
         (car, True, "complete") for car in ("blue", "green", "red")
     ]
 
 
-def test_a_missing_car_keeps_no_other_from_its_command(client: FleetClient) -> None:
+def test_a_missing_car_keeps_no_other_from_its_command(client: Fleet) -> None:
     outcomes = client.ask(led_request(1, 2, 3), ["red", "purple", "blue"])
     assert [(each.car, each.ok, each.phase) for each in outcomes] == [
         ("blue", True, "sent"),
@@ -76,22 +76,22 @@ def test_a_missing_car_keeps_no_other_from_its_command(client: FleetClient) -> N
     )
 
 
-def test_a_refusal_carries_its_reason_and_words(client: FleetClient) -> None:
+def test_a_refusal_carries_its_reason_and_words(client: Fleet) -> None:
     outcome = client.car("green").light("pink")
     assert (outcome.ok, outcome.phase, outcome.reason) == (False, "rejected", "bad_value")
     assert "allowed are white, red" in outcome.words
 
 
-def test_a_person_stop_holds_the_car_against_the_coordinator_until_resumed(client: FleetClient, cars: Cars) -> None:
+def test_a_person_stop_holds_the_car_against_the_coordinator_until_resumed(client: Fleet, cars: Cars) -> None:
     client.stop(["green"])
-    with FleetClient(cars.endpoint, sender="c", kind="coordinator") as coordinator:
+    with Fleet(cars.endpoint, sender="c", kind="coordinator") as coordinator:
         assert coordinator.car("green").mode("manual").reason == "held"
         assert client.car("green").resume().ok
         assert coordinator.car("green").mode("manual").ok
 
 
 def test_whoever_goes_while_driving_leaves_no_car_driving(cars: Cars) -> None:
-    with FleetClient(cars.endpoint, sender="gone", kind="script") as client:
+    with Fleet(cars.endpoint, sender="gone", kind="script") as client:
         assert client.car("blue").drive("forward", 10).ok
         wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
     began = time.monotonic()
@@ -100,12 +100,12 @@ def test_whoever_goes_while_driving_leaves_no_car_driving(cars: Cars) -> None:
 
 
 @pytest.mark.parametrize("duration_s", [0, -1, 3600.01, float("nan"), float("inf")])
-def test_a_drive_out_of_range_is_refused_here(client: FleetClient, duration_s: float) -> None:
+def test_a_drive_out_of_range_is_refused_here(client: Fleet, duration_s: float) -> None:
     with pytest.raises(ValueError, match="more than 0 and at most 3600 s"):
         client.car("red").drive("forward", duration_s)
 
 
-def test_other_values_that_no_message_can_carry(client: FleetClient) -> None:
+def test_other_values_that_no_message_can_carry(client: Fleet) -> None:
     with pytest.raises(ValueError, match="r 256 is not allowed"):
         client.car("red").led(256, 0, 0)
     with pytest.raises(ValueError, match="six joints, 2 given"):
@@ -116,7 +116,7 @@ def test_other_values_that_no_message_can_carry(client: FleetClient) -> None:
         client.car("Red")
 
 
-def test_readings_have_key_time_and_value(client: FleetClient) -> None:
+def test_readings_have_key_time_and_value(client: Fleet) -> None:
     readings = client.get("red")
     assert "fleet/red/sensor/range" in [reading.key for reading in readings]
     (battery,) = client.get("red/sensor/battery")
@@ -129,7 +129,7 @@ def test_readings_have_key_time_and_value(client: FleetClient) -> None:
         client.get("red//x")
 
 
-def test_a_watch_gives_what_is_published_and_ends_when_closed(client: FleetClient) -> None:
+def test_a_watch_gives_what_is_published_and_ends_when_closed(client: Fleet) -> None:
     with client.watch("*/state/health") as readings:
         seen = set()
         for reading in readings:
@@ -141,7 +141,7 @@ def test_a_watch_gives_what_is_published_and_ends_when_closed(client: FleetClien
 
 
 async def test_the_async_client_does_the_same(cars: Cars) -> None:
-    async with AsyncFleetClient(cars.endpoint, sender="eve") as client:
+    async with AsyncFleet(cars.endpoint, sender="eve") as client:
         assert await client.cars() == ["blue", "green", "red"]
         one, other = await asyncio.gather(client.car("red").whistle(), client.car("blue").led(0, 0, 9))
         assert (one.phase, other.phase) == ("sent", "sent")
@@ -198,7 +198,7 @@ def test_a_gateway_that_hangs_is_told_from_one_that_answers(cars: Cars, gateway:
 
     worker = threading.Thread(target=complete)
     worker.start()
-    with FleetClient(cars.endpoint, "odd", sender="ann") as client:
+    with Fleet(cars.endpoint, "odd", sender="ann") as client:
         wait_for(lambda: client.cars() == ["fine", "hung"], "both are there")
         fine, hung = client.stop()
     worker.join()
@@ -215,7 +215,7 @@ def test_a_command_of_which_nothing_more_is_heard_ends_with_what_was_heard_last(
 
     gateway.queryable("odd/mute/@cmd/*", answer)
     gateway.token(keys.car_token("odd", "mute"))
-    with FleetClient(cars.endpoint, "odd", sender="ann") as client:
+    with Fleet(cars.endpoint, "odd", sender="ann") as client:
         wait_for(lambda: "mute" in client.cars(), "it is there")
         outcome = client.car("mute").stop()
     assert (outcome.ok, outcome.phase) == (False, "queued")
@@ -234,7 +234,7 @@ def test_an_answer_that_nobody_can_read_costs_no_other_car_its_outcome(cars: Car
     answer("good", pb.Result(car="good", status="sent").SerializeToString(), messages.encoding_of(topics.RESULT))
     answer("noise", b"\xff\xff", "application/octet-stream")
     answer("other", pb.Range(range_m=1.0).SerializeToString(), messages.encoding_of("fleet.v1.Range"))
-    with FleetClient(cars.endpoint, "odd", sender="ann") as client:
+    with Fleet(cars.endpoint, "odd", sender="ann") as client:
         wait_for(lambda: client.cars() == ["good", "noise", "other"], "all are there")
         good, *unreadable = client.stop()
     assert (good.car, good.ok, good.phase) == ("good", True, "sent")
@@ -246,7 +246,7 @@ def test_an_answer_that_nobody_can_read_costs_no_other_car_its_outcome(cars: Car
 def test_a_gateway_that_ends_a_query_without_a_word_does_not_hang(cars: Cars, gateway: Bus) -> None:
     gateway.queryable("odd/brief/@cmd/*", lambda query: query.drop())
     gateway.token(keys.car_token("odd", "brief"))
-    with FleetClient(cars.endpoint, "odd", sender="ann") as client:
+    with Fleet(cars.endpoint, "odd", sender="ann") as client:
         wait_for(lambda: client.cars() == ["brief"], "it is there")
         outcome = client.car("brief").whistle()
     assert (outcome.ok, outcome.phase) == (False, "no_answer")
@@ -264,7 +264,7 @@ def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
 
     gateway.queryable("odd/slow/@cmd/*", answer)
     gateway.token(keys.car_token("odd", "slow"))
-    client = FleetClient(cars.endpoint, "odd", sender="ann")
+    client = Fleet(cars.endpoint, "odd", sender="ann")
     wait_for(lambda: "slow" in client.cars(), "it is there")
     outcomes: list[object] = []
     waiting = threading.Thread(target=lambda: outcomes.extend(client.stop(["slow"])))
@@ -277,16 +277,16 @@ def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
 
 def test_no_fleet_and_bad_names_are_told_apart() -> None:
     with pytest.raises(NoFleet):
-        FleetClient(free_endpoint())
+        Fleet(free_endpoint())
     with pytest.raises(BadEndpoint):
-        FleetClient("nowhere")
+        Fleet("nowhere")
     with pytest.raises(keys.BadKey, match="fleet name 'A B'"):
-        FleetClient(fleet="A B")
+        Fleet(name="A B")
     with pytest.raises(keys.BadKey, match="sender 'a/b'"):
-        FleetClient(sender="a/b")
+        Fleet(sender="a/b")
 
 
-def test_reading_a_command_is_refused_because_asking_for_it_would_carry_it_out(client: FleetClient) -> None:
+def test_reading_a_command_is_refused_because_asking_for_it_would_carry_it_out(client: Fleet) -> None:
     events: list[Any] = []
     client.bus.subscribe("fleet/red/event/command", lambda sample: events.append(sample.message()))
     with pytest.raises(keys.BadKey, match="is a command"):

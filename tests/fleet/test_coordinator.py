@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fleet.client import FleetClient
+from fleet.client import Fleet
 from schemas import bus
 from tests.fleet.conftest import Cars
 from tests.support.processes import Process, wait_for
@@ -63,7 +63,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
     lines = Lines(process)
     lines.until("red", "tracking", "the plan")
     wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
-    with FleetClient(cars.endpoint, sender="ann", kind="person") as client:
+    with Fleet(cars.endpoint, sender="ann", kind="person") as client:
         # Someone's stop: the coordinator leaves the car alone, also when its mode is not the planned one.
         assert client.car("red").stop().ok
         held = lines.until("red", None, "on hold by ann")

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from fleet.aio import AsyncWatch
+from fleet.aio import Watch as AsyncWatch
 from fleet.readings import QUEUE_LIMIT, Reading, Watch, reading_of
 from schemas import messages
 from schemas.bus import Sample

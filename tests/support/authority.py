@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fleet.client import FleetClient
+from fleet.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.processes import Fleet, Process, wait_for
 
@@ -27,7 +27,7 @@ def want_for_ever(fleet: Fleet, directory: Path, killed: Sequence[str]) -> list[
     gateway = fleet.gateway(link)
     coordinator = coordinate()
     wait_for(lambda: judge.modes and judge.modes[-1][1] == "tracking", "the coordinator has its mode")
-    with FleetClient(fleet.endpoint, sender="mia", kind="person") as person:
+    with Client(fleet.endpoint, sender="mia", kind="person") as person:
         assert person.car("red").stop().ok
     held_ns = judge.heard_ns
     for victims in killed:
@@ -49,7 +49,7 @@ def want_for_ever(fleet: Fleet, directory: Path, killed: Sequence[str]) -> list[
         assert judge.modes[-1][1] == "manual"
     moved = judge.on_after(held_ns)
     # And it would still have it: the end of the hold is all that it needs.
-    with FleetClient(fleet.endpoint, sender="mia", kind="person") as person:
+    with Client(fleet.endpoint, sender="mia", kind="person") as person:
         assert person.car("red").resume().ok
     wait_for(lambda: judge.modes[-1][1] == "tracking", "the coordinator has its mode again")
     return moved
