@@ -1,0 +1,121 @@
+"""What pydantic finds wrong, in words for a person. Pure.
+
+What is allowed is taken from the model's JSON schema, which knows all members of a union. Where: `marked`.
+"""
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+Where = tuple[str | int, ...]
+"""The way to a value: names of fields, positions in lists."""
+
+_LONGEST: Final = 60
+_TYPES: Final = {
+    "string": "text",
+    "integer": "a whole number",
+    "number": "a number",
+    "boolean": "true or false",
+    "array": "a list",
+    "object": "fields, `name: value`",
+    "null": "nothing",
+}
+
+
+def spelled(where: Where) -> str:
+    """A place in words: `cars.red.limits`, `rules[2].when`."""
+    text = ""
+    for part in where:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            word = part if part.isprintable() and part and not set(part) & set(" .[]:") else shown(part)
+            text += f".{word}" if text else word
+    return text
+
+
+def meant(word: str, allowed: Iterable[str]) -> str:
+    """`; did you mean 'red'?`, or nothing if none of the allowed is near."""
+    near = difflib.get_close_matches(word, list(allowed), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def shown(value: object) -> str:
+    """A value as a person reads it, cut if it is long."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict | list | tuple):
+        return "a list" if isinstance(value, list | tuple) else "a mapping"
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def fault(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str, Any]) -> tuple[str, str]:
+    """What is wrong, and what is allowed (may be empty); `error` is one of pydantic's of this kind."""
+    definitions = schema.get("$defs", {})
+    if kind == "extra_forbidden":
+        allowed = sorted({name for each in _at(schema, where[:-1], definitions) for name in each.get("properties", ())})
+        return "there is no such field here", f"allowed are {', '.join(allowed)}{meant(str(where[-1]), allowed)}"
+    here = _at(schema, where, definitions)
+    if kind == "missing":
+        return "is missing", next((each["description"] for each in here if "description" in each), "")
+    value = error["input"]
+    if kind in ("value_error", "assertion_error"):
+        return str(error["ctx"]["error"]), ""
+    head = "has no value" if value is None else f"{shown(value)} is not allowed"
+    if kind in ("enum", "literal_error"):
+        words = [str(word) for each in here for word in each.get("enum", [each["const"]] if "const" in each else [])]
+        listed = f"one of {', '.join(words)}" if words else str(error["ctx"]["expected"])
+        return head, listed + meant(str(value), words)
+    allowed_here = [words for words in map(_allowed, here) if words and words != "nothing"]
+    if allowed_here and (kind.endswith(("_type", "_than", "_equal", "_parsing")) or kind == "int_from_float"):
+        quotes = " (write it in quotes)" if kind == "string_type" and isinstance(value, bool | int | float) else ""
+        return head, " or ".join(dict.fromkeys(allowed_here)) + quotes
+    message = str(error["msg"])
+    return head, message[:1].lower() + message[1:]
+
+
+def _allowed(schema: Mapping[str, Any]) -> str:
+    """What one member of the schema allows, with its range."""
+    if "enum" in schema:
+        return f"one of {', '.join(map(str, schema['enum']))}"
+    words = _TYPES.get(schema.get("type", ""), "")
+    bounds = []
+    for key, text in (("exclusiveMinimum", "more than"), ("minimum", "at least")):
+        if key in schema:
+            bounds.append(f"{text} {schema[key]:g}")
+    for key, text in (("exclusiveMaximum", "less than"), ("maximum", "at most")):
+        if key in schema:
+            bounds.append(f"{text} {schema[key]:g}")
+    return f"{words}, {' and '.join(bounds)}" if bounds else words
+
+
+def _at(schema: Mapping[str, Any], where: Where, definitions: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The members of the schema that speak of a place, references and unions resolved."""
+    here = _members(schema, definitions)
+    for part in where:
+        below: list[Mapping[str, Any]] = []
+        for each in here:
+            if isinstance(part, int):
+                found = [*each.get("prefixItems", [])[part : part + 1], each.get("items")]
+            else:
+                named = each.get("properties", {})
+                others = [each.get("additionalProperties"), *each.get("patternProperties", {}).values()]
+                found = [named[part]] if part in named else others
+            below += [member for one in found if isinstance(one, dict) for member in _members(one, definitions)]
+        here = below
+    return here
+
+
+def _members(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    found: list[Mapping[str, Any]] = []
+    if "$ref" in schema:
+        found += _members(definitions[schema["$ref"].rpartition("/")[2]], definitions)
+    for key in ("anyOf", "oneOf", "allOf"):
+        found += [member for each in schema.get(key, ()) for member in _members(each, definitions)]
+    # A description beside a reference or a union is the field's own.
+    return [schema] if not found else [{**each, **_own(schema)} for each in found]
+
+
+def _own(schema: Mapping[str, Any]) -> dict[str, Any]:
+    return {"description": schema["description"]} if "description" in schema else {}
