@@ -41,10 +41,12 @@ class Situation:
     link_open: bool
     link_reason: str
     answering: bool
-    """False once recovery has given up: nothing heard, motors unknown."""
+    """False once recovery has given up, or the car was silent for too long: motors unknown."""
     closing: bool
     asked: Mode | None
     """The mode the car is in, or is about to be in."""
+    contradicted: bool
+    """Its readings show another mode, or none at all."""
     held_by: str | None
     estops: tuple[Estop, ...]
     ended: tuple[str, ...]
@@ -183,25 +185,27 @@ def _unmet(command: Command, needed: Needs, situation: Situation) -> Refusal | N
     if needed.battery and situation.battery:
         return Reason.BATTERY_LOW, situation.battery
     if needed.link:
-        refusal = _unreachable(situation)
+        refusal = _unreachable(situation, fan=isinstance(command.what, Fan))
         if refusal is not None:
             return refusal
     if needed.manual and situation.asked not in (None, Mode.MANUAL):
         # The stop first: under a coordinator, which would bring a mode back, it is what helps.
         helps = "stop it, or bring it to mode manual first"
         return Reason.WRONG_MODE, f"{car} is in mode {situation.asked}, where it ignores this: {helps}"
+    if needed.manual and situation.contradicted:
+        return Reason.WRONG_MODE, f"{car} is not in the mode that it was asked for, and may ignore this: stop it first"
     if needed.queue and situation.queued >= QUEUE_LIMIT:
         return Reason.QUEUE_FULL, f"{situation.queued} commands wait for {car} already: ask again in a second"
     return None
 
 
-def _unreachable(situation: Situation) -> Refusal | None:
+def _unreachable(situation: Situation, *, fan: bool) -> Refusal | None:
     car = situation.car
     if situation.closing:
         return Reason.LINK_DOWN, f"the gateway of {car} is ending"
     if not situation.link_open:
         return Reason.LINK_DOWN, f"{car} cannot be reached: {situation.link_reason}"
-    if not situation.answering:
-        words = f"{car} does not answer: no reading since its recovery; is it on, and the platform right?"
+    if not situation.answering and not (fan and situation.fan is not False):  # it may be what silences the car
+        words = f"{car} does not answer: no reading for seconds; is it on, its fan off, and the platform right?"
         return Reason.LINK_DOWN, words
     return None

@@ -100,6 +100,8 @@ class Controller:
         self._gave_up = False
         self._unheard = False
         """The car was silent for longer than it ever is, on an open link: what was sent may not have come."""
+        self._unsure = False
+        """Its bytes have spoken against its platform since it was stopped last: that stop may not have been its own."""
         self._closing = False
         self.unstopped = False
         """The gateway ends, and the car could not be stopped."""
@@ -121,15 +123,14 @@ class Controller:
     @property
     def motors(self) -> str:
         """`off` only after a stop that is complete; `unknown` while the car's state is."""
-        if not self.known or self._unheard or self.mode.verdict is Verdict.CONTRADICTED:
+        if not self.known or self._unsure or self.mode.verdict is Verdict.CONTRADICTED:
             return "unknown"
         return "on" if self.believed.motors_on else "off"
 
     @property
     def motion(self) -> Motion | None:
-        """The motion that was sent last; None while the car's state is unknown."""
-        sure = self.known and self.mode.verdict is not Verdict.CONTRADICTED
-        return self.believed.motion if sure else None
+        """The motion that was sent last; None while the car's state is unknown, and where it moves of its own."""
+        return self.believed.motion if self.known and self._manual else None
 
     @property
     def owner(self) -> str:
@@ -172,7 +173,7 @@ class Controller:
             self.platform = PlatformTruth(self.platform.told, auto=True)
             self._treat_as(self.platform.told)
         self.pacing.reset()
-        self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
+        self._begin(self._recovery(now), Why.RECOVERY, now)
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """The link is gone: nothing that waits can be sent, and the car may do anything."""
@@ -195,6 +196,7 @@ class Controller:
         """Take an event of the decoder as evidence."""
         for words in self.platform.heard(event):
             self._ledger.log(Level.WARNING, "platform_contradicted", f"{self.car}: {words}", now)
+            self._unsure = self.platform.doubted
         if not isinstance(event, Sensors):
             return
         before = self.mode.verdict
@@ -219,7 +221,7 @@ class Controller:
             if self._gave_up and self._link_open:
                 self._gave_up = False
                 self._ledger.log(Level.INFO, "answers_again", "a reading came: recovery begins again", now)
-                self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
+                self._begin(self._recovery(now), Why.RECOVERY, now)
         elif running.frames_sent and event.at > running.last_at + UNDER_WAY_S:
             self._finish(running, now)
 
@@ -262,6 +264,7 @@ class Controller:
         silent_s = self.mode.unheard_s(now)
         if expected and not self._unheard and silent_s > MANUAL_SILENCE_S:
             self._unheard = True
+            self.known = False
             words = (
                 f"{self.car} was not heard for {silent_s:.1f} s: whether it moves is not known "
                 "(off, out of reach, or its link stuck); it is stopped when it is heard again"
@@ -270,11 +273,15 @@ class Controller:
 
     def _heard_again(self, now: float) -> None:
         """A link that was stuck may deliver at once what was written meanwhile, of which a car obeys only the first."""
-        self._unheard = self.known = False
+        self._unheard = self._gave_up = False
         words = f"{self.car} is heard again: it is stopped first"
         self._ledger.log(Level.INFO, "answers_again", words, now)
         self._drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
-        self._begin(stop.recovery(self.profile), Why.RECOVERY, now)
+        running, self._running = self._running, None  # its frames may be among what was held up
+        self._begin(self._recovery(now), Why.RECOVERY, now)
+        if running is not None and self._running is not None:
+            self._running.commands.extend(running.commands)
+            self._running.why = running.why
 
     def sender_alive(self, name: str, *, alive: bool, now: float) -> None:
         """A sender's liveliness token appeared or went."""
@@ -320,8 +327,8 @@ class Controller:
             return self._stop(pending, now)
         if self._ledger.known(command):
             return self._reject(pending, Reason.DUPLICATE, f"a command with id {command.id} came already", now)
-        # A stream is noted also while it is refused: a lease that lapses after a stop must not set it going.
-        halted = command.streamed and not self._has_let_go(command, now)
+        # A drive is noted also while it is refused: a lease that lapses after a stop must not set it going.
+        halted = isinstance(what, Drive) and not self._has_let_go(command, what, now)
         refusal = arbiter.refuse(command, self._situation(now))
         if refusal is not None:
             return self._reject(pending, *refusal, now)
@@ -404,6 +411,9 @@ class Controller:
         self._expire(now)
         if self._running is not None:
             return self._step(now)
+        if self._gave_up and self._acts and isinstance(self._acts[0].command.what, Fan):
+            pending = self._acts[0]  # what silences it may be the fan: when that is off, a reading begins a recovery
+            return self._write(pending.frames[0], Why.COMMAND, pending, pending) if now >= self._ready_at else None
         if not self.known or now < self._ready_at:
             return None
         held = self._held
@@ -493,26 +503,28 @@ class Controller:
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not Kind.COORDINATOR:
             self.safety.held_by(sender.name, command.asked_ns)
-        self._halt(f"{command.verb} by {sender.name}", now)
+        self._halt(f"{command.verb} by {sender.name}", now, by=sender.name)
         if not self._link_open or self._closing:
             why = "its gateway is ending" if self._closing else self._link_reason
             words = f"{self.car} cannot be reached: {why}; it is stopped first when its link is back"
             return self._reject(pending, Reason.LINK_DOWN, f"{words} ({latched})" if latched else words, now)
+        if self._unheard:
+            silent = f"{self.car} was not heard for {self.mode.unheard_s(now):.0f} s: it may not get this stop"
+            latched = f"{silent}; {latched}" if latched else silent
         worst = self.worst_stop_s(now)
         self._ledger.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
         self._begin(self._full(now), Why.STOP, now, pending)
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
 
-    def _halt(self, words: str, now: float) -> None:
-        """Nothing that waits is sent, and no stream that runs is obeyed before it has paused."""
+    def _halt(self, words: str, now: float, by: str = "") -> None:
+        """Nothing that waits is sent, and who drives on and on is not obeyed before it has paused."""
         self._drop(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self.safety.driven_no_more(now)
-        self._senders.halt(now)
+        self._senders.halt(now, by)
 
-    def _has_let_go(self, command: Command, now: float) -> bool:
-        what = command.what
-        release = isinstance(what, Drive) and what.motion is Motion.STOP
-        return self._senders.streamed(command.sender.name, now, release=release)
+    def _has_let_go(self, command: Command, drive: Drive, now: float) -> bool:
+        release = drive.motion is Motion.STOP
+        return self._senders.drives(command.sender.name, now, streamed=command.streamed, release=release)
 
     def _resume(self, pending: Pending, ids: tuple[str, ...], now: float) -> Answer:
         sender = pending.command.sender.name
@@ -648,9 +660,10 @@ class Controller:
             now=now,
             link_open=self._link_open,
             link_reason=self._link_reason,
-            answering=not self._gave_up,
+            answering=not (self._gave_up or self._unheard),
             closing=self._closing,
             asked=self.asked,
+            contradicted=self.mode.verdict is Verdict.CONTRADICTED,
             held_by=self.hold.by if self.hold else None,
             estops=self.safety.estops,
             ended=self.safety.ended,
@@ -677,10 +690,14 @@ class Controller:
     def _full(self, now: float) -> Recipe:
         return stop.full(self._for_stop(now))
 
+    def _recovery(self, now: float) -> Recipe:
+        return stop.recovery(self._for_stop(now))
+
     def _for_stop(self, now: float) -> stop.Situation:
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
         clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
-        return stop.Situation(self.profile, self.known, self.mode.asked, contradicted, clear, blocked)
+        doubted = self.platform.doubted
+        return stop.Situation(self.profile, self.known, self.mode.asked, contradicted, clear, blocked, doubted)
 
     def _begin(self, recipe: Recipe, why: Why, now: float, pending: Pending | None = None) -> None:
         """Carry out a recipe, or join the one that runs if that is no weaker."""
@@ -724,7 +741,7 @@ class Controller:
         if not self.known:
             self._ledger.log(Level.INFO, "recovered", f"{self.car} is in a known state: stopped, mode manual", now)
         self.known = True
-        self._gave_up = False
+        self._gave_up = self._unsure = False
         self.believed.motors_on = False
         for pending in running.commands:
             if not isinstance(pending.command.what, SetMode):
@@ -733,19 +750,21 @@ class Controller:
     def _overdue(self, running: Running, now: float) -> None:
         """No mode-0 reading since the last frame: a stop is over in time; a recovery tries again, three times."""
         if not running.recipe.confirmed:
-            if now >= running.obeyed_at:
+            if now < running.obeyed_at:
+                return
+            if not self._unheard:
                 self._finish(running, now)
+                return
+        elif now < running.last_at + recipes.CONFIRM_S:
             return
-        if now < running.last_at + recipes.CONFIRM_S:
-            return
-        if running.retries < recipes.RETRIES:
+        elif running.retries < recipes.RETRIES:
             self._running = running.again(now)
             return
         self._running = None
         self._gave_up = True
         words = (
-            f"{self.car} sent no reading after {recipes.RETRIES + 1} recoveries: whether its motors run is not known "
-            "(off, out of reach, its fan on, another platform, or avoiding without an echo)"
+            f"{self.car} sent no reading after {running.retries + 1} recoveries: whether its motors run is not known "
+            "(off, out of reach, its fan on: toggle it, another platform, or avoiding without an echo)"
         )
         self._ledger.log(Level.ERROR, "no_answer", words, now)
         for pending in running.commands:

@@ -57,6 +57,8 @@ class PlatformTruth:
         default_factory=lambda: {word: _Shown() for word in (_MODES, _MEASURED, _CONSTANTS)}
     )
     _frames: dict[str, int] = field(default_factory=lambda: {"arm": 0, "imu": 0})
+    _more: set[str] = field(default_factory=set)
+    """What speaks for an option that was not told."""
 
     def __post_init__(self) -> None:
         self.profile = self.told
@@ -65,6 +67,11 @@ class PlatformTruth:
     def contradictions(self) -> tuple[str, ...]:
         """What speaks against the profile now, in words."""
         return tuple(words for words, shown in self._against.items() if shown.stands)
+
+    @property
+    def doubted(self) -> bool:
+        """Whether its sensors frames speak against the profile now; an option that was not told is no doubt."""
+        return any(shown.stands for words, shown in self._against.items() if words not in self._more)
 
     @property
     def evidence(self) -> tuple[str, ...]:
@@ -108,6 +115,7 @@ class PlatformTruth:
             self._settle()
             return ()
         words = f"{option} frames, which {self.profile.name} cars do not send: is it {self.profile.name}+{option}?"
+        self._more.add(words)
         self._against[words] = _Shown(stands=True)
         return (words,)
 

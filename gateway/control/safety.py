@@ -101,7 +101,10 @@ class Safety:
         if estop.id in self._ended:
             estop = Estop(f"{estop.id}.{estop.at_ns:x}", estop.by, estop.why, estop.at_ns, estop.fleet_wide)
         self.held_by(estop.by, estop.at_ns)
-        return self._estops.setdefault(estop.id, estop)
+        first = self._estops.get(estop.id)
+        if first is None or (estop.fleet_wide and not first.fleet_wide):  # said of this car, then of the fleet
+            self._estops[estop.id] = estop
+        return self._estops[estop.id]
 
     def end(self, ids: Iterable[str]) -> list[Estop]:
         """End e-stops; returns those that were in force."""

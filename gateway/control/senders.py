@@ -6,7 +6,7 @@ from typing import Final
 SENDER_GONE_S: Final = 1.0
 """A sender is lost when its token has been away so long: a restarted hub takes all tokens down for half a second."""
 PAUSE_S: Final = 0.5
-"""After a stop, whoever streams drives is heard again when the stream has paused so long, or has said `stop`.
+"""After a stop, whoever drives on and on is heard again when that has paused so long, or has said `stop`.
 
 Without it the next sample of a stick that somebody still leans on would drive on, 50 ms after another person's stop.
 """
@@ -19,8 +19,8 @@ class Senders:
 
     _tokens: dict[str, float | None] = field(default_factory=dict)
     """None while the token is there; since when it is gone."""
-    _streams: dict[str, float] = field(default_factory=dict)
-    """When a sender's last streamed drive came."""
+    _drives: dict[str, tuple[float, bool]] = field(default_factory=dict)
+    """When a sender's last drive came, and whether as a stream's."""
     _halted: set[str] = field(default_factory=set)
 
     # ------------------------------------------------------------------ tokens
@@ -51,20 +51,26 @@ class Senders:
             del self._tokens[name]
         return gone
 
-    # ------------------------------------------------------------------ streams
+    # ------------------------------------------------------------------ who drives on and on
 
-    def streamed(self, name: str, now: float, *, release: bool) -> bool:
-        """Note a streamed drive; False if it must not be obeyed, since the stream has not paused after a stop."""
-        last = self._streams.pop(name, float("-inf"))
+    def drives(self, name: str, now: float, *, streamed: bool, release: bool) -> bool:
+        """Note a drive; False if it must not be obeyed: its sender has driven on and on since the car was stopped."""
+        last, _ = self._drives.pop(name, (float("-inf"), False))
         if release or now - last >= PAUSE_S:
             self._halted.discard(name)
-        self._streams[name] = now
-        while len(self._streams) > _REMEMBERED:
-            oldest = next(iter(self._streams))
-            del self._streams[oldest]
+        self._drives[name] = now, streamed
+        while len(self._drives) > _REMEMBERED:
+            oldest = next(iter(self._drives))
+            del self._drives[oldest]
             self._halted.discard(oldest)
         return name not in self._halted
 
-    def halt(self, now: float) -> None:
-        """The car was stopped: streams that run must pause before they are heard again."""
-        self._halted.update(name for name, last in self._streams.items() if now - last < PAUSE_S)
+    def halt(self, now: float, by: str = "") -> None:
+        """The car was stopped: who has just driven must pause before it is heard again.
+
+        Not who stopped it: a script that drives, stops and drives is no stick that somebody leans on. A stream is.
+        """
+        running = (
+            name for name, (last, streamed) in self._drives.items() if now - last < PAUSE_S and (streamed or name != by)
+        )
+        self._halted.update(running)

@@ -35,6 +35,13 @@ class Situation:
     """No frame of ours can lie unread in the car's buffer when the first frame of the stop is written."""
     blocked: bool = False
     """In mode 0 a block of ours runs: the car ranges some time after it, but not at once."""
+    doubted: bool = False
+    """Its bytes speak against its platform: what stops any platform is what stops it."""
+
+    @property
+    def style(self) -> StopStyle:
+        """Which kind of stop it takes."""
+        return StopStyle.UNKNOWN if self.doubted else self.profile.stop_style
 
     @property
     def manual(self) -> bool:
@@ -132,9 +139,9 @@ class Running:
         )
 
 
-def recovery(profile: Profile) -> Recipe:
+def recovery(situation: Situation) -> Recipe:
     """What brings a car of unknown state to rest in mode 0."""
-    match profile.stop_style:
+    match situation.style:
         case StopStyle.RASPBERRY_PI:
             return recipes.PI
         case StopStyle.UNKNOWN:
@@ -145,9 +152,9 @@ def recovery(profile: Profile) -> Recipe:
 
 def full(situation: Situation) -> Recipe:
     """What `stop`, `estop` and a shutdown send."""
-    style = situation.profile.stop_style
+    style = situation.style
     if not situation.known or style is StopStyle.RASPBERRY_PI:
-        return recovery(situation.profile)
+        return recovery(situation)
     if style is StopStyle.UNKNOWN:
         return recipes.UNKNOWN_MANUAL if situation.manual else recipes.UNKNOWN
     return recipes.FULL_BEHIND if situation.manual and not situation.clear else recipes.FULL
@@ -155,9 +162,9 @@ def full(situation: Situation) -> Recipe:
 
 def soft(situation: Situation) -> Recipe:
     """What release and expiry send."""
-    if situation.profile.stop_style is StopStyle.RASPBERRY_PI:
+    if situation.style is StopStyle.RASPBERRY_PI:
         return recipes.PI_SOFT
-    if situation.known and situation.manual and situation.profile.stop_style is StopStyle.MODE_FRAME:
+    if situation.known and situation.manual and situation.style is StopStyle.MODE_FRAME:
         return recipes.SOFT
     return full(situation)
 

@@ -20,6 +20,7 @@ from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import parse_platform
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
+PI_READING = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
 
 STOP = b"$0,0,0,0,0,0,0,0,0#"
@@ -38,6 +39,7 @@ class Desk:
     def __init__(self, platform: str = "arduino", *, kept: Kept | None = None) -> None:
         self.now = 100.0
         self.control = Controller("red", parse_platform(platform), kept=kept)
+        self.reading = PI_READING if platform.startswith("raspberry_pi") else READING
         self.sent: list[tuple[float, bytes, Why]] = []
         self.records: list[CommandRecord] = []
         self.logs: list[LogRecord] = []
@@ -56,9 +58,9 @@ class Desk:
         self.logs.clear()
         return self
 
-    def hear(self, frame: bytes = READING) -> None:
-        """The car sends a frame."""
-        for event in Decoder().feed(frame, self.now):
+    def hear(self, frame: bytes = b"") -> None:
+        """The car sends a frame; if none is given, a mode-0 reading."""
+        for event in Decoder().feed(frame or self.reading, self.now):
             self.control.heard(event, self.now)
         self.pump()
 

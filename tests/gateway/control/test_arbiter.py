@@ -59,21 +59,27 @@ MOVES = (Drive, SetMode, ChangeSpeed, Fan)
 """What moves the car, or how it moves; with servo and arm it needs the lease."""
 SENDERS = [Sender("ann", kind) for kind in Kind]
 LEASES = [None, *(Lease(Sender("bob", kind), NOW + 1.0) for kind in Kind), Lease(Sender("bob", Kind.PERSON), NOW - 1.0)]
+MODES = [
+    (None, False),
+    *((mode, contradicted) for mode in (Mode.MANUAL, Mode.TRACKING) for contradicted in (False, True)),
+    (Mode.COLOR_LED, False),
+]
+"""The mode that was asked, and whether what is heard contradicts it."""
 RANK = [Kind.COORDINATOR, Kind.SCRIPT, Kind.PERSON]
 ESTOP = Estop("e1", "eve", "smoke", 1, fleet_wide=False)
 
 
 def situations() -> Iterator[Situation]:
-    """2 x 2 x 2 x 2 x 4 x 2 x 2 x 5 x 2 x 2 x 4 states: mode, hold, e-stop, lease, link, platform, battery."""
+    """30,720 states: link, answering, closing, hold, e-stop, lease, battery, queue; mode and verdict; platform."""
     for (
         (link, answering, closing, held, estopped, lease, battery, queued),
-        asked,
+        (asked, contradicted),
         platform,
     ) in itertools.product(
         itertools.product(
             (True, False), (True, False), (True, False), (None, "mia"), ((), (ESTOP,)), LEASES, ("", "flat"), (0, 8)
         ),
-        (None, Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED),
+        MODES,
         ("arduino", "raspberry_pi", "unknown", "stm32+arm"),
     ):
         yield Situation(
@@ -85,6 +91,7 @@ def situations() -> Iterator[Situation]:
             answering=answering,
             closing=closing,
             asked=asked,
+            contradicted=contradicted,
             held_by=held,
             estops=estopped,
             ended=("over",),
@@ -135,7 +142,7 @@ def _check(command: Command, at: Situation, reason: Reason | None) -> None:
     assert not (at.held_by and kind is Kind.COORDINATOR), "no coordinator's command moves a held car"
     if not isinstance(what, TakeLease):
         assert at.link_open
-        assert at.answering
+        assert at.answering or isinstance(what, Fan), "a fan that runs silences a car"
         assert not at.closing
     moves = isinstance(what, MOVES) or (isinstance(what, Act) and _turns(what))
     if (moves or isinstance(what, TakeLease)) and at.lease is not None and at.lease.until > NOW:
@@ -147,6 +154,7 @@ def _check(command: Command, at: Situation, reason: Reason | None) -> None:
     releases = isinstance(what, Drive) and what.motion is Motion.STOP
     if not isinstance(what, SetMode | TakeLease) and not releases:
         assert at.asked in (None, Mode.MANUAL), "the car would ignore it"
+        assert not at.contradicted, "the car may ignore it"
     if isinstance(what, Act | ChangeSpeed | Fan | Find):
         assert at.queued < QUEUE_LIMIT
 

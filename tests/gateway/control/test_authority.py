@@ -222,14 +222,34 @@ def test_a_single_drive_is_no_stream(desk: Desk) -> None:
     assert desk.ask(FORWARD, SCRIPT).status is QUEUED
 
 
+def test_who_asks_for_one_drive_after_another_lets_go_first_too(desk: Desk) -> None:
+    for _ in range(5):
+        desk.ask(Drive(Motion.FORWARD, 0.5), SCRIPT)
+        desk.run(0.1)
+    desk.ask(Stop(), PERSON)
+    for _ in range(20):
+        assert desk.ask(FORWARD, SCRIPT).reason is Reason.HELD
+        desk.run(0.1)
+    desk.run(0.5)
+    assert desk.ask(FORWARD, SCRIPT).status is QUEUED
+
+
+def test_a_script_that_drives_stops_and_drives_leans_on_nothing(desk: Desk) -> None:
+    desk.ask(FORWARD, SCRIPT)
+    desk.run(0.1)
+    desk.ask(Stop(), SCRIPT)
+    desk.run(0.1)
+    assert desk.ask(FORWARD, SCRIPT).status is QUEUED
+
+
 # ---------------------------------------------------------------------- what ends no hold
 
 
 def test_a_drive_that_is_refused_and_a_stick_that_is_let_go_end_no_hold(desk: Desk) -> None:
     desk.ask(FORWARD, SCRIPT)
     desk.ask(Stop(), PERSON)
-    desk.run(0.1)
-    assert desk.ask(Drive(Motion.FORWARD, 0.5), SCRIPT).reason is Reason.EXPIRED, "the stop takes longer"
+    desk.run(0.55)
+    assert desk.ask(Drive(Motion.FORWARD, 0.1), SCRIPT).reason is Reason.EXPIRED, "the stop takes longer"
     assert desk.control.hold is not None
     assert desk.control.safety.lease is None or desk.control.safety.lease.holder == SCRIPT
     desk.run(3.0)
@@ -244,3 +264,4 @@ def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Desk) -> None:
         desk.run(0.3, reports=False)
         desk.hear(TRACKING)
     assert (desk.control.motors, desk.control.motion) == ("unknown", None)
+    assert desk.ask(Act(ColorLed(1, 2, 3)), PERSON).reason is Reason.WRONG_MODE, "it would be lost"

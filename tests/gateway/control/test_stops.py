@@ -120,9 +120,9 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
 def situations() -> list[stop.Situation]:
     """The whole product of what the choice looks at."""
     return [
-        stop.Situation(parse_platform(platform), known, mode, contradicted, clear, blocked)
-        for platform, known, mode, contradicted, clear, blocked in product(
-            Platform, (True, False), (None, *Mode), (True, False), (True, False), (True, False)
+        stop.Situation(parse_platform(platform), known, mode, *flags)
+        for platform, known, mode, *flags in product(
+            Platform, (True, False), (None, *Mode), (True, False), (True, False), (True, False), (True, False)
         )
     ]
 
@@ -134,9 +134,9 @@ def certain(situation: stop.Situation) -> bool:
 
 # protocol.md, stopping: the first row that fits.
 FULL: tuple[tuple[Callable[[stop.Situation], bool], recipes.Recipe], ...] = (
+    (lambda it: (it.doubted or it.profile.kind is Platform.UNKNOWN) and certain(it), recipes.UNKNOWN_MANUAL),
+    (lambda it: it.doubted or it.profile.kind is Platform.UNKNOWN, recipes.UNKNOWN),
     (lambda it: it.profile.stop_style is StopStyle.RASPBERRY_PI, recipes.PI),
-    (lambda it: it.profile.kind is Platform.UNKNOWN and certain(it), recipes.UNKNOWN_MANUAL),
-    (lambda it: it.profile.kind is Platform.UNKNOWN, recipes.UNKNOWN),
     (lambda it: not it.known, recipes.RECOVERY),
     (lambda it: certain(it) and not it.clear, recipes.FULL_BEHIND),
     (lambda it: True, recipes.FULL),
@@ -145,24 +145,25 @@ FULL: tuple[tuple[Callable[[stop.Situation], bool], recipes.Recipe], ...] = (
 
 def test_the_choice_of_a_stop_over_the_whole_product_of_its_inputs() -> None:
     everything = situations()
-    assert len(everything) == 4 * 2 * 8 * 2 * 2 * 2
+    assert len(everything) == 4 * 2 * 8 * 2 * 2 * 2 * 2
     for situation in everything:
         full = next(recipe for fits, recipe in FULL if fits(situation))
         assert stop.full(situation) is full, situation
-        style = situation.profile.stop_style
+        style = StopStyle.UNKNOWN if situation.doubted else situation.profile.stop_style
         if style is StopStyle.RASPBERRY_PI:
             soft = recipes.PI_SOFT
         else:
             soft = recipes.SOFT if certain(situation) and style is StopStyle.MODE_FRAME else full
         assert stop.soft(situation) is soft, situation
-        assert stop.recovery(situation.profile).rank <= max(full.rank, recipes.RECOVERY.rank)
+        assert stop.recovery(situation).rank <= max(full.rank, recipes.RECOVERY.rank)
 
 
 def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
     for situation in situations():
-        for recipe in (stop.full(situation), stop.soft(situation), stop.recovery(situation.profile)):
+        profile = parse_platform("unknown") if situation.doubted else situation.profile
+        for recipe in (stop.full(situation), stop.soft(situation), stop.recovery(situation)):
             for step in recipe.steps:
-                assert situation.profile.refusal(step.frame) is None, (situation, recipe)
+                assert profile.refusal(step.frame) is None, (situation, recipe)
 
 
 def test_every_recipe_ends_alone_in_the_buffer() -> None:
@@ -182,5 +183,6 @@ def test_what_is_announced_is_never_less_than_what_is_waited_for() -> None:
             for recipe in (stop.full(situation), stop.soft(situation)):
                 worst_s = stop.worst_s(recipe, situation, pacing, 100.0)
                 assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stop.WIRE_S
-                possible = not situation.contradicted and situation.known and situation.mode in situation.profile.modes
+                sure = situation.known and not (situation.contradicted or situation.doubted)
+                possible = sure and situation.mode in situation.profile.modes
                 assert worst_s <= LONGEST_S or situation.turn_s > 1.0 or not possible, (situation, recipe)
