@@ -1,0 +1,220 @@
+"""A condition that was understood, as a tree: its value over readings, and its text again. Pure."""
+
+import math
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Any, Final, TypeAlias
+
+Value: TypeAlias = bool | int | float | str
+Lookup: TypeAlias = Callable[[str], object | None]
+"""The value under a name; None: not measured."""
+
+
+class Kind(StrEnum):
+    """What a value is."""
+
+    NUMBER = "a number"
+    WORD = "a word"
+    TRUTH = "yes or no"
+
+
+KINDS: Final[Mapping[type, Kind]] = {float: Kind.NUMBER, int: Kind.NUMBER, str: Kind.WORD, bool: Kind.TRUTH}
+
+
+class Op(StrEnum):
+    """A comparison."""
+
+    LT = "<"
+    LE = "<="
+    GT = ">"
+    GE = ">="
+    EQ = "=="
+    NE = "!="
+
+
+_TESTS: Final[Mapping[Op, Callable[[Any, Any], bool]]] = MappingProxyType(
+    {
+        Op.LT: operator.lt,
+        Op.LE: operator.le,
+        Op.GT: operator.gt,
+        Op.GE: operator.ge,
+        Op.EQ: operator.eq,
+        Op.NE: operator.ne,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """A field."""
+
+    name: str
+    kind: Kind
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Literal:
+    """A value as written."""
+
+    value: Value
+
+    @property
+    def kind(self) -> Kind:
+        """What it is."""
+        return KINDS[type(self.value)]
+
+    def __str__(self) -> str:
+        if isinstance(self.value, bool):
+            return "true" if self.value else "false"
+        if isinstance(self.value, str):
+            return f'"{self.value}"' if "'" in self.value else f"'{self.value}'"
+        return repr(self.value)
+
+
+@dataclass(frozen=True, slots=True)
+class Compare:
+    """Two values and how they must stand to each other."""
+
+    left: "Node"
+    op: Op
+    right: "Node"
+
+    def __str__(self) -> str:
+        return " ".join((_within(self.left), self.op, _within(self.right)))
+
+
+@dataclass(frozen=True, slots=True)
+class Not:
+    """The opposite."""
+
+    inner: "Node"
+
+    def __str__(self) -> str:
+        return f"not {f'({self.inner})' if isinstance(self.inner, Every | Some) else self.inner}"
+
+
+@dataclass(frozen=True, slots=True)
+class Every:
+    """`and`, of two or more."""
+
+    parts: tuple["Node", ...]
+
+    def __str__(self) -> str:
+        return " and ".join(f"({part})" if isinstance(part, Some) else str(part) for part in self.parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Some:
+    """`or`, of two or more."""
+
+    parts: tuple["Node", ...]
+
+    def __str__(self) -> str:
+        return " or ".join(map(str, self.parts))
+
+
+Node: TypeAlias = Name | Literal | Compare | Not | Every | Some
+
+
+def _within(side: Node) -> str:
+    return str(side) if isinstance(side, Name | Literal) else f"({side})"
+
+
+@dataclass(frozen=True, slots=True)
+class Expression:
+    """A condition that was understood; as text it is normalised, and the same when it is read again."""
+
+    root: Node
+
+    def __str__(self) -> str:
+        return str(self.root)
+
+    def __and__(self, other: "Expression") -> "Expression":
+        """Both."""
+        return Expression(joined(Every, (self.root, other.root)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names it uses, each once, as they come."""
+        return tuple(dict.fromkeys(_names(self.root)))
+
+    def value(self, lookup: Lookup) -> bool | None:
+        """Whether it holds; None: it cannot be said, because something was not measured (None, or not a number).
+
+        Raises TypeError for a value that is not of its name's type: the caller's mistake.
+        """
+        return _truth(self.root, lookup)
+
+
+def _names(node: Node) -> Iterator[str]:
+    match node:
+        case Name(name):
+            yield name
+        case Literal():
+            pass
+        case Compare(left, _, right):
+            yield from _names(left)
+            yield from _names(right)
+        case Not(inner):
+            yield from _names(inner)
+        case Every(parts) | Some(parts):
+            for part in parts:
+                yield from _names(part)
+
+
+def _truth(node: Node, lookup: Lookup) -> bool | None:
+    match node:
+        case Name() | Literal():
+            found = _value(node, lookup)
+            return None if found is None else bool(found)
+        case Compare(left, op, right):
+            one, other = _value(left, lookup), _value(right, lookup)
+            return None if one is None or other is None else _TESTS[op](one, other)
+        case Not(inner):
+            held = _truth(inner, lookup)
+            return None if held is None else not held
+        case Every(parts):
+            return _first((_truth(part, lookup) for part in parts), decisive=False)
+        case Some(parts):
+            return _first((_truth(part, lookup) for part in parts), decisive=True)
+
+
+def _first(parts: Iterator[bool | None], *, decisive: bool) -> bool | None:
+    unknown = False
+    for held in parts:
+        if held is decisive:
+            return decisive
+        unknown = unknown or held is None
+    return None if unknown else not decisive
+
+
+def _value(node: Node, lookup: Lookup) -> Value | None:
+    if isinstance(node, Literal):
+        return node.value
+    if not isinstance(node, Name):
+        return _truth(node, lookup)
+    found = lookup(node.name)
+    if found is None:
+        return None
+    if not isinstance(found, bool | int | float | str) or KINDS.get(type(found)) is not node.kind:
+        raise TypeError(f"{node.name} should be {node.kind}, and is {found!r}")
+    return None if isinstance(found, float) and math.isnan(found) else found
+
+
+def joined(join: type[Every] | type[Some], parts: Sequence[Node]) -> Node:
+    """One node of these; `a and (b and c)` is `a and b and c`."""
+    flat: list[Node] = []
+    for part in parts:
+        flat.extend(part.parts if isinstance(part, join) else (part,))
+    return flat[0] if len(flat) == 1 else join(tuple(flat))
+
+
+def kind_of(node: Node) -> Kind:
+    """What its value is."""
+    return node.kind if isinstance(node, Name | Literal) else Kind.TRUTH

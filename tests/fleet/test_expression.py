@@ -1,0 +1,302 @@
+"""Conditions: what they mean, what is said of the ones that mean nothing, and which can never be true."""
+
+import contextlib
+import math
+import operator
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.expression import BadExpression, contradictory, fields_of, parse, value_in
+from fleet.expression.reader import DEPTH, LENGTH
+from fleet.expression.tree import Compare, Every, Expression, Kind, Literal, Name, Node, Not, Op, Some, joined
+from schemas import messages, topics
+from schemas.gen import fleet_v1_pb2 as pb
+
+NAMES = {"range_m": float, "voltage_v": float, "level": str, "verdict": str, "light.left": bool, "no_echo": bool}
+READING = {"range_m": 0.25, "voltage_v": 7.4, "level": "low", "light.left": True, "no_echo": False}  # verdict: unknown
+
+
+@pytest.mark.parametrize(
+    ("text", "held"),
+    [
+        ("range_m < 0.3", True),
+        ("0.3 > range_m", True),
+        ("range_m<.25", False),
+        ("range_m <= 2.5e-1 and range_m>=0.25", True),
+        ("range_m > -1", True),
+        ("range_m != 0", True),
+        ("range_m < voltage_v", True),
+        ("level == 'low'", True),
+        ('level != "low"', False),
+        ("light.left", True),
+        ("not light.left", False),
+        ("not not light.left", True),
+        ("light.left == true and no_echo == false", True),
+        ("light.left == no_echo", False),
+        ("(range_m < 1) == (voltage_v < 1)", False),
+        ("no_echo and no_echo or light.left", True),  # and binds before or
+        ("no_echo and (no_echo or light.left)", False),
+        ("not no_echo and light.left", True),  # not binds before and
+        ("not range_m > 0.3", True),  # a comparison binds before not
+        ("true", True),
+        ("verdict == 'confirmed'", None),
+        ("not verdict == 'confirmed'", None),
+        ("verdict == 'confirmed' or light.left", True),
+        ("verdict == 'confirmed' and light.left", None),
+        ("verdict == 'confirmed' and no_echo", False),
+        ("verdict == 'confirmed' or no_echo", None),
+        ("(verdict == 'x') == light.left", None),
+    ],
+)
+def test_what_a_condition_means(text: str, held: bool | None) -> None:
+    assert parse(text, NAMES).value(READING.get) is held
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "words"),
+    [
+        ("", 1, "a field or a value is missing here: there are range_m, voltage_v, level"),
+        ("range_m <", 10, "a field or a value is missing here: there are range_m"),
+        ("range_m < and no_echo", 11, "a field or a value is missing here, before and"),
+        ("< 0.3", 1, "a field or a value is missing here, before <"),
+        ("()", 2, "a field or a value is missing here, before )"),
+        ("range < 0.3", 1, "there is no range: did you mean range_m? there are range_m, voltage_v, level, verdict"),
+        ("level == low", 10, "words are quoted, as 'low'"),
+        ("light.left == True", 15, "did you mean true?"),
+        ("range_m", 1, "range_m is a number, not a condition: compare it, as range_m < 0.3"),
+        ("no_echo or level", 12, "level is a word, not a condition: compare it, as level == 'low'"),
+        ("not range_m", 5, "range_m is a number, not a condition"),
+        ("not (range_m)", 5, "range_m is a number, not a condition"),
+        ("light.left < 1", 1, "light.left is yes or no: < compares numbers, this takes == or !=, or stands alone"),
+        ("range_m >= 'far'", 12, "'far' is a word: >= compares numbers, this takes == or !="),
+        ("level == 3", 7, "level is a word, 3 is a number: they are never the same"),
+        ("light.left != 'on'", 12, "light.left is yes or no, 'on' is a word: they are never the same"),
+        ("0.1 < range_m < 0.3", 15, "comparisons do not chain: write 0.1 < x and x < 0.3"),
+        ("range_m = 0.3", 9, "= is not known: write =="),
+        ("range_m =< 0.3", 9, "=< is not known: write <="),
+        ("no_echo && light.left", 9, "& is not known: write and"),
+        ("no_echo | light.left", 9, "| is not known: write or"),
+        ("!no_echo", 1, "! is not known: write not"),
+        ("range_m < 30cm", 11, "30cm is no number; units are not written: they are the field's"),
+        ("range_m < 0.3.1", 11, "0.3.1 is no number"),
+        ("range_m < 0,3", 12, "',' is not known: there are names, numbers"),
+        ("range_m < 1e999", 11, "1e999 is beyond what a number can be"),
+        ("range_m < \u0663", 11, "is not known"),
+        ("level == 'low", 10, "the word that begins with ' has no end"),
+        ("(no_echo", 9, "the ( of column 1 is not closed"),
+        ("no_echo)", 8, "this ) has no ( before it"),
+        ("no_echo light.left", 9, "light.left is not expected here: join conditions with and, or"),
+        ("(" * (DEPTH + 1) + "no_echo" + ")" * (DEPTH + 1), DEPTH + 1, "parentheses are too deep: allowed are 32"),
+        ("no_echo" + " " * LENGTH, LENGTH + 1, "it is too long: 1007 characters, allowed are 1000"),
+    ],
+)
+def test_what_means_nothing_is_told_with_its_place(text: str, column: int, words: str) -> None:
+    with pytest.raises(BadExpression) as bad:
+        parse(text, NAMES)
+    assert bad.value.column == column
+    assert words in bad.value.words
+    assert f"column {column}: " in str(bad.value)
+    assert "\n" not in str(bad.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "normal"),
+    [
+        ("((range_m)<.3)", "range_m < 0.3"),
+        ("not((light.left))", "not light.left"),
+        ("not not not no_echo", "not no_echo"),
+        ("not (no_echo or light.left)", "not (no_echo or light.left)"),
+        ("no_echo and (no_echo and light.left)", "no_echo and no_echo and light.left"),
+        ("no_echo and (no_echo or light.left)", "no_echo and (no_echo or light.left)"),
+        ("(no_echo and light.left) or no_echo", "no_echo and light.left or no_echo"),
+        ('level == "it\'s"', 'level == "it\'s"'),
+        ('level == "low"', "level == 'low'"),
+        ("range_m < 12", "range_m < 12"),
+        ("range_m < +1e-7", "range_m < 1e-07"),
+    ],
+)
+def test_a_condition_has_one_way_to_be_written(text: str, normal: str) -> None:
+    assert str(parse(text, NAMES)) == normal
+
+
+def test_names_are_those_it_uses_in_order() -> None:
+    assert parse("voltage_v > 7 and (range_m < 1 or voltage_v > range_m)", NAMES).names == ("voltage_v", "range_m")
+
+
+def test_a_number_that_is_none_was_not_measured_and_a_wrong_type_is_the_callers_mistake() -> None:
+    assert parse("range_m != 1", NAMES).value({"range_m": math.nan}.get) is None
+    with pytest.raises(TypeError, match="range_m should be a number, and is 'far'"):
+        parse("range_m < 1", NAMES).value({"range_m": "far"}.get)
+    with pytest.raises(TypeError, match=r"light\.left should be yes or no, and is 1"):
+        parse("light.left", NAMES).value({"light.left": 1}.get)
+
+
+@pytest.mark.parametrize(
+    ("text", "never"),
+    [
+        ("range_m < 0.1 and range_m > 0.2", True),
+        ("range_m < 0.1 and 0.2 < range_m", True),
+        ("range_m < 0.2 and range_m > 0.1", False),
+        ("range_m <= 0.1 and range_m >= 0.1", False),
+        ("range_m < 0.1 and range_m >= 0.1", True),
+        ("range_m <= 0.1 and range_m >= 0.1 and range_m != 0.1", True),
+        ("range_m == 1 and range_m == 2", True),
+        ("range_m == 1 and range_m > 1", True),
+        ("not (range_m >= 0.1 or range_m <= 0.2)", True),
+        ("not (range_m < 0.1) and not range_m >= 0.1", True),
+        ("level == 'low' and level == 'ok'", True),
+        ("level == 'low' and level != 'low'", True),
+        ("level != 'low' and level != 'ok'", False),
+        ("no_echo and not no_echo", True),
+        ("no_echo and (not no_echo or light.left)", False),
+        ("no_echo != true and no_echo != false", True),
+        ("no_echo == light.left and no_echo != light.left", True),
+        ("range_m < voltage_v and voltage_v < range_m", True),
+        ("range_m < voltage_v and voltage_v != range_m", False),
+        ("range_m < range_m", True),
+        ("(range_m < 1) == (range_m >= 1)", True),
+        ("(range_m < 1) != (range_m >= 1)", False),
+        ("1 > 2", True),
+        ("'a' == 'b'", True),
+        ("'a' != 'b'", False),
+        ("false", True),
+        (" and ".join(["(range_m < 1 or range_m > 2)"] * 12 + ["false"]), False),  # more ways than are looked at
+    ],
+)
+def test_what_can_never_be_true(text: str, never: bool) -> None:
+    assert contradictory(parse(text, NAMES)) is never
+
+
+def test_two_conditions_make_one() -> None:
+    both = parse("no_echo or light.left", NAMES) & parse("range_m < 1", NAMES)
+    assert str(both) == "(no_echo or light.left) and range_m < 1"
+    assert contradictory(parse("range_m < 1", NAMES) & parse("range_m > 1", NAMES))
+
+
+# ---------------------------------------------------------------------- against a second opinion
+
+_numbers = st.one_of(st.integers(-5, 5), st.floats(-3, 3), st.sampled_from([0.25, 1e22, -1e-9, 2**64]))
+_words = st.text(st.characters(codec="utf-8", exclude_characters="\n\"'"), max_size=4) | st.just("it's")
+_atoms = st.one_of(
+    st.sampled_from(["light.left", "no_echo"]).map(lambda name: Name(name, Kind.TRUTH)),
+    st.booleans().map(Literal),
+    st.builds(
+        Compare,
+        st.sampled_from(["range_m", "voltage_v"]).map(lambda name: Name(name, Kind.NUMBER)) | _numbers.map(Literal),
+        st.sampled_from(list(Op)),
+        st.sampled_from(["range_m", "voltage_v"]).map(lambda name: Name(name, Kind.NUMBER)) | _numbers.map(Literal),
+    ),
+    st.builds(
+        Compare,
+        st.sampled_from(["level", "verdict"]).map(lambda name: Name(name, Kind.WORD)),
+        st.sampled_from([Op.EQ, Op.NE]),
+        _words.map(Literal),
+    ),
+)
+
+
+def _larger(inner: st.SearchStrategy[Node]) -> st.SearchStrategy[Node]:
+    parts = st.lists(inner, min_size=2, max_size=3)
+    return st.one_of(
+        parts.map(lambda several: joined(Every, several)),
+        parts.map(lambda several: joined(Some, several)),
+        inner.map(lambda one: one.inner if isinstance(one, Not) else Not(one)),
+        st.builds(Compare, inner, st.sampled_from([Op.EQ, Op.NE]), inner),
+    )
+
+
+_trees = st.recursive(_atoms, _larger, max_leaves=8).map(Expression).filter(lambda made: len(str(made)) <= LENGTH)
+_values = st.fixed_dictionaries(
+    {},
+    optional={
+        "range_m": _numbers,
+        "voltage_v": _numbers,
+        "level": _words,
+        "verdict": _words,
+        "light.left": st.booleans(),
+        "no_echo": st.booleans(),
+    },
+)
+_OPS: dict[str, Any] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+}
+
+
+def _reference(node: Node, values: dict[str, Any]) -> Any:
+    """Kleene's tables, written another way: as least, most and complement of 0, 1/2, 1."""
+    if isinstance(node, Literal):
+        return float(node.value) if isinstance(node.value, bool) else node.value
+    if isinstance(node, Name):
+        found = values.get(node.name, 0.5 if node.kind is Kind.TRUTH else None)
+        return float(found) if isinstance(found, bool) else found
+    if isinstance(node, Compare):
+        truth = not isinstance(node.left, Name | Literal) or node.left.kind is Kind.TRUTH
+        one, other = _reference(node.left, values), _reference(node.right, values)
+        unknown = 0.5 in (one, other) if truth else None in (one, other)
+        return 0.5 if unknown else float(_OPS[node.op](one, other))
+    if isinstance(node, Not):
+        return 1 - _reference(node.inner, values)
+    return (min if isinstance(node, Every) else max)(_reference(part, values) for part in node.parts)
+
+
+@given(_trees)
+def test_what_is_written_is_read_back_the_same(tree: Expression) -> None:
+    read = parse(str(tree), NAMES)
+    assert str(read) == str(tree)
+    assert read == tree
+
+
+@given(_trees, _values)
+def test_its_value_is_that_of_a_reference(tree: Expression, values: dict[str, Any]) -> None:
+    held = tree.value(values.get)
+    assert {True: 1, None: 0.5, False: 0}[held] == _reference(tree.root, values)
+
+
+@given(_trees, _values)
+def test_what_is_true_once_is_not_contradictory(tree: Expression, values: dict[str, Any]) -> None:
+    if tree.value(values.get):
+        assert not contradictory(tree)
+
+
+@given(st.text(max_size=40) | st.text("range_m<>=!()'\" andortu0.3-", max_size=40))
+def test_any_text_is_a_condition_or_a_bad_one(text: str) -> None:
+    with contextlib.suppress(BadExpression):
+        read = parse(text, NAMES)
+        assert parse(str(read), NAMES) == read
+
+
+# ---------------------------------------------------------------------- the fields of messages
+
+
+def test_every_message_of_the_table_has_fields_and_a_value_for_each() -> None:
+    for topic in topics.TOPICS.values():
+        message = messages.message_class(topic.message)()
+        for name, kind in fields_of(type(message)).items():
+            value = value_in(message)(name)
+            assert value is None or isinstance(value, {float: int | float}.get(kind, kind)), f"{topic.name} {name}"
+
+
+def test_what_was_not_measured_is_not_known() -> None:
+    close = parse("range_m < 0.3", fields_of(pb.Range))
+    assert close.value(value_in(pb.Range(range_m=0.2))) is True
+    assert close.value(value_in(pb.Range(no_echo=True))) is None
+    safety = pb.Safety(motors="off")
+    safety.hold.by = "ann"
+    names = fields_of(pb.Safety)
+    assert parse("hold and hold.by == 'ann' and not estops", names).value(value_in(safety)) is True
+    assert parse("lease.holder == 'ann'", names).value(value_in(safety)) is None
+    assert parse("lease", names).value(value_in(safety)) is False
+    log = messages.message_class("foxglove.Log")(level=3)  # type: ignore[call-arg]  # a field of the generated class
+    assert parse("level == 'WARNING'", fields_of(type(log))).value(value_in(log)) is True
+
+
+def test_times_and_bytes_are_no_fields_and_what_all_have_comes_last() -> None:
+    assert list(fields_of(pb.RxFrame)) == ["verdict", "published", "car", "seq", "boot_id"]
