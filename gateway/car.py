@@ -13,7 +13,7 @@ import os
 import random
 import signal
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -107,7 +107,7 @@ class Car:
         self._saved = self._control.safety.kept
         self._passing_on: set[asyncio.Task[None]] = set()
         self._came = asyncio.Event()
-        """Another car's gateway came onto the bus."""
+        """There may be fleet-wide e-stops that this gateway does not know: it asks the others."""
         self._health = LinkHealth(since=now)
         self._decoder = Decoder()
         self._flood_until = now
@@ -343,6 +343,8 @@ class Car:
         command, answer = self._command(request)
         if not request.by_wildcard:
             self._pass_on(command, fleet_wide)
+        elif isinstance(command.what, EmergencyStop) and command.what.fleet_wide:
+            self._came.set()  # what one gateway made of it, or did not hear, the others show
         key = keys.command_key(self._settings.fleet, self._settings.car, verb)
         self._asked.append(_Asked(query, key, command.id, answer, as_json))
         self._wake.set()
@@ -394,18 +396,27 @@ class Car:
     def _flush(self) -> None:
         """Publish records and states, answer what waits for an answer, keep what must survive a restart."""
         self._publish_records()
+        self._save()
         sent, self._sent = self._sent, set()
         asked, self._asked = self._asked, []
         for each in asked:
             self._reply(each, sent)
         self._out.states(self._control, self._health, self._loop.time())
+
+    def _save(self) -> None:
+        """Before anybody is answered: who is told that an e-stop is latched may pull the plug."""
         kept = self._control.safety.kept
-        if kept != self._saved:
-            self._saved = kept
-            try:
-                self._store.save(kept)
-            except OSError as error:
-                self._log(Level.ERROR, "not_saved", f"hold and e-stops will not survive a restart: {error}")
+        if kept == self._saved:
+            return
+        self._saved = kept
+        try:
+            self._store.save(kept)
+        except OSError as error:
+            words = f"hold and e-stops will not survive a restart: {error}"
+            self._log(Level.ERROR, "not_saved", words)
+            for index, each in enumerate(self._asked):
+                answer = replace(each.answer, words="; ".join(filter(None, (each.answer.words, f"not saved: {error}"))))
+                self._asked[index] = replace(each, answer=answer)
 
     def _publish_records(self, command_id: str = "", request: requests.Request | None = None) -> None:
         for record in self._control.take_records():

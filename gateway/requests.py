@@ -3,6 +3,8 @@
 Ranges are checked here, at the edge; whether the car may do it now is the arbiter's.
 """
 
+import hashlib
+import json
 import math
 import uuid
 from collections.abc import Callable
@@ -39,8 +41,10 @@ LONGEST_WHY: Final = 200
 """Of an e-stop's reason, characters; the rest is cut off: nobody's e-stop fails over its words."""
 _DRIVE_TTL_S: Final = 0.5
 _TTL_S: Final = 2.0  # messages.md: greatest age at arrival, default 0.5 for drive, 2 for the rest
-_STOPS: Final[dict[str, What]] = {"stop": Stop(), "estop": EmergencyStop()}
+_STOPS: Final = ("stop", "estop")
 """The verbs that need no payload, and are obeyed whatever is in it."""
+_SAME_QUERY_NS: Final = 2_000_000_000
+"""One query reaches every gateway within this time."""
 BY_WILDCARD: Final = ("stop", "estop", "resume")
 """Verbs that may be asked of several cars with one query (design.md, "Keys")."""
 
@@ -79,7 +83,7 @@ class BadRequest(ValueError):
 def parse(request: Request) -> Command:
     """The command in a request; raises BadRequest."""
     verb = request.verb
-    blank = Command(uuid.uuid4().hex, verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
+    blank = Command(_id(request), verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
     if verb not in COMMANDS:
         words = f"{verb!r} is no command; there are: {', '.join(COMMANDS)}"
         raise BadRequest(Reason.UNSUPPORTED, words, blank)
@@ -92,11 +96,35 @@ def parse(request: Request) -> Command:
     try:
         return _filled(blank, request)
     except BadRequest as error:
-        stops = _STOPS.get(verb)
-        if stops is None:
+        if verb not in _STOPS:
             raise
         # Whatever is wrong with its words: somebody wants this car to stop.
-        return replace(error.command, what=stops, note=f"stopped, though: {error.words}")
+        what = Stop() if verb == "stop" else _readable_estop(request)
+        return replace(error.command, what=what, note=f"stopped, though: {error.words}")
+
+
+def _id(request: Request) -> str:
+    """An id for who gave none. An e-stop asked of all with one query is one e-stop: every gateway makes the same."""
+    if request.verb != "estop" or not request.by_wildcard:
+        return uuid.uuid4().hex
+    query = (request.payload or b"") + str(request.now_ns // _SAME_QUERY_NS).encode()
+    return hashlib.sha256(query).hexdigest()[:32]
+
+
+def _readable_estop(request: Request) -> EmergencyStop:
+    """What can be read of an e-stop in which something is wrong: its scope and its reason, if nothing else."""
+    try:
+        given = json.loads(request.payload or b"{}")
+    except (ValueError, RecursionError):
+        given = None
+    if not isinstance(given, dict):
+        try:
+            message: Any = messages.parse(COMMANDS["estop"], request.payload or b"", _encoding(request))
+        except messages.BadPayload:
+            return EmergencyStop()
+        given = {"why": message.why, "scope": message.scope}
+    why = given.get("why")
+    return EmergencyStop(_why(why) if isinstance(why, str) else "", given.get("scope") == "fleet")
 
 
 def _filled(blank: Command, request: Request) -> Command:
@@ -224,8 +252,11 @@ def _fan(message: Any) -> What:
 def _estop(message: Any) -> What:
     if message.scope not in ("", "car", "fleet"):
         raise ValueError(f"scope {message.scope!r}: allowed are car (the default) and fleet")
-    why = "".join(each if each.isprintable() else " " for each in message.why)
-    return EmergencyStop(why[:LONGEST_WHY], message.scope == "fleet")
+    return EmergencyStop(_why(message.why), message.scope == "fleet")
+
+
+def _why(text: str) -> str:
+    return "".join(each if each.isprintable() else " " for each in text)[:LONGEST_WHY]
 
 
 def _checked(frame: ColorLed | Ptz | ArmSet) -> Act:

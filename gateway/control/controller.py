@@ -277,11 +277,10 @@ class Controller:
         words = f"{self.car} is heard again: it is stopped first"
         self._ledger.log(Level.INFO, "answers_again", words, now)
         self._drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
-        running, self._running = self._running, None  # its frames may be among what was held up
-        self._begin(self._recovery(now), Why.RECOVERY, now)
-        if running is not None and self._running is not None:
-            self._running.commands.extend(running.commands)
-            self._running.why = running.why
+        recipe, before = self._recovery(now), self._running  # whose frames may be among what was held up
+        worst_at = now + stop.worst_s(recipe, self._for_stop(now), self.pacing, now)
+        why, commands = (before.why, before.commands) if before is not None else (Why.RECOVERY, [])
+        self._running = Running(recipe, why, now, commands, worst_at=worst_at)
 
     def sender_alive(self, name: str, *, alive: bool, now: float) -> None:
         """A sender's liveliness token appeared or went."""

@@ -42,6 +42,20 @@ def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gatew
     assert fleet.ask("drive", "blue", motion="forward")["status"] in ("sent", "queued")
 
 
+def test_an_e_stop_of_all_without_an_id_is_one_and_one_resume_ends_it(fleet: Fleet) -> None:
+    _, links = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp", "green:arduino:tcp")
+    cars = ("red", "blue", "green")
+    for car, link in zip(cars, links, strict=True):
+        fleet.gateway(link, car=car)
+    for car in cars:
+        fleet.ready(car)
+    assert len(fleet.ask_all("estop", why="smoke", scope="fleet")) == len(cars)
+    wait_for(lambda: all(estops(fleet, car) for car in cars), "latched by all")
+    wait_for(lambda: len({tuple(estops(fleet, car)) for car in cars}) == 1, "the same for all")
+    assert fleet.ask("resume", "blue", ids=estops(fleet, "red"), kind="person")["status"] == "sent"
+    wait_for(lambda: not any(estops(fleet, car) for car in cars), "ended for all")
+
+
 def test_an_e_stop_of_one_car_is_its_own(fleet: Fleet) -> None:
     _, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     for car, link in (("red", red), ("blue", blue)):

@@ -30,7 +30,7 @@ from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.requests import BadRequest, Request, parse
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.topics import COMMANDS
+from schemas.topics import COMMANDS, PROTOBUF
 
 NOW = 1_800_000_000_000_000_000
 
@@ -174,6 +174,23 @@ def test_a_stop_is_a_stop_whatever_is_wrong_with_its_words(payload: Any, words: 
     assert stop.note.startswith("stopped, though: stop: ")
     assert words in stop.note
     assert ask("estop", payload).what == EmergencyStop()
+
+
+@pytest.mark.parametrize("wrong", [{"ttl_s": "soon"}, {"colour": 1}, {"kind": "boss"}, {"id": "x" * 200}], ids=str)
+def test_an_e_stop_in_which_something_is_wrong_keeps_its_scope_and_its_reason(wrong: dict[str, Any]) -> None:
+    stop = ask("estop", {"why": "smoke", "scope": "fleet", **wrong})
+    assert stop.what == EmergencyStop("smoke", fleet_wide=True)
+    assert "stopped, though" in stop.note
+    as_message = pb.EstopCommand(why="smoke", scope="fleet", kind="boss").SerializeToString()
+    assert ask("estop", as_message, f"{PROTOBUF};fleet.v1.EstopCommand").what == EmergencyStop("smoke", fleet_wide=True)
+
+
+def test_an_e_stop_of_all_without_an_id_is_the_same_one_for_every_gateway() -> None:
+    first, second = (ask("estop", {"why": "smoke", "scope": "fleet"}, by_wildcard=True) for _ in range(2))
+    assert first.id == second.id
+    assert ask("estop", {"why": "fire", "scope": "fleet"}, by_wildcard=True).id != first.id
+    assert ask("estop", {"why": "smoke", "scope": "fleet"}).id != first.id, "of one car: who asks twice means two"
+    assert ask("resume", {}, by_wildcard=True).id != ask("resume", {}, by_wildcard=True).id
 
 
 def test_an_e_stop_for_an_unknown_scope_stops_this_car() -> None:

@@ -158,17 +158,16 @@ class Fleet:
 
     def ask(self, verb: str, car: str = "red", **fields: Any) -> Any:
         """Give a command as JSON; the answer as a dict."""
-        answers = list(
-            self.bus.query(
-                f"fleet/{car}/@cmd/{verb}",
-                payload=json.dumps(fields).encode(),
-                encoding=messages.JSON,
-                timeout_s=5.0,
-            )
-        )
+        answers = self.ask_all(verb, car, **fields)
         assert len(answers) == 1, answers
-        assert isinstance(answers[0], bus.Sample), answers
-        return json.loads(answers[0].payload)
+        return answers[0]
+
+    def ask_all(self, verb: str, car: str = "*", **fields: Any) -> list[Any]:
+        """Give a command as JSON to every car that matches; the answers."""
+        key, payload = f"fleet/{car}/@cmd/{verb}", json.dumps(fields).encode()
+        answers = list(self.bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=5.0))
+        assert all(isinstance(answer, bus.Sample) for answer in answers), answers
+        return [json.loads(answer.payload) for answer in answers if isinstance(answer, bus.Sample)]
 
     def left(self) -> list[str]:
         """Processes that still run at this endpoint, by the system's own list."""

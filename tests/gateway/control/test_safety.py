@@ -25,6 +25,14 @@ def test_an_e_stop_holds_and_the_hold_outlives_it() -> None:
     assert (safety.estops, safety.ended, safety.hold) == ((), ("b", "a"), Hold("eve", 7))
 
 
+def test_what_is_said_of_one_car_and_then_of_the_fleet_is_the_fleets() -> None:
+    safety = Safety()
+    safety.latch(estop("a", fleet_wide=False))
+    safety.latch(estop("a"))
+    safety.latch(estop("a", fleet_wide=False))
+    assert [each.fleet_wide for each in safety.estops] == [True]
+
+
 def test_an_id_that_was_ended_is_latched_under_another_one() -> None:
     safety = Safety()
     safety.latch(estop("a"))
