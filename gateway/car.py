@@ -31,7 +31,7 @@ from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Event, Rejected
-from gateway.publish import RAW_PER_S, Publications, wall_ns
+from gateway.publish import RAW_PER_S, STALLED_S, Publications, wall_ns
 from gateway.store import Store
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
@@ -165,6 +165,7 @@ class Car:
             if self._link is not None:
                 await self._link.close()
             self._flush()
+            self._out.bus_back(self._loop.time(), at_once=True)
             self._out.states(self._control, self._health, self._loop.time(), force=True)
         return not self._control.unstopped
 
@@ -303,7 +304,7 @@ class Car:
 
     async def _pump(self) -> None:
         now = self._loop.time()
-        self._control.stalled(now - self._alive_at - TICK_S, now)
+        self._woke(now - self._alive_at - TICK_S, now)
         self._events(self._decoder.tick(now))
         while (link := self._link) is not None and (write := self._control.poll(self._loop.time())) is not None:
             self._decoder.sent(write.data, self._loop.time())  # an echo may be there before the write returns
@@ -501,12 +502,15 @@ class Car:
             await asyncio.sleep(TICK_S)
             now = self._loop.time()
             worst = max(worst, now - due)
-            self._control.stalled(now - due, now)
+            self._woke(now - due, now)
             self._alive_at = now
             if self._settings.parent not in (None, os.getppid()) and not self._ending:
                 self._log(Level.WARNING, "parent_gone", "the process that started this gateway has ended: ending, too")
                 self.stop()
-            if not self._bus.connected:
+            if self._bus.connected:
+                self._out.bus_back(now)
+            else:
+                self._out.bus_away(now)
                 self._hub_gone.set()
             shown = self._shown
             self._control.tick(now)
@@ -525,9 +529,17 @@ class Car:
                 self._publish_health(now, worst)
                 worst = 0.0
 
+    def _woke(self, gap_s: float, now: float) -> None:
+        """The loop slept for so long."""
+        if gap_s > STALLED_S:
+            self._out.bus_away(now)
+        self._control.stalled(gap_s, now)
+
     def _publish_health(self, now: float, lag_s: float) -> None:
         evidence = self._control.platform.evidence
-        self._out.health(now, loop_lag_s=lag_s, bus_drops=self._doors.dropped, platform_evidence=evidence)
+        self._out.health(
+            now, loop_lag_s=lag_s, bus_drops=self._doors.dropped + self._out.dropped, platform_evidence=evidence
+        )
 
     async def _keep_hub(self) -> None:
         """Bring a hub back that is gone for half a second; jitter keeps a hundred gateways from trying at once."""

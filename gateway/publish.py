@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 import time
+from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -28,6 +29,12 @@ VERSION: Final = "0.1.0"
 _STATM: Final = Path("/proc/self/statm")
 STATE_EVERY_S: Final = 1.0
 """States are published on change and once a second (design.md, "Keys")."""
+BACK_S: Final = 1.0
+"""After the bus was away its other clients, a recorder above all, need so long to be back."""
+STALLED_S: Final = 1.0
+"""A process that slept longer may have lost its link to the bus, and not know it yet (Zenoh's lease is 2 s)."""
+KEPT_RECORDS: Final = 1000
+"""Records of commands and events that wait for the bus; of more the oldest are dropped, and counted."""
 RAW_PER_S: Final = 100.0
 RAW_AT_ONCE: Final = 1000.0
 """Raw frames that are published: a car sends up to 27 a second (protocol.md); what a link held up comes at once."""
@@ -68,6 +75,11 @@ class Publications:
                 self._rings[topic.name] = Ring(RING if topic.family == "sensor" else 1)
         self._raw = Allowance(RAW_PER_S, RAW_AT_ONCE)
         self._process = _Process()
+        self._away_at = float("-inf")
+        """When the bus was away last."""
+        self._kept: deque[tuple[bus.Publisher, Any, int]] = deque()
+        self.dropped = 0
+        """Records that found too many waiting for the bus."""
 
     # ------------------------------------------------------------------ readings
 
@@ -173,17 +185,38 @@ class Publications:
         event.evidence.extend(record.evidence)
         if request is not None:
             event.request, event.request_encoding = request
-        self._publishers["event/command"].put(event, wall_ns(record.at))
+        self._record("event/command", event, record.at)
 
     def log(self, record: LogRecord) -> None:
         """Publish a notable event as foxglove.Log."""
-        stamp_ns = wall_ns(record.at)
         message: Any = messages.message_class("foxglove.Log")()
-        message.timestamp.seconds, message.timestamp.nanos = divmod(stamp_ns, 1_000_000_000)
+        message.timestamp.seconds, message.timestamp.nanos = divmod(wall_ns(record.at), 1_000_000_000)
         message.level = _LEVELS[record.level]
         message.name = f"{self._car} {record.code}"
         message.message = record.words
-        self._publishers["event/log"].put(message, stamp_ns)
+        self._record("event/log", message, record.at)
+
+    def _record(self, name: str, message: Any, at: float) -> None:
+        """Publish what explains afterwards what happened; while the bus is away it waits."""
+        publisher, stamp_ns = self._publishers[name], wall_ns(at)
+        if not self._kept and at > self._away_at + BACK_S:
+            publisher.put(message, stamp_ns)
+            return
+        self._kept.append((publisher, message, stamp_ns))
+        if len(self._kept) > KEPT_RECORDS:
+            self._kept.popleft()
+            self.dropped += 1
+
+    def bus_away(self, now: float) -> None:
+        """The bus cannot be reached now, or it is not sure that it can."""
+        self._away_at = now
+
+    def bus_back(self, now: float, *, at_once: bool = False) -> None:
+        """The bus can be reached: what waited is published when the others are back, too, or at once."""
+        if self._kept and (at_once or now > self._away_at + BACK_S):
+            for publisher, message, stamp_ns in self._kept:
+                publisher.put(message, stamp_ns)
+            self._kept.clear()
 
     # ------------------------------------------------------------------ states
 

@@ -1,0 +1,60 @@
+"""What explains afterwards what happened is not lost because the bus was away when it happened."""
+
+import signal
+import time
+from typing import Any
+
+from schemas import bus
+from tests.support.judge import Judge
+from tests.support.processes import Fleet, wait_for
+from tests.support.tap import Tap
+
+
+class Records:
+    """Every record of commands and events, as a subscriber gets them."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.events: list[Any] = []
+        self.logs: list[Any] = []
+        fleet.bus.subscribe("fleet/red/event/command", lambda sample: self.events.append(sample.message()))
+        fleet.bus.subscribe("fleet/red/event/log", lambda sample: self.logs.append(sample.message()))
+
+    def phases(self, identity: str) -> list[str]:
+        return [event.phase for event in self.events if event.id == identity]
+
+    def codes(self) -> list[str]:
+        return [log.name.removeprefix("red ") for log in self.logs]
+
+
+def test_a_gateway_that_slept_longer_than_the_bus_waits_tells_of_it(fleet: Fleet) -> None:
+    records, judge = Records(fleet), Judge.follow(fleet.bus)
+    _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
+    gateway = fleet.gateway(link)
+    fleet.ready()
+    fleet.ask("drive", motion="forward", duration_s=10, id="drive")
+    wait_for(lambda: judge.driving, "it drives")
+    gateway.popen.send_signal(signal.SIGSTOP)
+    wait_for(lambda: not fleet.bus.tokens("fleet/red"), "the bus has given it up")
+    gateway.popen.send_signal(signal.SIGCONT)
+    wait_for(lambda: "stalled" in records.codes(), "it says that it slept")
+    wait_for(lambda: records.phases("drive")[-1] == "expired", "and what became of the drive")
+    assert not judge.driving
+
+
+def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(fleet: Fleet) -> None:
+    _, (link,) = fleet.simulate("red:arduino:tcp")
+    tap = Tap(link)
+    try:
+        fleet.gateway(tap.link)
+        fleet.ready()
+        records = Records(fleet)
+        fleet.hub.popen.send_signal(signal.SIGSTOP)  # nothing is delivered, and no new hub can begin at its port
+        tap.reset()
+        fleet.hub.popen.send_signal(signal.SIGKILL)
+        wait_for(lambda: fleet.left() and bus.accepts(fleet.endpoint), "another hub")
+        back_ns = time.time_ns()
+        wait_for(lambda: "link_lost" in records.codes(), "the loss of the link is told")
+        lost = next(log for log in records.logs if log.name == "red link_lost")
+        assert lost.timestamp.ToNanoseconds() < back_ns, "with the time at which it happened"
+    finally:
+        tap.close()
