@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
-RING: Final = 1500  # design.md, "Keys": one minute of the fastest readings
+from schemas.topics import HISTORY
+
 _UNITS_NS: Final = {
     "u": 1_000,
     "us": 1_000,
@@ -63,8 +64,8 @@ class Ring:
         if last is not None:
             found = _COUNT.fullmatch(last)
             if found is None:
-                raise BadRange(f"last={last}: give a whole number from 1 on, at most {RING} are kept")
-            if len(found[1]) <= len(str(RING)):
+                raise BadRange(f"last={last}: give a whole number from 1 on, at most {HISTORY} are kept")
+            if len(found[1]) <= len(str(HISTORY)):
                 values = values[-int(found[1]) :]
         return values
 

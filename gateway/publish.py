@@ -8,7 +8,7 @@ import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from gateway.control.allowance import Allowance
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
 from gateway.control.records import CommandRecord, Level, LogRecord, Write
-from gateway.history import RING, BadRange, Ring
+from gateway.history import BadRange, Ring
 from gateway.protocol.readings import ArmReading, Echo, Event, ImuReading, Rejected, Sensors
 from gateway.protocol.values import Mode
 from schemas import bus, keys, messages, topics
@@ -28,6 +28,8 @@ from schemas.gen import fleet_v1_pb2 as pb
 VERSION: Final = "0.1.0"
 _STATM: Final = Path("/proc/self/statm")
 STATE_EVERY_S: Final = 1.0
+SLICE: Final = 100
+"""Answers to a query without a pause: 5 ms as JSON."""
 """States are published on change and once a second (design.md, "Keys")."""
 BACK_S: Final = 1.0
 """After the bus was away its other clients, a recorder above all, need so long to be back."""
@@ -71,8 +73,8 @@ class Publications:
                 continue
             key = keys.topic_key(fleet, car, topic.name)
             self._publishers[topic.name] = opened.publisher(key, topic, car)
-            if topic.family in ("sensor", "state"):
-                self._rings[topic.name] = Ring(RING if topic.family == "sensor" else 1)
+            if topic.kept:
+                self._rings[topic.name] = Ring(topic.kept)
         self._raw = Allowance(RAW_PER_S, RAW_AT_ONCE)
         self._process = _Process()
         self._away_at = float("-inf")
@@ -270,14 +272,19 @@ class Publications:
 
     # ------------------------------------------------------------------ queries
 
-    def answer(self, family: str, query: zenoh.Query) -> None:
-        """Answer a query for one family, `sensor` or `state`: the latest values, or the history that it asks for."""
+    def answers(self, family: str, query: zenoh.Query) -> Iterator[None]:
+        """Answer a query for one family, `sensor` or `state`: the latest values, or the history that it asks for.
+
+        Stops after every so many, so that whoever iterates can do something else: the whole history as JSON takes
+        longer than a car may be left alone.
+        """
         with query:
             parameters = query.parameters
             form = parameters.get("format") or "protobuf"
             if form not in ("protobuf", "json"):
                 query.reply_err(f"format={form}: allowed are json and protobuf", encoding="text/plain")
                 return
+            count = 0
             for name, ring in self._rings.items():
                 publisher = self._publishers[name]
                 if publisher.topic.family != family or not query.key_expr.intersects(publisher.key):
@@ -291,6 +298,9 @@ class Publications:
                     return
                 for value in values:
                     bus.reply_value(query, publisher.key, value.payload, publisher.topic)
+                    count += 1
+                    if count % SLICE == 0:
+                        yield
 
 
 def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> None:

@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import Final
 
 PROTOBUF: Final = "application/protobuf"
+HISTORY: Final = 1500  # design.md, "Keys": one minute of the fastest readings
 
 
 class Qos(StrEnum):
@@ -48,6 +49,11 @@ class Topic:
     def family(self) -> str:
         """`sensor`, `state`, `frame`, `event` or `sim`; a service's topics have none."""
         return self.name.partition("/")[0]
+
+    @property
+    def kept(self) -> int:
+        """How many values a gateway keeps for queries: of a reading its history, of a state the latest."""
+        return {"sensor": HISTORY, "state": 1}.get(self.family, 0)
 
 
 # A mode-0 report comes about once a second and may be blocked for another (protocol.md, "From the car: readings"), so a

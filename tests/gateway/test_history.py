@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.history import RING, BadRange, Ring, parse_range
+from gateway.history import BadRange, Ring, parse_range
+from schemas.topics import HISTORY
 
 S = 1_000_000_000
 NOW = 1_800_000_000 * S
@@ -97,7 +98,7 @@ def test_the_ring_gives_the_latest_the_last_or_a_range_oldest_first(
 
 @pytest.mark.parametrize("last", ["", "0", "-1", "1.5", "three", "³", "٣", "1_0", " 3", "inf", "0" * 5000])
 def test_a_last_that_is_no_count_is_refused(last: str) -> None:
-    with pytest.raises(BadRange, match=f"whole number from 1 on, at most {RING} are kept"):
+    with pytest.raises(BadRange, match=f"whole number from 1 on, at most {HISTORY} are kept"):
         filled(3).select(time_range=None, last=last, now_ns=NOW)
 
 
