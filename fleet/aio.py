@@ -6,12 +6,15 @@ The blocking calls run in threads; a watch is an asynchronous iterator fed throu
 import asyncio
 from collections.abc import AsyncIterator, Coroutine, Iterable, Sequence
 from contextlib import asynccontextmanager
+from datetime import UTC, datetime
 from typing import Any, Self
 
 from fleet import client
+from fleet.condition import Condition
 from fleet.outcome import Outcome
-from fleet.readings import QUEUE_LIMIT, Reading, reading_of
+from fleet.readings import QUEUE_LIMIT, Reading, Wanted, reading_of
 from fleet.verbs import Request, Verbs
+from fleet.waiting import Waiting
 from schemas import keys, messages
 from schemas.bus import Handover, Sample
 
@@ -57,15 +60,39 @@ class Fleet:
         """The latest value under every key that matches."""
         return await asyncio.to_thread(self.sync.get, expression)
 
+    async def history(self, expression: str, *, last: int | None = None, since_s: float | None = None) -> list[Reading]:
+        """The last so many values of every key that matches, or of the last so many seconds; each oldest first."""
+        return await asyncio.to_thread(self.sync.history, expression, last=last, since_s=since_s)
+
     @asynccontextmanager
-    async def watch(self, expression: str) -> AsyncIterator["Watch"]:
-        """Readings as they are published: `async with fleet.watch("red") as stream: async for reading in stream`."""
-        stream = Watch()
-        subscriber = self.sync.bus.subscribe(self.sync.expression(expression), stream.hand_over)
+    async def watch(self, expression: str, *, when: str | None = None) -> AsyncIterator["Watch"]:
+        """Readings as they are published: `async with fleet.watch("red") as stream: async for reading in stream`.
+
+        Only those of which `when` holds, if it is given.
+        """
+        written = self.sync.expression(expression)
+        stream = Watch(None if when is None else Condition.of(when, written).holds)
+        subscriber = self.sync.bus.subscribe(written, stream.hand_over)
         try:
             yield stream
         finally:
             await asyncio.to_thread(subscriber.undeclare)
+
+    async def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
+        """Wait until `when` holds of a fresh reading, and return that; raises waiting.NotInTime."""
+        written = self.sync.expression(expression)
+        waiting = Waiting(Condition.of(when, written), for_s)
+        try:
+            async with asyncio.timeout(timeout_s), self.watch(expression) as stream:
+                for reading in await self.get(expression):
+                    if waiting.ends(reading, datetime.now(UTC)):
+                        return reading
+                async for reading in stream:
+                    if waiting.ends(reading, datetime.now(UTC)):
+                        return reading
+        except TimeoutError:
+            pass
+        raise waiting.late(written, timeout_s or 0.0, datetime.now(UTC))
 
     async def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Stop these cars, or every car."""
@@ -102,7 +129,8 @@ class Car(Verbs[Coroutine[Any, Any, Outcome]]):
 class Watch:
     """Readings as they come; a reader that is too slow loses the oldest."""
 
-    def __init__(self) -> None:
+    def __init__(self, wanted: Wanted | None = None) -> None:
+        self._wanted = wanted
         self._waiting: asyncio.Queue[Sample] = asyncio.Queue(QUEUE_LIMIT)
         self.hand_over: Handover[Sample] = Handover(asyncio.get_running_loop(), self._take, limit=QUEUE_LIMIT)
         self._full = 0
@@ -120,9 +148,12 @@ class Watch:
     async def __anext__(self) -> Reading:
         while True:
             try:
-                return reading_of(await self._waiting.get())
+                reading = reading_of(await self._waiting.get())
             except (messages.BadPayload, KeyError):
                 self.unreadable += 1
+                continue
+            if self._wanted is None or self._wanted(reading):
+                return reading
 
     def _take(self, sample: Sample) -> None:
         if self._waiting.full():

@@ -13,17 +13,25 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from typing import Any, Final, Self
 
+from fleet import history
+from fleet.condition import Condition
 from fleet.outcome import Outcome, Progress
 from fleet.readings import Reading, Watch, reading_of
 from fleet.verbs import Request, Verbs, estop_request, resume_request, stop_request
+from fleet.waiting import Waiting
 from schemas import keys, messages, topics
 from schemas.bus import Bus, Failure, Sample, canon
 from schemas.topics import Qos
 
 ANSWER_S: Final = 2.0
 """How long a gateway may take to answer; it answers at once, whatever its car does."""
+_FOREVER_S: Final = 3600.0
+"""One look of a wait without a time-out."""
+_SHORTEST_S: Final = 0.1
+"""However short a wait is, the current value is asked for."""
 _QUEUE: Final = 4096  # answers and events of one command: a few for each of some hundred cars
 
 log = logging.getLogger("fleet")
@@ -99,11 +107,22 @@ class Fleet:
 
     def get(self, expression: str) -> list[Reading]:
         """The latest value under every key that matches, sorted by key; short forms as on the command line."""
-        written = self.expression(expression)
+        return self._read(self.expression(expression), ANSWER_S)
+
+    def history(self, expression: str, *, last: int | None = None, since_s: float | None = None) -> list[Reading]:
+        """The last so many values of every key that matches, or those of the last so many seconds, or both.
+
+        Sorted by key, each key's oldest first. A gateway keeps 1500 of each reading and the latest of each state:
+        `history.shortfalls` says what is missing. Raises ValueError.
+        """
+        return self._read(history.selector(self.expression(expression), last=last, since_s=since_s), history.ANSWER_S)
+
+    def _read(self, selector: str, timeout_s: float) -> list[Reading]:
+        written = selector.partition("?")[0]
         if "@cmd" in written.split("/"):
             raise keys.BadKey(f"{written} is a command, not a reading: a query of it would be carried out")
         found = []
-        for answer in self.bus.query(written, timeout_s=ANSWER_S, qos=Qos.STATE):
+        for answer in self.bus.query(selector, timeout_s=timeout_s, qos=Qos.STATE):
             if isinstance(answer, Failure):
                 log.warning("not every gateway answered: %s", answer.words)
                 continue
@@ -113,14 +132,41 @@ class Fleet:
                 log.warning("%s: an answer that is no message of this fleet: %s", answer.key, error)
         return sorted(found, key=lambda reading: reading.key)
 
-    def watch(self, expression: str) -> Watch:
-        """Readings as they are published under matching keys, until closed."""
+    def watch(self, expression: str, *, when: str | None = None) -> Watch:
+        """Readings as they are published under matching keys, until closed; only those of which `when` holds.
+
+        `when` is about the fields of one message, as `range_m < 0.3`; raises expression.BadExpression.
+        """
         written = self.expression(expression)
+        wanted = None if when is None else Condition.of(when, written).holds
 
         def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
             return self.bus.subscribe(written, take).undeclare
 
-        return Watch().begin(subscribe)
+        return Watch(wanted).begin(subscribe)
+
+    def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
+        """Wait until `when` holds of a fresh reading, the current one included, and return that.
+
+        `for_s`: it must have held of every reading for so long, by their stamps. Raises waiting.NotInTime (a
+        TimeoutError) after `timeout_s` (None: never), and expression.BadExpression.
+        """
+        written = self.expression(expression)
+        waiting = Waiting(Condition.of(when, written), for_s)
+        began = time.monotonic()
+
+        def left_s() -> float:
+            return _FOREVER_S if timeout_s is None else began + timeout_s - time.monotonic()
+
+        with self.watch(expression) as stream:  # before the current values are asked for: nothing falls between
+            for reading in self._read(written, max(_SHORTEST_S, min(ANSWER_S, left_s()))):
+                if waiting.ends(reading, datetime.now(UTC)):
+                    return reading
+            while (left := left_s()) > 0:
+                coming = stream.within(left)
+                if coming is not None and waiting.ends(coming, datetime.now(UTC)):
+                    return coming
+        raise waiting.late(written, timeout_s or 0.0, datetime.now(UTC))
 
     # ------------------------------------------------------------------ commands
 

@@ -3,15 +3,17 @@
 import contextlib
 import queue
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeAlias
 
 from schemas import messages, topics
 from schemas.bus import Sample
 
 QUEUE_LIMIT: Final = 1024
+"""Samples that wait for a reader."""
 _LOOK_S: Final = 0.2
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -40,6 +42,10 @@ class Reading:
         return messages.to_dict(self.value)
 
 
+Wanted: TypeAlias = Callable[[Reading], bool | None]
+"""Which readings of a stream are wanted."""
+
+
 def reading_of(sample: Sample) -> Reading:
     """The reading in a sample; raises messages.BadPayload or KeyError for what is no message of ours."""
     value: Any = sample.message()
@@ -51,7 +57,8 @@ def reading_of(sample: Sample) -> Reading:
 class Watch:
     """Readings as they come. Iterate; `close` (or `with`) ends it. A reader that is too slow loses the oldest."""
 
-    def __init__(self) -> None:
+    def __init__(self, wanted: Wanted | None = None) -> None:
+        self._wanted = wanted
         self._waiting: queue.Queue[Sample] = queue.Queue(QUEUE_LIMIT)
         self._closed = threading.Event()
         self._undeclare: Callable[[], object] = lambda: None
@@ -76,13 +83,25 @@ class Watch:
 
     def __next__(self) -> Reading:
         while not self._closed.is_set():
+            reading = self.within(_LOOK_S)
+            if reading is not None:
+                return reading
+        raise StopIteration
+
+    def within(self, seconds: float) -> Reading | None:
+        """The next reading, waited for so long at most; None if there is none."""
+        deadline = time.monotonic() + seconds
+        while not self._closed.is_set():
             try:
-                return reading_of(self._waiting.get(timeout=_LOOK_S))
+                reading = reading_of(self._waiting.get(timeout=max(0.0, deadline - time.monotonic())))
             except queue.Empty:
-                continue
+                return None
             except (messages.BadPayload, KeyError):
                 self.unreadable += 1
-        raise StopIteration
+                continue
+            if self._wanted is None or self._wanted(reading):
+                return reading
+        return None
 
     def close(self) -> None:
         """End the stream; the iteration stops."""

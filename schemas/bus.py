@@ -155,6 +155,11 @@ def canon(expression: str) -> str:
         raise BadKey(f"key expression {expression!r} is not allowed: {words}") from None
 
 
+def intersects(one: str, other: str) -> bool:
+    """Whether some key matches both expressions; each must be as `canon` gives it."""
+    return bool(zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other)))
+
+
 class Handover(Generic[T]):
     """Hands objects from Zenoh's threads to one asyncio loop, in order and bounded; what does not fit is counted.
 

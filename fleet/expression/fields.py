@@ -1,7 +1,6 @@
 """The fields of a message as names of a condition: which there are, of which type, and their values."""
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -23,7 +22,6 @@ _LAST: Final = ("car", "seq", "boot_id")
 """Every message has them; few ask for them."""
 
 
-@cache
 def fields_of(message_class: type[Message]) -> Mapping[str, type]:
     """The fields that a condition may name, with their types: float, bool or str.
 

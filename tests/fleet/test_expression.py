@@ -147,6 +147,7 @@ def test_a_number_that_is_none_was_not_measured_and_a_wrong_type_is_the_callers_
         ("range_m == 1 and range_m > 1", True),
         ("not (range_m >= 0.1 or range_m <= 0.2)", True),
         ("not (range_m < 0.1) and not range_m >= 0.1", True),
+        ("not (range_m < 0.1) and range_m == 0.1", False),
         ("level == 'low' and level == 'ok'", True),
         ("level == 'low' and level != 'low'", True),
         ("level != 'low' and level != 'ok'", False),

@@ -1,0 +1,63 @@
+"""A condition over the messages that a key expression can match: `range_m < 0.3` of `*/sensor/range`.
+
+Understood before anything is asked: a field that no message there has is an error, and so is what can never be true.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Self
+
+from fleet.expression import BadExpression, Expression, contradictory, fields_of, parse, value_in
+from fleet.readings import Reading
+from schemas import keys, messages, topics
+from schemas.bus import intersects
+
+_PATTERNS: Final = {
+    topic.name: f"*/{topic.name}" if topic.name.startswith("@") else f"*/*/{topic.name}"
+    for topic in topics.TOPICS.values()
+}
+
+
+def topics_under(written: str) -> list[topics.Topic]:
+    """The topics that a written-out key expression can match, in the table's order."""
+    return [topic for topic in topics.TOPICS.values() if intersects(written, _PATTERNS[topic.name])]
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What must hold of one reading; each type of message that has the fields has its own expression."""
+
+    text: str
+    by_message: Mapping[str, Expression]
+
+    @classmethod
+    def of(cls, text: str, written: str) -> Self:
+        """Understand a condition over what `written` can match; raises BadExpression, BadKey (nothing is there)."""
+        under = topics_under(written)
+        if not under:
+            there = ", ".join(topics.TOPICS)
+            raise keys.BadKey(
+                f"nothing is ever published under {written}, so no condition can hold; topics are {there}"
+            )
+        names = {topic.message: fields_of(messages.message_class(topic.message)) for topic in under}
+        found: dict[str, Expression] = {}
+        for message, fields in names.items():
+            try:
+                found[message] = parse(text, fields)
+            except BadExpression:
+                if len(names) == 1:
+                    raise
+        if not found:
+            parse(text, {name: kind for fields in names.values() for name, kind in fields.items()})
+            raise BadExpression(text, 1, f"no message under {written} has all of its fields: it is about one message")
+        if all(contradictory(expression) for expression in found.values()):
+            raise BadExpression(text, 1, "it can never be true")
+        return cls(str(next(iter(found.values()))), found)
+
+    def __str__(self) -> str:
+        return self.text
+
+    def holds(self, reading: Reading) -> bool | None:
+        """Whether it holds of this reading; None: its message has no such field, or it was not measured."""
+        expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
+        return None if expression is None else expression.value(value_in(reading.value))

@@ -1,0 +1,57 @@
+"""What gateways still know of the past: how it is asked for, and what is said when they know less than was asked."""
+
+import itertools
+from collections.abc import Iterable
+from datetime import datetime
+from typing import Final
+
+from fleet.readings import Reading
+from schemas import keys, topics
+
+ANSWER_S: Final = 10.0
+"""How long the whole history of many cars may take."""
+LONGEST_S: Final = 7 * 86_400.0
+
+
+def selector(written: str, *, last: int | None = None, since_s: float | None = None) -> str:
+    """The query for the last so many values of each key, or of the last so many seconds; raises ValueError."""
+    if last is None and since_s is None:
+        raise ValueError("a history needs last (how many), since_s (how far back), or both")
+    if last is not None and last < 1:
+        raise ValueError(f"last {last} is not allowed: a whole number from 1 on")
+    if since_s is not None and not 0 < since_s <= LONGEST_S:
+        raise ValueError(f"since_s {since_s:g} is not allowed: more than 0 and at most {LONGEST_S:g} s")
+    asked = [] if since_s is None else [f"_time=[now(-{since_s:f}s)..]"]
+    return f"{written}?{';'.join(asked + ([] if last is None else [f'last={last}']))}"
+
+
+def shortfalls(
+    readings: Iterable[Reading], now: datetime, *, last: int | None = None, since_s: float | None = None
+) -> list[str]:
+    """For each key of which less came than was asked (readings sorted by key), why, as far as it is known."""
+    said = []
+    for key, group in itertools.groupby(readings, key=lambda reading: reading.key):
+        found, topic = list(group), topics.of_key(key)
+        if topic is None:
+            continue
+        keeps = f"its gateway keeps {f'the last {topic.kept}' if topic.kept > 1 else 'only the latest of a state'}"
+        oldest_s = found[0].age_s(now)
+        full = len(found) >= topic.kept
+        if since_s is not None:
+            if full and oldest_s < since_s and (last is None or last > topic.kept):
+                said.append(f"{key}: goes back {oldest_s:.1f} s of {since_s:g} s, {keeps}")
+        elif last is not None and len(found) < last:
+            more = keeps if full else "its gateway has had no more"
+            said.append(f"{key}: {len(found)} of {last}, {more}")
+    return said
+
+
+def without_history(written: str, under: Iterable[topics.Topic]) -> str:
+    """Why nothing can be asked of the past of these topics; empty if something can."""
+    names = [topic.name for topic in under]
+    if any(topics.TOPICS[name].kept for name in names):
+        return ""
+    what = ", ".join(names) if names else written
+    return (
+        f"{what}: gateways keep no history of it, only of {keys.DEFAULT_FLEET}/CAR/sensor/*; `fleet record` keeps all"
+    )
