@@ -13,8 +13,8 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 ALLOWED: Final = (
     "allowed are /dev/ttyUSB0 or COM3 (also as serial:///dev/ttyUSB0?baud=9600), "
-    "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://HOST:PORT, ble://AA:BB:CC:DD:EE:FF (macOS: a UUID), ble://name=BT04; "
-    "`gateway scan` shows them"
+    "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://HOST:PORT, "
+    "ble://AA:BB:CC:DD:EE:FF (macOS: a UUID), ble://name=BT04; `gateway scan` shows them"
 )
 _WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
 _USB_ID: Final = re.compile(r"(?:0[xX])?([0-9a-fA-F]{4})")
