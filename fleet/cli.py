@@ -11,6 +11,11 @@ from typing import Final
 import click
 
 COMMANDS: Final = {
+    "up": ("fleet.commands.up:up", "Start a fleet from its file, or simulated cars, and keep it running."),
+    "down": ("fleet.commands.supervised:down", "End a fleet that is up: every car is stopped first."),
+    "status": ("fleet.commands.supervised:status", "The processes of a fleet that is up."),
+    "reload": ("fleet.commands.supervised:reload", "Have the fleet file of a fleet that is up read again."),
+    "logs": ("fleet.commands.supervised:logs", "What a car's gateway has said."),
     "list": ("fleet.commands.reading:list_cars", "The cars on the bus, and how each is."),
     "get": ("fleet.commands.reading:get", "The latest value of every matching reading."),
     "watch": ("fleet.commands.reading:watch", "Readings as they come, until Ctrl-C."),

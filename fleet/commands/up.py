@@ -1,0 +1,181 @@
+"""`fleet up`: a fleet from its file, or of simulated cars, until Ctrl-C. What it does is supervisor.py's."""
+
+import asyncio
+import json
+import os
+import signal
+import stat
+import sys
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import click
+
+from fleet.commands.common import explained
+from fleet.config import read_fleet
+from fleet.policy.plan import parse as parse_plan
+from fleet.supervise.desk import AnotherSupervisor
+from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, wanted
+from fleet.supervisor import Happening, Supervisor
+from schemas import keys
+
+DEFAULT_FILE: Final = Path("fleet.yaml")
+_Tell = Callable[[Happening], None]
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet up
+  fleet up deploy/fleet.yaml --plan deploy/plan.yaml
+  fleet up --sim 8
+
+Without FILE and --sim it takes ./fleet.yaml. With --sim and --json, lines on stdin go to the simulator (gateway sim
+--help). Exit codes: 0 every car was stopped, 1 one was not or nothing came up, 2 wrong use."""
+)
+@click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
+@click.option("--sim", "simulated", type=click.IntRange(1, MOST_SIMULATED), metavar="N",
+              help="Simulate N cars: those of the file first, whatever their link.")  # fmt: skip
+@click.option(
+    "--plan",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="What the cars shall do (default: as the file says).",
+)
+@click.option("--world", type=click.Path(path_type=Path, dir_okay=False), help="The simulated cars' world.")
+@click.option("--record/--no-record", default=None, help="Record everything (the default, unless the file says no).")
+@click.option(
+    "--out", type=click.Path(path_type=Path, file_okay=False), help="Where recordings go (default: sessions)."
+)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object for each thing that happens.")
+@click.option(
+    "--connect",
+    metavar="ENDPOINT",
+    help="The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or loopback port 7447).",
+)
+@click.option("--fleet", help="Name of the fleet (default: the file's, or fleet).")
+def up(
+    file: Path | None,
+    simulated: int | None,
+    plan: Path | None,
+    world: Path | None,
+    *,
+    record: bool | None,
+    out: Path | None,
+    as_json: bool,
+    connect: str | None,
+    fleet: str | None,
+) -> None:
+    """Start all that a fleet needs, show its cars, start again what dies; Ctrl-C stops every car, then ends."""
+    if file is None and simulated is None:
+        if not DEFAULT_FILE.exists():
+            raise click.UsageError(
+                "there is no fleet.yaml here: name a file, make one with fleet init, or give --sim 3"
+            )
+        file = DEFAULT_FILE
+    asked = Asked(simulated or 0, plan, world, record, out, connect, fleet)
+    with explained():
+        if fleet is not None:
+            keys.check_name(fleet, "fleet name")
+        wish = read(file, asked)
+        if not wish.cars:
+            raise click.UsageError(f"{file} has no car with a link: fleet bind finds links, --sim {3} simulates cars")
+        try:
+            stopped = asyncio.run(_serve(wish, file, asked, as_json=as_json))
+        except AnotherSupervisor as error:
+            raise click.ClickException(str(error)) from None
+        except OSError as error:
+            raise click.ClickException(f"there is no place for the logs: {error}; set FLEET_STATE_DIR") from None
+    raise SystemExit(0 if stopped else 1)
+
+
+def read(file: Path | None, asked: Asked) -> Wanted:
+    """What is wanted, with a plan that can be read; raises ValueError."""
+    wish = wanted(None if file is None else read_fleet(file, unbound=asked.simulated > 0), asked)
+    for path, what in ((wish.plan, "the plan"), (wish.world, "the world")):
+        if path is None:
+            continue
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            raise ValueError(f"{what} {path} is not a text in UTF-8") from None
+        except OSError as error:
+            raise ValueError(f"{what} {path} cannot be read: {error.strerror}") from None
+        if path is wish.plan:
+            parse_plan(text, str(path))
+    return wish
+
+
+async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool) -> bool:
+    loop = asyncio.get_running_loop()
+    teller = _json if as_json else _plain
+    live = sys.stdout.isatty() and not as_json
+
+    def tell(happening: Happening) -> None:
+        _written(teller, happening) if table is None else table.tell(happening)
+
+    supervisor = Supervisor(wish, str(file) if file else "", lambda: read(file, asked), tell)
+    table = None
+    if live:
+        from fleet.supervise.table import Table
+
+        table = Table(supervisor)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None:
+            words = {"SIGINT": "Ctrl-C", "SIGHUP": "the terminal was closed"}.get(name, "told to end")
+            try:
+                loop.add_signal_handler(number, supervisor.end, words)
+            except NotImplementedError:  # Windows has no signal handlers on the loop
+                signal.signal(number, lambda *_, words=words: loop.call_soon_threadsafe(supervisor.end, words))
+    if as_json and wish.simulated:
+        await _pass_stdin(loop, supervisor.tell_simulator)
+    if table is None:
+        return await supervisor.run()
+    with table:
+        drawing = asyncio.ensure_future(table.draw())
+        try:
+            return await supervisor.run()
+        finally:
+            drawing.cancel()
+            await asyncio.gather(drawing, return_exceptions=True)
+
+
+class _Lines(asyncio.Protocol):
+    """Lines as they come."""
+
+    def __init__(self, take: Callable[[str], None]) -> None:
+        self._take = take
+        self._rest = b""
+
+    def data_received(self, data: bytes) -> None:
+        *whole, rest = (self._rest + data).split(b"\n")
+        self._rest = rest[-65536:]
+        for line in whole:
+            if line.strip():
+                self._take(line.decode("utf-8", "replace"))
+
+
+async def _pass_stdin(loop: asyncio.AbstractEventLoop, take: Callable[[str], None]) -> None:
+    """Whoever writes JSON to our stdin plays with the simulator; a terminal, a file or nothing does not."""
+    mode = os.fstat(sys.stdin.fileno()).st_mode
+    if stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode):
+        await loop.connect_read_pipe(lambda: _Lines(take), sys.stdin)
+
+
+def _written(teller: _Tell, happening: Happening) -> None:
+    """A reader that has gone (a pipe, a closed terminal) must not keep the cars from being stopped."""
+    try:
+        teller(happening)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _json(happening: Happening) -> None:
+    told = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "what": happening.what}
+    click.echo(json.dumps({**told, "name": happening.name, "words": happening.words}))
+
+
+def _plain(happening: Happening) -> None:
+    click.echo(f"{datetime.now(UTC):%H:%M:%S} {happening.name}: {happening.words}")

@@ -1,0 +1,90 @@
+"""What the cars of a fleet show, one row each, and which changes are worth a line. Pure: time is an argument."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+RATE_OVER_S: Final = 2.0
+
+
+@dataclass(slots=True)
+class Row:
+    """One car as it was last heard."""
+
+    car: str
+    link: str = ""
+    reason: str = ""
+    mode: str = ""
+    verdict: str = ""
+    motion: str = ""
+    hold: str = ""
+    estop: str = ""
+    lease: str = ""
+    battery: str = ""
+    rate_hz: float | None = None
+    """Frames from the car."""
+    event: str = ""
+    worst_stop_s: float | None = None
+    _counted: tuple[float, int] | None = None
+    _told: dict[str, str] = field(default_factory=dict)
+
+    def take(self, topic: str, value: Any, now: float) -> str:
+        """Take a message; the words for a change that is worth a line, else nothing."""
+        match topic:
+            case "state/link":
+                self.link, self.reason = value.state, value.reason
+                self._count(value.rx_frames, now)
+                return self._change("link", f"link {value.state}{f': {value.reason}' if value.reason else ''}")
+            case "state/mode":
+                self.mode, self.verdict = value.asked, value.verdict
+                return self._change("mode", f"mode {value.asked}, {value.verdict}")
+            case "state/motion":
+                by = f" by {value.owner}" if value.owner else ""
+                self.motion = value.motion
+                return self._change("motion", f"motion {value.motion}{by}")
+            case "state/safety":
+                return self._safety(value)
+            case "sensor/battery":
+                level = "" if value.level == "ok" else f" {value.level}"
+                self.battery = f"{value.voltage_v:.2f} V{level}"
+                return self._change("battery", f"battery {value.level}")
+            case "event/log":
+                self.event = value.message.removeprefix(f"{self.car} ")
+            case _:
+                pass
+        return ""
+
+    def gone(self) -> None:
+        """Its gateway is away: nothing of it is known."""
+        self.link, self.reason, self.rate_hz, self._counted = "", "", None, None
+        self.mode = self.verdict = self.motion = self.lease = ""
+        self._told.clear()
+
+    def _safety(self, value: Any) -> str:
+        self.hold = value.hold.by if value.HasField("hold") else ""
+        self.estop = " ".join(each.id for each in value.estops)
+        self.lease = value.lease.holder if value.HasField("lease") else ""
+        self.worst_stop_s = value.worst_stop_s
+        if self.estop:
+            return self._change("safety", f"e-stop {self.estop}")
+        return self._change("safety", f"on hold by {self.hold}" if self.hold else "not on hold")
+
+    def _count(self, frames: int, now: float) -> None:
+        if self._counted is None or frames < self._counted[1]:
+            self._counted = (now, frames)
+        elif now - self._counted[0] >= RATE_OVER_S:
+            self.rate_hz = (frames - self._counted[1]) / (now - self._counted[0])
+            self._counted = (now, frames)
+
+    def _change(self, what: str, words: str) -> str:
+        """The words, if they say something new; what is as it should be at first is not new."""
+        before, self._told[what] = self._told.get(what), words
+        return "" if words == before or (before is None and words in _AT_FIRST) else words
+
+    def as_dict(self) -> Mapping[str, object]:
+        """For a script."""
+        names = ("car", "link", "reason", "mode", "verdict", "motion", "hold", "estop", "lease", "battery")
+        return {name: getattr(self, name) for name in (*names, "rate_hz", "event")}
+
+
+_AT_FIRST: Final = frozenset({"not on hold", "battery ok", "motion stop", "motion unknown"})

@@ -1,0 +1,179 @@
+"""When a process is started, when it counts as hung, and when it is started again. Pure: time is an argument.
+
+A car that is off is none of this: its gateway runs, is heard, and keeps trying by itself.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from math import inf
+from typing import Final
+
+FIRST_S: Final = 0.25
+LONGEST_S: Final = 10.0
+JITTER: Final = 0.2
+"""Share of a delay: what a fault took down together does not come back in one instant."""
+STEADY_S: Final = 10.0
+"""Who ran for so long fell for a new reason: the delay begins anew."""
+WRONG_USE: Final = 2
+"""The exit code of a process that will never do what it was told: another start would change nothing."""
+RECIPE_S: Final = 4.9
+MARGIN_S: Final = 1.0
+UNKNOWN_STOP_S: Final = 9.1
+"""design.md: the longest stop recipe, and a second more, to SIGKILL; with this as worst case the 15 s of systemd."""
+
+
+class State(StrEnum):
+    """What is so of one process."""
+
+    WAITING = "waiting"
+    STARTING = "starting"
+    RUNNING = "running"
+    ENDING = "ending"
+    ENDED = "ended"
+    GIVEN_UP = "given_up"
+    ELSEWHERE = "elsewhere"
+
+
+class Act(StrEnum):
+    """What is to be done now."""
+
+    NOTHING = "nothing"
+    START = "start"
+    KILL = "kill"
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long a process may say nothing, s: until it is first heard, and then."""
+
+    start_s: float
+    silence_s: float
+
+
+def delay_s(falls: int, chance: float) -> float:
+    """How long to wait after so many falls in a row (1, 2, ...); `chance` in 0..1 spreads it by JITTER either way."""
+    delay: float = min(LONGEST_S, FIRST_S * 2.0 ** min(falls - 1, 16))
+    return delay * (1 + JITTER * (2 * chance - 1))
+
+
+def grace_s(worst_stop_s: float | None) -> float:
+    """How long a gateway may take from SIGTERM to its end, if its stop takes so long at worst; None: not known."""
+    return RECIPE_S + MARGIN_S + (UNKNOWN_STOP_S if worst_stop_s is None else worst_stop_s)
+
+
+@dataclass(slots=True)
+class Ward:
+    """One process, from the first start to the last; `turn` says what to do, the rest tells what happened."""
+
+    patience: Patience
+    due: float
+    """When it is to be started."""
+    state: State = State.WAITING
+    since: float = 0.0
+    heard_at: float = -inf
+    restarts: int = 0
+    words: str = ""
+    """Why it was started again, or is not."""
+    _falls: int = 0
+    _kill_at: float = inf
+    _killed: bool = False
+    _again: bool = field(default=False)
+
+    @property
+    def killed(self) -> bool:
+        """Whether it was to be killed, which was said then."""
+        return self._killed
+
+    @property
+    def alive(self) -> bool:
+        """Whether there is a process."""
+        return self.state in (State.STARTING, State.RUNNING, State.ENDING)
+
+    def turn(self, now: float, listening_since: float | None) -> Act:
+        """What to do; `listening_since`: since when it could have been heard without a gap, None if it cannot be."""
+        match self.state:
+            case State.WAITING if now >= self.due:
+                return Act.START
+            case State.ENDING if now >= self._kill_at and not self._killed:
+                self._killed = True
+                self.words = "did not end in time and was killed"
+                return Act.KILL
+            case State.STARTING | State.RUNNING if listening_since is not None and not self._killed:
+                starting = self.state is State.STARTING
+                allowed = self.patience.start_s if starting else self.patience.silence_s
+                silent = now - max(listening_since, self.since if starting else self.heard_at)
+                if silent > allowed:
+                    self._killed = True
+                    self.words = f"hung: not heard for {silent:.1f} s"
+                    return Act.KILL
+        return Act.NOTHING
+
+    def started(self, now: float) -> None:
+        """It was started."""
+        if self.since or self.restarts:
+            self.restarts += 1
+        self._set(State.STARTING, now)
+        self._killed = False
+
+    def heard(self, now: float) -> bool:
+        """A sign of life; whether it is the first."""
+        first = self.state is State.STARTING
+        if first:
+            self._set(State.RUNNING, now)
+        self.heard_at = now
+        return first
+
+    def ended(self, code: int, why: str, now: float, chance: float) -> None:
+        """It has ended with this exit code (negative: by that signal); `why` is its last word, if it had one.
+
+        `chance` in 0..1 spreads the restart.
+        """
+        if self.state is State.ENDING:
+            self._set(State.WAITING if self._again else State.ENDED, now)
+            self.due = now
+            return
+        if not self._killed:
+            said = f": {why}" if why and code > 0 else ""
+            self.words = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}{said}"
+        if code == WRONG_USE:
+            self._set(State.GIVEN_UP, now)
+            return
+        self._falls = 1 if self.alive and now - self.since >= STEADY_S else self._falls + 1
+        self._set(State.WAITING, now)
+        self.due = now + delay_s(self._falls, chance)
+
+    def not_started(self, words: str, now: float, chance: float) -> None:
+        """The system would not start it."""
+        self._falls += 1
+        self.words = words
+        self._set(State.WAITING, now)
+        self.due = now + delay_s(self._falls, chance)
+
+    def end(self, now: float, grace_s: float, *, again: bool = False) -> bool:
+        """It is told to end, and then to be started anew if `again`; whether there is a process to tell."""
+        self._again = again
+        if self.state is State.ENDING:
+            return False
+        if not self.alive:
+            self._set(State.WAITING if again else State.ENDED, now)
+            self.due, self._falls = now, 0
+            return False
+        self._set(State.ENDING, now)
+        self._kill_at = now + grace_s
+        self._falls = 0
+        return True
+
+    def elsewhere(self, now: float, words: str) -> None:
+        """Somebody else does what it is for."""
+        if self.state is not State.ELSEWHERE:
+            self._set(State.ELSEWHERE, now)
+        self.words = words
+
+    def wanted(self, now: float) -> None:
+        """Nobody else does it any more."""
+        self._set(State.WAITING, now)
+        self.due = now
+
+    def _set(self, state: State, now: float) -> None:
+        if state is not self.state or state is State.STARTING:
+            self.state, self.since = state, now

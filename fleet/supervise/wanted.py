@@ -1,0 +1,177 @@
+"""What is to run: from a fleet file and the command line to the processes' arguments. Nothing is started here.
+
+What fleet needs of links and simulators it starts as processes; it imports none of them.
+"""
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from fleet.config import CarSpec, FleetFile
+from fleet.supervise.restart import Patience
+from schemas.keys import DEFAULT_FLEET
+
+SIMULATED: Final = "sim"
+"""The link of a car that the supervisor's simulator plays."""
+NAMES: Final = ("red", "green", "blue", "yellow", "orange", "violet", "white", "black")
+PLATFORMS: Final = ("arduino", "stm32", "arduino", "raspberry_pi")
+"""Of simulated cars without a file, in turns."""
+MOST_SIMULATED: Final = 200
+RECORDINGS: Final = Path("sessions")
+
+HUB: Final = "@hub"
+SIMULATOR: Final = "@simulator"
+RECORDER: Final = "@recorder"
+COORDINATOR: Final = "@coordinator"
+SELF: Final = "@supervisor"
+"""Names of processes; all others are a car's gateway, and no car's name begins with @."""
+
+
+class Kind(StrEnum):
+    """What a process is for."""
+
+    HUB = "hub"
+    SIMULATOR = "simulator"
+    GATEWAY = "gateway"
+    COORDINATOR = "coordinator"
+    RECORDER = "recorder"
+
+
+PATIENCE: Final[Mapping[Kind, Patience]] = {
+    Kind.HUB: Patience(start_s=10.0, silence_s=4.0),  # linked again after half a second, a lease is 2 s
+    Kind.SIMULATOR: Patience(start_s=20.0, silence_s=5.0),  # asked each second
+    Kind.GATEWAY: Patience(start_s=20.0, silence_s=4.0),  # state/health comes each second
+    Kind.COORDINATOR: Patience(start_s=20.0, silence_s=6.0),  # asked each second
+    Kind.RECORDER: Patience(start_s=20.0, silence_s=10.0),  # each second, from a thread that waits for the disk
+}
+
+
+@dataclass(frozen=True, slots=True)
+class WantedCar:
+    """One car: its link, or SIMULATED, and what its gateway is told besides."""
+
+    name: str
+    link: str
+    platform: str = "auto"
+    arguments: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """All that is to run."""
+
+    fleet: str = DEFAULT_FLEET
+    endpoint: str | None = None
+    cars: Mapping[str, WantedCar] = field(default_factory=dict)
+    plan: Path | None = None
+    record: bool = True
+    recordings: Path = RECORDINGS
+    world: Path | None = None
+
+    @property
+    def simulated(self) -> list[WantedCar]:
+        """The cars that the simulator plays."""
+        return [car for car in self.cars.values() if car.link == SIMULATED]
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What the command line says; None: as the file says."""
+
+    simulated: int = 0
+    plan: Path | None = None
+    world: Path | None = None
+    record: bool | None = None
+    out: Path | None = None
+    connect: str | None = None
+    fleet: str | None = None
+
+
+def wanted(file: FleetFile | None, asked: Asked) -> Wanted:
+    """Unite file and command line, which wins. Of `asked.simulated` cars the file's come first, whatever their link."""
+    cars = {} if file is None else {name: _car(spec) for name, spec in file.cars.items()}
+    for index, name in enumerate(_names(list(cars), asked.simulated)):
+        car = cars.get(name) or WantedCar(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
+        # A simulated car must be of some platform, one of a real car may be found out.
+        platform = "arduino" if car.platform in ("auto", "unknown") else car.platform
+        cars[name] = WantedCar(name, SIMULATED, platform, car.arguments)
+    return Wanted(
+        fleet=asked.fleet or (file.name if file else DEFAULT_FLEET),
+        endpoint=asked.connect or (file.endpoint if file else None),
+        cars=cars,
+        plan=asked.plan or (file.plan if file else None),
+        record=(file.record if file else True) if asked.record is None else asked.record,
+        recordings=asked.out or (file.recordings if file else None) or RECORDINGS,
+        world=asked.world or (file.world if file else None),
+    )
+
+
+def _names(known: Sequence[str], count: int) -> list[str]:
+    """So many names: those of the file, then ours."""
+    more = (name for name in (*NAMES, *(f"car{number}" for number in range(len(NAMES) + 1, MOST_SIMULATED + 1))))
+    names = list(known)[:count]
+    for name in more:
+        if len(names) >= count:
+            break
+        if name not in known:
+            names.append(name)
+    return names
+
+
+def _car(spec: CarSpec) -> WantedCar:
+    limits = spec.limits
+    return WantedCar(
+        spec.name,
+        spec.link,
+        spec.platform,
+        (
+            *("--longest-drive", f"{limits.longest_drive_s:g}"),
+            *("--battery-low", limits.on_battery_low),
+            *("--battery-critical", limits.on_battery_critical),
+        ),
+    )
+
+
+def module(name: str, *arguments: str) -> tuple[str, ...]:
+    """The command that runs a module with this interpreter."""
+    return (sys.executable, "-m", name, *arguments)
+
+
+def hub_command(endpoint: str) -> tuple[str, ...]:
+    """The hub."""
+    return module("schemas.hub", "--endpoint", endpoint)
+
+
+def gateway_command(wish: Wanted, car: WantedCar, link: str, endpoint: str) -> tuple[str, ...]:
+    """The gateway of a car, which keeps trying when its car is off."""
+    where = ("--fleet", wish.fleet, "--connect", endpoint, "--retry", "--with-parent")
+    told = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
+    return module("gateway.cli", "run", *told, *where)
+
+
+def simulator_command(wish: Wanted, directory: Path, endpoint: str) -> tuple[str, ...]:
+    """One simulator for all simulated cars; a named terminal is found again by a gateway when it was away."""
+    cars = [f"{car.name}:{car.platform}:{_terminal(directory, car.name)}" for car in wish.simulated]
+    world = () if wish.world is None else ("--world", str(wish.world))
+    told = [word for car in cars for word in ("--car", car)]
+    return module("gateway.cli", "sim", *told, *world, "--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
+
+
+def _terminal(directory: Path, car: str) -> str:
+    return f"pty:{directory / car}.tty" if os.name == "posix" else "tcp"
+
+
+def recorder_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
+    """The recorder."""
+    where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
+    return module("fleet.cli", "record", "--out", str(wish.recordings), "--json", *where)
+
+
+def coordinator_command(wish: Wanted, plan: Path, endpoint: str) -> tuple[str, ...]:
+    """The coordinator."""
+    where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
+    return module("fleet.cli", "coordinate", "--plan", str(plan), "--json", *where)

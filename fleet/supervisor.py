@@ -1,0 +1,397 @@
+"""The supervisor of `fleet up`: hub, simulator, recorder, gateways and coordinator, kept running until told to end.
+
+When a process is started again is supervise/restart.py's part (pure), what it is told supervise/wanted.py's, what is
+heard and asked over the bus supervise/desk.py's. Here is the loop that joins them, and the order of the end.
+"""
+
+import asyncio
+import hashlib
+import json
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from fleet.supervise import wanted
+from fleet.supervise.cars import Row
+from fleet.supervise.crew import TURN_S, Crew, Process
+from fleet.supervise.desk import Desk, Refused
+from fleet.supervise.process import new_run
+from fleet.supervise.reload import change
+from fleet.supervise.restart import State, grace_s
+from fleet.supervise.wanted import COORDINATOR, HUB, RECORDER, SELF, SIMULATOR, Kind, Wanted, WantedCar
+from schemas.bus import Bus, BusError, accepts, resolve_endpoint
+from schemas.gen import fleet_v1_pb2 as pb
+
+STALL_S: Final = 1.0
+"""Who slept for so long has heard nobody meanwhile, and blames nobody."""
+SECOND_S: Final = 1.0
+HUB_UP_S: Final = 10.0
+HUB_GONE_S: Final = 0.3
+"""Sooner than gateways start one of their own (0.5 s)."""
+RECORDER_FIRST_S: Final = 5.0
+"""How long the cars wait for the recorder, so that it misses nothing."""
+STOP_ASKED_S: Final = 0.5
+END_S: Final = 5.0
+RECORDER_END_S: Final = 30.0
+"""It writes what it has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Happening:
+    """Something that is worth a line. what: `process`, `car`, `log`, `simulator` or `end`; name: a car, or `@hub`."""
+
+    what: str
+    name: str
+    words: str
+
+
+class Supervisor:
+    """Keeps what is wanted running. `run` returns when all has ended: whether every car was stopped.
+
+    `read` reads what is wanted anew, for a reload; it raises ValueError for what cannot be. `tell` hears what happens.
+    """
+
+    def __init__(
+        self, wish: Wanted, source: str, read: Callable[[], Wanted], tell: Callable[[Happening], None]
+    ) -> None:
+        self.endpoint = resolve_endpoint(wish.endpoint)
+        self.rows: dict[str, Row] = {}
+        self.crew = Crew(lambda name, words: self._say("process", name, words), self._said, self._ended)
+        self._wish = wish
+        self._source = source
+        self._read = read
+        self._tell = tell
+        self._state = "starting"
+        self._became: dict[str, str] = {}
+        """By car, at the end."""
+        self._desk: Desk | None = None
+        self._began = self._turned_at = self._awake_since = self._unlinked_since = time.monotonic()
+        self._linked_since: float | None = None
+        self._gateways_from = 0.0
+        self._end_asked = asyncio.Event()
+        self._sim_asked: deque[bool] = deque()
+        """Whose questions to the simulator wait for an answer: True for a user's."""
+        self._sim_links: dict[str, str] = {}
+        self._shown: object = None
+
+    def end(self, why: str) -> None:
+        """Begin to end; asked again it says what is waited for."""
+        if self._end_asked.is_set():
+            waiting = ", ".join(process.name for process in self.crew if process.ward.alive)
+            self._say("end", SELF, f"{why}: is ending already, waits for {waiting or 'nothing'}")
+            return
+        self._say("end", SELF, f"{why}: stopping every car, then closing the recording")
+        self._end_asked.set()
+
+    def tell_simulator(self, line: str) -> None:
+        """Pass a line on to the simulator; its answer is a happening."""
+        process = self.crew.get(SIMULATOR)
+        if process is not None and process.child is not None and process.ward.alive:
+            self._sim_asked.append(True)
+            process.child.tell(line)
+        else:
+            self._say("simulator", SIMULATOR, json.dumps({"ok": False, "error": "no simulator is running"}))
+
+    async def run(self) -> bool:
+        """Supervise until `end`. Raises AnotherSupervisor, BusError, and OSError if there is no place for the logs."""
+        self.crew.directory = await asyncio.to_thread(new_run, self._wish.fleet, time.time())
+        try:
+            desk = self._desk = Desk(await self._bus(), self._wish.fleet)
+            await desk.open(self._heard, {"down": self._down, "reload": self._reload}, self.status)
+            self._populate()
+            self._state = "running"
+            each_second = asyncio.ensure_future(self._each_second(desk))
+            try:
+                while not self._end_asked.is_set():
+                    await self._turn()
+                    with suppress(TimeoutError):
+                        await asyncio.wait_for(self._end_asked.wait(), TURN_S)
+                await self._end_all(desk)
+            finally:
+                each_second.cancel()
+                await asyncio.gather(each_second, return_exceptions=True)
+            self._state = "ended"
+            desk.publish(self.status())
+            await asyncio.sleep(TURN_S)  # whoever waits for the end hears of it
+        finally:
+            await self._leave()
+        return all(process.code == 0 for process in self.crew.of(Kind.GATEWAY))
+
+    # ------------------------------------------------------------------ the bus
+
+    async def _bus(self) -> Bus:
+        """A session; the hub is started if there is none. Raises BusError."""
+        self.crew.add(HUB, Kind.HUB, wanted.hub_command(self.endpoint))
+        deadline = time.monotonic() + HUB_UP_S
+        while True:
+            await self._turn()
+            if await asyncio.to_thread(accepts, self.endpoint):
+                return await asyncio.to_thread(Bus.open, self.endpoint)
+            hub = self.crew.get(HUB)
+            if time.monotonic() > deadline:
+                words = hub.ward.words if hub is not None else ""
+                raise BusError(f"no hub came up at {self.endpoint}: {words or 'it does not listen'}")
+            await asyncio.sleep(TURN_S)
+
+    async def _see_to_hub(self, now: float, *, linked: bool) -> None:
+        """A hub that somebody else started serves as well as ours."""
+        hub = self.crew.get(HUB)
+        assert hub is not None
+        if linked:
+            self.crew.heard(HUB)
+        gone = self._desk is not None and not linked and now - self._unlinked_since >= HUB_GONE_S
+        if hub.ward.state is State.WAITING and now >= hub.ward.due and await asyncio.to_thread(accepts, self.endpoint):
+            hub.ward.elsewhere(now, f"somebody else's listens at {self.endpoint}")
+        elif hub.ward.state is State.ELSEWHERE and gone and not await asyncio.to_thread(accepts, self.endpoint):
+            hub.ward.wanted(now)
+
+    async def _leave(self) -> None:
+        """Off the bus, and the hub last; whatever still runs (something broke here) ends with it."""
+        if self._desk is not None:
+            await asyncio.to_thread(self._desk.bus.close)
+            self._desk = None
+        for process in self.crew:
+            self.crew.end(process, grace_s(None))
+        await self.crew.gone(self.crew, grace_s(None))
+
+    # ------------------------------------------------------------------ what is to run
+
+    def _populate(self) -> None:
+        if self._wish.record:
+            self.crew.add(RECORDER, Kind.RECORDER, wanted.recorder_command(self._wish, self.endpoint))
+            self._gateways_from = time.monotonic() + RECORDER_FIRST_S
+        if self._wish.simulated:
+            command = wanted.simulator_command(self._wish, self.crew.directory, self.endpoint)
+            self.crew.add(SIMULATOR, Kind.SIMULATOR, command)
+        for car in self._wish.cars.values():
+            self._add_car(car)
+        self._set_plan(self._wish.plan)
+
+    def _add_car(self, car: WantedCar) -> None:
+        """Start its gateway, or do it anew with what is wanted now; a simulated car's as soon as its link is known."""
+        self.rows.setdefault(car.name, Row(car.name))
+        link = self._sim_links.get(car.name) if car.link == wanted.SIMULATED else car.link
+        if link is not None:
+            self.crew.add(car.name, Kind.GATEWAY, wanted.gateway_command(self._wish, car, link, self.endpoint))
+
+    def _set_plan(self, plan: Path | None) -> bool:
+        """See that the coordinator has this plan; whether that is new. One that begins anew repeats no mode.
+
+        Its plan is a copy: a file that is changed counts when it is reloaded, whole and checked.
+        """
+        coordinator = self.crew.get(COORDINATOR)
+        if plan is None:
+            self.crew.remove(COORDINATOR, END_S)
+            return coordinator is not None
+        text = plan.read_bytes()
+        copy = self.crew.directory / f"plan-{hashlib.sha256(text).hexdigest()[:12]}.yaml"
+        copy.write_bytes(text)
+        command = wanted.coordinator_command(self._wish, copy, self.endpoint)
+        before = coordinator.command if coordinator is not None else None
+        self.crew.add(COORDINATOR, Kind.COORDINATOR, command)
+        return before != command
+
+    # ------------------------------------------------------------------ one turn
+
+    async def _turn(self) -> None:
+        now = time.monotonic()
+        if now - self._turned_at > STALL_S:
+            self._awake_since = now
+        self._turned_at = now
+        linked = self._desk is not None and self._desk.bus.connected
+        if linked and self._linked_since is None:
+            self._linked_since = now
+        elif not linked and self._linked_since is not None:
+            self._linked_since, self._unlinked_since = None, now
+        await self._see_to_hub(now, linked=linked)
+        await self.crew.turn(now, self._listening_since, self._may_start)
+        shown = [(process.name, process.ward.state, process.ward.restarts) for process in self.crew]
+        if self._desk is not None and shown != self._shown:
+            self._shown = shown
+            self._desk.publish(self.status())
+
+    def _listening_since(self, process: Process) -> float | None:
+        if process.kind is Kind.HUB:
+            return self._awake_since if self._desk is not None else None
+        return None if self._linked_since is None else max(self._linked_since, self._awake_since)
+
+    def _may_start(self, process: Process) -> bool:
+        if process.kind is Kind.HUB:
+            return True
+        waits = process.kind is Kind.GATEWAY and time.monotonic() < self._gateways_from
+        return not waits and not self._end_asked.is_set()
+
+    # ------------------------------------------------------------------ what is heard
+
+    def _ended(self, process: Process, told: bool) -> None:  # noqa: FBT001 - the crew calls it so
+        if process.kind is Kind.SIMULATOR:
+            self._sim_asked.clear()
+        if process.kind is not Kind.GATEWAY:
+            return
+        row = self.rows.get(process.name)
+        if row is not None:
+            row.gone()
+        if process.leaving:
+            self.rows.pop(process.name, None)
+        if self._end_asked.is_set() and process.code is not None:
+            self._set_became(process, process.code, told=told)
+
+    def _set_became(self, process: Process, code: int, *, told: bool) -> None:
+        if code == 0 and told:
+            words = "stopped"
+        elif code < 0:
+            words = "its gateway was killed: the car may be moving"
+        else:
+            words = f"not stopped: {process.why or f'exit code {code}'}"
+        self._became[process.name] = words
+        self._say("end", process.name, words)
+
+    def _heard(self, car: str, topic: str, value: Any) -> None:
+        now = time.monotonic()
+        row = self.rows.get(car)
+        if car == RECORDER and self.crew.heard(RECORDER):
+            self._gateways_from = now
+        elif row is not None and topic == "state/health":
+            # The last words of a process that has ended are no sign of life of the next.
+            self.crew.heard(car, value.pid)
+        elif row is not None:
+            if words := row.take(topic, value, now):
+                self._say("car", car, words)
+            if topic == "event/log":
+                self._say("log", car, row.event)
+
+    def _said(self, process: Process, line: str) -> None:
+        """A line of a process's stdout."""
+        if process.kind is Kind.RECORDER:
+            self._say("process", RECORDER, _recording(line))
+        if process.kind is not Kind.SIMULATOR:
+            return
+        try:
+            told = json.loads(line)
+        except ValueError:
+            return
+        self.crew.heard(SIMULATOR)
+        if "link" in told and told.get("car") in self._wish.cars:
+            self._sim_links[told["car"]] = told["link"]
+            if not self._end_asked.is_set():
+                self._add_car(self._wish.cars[told["car"]])
+        elif "ok" in told and self._sim_asked and self._sim_asked.popleft():
+            self._say("simulator", SIMULATOR, line)
+
+    async def _each_second(self, desk: Desk) -> None:
+        """Ask who says nothing by itself for a sign of life, and say how things are."""
+        question = json.dumps({"car": next((car.name for car in self._wish.simulated), ""), "ask": "truth"})
+        asking: asyncio.Future[bool] | None = None
+        while True:
+            simulator, coordinator = self.crew.get(SIMULATOR), self.crew.get(COORDINATOR)
+            if simulator is not None and simulator.child is not None and simulator.ward.alive:
+                self._sim_asked.append(False)
+                simulator.child.tell(question)
+            if asking is not None and asking.done():
+                if asking.result():
+                    self.crew.heard(COORDINATOR)
+                asking = None
+            if coordinator is not None and coordinator.ward.alive and asking is None:
+                asking = asyncio.ensure_future(asyncio.to_thread(desk.coordinator_answers))
+            desk.publish(self.status())
+            await asyncio.sleep(SECOND_S)
+
+    # ------------------------------------------------------------------ the end
+
+    async def _end_all(self, desk: Desk) -> None:
+        """The coordinator first, so that it opens nothing again; every car; the recording; the simulated cars."""
+        self._state = "ending"
+        desk.publish(self.status())
+        gateways = self.crew.of(Kind.GATEWAY)
+        for process in self.crew.of(Kind.COORDINATOR):
+            self.crew.end(process, END_S)
+        asked = asyncio.ensure_future(asyncio.to_thread(desk.stop_all))
+        await asyncio.wait([asked], timeout=STOP_ASKED_S)
+        for process in gateways:
+            row = self.rows.get(process.name)
+            if not process.ward.alive:
+                process.code = process.code or 1
+                self._became[process.name] = f"not stopped: no gateway was running ({process.ward.words or 'not yet'})"
+                self._say("end", process.name, self._became[process.name])
+            self.crew.end(process, grace_s(row.worst_stop_s if row else None))
+        await self._until_ended([*gateways, *self.crew.of(Kind.COORDINATOR)])
+        for kind, grace in ((Kind.RECORDER, RECORDER_END_S), (Kind.SIMULATOR, END_S)):
+            for process in self.crew.of(kind):
+                self.crew.end(process, grace)
+                await self._until_ended([process])
+        await asyncio.wait([asked], timeout=END_S)
+
+    async def _until_ended(self, processes: list[Process]) -> None:
+        while any(process.ward.alive for process in processes):
+            await self._turn()
+            await asyncio.sleep(TURN_S / 2)
+
+    # ------------------------------------------------------------------ what is asked
+
+    def status(self) -> pb.Supervision:
+        """How things are."""
+        now = time.monotonic()
+        message = pb.Supervision(
+            state=self._state,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            uptime_s=now - self._began,
+            fleet_file=self._source,
+            directory=str(self.crew.directory),
+            became=self._became,
+        )
+        for process in self.crew:
+            ward = process.ward
+            shown = message.processes.add(name=process.name, kind=process.kind, state=ward.state, words=ward.words)
+            shown.restarts, shown.since_s = ward.restarts, now - ward.since if ward.since else 0.0
+            if process.child is not None and ward.alive:
+                shown.pid = process.child.pid
+        return message
+
+    async def _down(self, sender: str) -> str:
+        self.end(f"fleet down by {sender}")
+        return "stopping every car, then closing the recording"
+
+    async def _reload(self, sender: str) -> str:
+        """Read what is wanted anew and do what can be done; what was done, and what cannot. Raises Refused."""
+        try:
+            new = await asyncio.to_thread(self._read)
+        except ValueError as error:
+            raise Refused(f"nothing was changed: {error}") from None
+        found = change(self._wish, new)
+        words = list(found.words)
+        self._wish = found.wish
+        for name in found.gone:
+            row = self.rows.get(name)
+            self.crew.remove(name, grace_s(row.worst_stop_s if row else None))
+            if self.crew.get(name) is None:
+                self.rows.pop(name, None)
+        for name in found.begun:
+            self._add_car(self._wish.cars[name])
+        if self._set_plan(self._wish.plan):
+            words.append(
+                "the plan is changed" if self._wish.plan else "there is no plan any more: cars keep their modes"
+            )
+        for line in words:
+            self._say("process", SELF, f"reload by {sender}: {line}")
+        return "\n".join(words or ["nothing has changed"])
+
+    def _say(self, what: str, name: str, words: str) -> None:
+        self._tell(Happening(what, name, words))
+
+
+def _recording(line: str) -> str:
+    try:
+        told = json.loads(line)
+    except ValueError:
+        return line
+    if told.get("state") == "closed":
+        lost = sum(told.get("drops", {}).values()) + sum(told.get("missed", {}).values())
+        return f"recording closed: {told['session']}, {told['messages']} messages, {lost} lost"
+    return f"recording to {told.get('session')}"
