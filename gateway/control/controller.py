@@ -318,14 +318,17 @@ class Controller:
 
     def command(self, command: Command, now: float) -> Answer:
         """Take a command: refuse it with a reason, or begin to carry it out. What becomes of it is recorded."""
-        pending = Pending(command, now)
+        pending, what = Pending(command, now), command.what
+        if self._ledger.known(command) and not isinstance(what, Stop | EmergencyStop):
+            words = f"a command with id {command.id} came already"
+            if not command.streamed:  # not under its id: that is the record of the first
+                self._ledger.log(Level.WARNING, "duplicate", f"{command.verb} by {command.sender.name}: {words}", now)
+                return Answer(Phase.REJECTED, Reason.DUPLICATE, words)
+            return self._reject(pending, Reason.DUPLICATE, words, now)
         if not command.streamed:
             self._ledger.record(pending, Phase.ASKED, now)
-        what = command.what
         if isinstance(what, Stop | EmergencyStop):
             return self._stop(pending, now)
-        if self._ledger.known(command):
-            return self._reject(pending, Reason.DUPLICATE, f"a command with id {command.id} came already", now)
         # A drive is noted also while it is refused: a lease that lapses after a stop must not set it going.
         halted = isinstance(what, Drive) and not self._has_let_go(command, what, now)
         refusal = arbiter.refuse(command, self._situation(now))

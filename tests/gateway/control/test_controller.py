@@ -402,7 +402,10 @@ def test_what_the_platform_does_not_know_is_never_sent(platform: str, what: What
 
 def test_duplicate_and_stale(desk: Desk) -> None:
     assert desk.ask(Fan(), identity="x").status is QUEUED
+    life = desk.life("x")
     assert desk.ask(Fan(), identity="x").reason is Reason.DUPLICATE
+    assert desk.life("x") == life, "the record of the first says nothing of the second"
+    assert [log.code for log in desk.logs] == ["duplicate"]
     assert desk.ask(Fan(), identity="y", age_s=2.1).reason is Reason.STALE
     assert desk.ask(Fan(), identity="y").status is QUEUED, "a refused id is not used up"
     assert desk.ask(Stop(), identity="x", age_s=99.0).status is QUEUED, "a stop never is"
