@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import Final
 
 from fleet.readings import Reading
-from schemas import keys, topics
+from schemas import topics
 
 ANSWER_S: Final = 10.0
 """How long the whole history of many cars may take."""
@@ -46,12 +46,10 @@ def shortfalls(
     return said
 
 
-def without_history(written: str, under: Iterable[topics.Topic]) -> str:
-    """Why nothing can be asked of the past of these topics; empty if something can."""
-    names = [topic.name for topic in under]
-    if any(topics.TOPICS[name].kept for name in names):
+def without_history(under: Iterable[topics.Topic]) -> str:
+    """Why nothing can be asked of the past of these topics; empty if something can, or if there are none."""
+    listed = list(under)
+    if not listed or any(topic.kept for topic in listed):
         return ""
-    what = ", ".join(names) if names else written
-    return (
-        f"{what}: gateways keep no history of it, only of {keys.DEFAULT_FLEET}/CAR/sensor/*; `fleet record` keeps all"
-    )
+    names = ", ".join(topic.name for topic in listed)
+    return f"gateways keep no history of {names}, only of sensor/*; a recording has everything (fleet record)"

@@ -1,29 +1,23 @@
-"""`fleet list, get, watch`: what cars say. Nothing here makes a car do anything."""
+"""`fleet list, get, watch`: what cars say, now and before. Nothing here makes a car do anything."""
 
 import json
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from typing import Any, Final
 
 import click
 
+from fleet import csv_table, history
 from fleet.client import Fleet
-from fleet.commands.common import json_option, with_client
+from fleet.commands.asked import Span, warn_if_missing, what_there_is, written_out
+from fleet.commands.common import bus_options, json_option, with_client
+from fleet.commands.showing import json_text, line, show_table
+from fleet.condition import Condition, topics_under
 from fleet.readings import Reading
 from schemas import keys, topics
-from schemas.bus import canon
 
-
-def _checked(_: click.Context, __: click.Parameter, keyexpr: str) -> str:
-    """A key expression that can be asked; wrong use is found before anyone is."""
-    try:
-        canon(keys.expand(keyexpr))
-    except keys.BadKey as error:
-        raise click.UsageError(str(error)) from None
-    return keyexpr
-
-
-_HEADER: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 _COLUMNS: Final = ("car", "link", "mode", "verdict", "motion", "hold", "battery")
+_TOLD: Final = 5
 
 
 @click.command("list", epilog="\b\nexample:\n  fleet list --json")
@@ -44,12 +38,7 @@ def list_cars(client: Fleet, *, as_json: bool) -> None:
         for row in rows:
             click.echo(json.dumps(row))
         return
-    table = [{name: name.upper() for name in _COLUMNS}] + [
-        {name: _shown(name, row) for name in _COLUMNS} for row in rows
-    ]
-    widths = {name: max(len(row[name]) for row in table) for name in _COLUMNS}
-    for cells in table:
-        click.echo("  ".join(cells[name].ljust(widths[name]) for name in _COLUMNS).rstrip())
+    show_table(_COLUMNS, [{name: _shown(name, row) for name in _COLUMNS} for row in rows])
 
 
 def _row(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
@@ -87,84 +76,93 @@ def _shown(name: str, row: Mapping[str, Any]) -> str:
 
 
 @click.command(
-    epilog="\b\nexamples:\n  fleet get red\n  fleet get red/sensor/range\n  fleet get '*/sensor/battery' --json"
+    epilog="\b\nexamples:\n  fleet get red\n  fleet get red/sensor/range\n  fleet get '*/sensor/battery' --json\n"
+    "  fleet get red/sensor/range --last 100\n  fleet get '*/sensor/range' --since 30s --csv > range.csv"
 )
-@click.argument("keyexpr", callback=_checked)
+@click.argument("keyexpr")
+@click.option("--last", type=click.IntRange(1), metavar="N", help="The last N values of each key, oldest first.")
+@click.option("--since", type=Span(history.LONGEST_S), help="The values of the last so many seconds, as 30s or 5m.")
+@click.option("--csv", "as_csv", is_flag=True, help="One CSV table; KEYEXPR must mean one type of message.")
 @json_option
-@with_client
-def get(client: Fleet, keyexpr: str, *, as_json: bool) -> None:
-    """The latest value of every reading that matches KEYEXPR; `red` is every sensor of red, * is any one part."""
-    readings = client.get(keyexpr)
-    if not readings:
-        written = client.expression(keyexpr)
-        raise click.ClickException(f"nothing under {written}; {_what_there_is(client, written)}")
+@bus_options
+def get(
+    keyexpr: str,
+    *,
+    last: int | None,
+    since: float | None,
+    as_csv: bool,
+    as_json: bool,
+    connect: str | None,
+    fleet: str,
+) -> None:
+    """The latest value of every reading that matches KEYEXPR, or its last values from the gateways' memory.
+
+    `red` is every sensor of red, * is any one part.
+    """
+    written = written_out(keyexpr, fleet)
+    under = topics_under(written)
+    if as_csv and as_json:
+        raise click.UsageError("--csv and --json: give one of them")
+    if as_csv and len(under) != 1:
+        meant = ", ".join(topic.name for topic in under) or "nothing that is ever published"
+        raise click.UsageError(f"a table has one type of message, {written} means {meant}: name one")
+    past = last is not None or since is not None
+    why_not = history.without_history(under) if past else ""
+    if why_not:
+        raise click.UsageError(why_not)
+    with Fleet(connect, fleet, kind="person") as client:
+        readings = client.history(keyexpr, last=last, since_s=since) if past else client.get(keyexpr)
+        if not readings:
+            within = f" of the last {since:g} s" if since is not None else ""
+            raise click.ClickException(f"nothing under {written}{within}; {what_there_is(client, written)}")
+    _show(readings, csv_of=under[0] if as_csv else None, as_json=as_json)
+    if past:
+        _tell(history.shortfalls(readings, datetime.now(UTC), last=last, since_s=since))
+
+
+def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: bool) -> None:
+    if csv_of is not None:
+        click.echo(csv_table.table(readings, csv_of).encode(), nl=False)
+        return
     width = max(len(reading.key) for reading in readings)
     for reading in readings:
-        click.echo(_json(reading) if as_json else _line(reading, width))
+        click.echo(json_text(reading) if as_json else line(reading, width))
 
 
-def _what_there_is(client: Fleet, expression: str) -> str:
-    """The readings of the car that was meant, or else the cars."""
-    cars = client.cars()
-    key = keys.parse(expression)
-    if key is not None and key.car in cars:
-        begin = len(f"{client.name}/{key.car}/")
-        found = [reading.key[begin:] for reading in client.get(f"{client.name}/{key.car}/*/*")]
-        return f"{key.car} has {', '.join(found)}" if found else f"{key.car} says nothing"
-    return f"the cars on the bus are: {', '.join(cars)}" if cars else "there is no car on the bus"
+def _tell(words: Sequence[str]) -> None:
+    """Say why there is less than was asked, for a few keys."""
+    more = [f"and {len(words) - _TOLD} other keys likewise"] if len(words) > _TOLD + 1 else words[_TOLD : _TOLD + 1]
+    for each in (*words[:_TOLD], *more):
+        click.echo(f"fleet: {each}", err=True)
 
 
 @click.command(
-    epilog="\b\nexamples:\n  fleet watch red\n  fleet watch '*/state/*' --json\n  fleet watch red/event/command"
+    epilog="\b\nexamples:\n  fleet watch red\n  fleet watch '*/state/*' --json\n  fleet watch red/event/command\n"
+    "  fleet watch '*/sensor/range' --when 'range_m < 0.3'\n  fleet watch red/sensor/light --when left --count 1"
 )
-@click.argument("keyexpr", callback=_checked)
+@click.argument("keyexpr")
+@click.option("--when", metavar="CONDITION", help="Only readings of which it holds, as 'range_m < 0.3'.")
+@click.option("--count", type=click.IntRange(1), metavar="N", help="End after N readings.")
 @json_option
-@with_client
-def watch(client: Fleet, keyexpr: str, *, as_json: bool) -> None:
-    """Readings that match KEYEXPR as they are published, until Ctrl-C."""
-    _warn_if_missing(client.expression(keyexpr), client.cars())
-    told = 0
-    with client.watch(keyexpr) as readings:
-        for reading in readings:
-            click.echo(_json(reading) if as_json else _line(reading))
-            if readings.dropped > told:
-                told = readings.dropped
-                click.echo(f"fleet: {told} readings dropped so far: what reads this is too slow", err=True)
+@bus_options
+def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, connect: str | None, fleet: str) -> None:
+    """Readings that match KEYEXPR as they are published, until Ctrl-C.
 
-
-def _warn_if_missing(expression: str, cars: Sequence[str]) -> None:
-    """A watch of a car that is not there waits for it; a misspelt name should not go unnoticed."""
-    key = keys.parse(expression)
-    if key is not None and not set(key.car) & set("*$@") and key.car not in cars:
-        there = f"there are: {', '.join(cars)}" if cars else "there is none"
-        click.echo(f"fleet: no car {key.car} on the bus yet ({there}); waiting", err=True)
-
-
-def _json(reading: Reading) -> str:
-    time = reading.time.isoformat(timespec="microseconds").replace("+00:00", "Z")
-    age_s, stale = round(reading.age_s(), 3), reading.stale()
-    return json.dumps({"key": reading.key, "time": time, "age_s": age_s, "stale": stale, "value": reading.as_dict()})
-
-
-def _line(reading: Reading, width: int = 0) -> str:
-    topic = topics.of_key(reading.key)
-    units = topic.units if topic is not None else {}
-    fields = [
-        f"{name}={_value(value)}{_unit(units.get(name, ''))}"
-        for name, value in reading.as_dict().items()
-        if name not in _HEADER and value not in ("", [], {})
-    ]
-    age = f"{reading.age_s():.1f} s ago{' (stale)' if reading.stale() else ''}"
-    return f"{reading.key:<{width}}  {'  '.join(fields)}  {age}"
-
-
-def _value(value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def _unit(unit: str) -> str:
-    return f" {unit}" if unit not in ("", "1") else ""
+    CONDITION is about the fields of one message: < <= > >= == != with numbers, 'words', true and false, a yes/no field
+    by itself, and, or, not, parentheses. What was not measured makes it hold never.
+    """
+    written = written_out(keyexpr, fleet)
+    if when is not None:
+        Condition.of(when, written)
+    with Fleet(connect, fleet, kind="person") as client:
+        warn_if_missing(written, client.cars())
+        told = shown = 0
+        with client.watch(keyexpr, when=when) as readings:
+            for reading in readings:
+                click.echo(json_text(reading) if as_json else line(reading))
+                if readings.dropped > told:
+                    told = readings.dropped
+                    click.echo(f"fleet: {told} readings dropped so far: what reads this is too slow", err=True)
+                shown += 1
+                if shown == count:
+                    return
