@@ -35,6 +35,10 @@ COMMANDS: Final = {
     "fan": ("fleet.commands.acting:fan", "Toggle the fan."),
     "find": ("fleet.commands.acting:find", "Make cars blink and beep, without moving."),
     "coordinate": ("fleet.commands.coordinate:coordinate", "Keep cars in the modes of a plan, until Ctrl-C."),
+    "init": ("fleet.commands.config:init", "Write a fleet file: look for cars, ask for their names."),
+    "check": ("fleet.commands.config:check", "Check a fleet file, and whether its cars' ports are there; opens none."),
+    "bind": ("fleet.commands.bind:bind", "Find out which car is at which link: each blinks, you say which it was."),
+    "schema": ("fleet.commands.config:print_schema", "Print the JSON Schema of fleet files, for editors."),
     "record": ("fleet.recording.command:record", "Record everything of the fleet to MCAP, until Ctrl-C."),
     "replay": ("fleet.replay.command:replay", "Open a recorded session in Rerun."),
     "demo": ("fleet.demo:demo", "Three simulated cars do a job, recorded and checked."),
@@ -87,7 +91,8 @@ def main() -> None:
         sys.stderr.write(f"fleet: {_one_line(error)} (see {where} --help)\n")
         code = error.exit_code
     except click.ClickException as error:
-        sys.stderr.write(f"fleet: {_one_line(error)}\n")
+        several = "\n" in error.message  # the faults of a file, one a line
+        sys.stderr.write(f"{error.message}\n" if several else f"fleet: {_one_line(error)}\n")
         code = error.exit_code
     except click.Abort:
         code = 130

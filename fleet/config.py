@@ -21,7 +21,7 @@ from fleet.config_fields import (
     LimitsEntry,
 )
 from fleet.faults import Where, meant, shown
-from fleet.links import BadLink, Link, parse_link
+from fleet.links import BadLink, Link, LinkKind, parse_link
 from fleet.marked import Document, read_text
 from gateway.protocol.profile import AUTO, Platform, parse_platform, parse_told
 
@@ -192,6 +192,9 @@ def _car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, An
         at = next(where for (where, _), there in zip(layers, said, strict=True) if there)
         yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}: it is at most that"
     platform, given = merged.get("platform", AUTO), merged.get("capabilities")
+    if car.get("link") == LinkKind.SIMULATED and str(platform).partition("+")[0] in (AUTO, Platform.UNKNOWN):
+        kinds = ", ".join(kind for kind in Platform if kind is not Platform.UNKNOWN)
+        yield ("cars", name, "platform"), f"a simulated car is of some platform: {kinds}, with +arm, +imu"
     if not isinstance(platform, str) or not isinstance(given, list):
         return
     try:

@@ -28,11 +28,13 @@ class BatteryAction(StrEnum):
     STOP = "stop"
 
 
-def _checked_name(name: str) -> str:
+def checked_name(name: str) -> str:
+    """A car's, type's, role's or fleet's name; else ValueError."""
     return keys.check_name(name, "name")
 
 
-def _checked_link(text: str) -> str:
+def checked_link(text: str) -> str:
+    """A link's text, which parse_link takes; else ValueError."""
     try:
         parse_link(text)
     except BadLink as error:
@@ -40,12 +42,14 @@ def _checked_link(text: str) -> str:
     return text
 
 
-def _checked_platform(text: str) -> str:
+def checked_platform(text: str) -> str:
+    """A platform's words, auto among them; else ValueError."""
     parse_told(text)
     return text
 
 
-def _checked_endpoint(text: str) -> str:
+def checked_endpoint(text: str) -> str:
+    """The bus's endpoint; else ValueError."""
     return bus.resolve_endpoint(text) if text else _bad_endpoint()
 
 
@@ -53,7 +57,8 @@ def _bad_endpoint() -> str:
     raise ValueError("'' is not allowed: write tcp/HOST:PORT, or leave it out")
 
 
-def _checked_colour(text: str) -> str:
+def checked_colour(text: str) -> str:
+    """A colour as #rrggbb, in small letters; else ValueError."""
     if len(text) != 7 or text[0] != "#" or set(text[1:].lower()) - set("0123456789abcdef"):
         raise ValueError(
             f'{shown(text)} is not allowed: a colour in quotes as "#e01b24", red, green and blue from 00 to ff'
@@ -61,7 +66,8 @@ def _checked_colour(text: str) -> str:
     return text.lower()
 
 
-def _checked_path(text: str) -> str:
+def checked_path(text: str) -> str:
+    """A path's text; else ValueError."""
     if not text or not text.isprintable():
         raise ValueError(f"{shown(text)} is not allowed: a path, from the place of this file")
     return text
@@ -72,13 +78,11 @@ CAPABILITIES: Final = tuple(sorted(PARTS | set(Mode)))
 Capability = StrEnum("Capability", {word: word for word in CAPABILITIES})  # type: ignore[misc]  # the words are the platforms' own
 _PLATFORMS: Final = f"^({'|'.join((AUTO, *Platform))})([+]({'|'.join(sorted(OPTIONS))}))*$"
 
-_Name = Annotated[
-    str, AfterValidator(_checked_name), Field(json_schema_extra={"pattern": "^[a-z0-9][a-z0-9_-]{0,31}$"})
-]
-_Link = Annotated[str, AfterValidator(_checked_link), Field(examples=["/dev/ttyUSB0", "tcp://192.168.1.7:8888"])]
-_Platform = Annotated[str, AfterValidator(_checked_platform), Field(json_schema_extra={"pattern": _PLATFORMS})]
-_Colour = Annotated[str, AfterValidator(_checked_colour), Field(json_schema_extra={"pattern": "^#[0-9a-fA-F]{6}$"})]
-_Path = Annotated[str, AfterValidator(_checked_path)]
+_Name = Annotated[str, AfterValidator(checked_name), Field(json_schema_extra={"pattern": "^[a-z0-9][a-z0-9_-]{0,31}$"})]
+_Link = Annotated[str, AfterValidator(checked_link), Field(examples=["/dev/ttyUSB0", "tcp://192.168.1.7:8888"])]
+_Platform = Annotated[str, AfterValidator(checked_platform), Field(json_schema_extra={"pattern": _PLATFORMS})]
+_Colour = Annotated[str, AfterValidator(checked_colour), Field(json_schema_extra={"pattern": "^#[0-9a-fA-F]{6}$"})]
+_Path = Annotated[str, AfterValidator(checked_path)]
 _Volts = Annotated[float, Field(ge=EMPTY_V, le=FULL_V)]
 
 
@@ -119,7 +123,7 @@ class FileEntry(Entry):
     """A fleet of cars, for `fleet up`."""
 
     name: _Name = Field(default=keys.DEFAULT_FLEET, description="the first part of every key")
-    endpoint: Annotated[str, AfterValidator(_checked_endpoint)] = Field(
+    endpoint: Annotated[str, AfterValidator(checked_endpoint)] = Field(
         default_factory=str, description="the bus, tcp/HOST:PORT; left out: FLEET_ENDPOINT, or loopback"
     )
     plan: _Path = Field(default_factory=str, description="what the fleet should do, a file")

@@ -1,6 +1,7 @@
 """What a fleet file may give as a link, and which links are one and the same port. Opens and asks nothing.
 
-The words are those of `gateway run --link`; a test holds the two together, since nothing of fleet imports gateway.link.
+The words are those of `gateway run --link`, and `sim`, a car that `fleet up` simulates. A test holds the two together,
+since nothing of fleet imports gateway.link.
 """
 
 import ipaddress
@@ -14,7 +15,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 ALLOWED: Final = (
     "allowed are /dev/ttyUSB0 or COM3 (also as serial:///dev/ttyUSB0?baud=9600), "
     "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://HOST:PORT, "
-    "ble://AA:BB:CC:DD:EE:FF (macOS: a UUID), ble://name=BT04; `gateway scan` shows them"
+    "ble://AA:BB:CC:DD:EE:FF (macOS: a UUID), ble://name=BT04 (`gateway scan` shows them), or sim"
 )
 _WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
 _USB_ID: Final = re.compile(r"(?:0[xX])?([0-9a-fA-F]{4})")
@@ -32,6 +33,7 @@ class LinkKind(StrEnum):
     USB = "usb"
     TCP = "tcp"
     BLE = "ble"
+    SIMULATED = "sim"
 
 
 class BadLink(ValueError):
@@ -51,7 +53,7 @@ class Link:
 
     def may_be(self, other: "Link") -> bool:
         """Whether both can be one port: the same device behind two paths, or one USB device described twice."""
-        if self.kind is not other.kind:
+        if self.kind is not other.kind or self.kind is LinkKind.SIMULATED:
             return False
         if self.kind is LinkKind.DEVICE:
             return _real(self.where) == _real(other.where)
@@ -64,6 +66,8 @@ def parse_link(text: str) -> Link:
     """The link that a text names; raises BadLink."""
     if not text.isprintable():
         raise BadLink("it has characters that cannot be printed")
+    if text == LinkKind.SIMULATED:
+        return Link(LinkKind.SIMULATED)
     if text.startswith("/") or _WINDOWS_PORT.fullmatch(text):
         return Link(LinkKind.DEVICE, text)
     if text[:6].lower() == "ble://":

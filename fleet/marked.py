@@ -100,7 +100,7 @@ class Document:
         self.source = source
         self._problems: list[Problem] = []
         self._faulty: set[Where] = set()
-        self._places: dict[Where, tuple[yaml.Mark | None, yaml.Mark]] = {}
+        self._places: dict[Where, tuple[yaml.Mark | None, yaml.Node]] = {}
         self._values = 0
         if len(text.encode(errors="surrogatepass")) > LARGEST_BYTES:
             raise BadFile(source, [_too_large()])
@@ -139,9 +139,9 @@ class Document:
         if self._problems:
             raise BadFile(self.source, self._problems)
 
-    def line(self, where: Where) -> int:
-        """The line in which a value, or the key that it belongs to, begins; from 1."""
-        return self._mark(where, on_key=True)[1].line + 1
+    def node(self, where: Where) -> yaml.Node | None:
+        """What stands at a place, with its marks: for who edits the text and leaves the rest of it as it is."""
+        return self._places[where][1] if where in self._places else None
 
     def _note(self, error: ValidationError, model: type[BaseModel]) -> None:
         schema = model.model_json_schema()
@@ -171,20 +171,20 @@ class Document:
             where = (*where, loc[-1])
         return where, bool(loc) and loc[-1] == "[key]"
 
-    def _mark(self, where: Where, *, on_key: bool) -> tuple[Where, yaml.Mark]:
+    def _mark(self, where: Where, *, on_key: bool) -> yaml.Mark:
         there = where
         while there not in self._places:
             there = there[:-1]
-        key, value = self._places[there]
-        return there, key if key is not None and (on_key or there != where) else value
+        key, node = self._places[there]
+        return key if key is not None and (on_key or there != where) else node.start_mark
 
     def _problem(self, where: Where, words: str, *, on_key: bool) -> Problem:
-        mark = self._mark(where, on_key=on_key)[1]
+        mark = self._mark(where, on_key=on_key)
         return Problem(mark.line + 1, mark.column + 1, spelled(where), words)
 
     def _value(self, where: Where, key: yaml.Mark | None, node: yaml.Node) -> Any:
         """Plain data, each alias written out; raises BadFile for more of it than is allowed."""
-        self._places[where] = (key, node.start_mark)
+        self._places[where] = (key, node)
         self._values += 1
         if self._values > MOST_VALUES or len(where) > DEEPEST:
             much = f"nested more than {DEEPEST} deep" if len(where) > DEEPEST else f"more than {MOST_VALUES} values"

@@ -1,0 +1,146 @@
+"""`fleet bind`: which car is at which link. Each unknown link's car blinks and beeps, and a person says which it was.
+
+For each link one gateway runs for a moment, under a name of its own; no car moves.
+"""
+
+import contextlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import click
+
+from fleet.client import Fleet
+from fleet.commands.common import explained, sigterm_interrupts
+from fleet.commands.config import file_argument, link_option, look_for, prompt_name, read, seconds_option, tell, write
+from fleet.config import FleetFile
+from fleet.config_fields import checked_link
+from fleet.edit import CannotEdit, with_link
+from fleet.found import Found
+from fleet.links import LinkKind, parse_link
+from fleet.marked import BadFile, read_text
+
+_READY_S: Final = 15.0
+"""A gateway starts in one, and brings a car of an unknown platform to a known state within six."""
+_END_S: Final = 15.0
+"""As systemd is told: a stop's whole recipe, its worst case, and a second."""
+_LOOK_S: Final = 0.1
+_AGAIN: Final = "again"
+_NONE: Final = "-"
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet bind
+  fleet bind lab.yaml --link /dev/ttyUSB0
+
+A TCP car is named by its address: write that into the file."""
+)
+@file_argument
+@link_option
+@seconds_option
+@click.option("--connect", metavar="ENDPOINT", help="The bus (default: the file's, FLEET_ENDPOINT, or loopback).")
+def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str | None) -> None:
+    """Find out which car is at which link: each blinks and beeps, you say which it was, and the file has it."""
+    with explained():
+        for link in links:
+            checked_link(link)
+    fleet = read(file, unbound=True)
+    found = [each for each in look_for(links, seconds) if each.verdict != "busy" and _unknown(each, fleet)]
+    if not found:
+        raise click.ClickException(
+            "there is no link that may be a car's and is no car's in the file: see what `gateway scan` shows"
+        )
+    with explained(), sigterm_interrupts(), Fleet(connect or fleet.endpoint, fleet.name, start_hub=True) as client:
+        for number, each in enumerate(found, 1):
+            click.echo(f"\n{number} of {len(found)}: {each.url}\n  {each.words}")
+            with _gateway(client, f"bind-{number}", each.url) as name:
+                if name is None:
+                    continue
+                car = _which(client, name, file)
+            if car != _NONE:
+                _write(file, car, each.url)
+    left = read(file, unbound=True).unbound
+    if left:
+        click.echo(f"still without a link: {', '.join(left)}")
+    raise SystemExit(1 if left else 0)
+
+
+def _unknown(found: Found, fleet: FleetFile) -> bool:
+    link = parse_link(found.url)
+    return link.kind is not LinkKind.TCP and not any(link.may_be(parse_link(car.link)) for car in fleet.cars.values())
+
+
+@contextlib.contextmanager
+def _gateway(client: Fleet, name: str, link: str) -> Iterator[str | None]:
+    """A gateway for this link while it lasts, its car in a known state if there is one; None if it did not come up."""
+    with tempfile.TemporaryDirectory() as directory, (Path(directory) / "log").open("w+", encoding="utf-8") as log:
+        command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, "--with-parent"]
+        command += ["--fleet", client.name, "--connect", client.bus.endpoint, "--state-dir", directory]
+        # A session of its own: Ctrl-C at the terminal reaches only us, and we let it stop its car.
+        gateway = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        try:
+            yield name if _ready(client, name, gateway, log.name) else None
+        finally:
+            gateway.terminate()
+            try:
+                gateway.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                gateway.kill()
+                gateway.wait()
+
+
+def _ready(client: Fleet, name: str, gateway: "subprocess.Popen[bytes]", log: str) -> bool:
+    """Wait until the gateway serves, and its car is known to stand; a silent car is not waited for longer."""
+    deadline, served = time.monotonic() + _READY_S, False
+    while time.monotonic() < deadline:
+        if gateway.poll() is not None:
+            said = Path(log).read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            click.echo(f"  {said[-1] if said else 'its gateway ended'}", err=True)
+            return False
+        states = client.get(f"{name}/state/safety")
+        served = served or bool(states)
+        if any(each.value.motors == "off" for each in states):
+            return True
+        time.sleep(_LOOK_S)
+    if not served:
+        click.echo("  its gateway did not come up", err=True)
+    return served
+
+
+def _which(client: Fleet, name: str, file: Path) -> str:
+    """Let the car blink until somebody says which it is: a name, or `-`."""
+    while True:
+        outcome = client.car(name).find()
+        if not outcome.ok:
+            click.echo(f"  it could not blink: {outcome.words or outcome.reason or outcome.phase}", err=True)
+            return _NONE
+        fleet = read(file, unbound=True)
+        listed = ", ".join([*fleet.unbound, *(car for car in fleet.cars if car not in fleet.unbound)])
+        first = fleet.unbound[0] if len(fleet.unbound) == 1 else None
+        words = f"  Which car blinked? ({listed}, a new name, {_AGAIN}, {_NONE} for none)"
+        answer = prompt_name(words, first, set())
+        if answer == _AGAIN:
+            continue
+        if answer in fleet.cars:
+            there = fleet.cars[answer].link
+            if not click.confirm(f"  {answer} has the link {there}. Give it this one?"):
+                continue
+        return answer
+
+
+def _write(file: Path, car: str, link: str) -> None:
+    """Write the link into the file as it is now."""
+    try:
+        write(file, with_link(read_text(file), file, car, link))
+    except BadFile as error:
+        tell(error)
+        raise SystemExit(1) from None
+    except CannotEdit as error:
+        raise click.ClickException(str(error)) from None
+    click.echo(f"  {file}: {car} is at {link}")
