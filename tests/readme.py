@@ -7,7 +7,7 @@ from pathlib import Path
 
 from google.protobuf.descriptor import FieldDescriptor
 
-from gateway.control.controller import STALL_S
+from gateway.control.evidence import STALL_S
 from gateway.control.recipes import REPEAT_S
 from gateway.control.senders import PAUSE_S, SENDER_GONE_S
 from gateway.requests import LONGEST_DRIVE_S

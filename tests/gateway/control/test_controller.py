@@ -4,7 +4,6 @@ import random
 
 import pytest
 
-from gateway.control.controller import PATIENCE_S
 from gateway.control.records import (
     Act,
     ChangeSpeed,
@@ -22,6 +21,7 @@ from gateway.control.records import (
     Why,
 )
 from gateway.control.safety import Hold, Kept
+from gateway.control.waiting import PATIENCE_S
 from gateway.protocol.encode import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from tests.gateway.control.desk import BACK, COORDINATOR, MODE00, PERSON, RUN, SCRIPT, STOP, TRACKING, Desk
