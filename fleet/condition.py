@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 from fleet.expression import BadExpression, Expression, contradictory, fields_of, parse, value_in
+from fleet.expression.fields import LAST
 from fleet.readings import Reading
 from schemas import keys, messages, topics
 from schemas.bus import intersects
@@ -48,7 +49,8 @@ class Condition:
                 if len(names) == 1:
                     raise
         if not found:
-            parse(text, {name: kind for fields in names.values() for name, kind in fields.items()})
+            every = {name: kind for fields in names.values() for name, kind in fields.items()}
+            parse(text, {name: every[name] for name in sorted(every, key=LAST.__contains__)})
             raise BadExpression(text, 1, f"no message under {written} has all of its fields: it is about one message")
         if all(contradictory(expression) for expression in found.values()):
             raise BadExpression(text, 1, "it can never be true")

@@ -28,13 +28,14 @@ def selector(written: str, *, last: int | None = None, since_s: float | None = N
 def shortfalls(
     readings: Iterable[Reading], now: datetime, *, last: int | None = None, since_s: float | None = None
 ) -> list[str]:
-    """For each key of which less came than was asked (readings sorted by key), why, as far as it is known."""
-    said = []
+    """For each key (readings sorted by key) of which less came than was asked, why, if it is known; states at once."""
+    said, states = [], 0
     for key, group in itertools.groupby(readings, key=lambda reading: reading.key):
         found, topic = list(group), topics.of_key(key)
-        if topic is None:
+        if topic is None or topic.kept <= 1:
+            states += topic is not None
             continue
-        keeps = f"its gateway keeps {f'the last {topic.kept}' if topic.kept > 1 else 'only the latest of a state'}"
+        keeps = f"its gateway keeps the last {topic.kept}"
         oldest_s = found[0].age_s(now)
         full = len(found) >= topic.kept
         if since_s is not None:
@@ -43,6 +44,8 @@ def shortfalls(
         elif last is not None and len(found) < last:
             more = keeps if full else "its gateway has had no more"
             said.append(f"{key}: {len(found)} of {last}, {more}")
+    if states and last != 1:
+        said.append("of states gateways keep only the latest; a recording has all (fleet record)")
     return said
 
 

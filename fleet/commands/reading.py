@@ -131,7 +131,7 @@ def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: 
 
 def _tell(words: Sequence[str]) -> None:
     """Say why there is less than was asked, for a few keys."""
-    more = [f"and {len(words) - _TOLD} other keys likewise"] if len(words) > _TOLD + 1 else words[_TOLD : _TOLD + 1]
+    more = [f"and {len(words) - _TOLD} more likewise"] if len(words) > _TOLD + 1 else words[_TOLD : _TOLD + 1]
     for each in (*words[:_TOLD], *more):
         click.echo(f"fleet: {each}", err=True)
 

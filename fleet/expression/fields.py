@@ -18,7 +18,7 @@ _TYPES: Final[Mapping[int, type]] = {
     FieldDescriptor.CPPTYPE_STRING: str,
     FieldDescriptor.CPPTYPE_ENUM: str,
 }
-_LAST: Final = ("car", "seq", "boot_id")
+LAST: Final = ("car", "seq", "boot_id")
 """Every message has them; few ask for them."""
 
 
@@ -29,7 +29,7 @@ def fields_of(message_class: type[Message]) -> Mapping[str, type]:
     repeated only whether there is any (`estops`). An enum is a word. Times and bytes cannot be compared.
     """
     found = dict(_fields(message_class.DESCRIPTOR))
-    return MappingProxyType({name: found[name] for name in sorted(found, key=_LAST.__contains__)})
+    return MappingProxyType({name: found[name] for name in sorted(found, key=LAST.__contains__)})
 
 
 def value_in(message: Message) -> Callable[[str], object | None]:

@@ -217,9 +217,9 @@ class _Parser:
             self._fail(token, f"a field or a value is missing here, before {token.text}")
         near = difflib.get_close_matches(token.text, [*self._names, *_KEYWORDS], n=2)
         meant = f"did you mean {' or '.join(near)}? " if near else ""
-        raise self._wrong(
-            token, f"there is no {token.text}: {meant}{self._there_are()}; words are quoted, as '{token.text}'"
-        )
+        compared = self._at > 1 and self._tokens[self._at - 2].text in tuple(Op)
+        quoted = f"; a word is quoted, as '{token.text}'" if compared else ""
+        raise self._wrong(token, f"there is no {token.text}: {meant}{self._there_are()}{quoted}")
 
     def _there_are(self) -> str:
         listed = list(self._names)
