@@ -1,0 +1,97 @@
+"""What deploy/ offers: read by our own eyes, and by the tools whose files they are where this computer has them."""
+
+import configparser
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fleet.commands.config import schema_text
+from fleet.config import read_fleet
+from gateway.control.recipes import CONFIRM_S, UNKNOWN
+
+DEPLOY = Path(__file__).parent.parent.parent / "deploy"
+FILES = sorted(DEPLOY.glob("fleet.*.yaml"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_a_fleet_file_is_one(path: Path) -> None:
+    fleet = read_fleet(path)
+    assert len(fleet.cars) >= 3
+    assert path.read_text().startswith("# yaml-language-server: $schema=fleet.schema.json\n")
+    links = {name: car.link.partition(":")[0] for name, car in fleet.cars.items()}
+    wanted = {"sim": {"sim"}, "bluetooth": {"ble"}, "mixed": {"serial", "tcp", "ble", "/dev/fleet/green"}}
+    assert set(links.values()) == wanted[path.name.split(".")[1]]
+
+
+def test_there_is_one_for_each_start() -> None:
+    assert [path.name for path in FILES] == ["fleet.bluetooth.yaml", "fleet.mixed.yaml", "fleet.sim.yaml"]
+
+
+def test_the_schema_is_up_to_date() -> None:
+    assert (DEPLOY / "fleet.schema.json").read_text(encoding="utf-8") == schema_text(), (
+        "fleet schema > deploy/fleet.schema.json"
+    )
+
+
+_PART = re.compile(r'(?P<key>[A-Z]+(?:\{[A-Za-z0-9_]+\})?)(?P<op>==|!=|\+=|-=|:=|=)"(?P<value>[^"]*)"')
+_MATCHED = {"SUBSYSTEM", "ENV{ID_BUS}", "ENV{ID_VENDOR_ID}", "ENV{ID_SERIAL_SHORT}", "ENV{ID_PATH}"}
+_SET = {"ENV{ID_MM_PORT_IGNORE}", "GROUP", "MODE", "TAG", "SYMLINK"}
+
+
+def test_udev_rules_give_each_car_a_name_of_its_own() -> None:
+    rules = DEPLOY / "70-fleet-cars.rules"
+    names = []
+    for line in rules.read_text(encoding="ascii").splitlines():
+        if not line or line.startswith("#"):
+            continue
+        parts = [_PART.fullmatch(part) for part in line.split(", ")]
+        assert all(parts), line
+        found = [(part["key"], part["op"], part["value"]) for part in parts if part is not None]
+        for key, operator, _ in found:
+            assert key in (_MATCHED if operator == "==" else _SET), line
+        assert ("SUBSYSTEM", "==", "tty") in found
+        assert any(operator == "==" and key.startswith("ENV{ID_") for key, operator, _ in found), line
+        names += [value for key, operator, value in found if (key, operator) == ("SYMLINK", "+=")]
+    assert names == ["fleet/red", "fleet/green"]
+    assert f"/dev/{names[1]}" in (DEPLOY / "fleet.mixed.yaml").read_text()
+    # 60-serial.rules must have told the ids before, 73-seat-late.rules acts on the tag after.
+    assert "60" < rules.name[:2] < "73"
+    udevadm = shutil.which("udevadm")
+    knows = udevadm and not subprocess.run([udevadm, "verify", "--help"], check=False, capture_output=True).returncode
+    if udevadm and knows:  # systemd 254 and later
+        subprocess.run([udevadm, "verify", str(rules)], check=True)
+
+
+class _Unit(configparser.ConfigParser):
+    def optionxform(self, optionstr: str) -> str:
+        return optionstr
+
+
+def test_the_unit_gives_cars_the_time_to_stop(tmp_path: Path) -> None:
+    path = DEPLOY / "fleet.service"
+    unit = _Unit(interpolation=None, delimiters=("=",))
+    unit.read(path)
+    assert unit.sections() == ["Unit", "Service", "Install"]
+    service = unit["Service"]
+    assert (service["Restart"], service["KillMode"], service["KillSignal"]) == ("on-failure", "mixed", "SIGINT")
+    assert int(service["TimeoutStopSec"]) >= max(15, UNKNOWN.length_s + CONFIRM_S)
+    assert re.fullmatch(r"/usr/bin/env %h/\S+/\.venv/bin/fleet up fleet\.yaml", service["ExecStart"])
+    assert unit["Install"]["WantedBy"] == "default.target"  # of a user's systemd: multi-user.target is the system's
+    verifier = shutil.which("systemd-analyze")
+    if verifier:
+        # It looks whether the program is there: this one is, at the home of whoever runs the test.
+        home, runtime = tmp_path / "home", tmp_path / "run"
+        program = home / "zenoh-car-fleet" / ".venv" / "bin" / "fleet"
+        (home / ".config" / "fleet").mkdir(parents=True)
+        program.parent.mkdir(parents=True)
+        program.symlink_to("/bin/true")
+        runtime.mkdir()
+        environment = os.environ | {"HOME": str(home), "XDG_RUNTIME_DIR": str(runtime)}
+        done = subprocess.run(
+            [verifier, "verify", "--user", str(path)], check=False, capture_output=True, text=True, env=environment
+        )
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")  # an unknown key only prints

@@ -1,0 +1,123 @@
+"""Files that people write: every fault at once, each at its line and column; and what would harm a reader refused."""
+
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from pydantic import Field
+
+from fleet.marked import LARGEST_BYTES, BadFile, Entry, read_marked, read_text
+
+
+class Wheel(Entry):
+    size_m: float = Field(default=1.0, gt=0, le=10)
+    spokes: int = Field(default=8, ge=1)
+
+
+class Wagon(Entry):
+    wheels: dict[str, Wheel] = Field(description="at least one wheel")
+    mode: Literal["slow", "fast"] = "slow"
+    flag: bool = False
+    spare: Wheel | list[Wheel] | None = None
+    names: list[str] = Field(default_factory=list)
+
+
+def _faults(text: str) -> list[str]:
+    with pytest.raises(BadFile) as caught:
+        read_marked(text, "f.yaml", Wagon)
+    return str(caught.value).splitlines()
+
+
+def test_all_faults_are_told_at_once_each_in_its_place() -> None:
+    text = "wheels:\n  a: {size_m: 12, spokes: 1.5, rim: 3}\n  b: 3\nmode: fats\nflg: true\nnames: [x, 7]\n"
+    assert _faults(text) == [
+        "f.yaml:2:15: wheels.a.size_m: 12 is not allowed: a number, more than 0 and at most 10",
+        "f.yaml:2:27: wheels.a.spokes: 1.5 is not allowed: a whole number, at least 1",
+        "f.yaml:2:32: wheels.a.rim: there is no such field here: allowed are size_m, spokes",
+        "f.yaml:3:6: wheels.b: 3 is not allowed: fields, `name: value`",
+        "f.yaml:4:7: mode: 'fats' is not allowed: one of slow, fast; did you mean 'fast'?",
+        "f.yaml:5:1: flg: there is no such field here: allowed are flag, mode, names, spare, wheels"
+        "; did you mean 'flag'?",
+        "f.yaml:6:12: names[1]: 7 is not allowed: text (write it in quotes)",
+    ]
+
+
+def test_yaml_is_that_of_1_2() -> None:
+    wagon = read_marked("wheels: {on: {}, no: {}}\nnames: [11:22:33:44:55:10, off, 1_000]", "f", Wagon)
+    assert list(wagon.wheels) == ["on", "no"]
+    assert wagon.names == ["11:22:33:44:55:10", "off", "1_000"]
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "words"),
+    [
+        ("", "1:1", "is empty"),
+        ("# nothing but words\n", "1:1", "is empty"),
+        ("wheels:\n\ta: 1", "2:1", "a tab"),
+        ("wheels: {a: {}\n", "2:1", "is no YAML"),
+        ("- 1", "1:1", "a list is not allowed: fields"),
+        ("--- {}\n--- {}", "2:1", "a second document"),
+        ("wheels: {}\nwheels: {}", "2:1", "wheels: is given twice, first in line 1"),
+        ("wheels: {a: {spokes: 2, spokes: 3}}", "1:25", "wheels.a.spokes: is given twice"),
+        ("mode: fast", "1:1", "wheels: is missing: at least one wheel"),
+        ("wheels:", "1:8", "wheels: has no value: fields"),
+        ("wheels: {1: {}}", "1:10", "key '1' is no word"),
+        ("wheels: {[a]: {}}", "1:10", "is no word"),
+        ("wheels: {a: {size_m: .nan}}", "1:22", "no finite number"),
+        ("wheels: {a: {size_m: 1e999}}", "1:22", "no finite number"),
+        ("wheels: {a: {size_m: true}}", "1:22", "true is not allowed: a number"),
+        ("wheels: {a: {spokes: '8'}}", "1:22", "'8' is not allowed: a whole number"),
+        ("wheels: {a: {spokes: " + "9" * 5000 + "}}", "1:22", "too long a number"),
+        ("wheels: {a: {spokes: " + "9" * 50 + "}}", "1:22", "too large a number"),
+        ("wheels: !!python/object:os.system {a: {}}", "1:9", "the tag"),
+        ("wheels: {}\nmode: !secret x", "2:7", "the tag '!secret' is not allowed"),
+        ("wheels: {}\nnames: ['\x01']", "2:10", "U+0001"),
+        ('wheels: {}\nnames: ["\\ud800"]', "2:9", "half a character"),
+        ("wheels: *nobody", "1:9", "undefined alias"),
+        ("spare: {spokes: 0}\nwheels: {}", "1:17", "spare.spokes: 0 is not allowed: a whole number, at least 1"),
+    ],
+)
+def test_one_fault(text: str, place: str, words: str) -> None:
+    (line,) = _faults(text)
+    assert line.startswith(f"f.yaml:{place}: ")
+    assert words in line
+
+
+BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (BOMB, "more than 20000 values"),
+        ("wheels: &a [*a]", "nested more than"),
+        ("wheels: " + "[" * 100_000, "nested more than"),
+        ("wheels: " + "{a: " * 20_000, "nested more than"),
+        ("#" * LARGEST_BYTES + "\nwheels: {}", "more than 256 KiB"),
+    ],
+    ids=["aliases", "a circle", "brackets", "mappings", "size"],
+)
+def test_a_bomb_is_a_fault(text: str, words: str) -> None:
+    (line,) = _faults(text)
+    assert words in line
+
+
+def test_no_more_faults_are_told_than_somebody_reads() -> None:
+    lines = _faults("wheels: {" + ", ".join(f"w{number}: 1" for number in range(80)) + "}")
+    assert len(lines) == 51
+    assert lines[-1] == "f.yaml: and 30 more"
+
+
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_bytes(b"wheels: {}\nmode: caf\xe9\n")
+    with pytest.raises(BadFile, match=r"f\.yaml:2:10: byte 0xe9 is no UTF-8"):
+        read_text(path)
+    with pytest.raises(BadFile, match="cannot be read: No such file"):
+        read_text(tmp_path / "other.yaml")
+    with pytest.raises(BadFile, match="cannot be read: Is a directory"):
+        read_text(tmp_path)
+    path.write_bytes("\ufeffmode: fast\nwheels: {}".encode())
+    assert read_marked(read_text(path), "f", Wagon).mode == "fast"
