@@ -21,7 +21,9 @@ SHARE: Final = 10.0
 """Drawing takes at most a tenth of the time: a hundred rows take 50 ms."""
 _LINK: Final = {"online": "green", "quiet": "green", "stale": "yellow", "lost": "red"}
 _VERDICT: Final = {"confirmed": "green", "contradicted": "red"}
-_COLUMNS: Final = ("car", "link", "mode", "motion", "hold, e-stop", "lease", "battery", "frames/s", "last event")
+_COLUMNS: Final = ("car", "link", "mode", "motion", "held, driven by", "battery", "Hz", "last event")
+_WHOLE: Final = frozenset({"car", "link", "motion", "battery", "Hz"})
+"""What is not cut in a narrow terminal."""
 
 
 class Table:
@@ -56,7 +58,14 @@ class Table:
 
     def rendered(self) -> Group:
         """The table, and under it the processes that are not as they should be."""
-        grid = Grid(*_COLUMNS, box=None, pad_edge=False, header_style="bold")
+        grid = Grid(box=None, pad_edge=False, header_style="bold", expand=True)
+        for column in _COLUMNS:
+            grid.add_column(
+                column,
+                no_wrap=column in _WHOLE,
+                ratio=1 if column == "last event" else None,
+                min_width=16 if column == "last event" else None,
+            )
         for name, row in self._supervisor.rows.items():
             process = self._supervisor.crew.get(name)
             running = process is not None and process.ward.state is State.RUNNING
@@ -83,15 +92,14 @@ class Table:
 
 def _cells(row: Row, process: str) -> list[Text]:
     link = process if process or not row.link else row.link
-    held = f"e-stop {row.estop}" if row.estop else row.hold
+    held = f"e-stop {row.estop}" if row.estop else f"hold {row.hold}" if row.hold else ""
     rate = "" if row.rate_hz is None else f"{row.rate_hz:.1f}"
     return [
         Text(row.car, "bold"),
         Text(link, _LINK.get(link, "yellow")),
         Text.assemble(row.mode, " ", (row.verdict, _VERDICT.get(row.verdict, ""))),
         Text(row.motion),
-        Text(held, "red" if held else ""),
-        Text(row.lease),
+        Text(held or row.lease, "red" if held else ""),
         Text(row.battery, "red" if row.battery.endswith(("low", "critical")) else ""),
         Text(rate, justify="right"),
         Text(row.event, overflow="ellipsis", no_wrap=True),

@@ -1,0 +1,308 @@
+"""`fleet up` with real processes: what dies or hangs is started again, what is off is not, and the end is orderly."""
+
+import json
+import os
+import pty
+import signal
+import socket
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from schemas import bus
+from tests.support.ports import free_endpoint
+from tests.support.processes import PATIENCE_S, Fleet, driving, wait_for
+from tests.support.up import Up
+
+pytestmark = pytest.mark.xdist_group("up")
+
+
+@pytest.fixture(scope="module")
+def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
+    """Two simulated cars, which need nothing but the clone."""
+    with Up(tmp_path_factory.mktemp("up"), free_endpoint(), "--sim", "2") as started:
+        for name in ("@hub", "@recorder", "@simulator", "red", "green"):
+            started.running(name)
+        yield started
+
+
+@pytest.mark.parametrize("name", ["@hub", "@recorder", "@simulator", "red"])
+def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) -> None:
+    before = {each.name: each.pid for each in up.status().processes}
+    os.kill(up.running(name), signal.SIGKILL)
+    up.running(name, but=before[name])
+    state = up.state(name)
+    assert state.words == "was ended by signal 9" or state.state == "elsewhere"
+    after = {each.name: each.pid for each in up.status().processes}
+    assert {other for other in before if other != name and before[other] != after[other]} == set()
+    for car in ("red", "green"):
+        up.ready(car)
+
+
+@pytest.mark.parametrize("name", ["green", "@simulator", "@recorder"])
+def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
+    pid = up.running(name)
+    os.kill(pid, signal.SIGSTOP)
+    wait_for(lambda: not _exists(pid), f"{name} is killed")
+    up.running(name, but=pid)
+    assert up.state(name).words.startswith("hung: not heard for")
+    for car in ("red", "green"):
+        up.ready(car)
+
+
+def test_a_hub_that_hangs_is_replaced_by_ours_or_by_a_gateways(tmp_path: Path) -> None:
+    with Up(tmp_path, free_endpoint(), "--sim", "1", "--no-record") as started:
+        started.ready("red")
+        hub, red = started.running("@hub"), started.running("red")
+        os.kill(hub, signal.SIGSTOP)
+        wait_for(lambda: not _exists(hub), "it is killed")
+        started.running("@hub", but=hub)
+        started.ready("red")
+        assert started.running("red") == red
+
+
+def test_one_that_sleeps_itself_blames_nobody(up: Up) -> None:
+    before = {each.name: up.running(each.name) for each in up.status().processes}
+    os.kill(up.process.pid, signal.SIGSTOP)
+    try:
+        began = time.monotonic()
+        seen: list[object] = []
+        up.bus.subscribe("fleet/*/state/health", seen.append)
+        wait_for(lambda: time.monotonic() - began > 6 and seen, "the cars go on")
+    finally:
+        os.kill(up.process.pid, signal.SIGCONT)
+    wait_for(lambda: up.status() is not None, "it answers again")
+    assert {each.name: up.running(each.name) for each in up.status().processes} == before
+
+
+def test_a_second_one_refuses_and_names_the_first(up: Up) -> None:
+    second = up.fleet("up", "--sim", "1", "--no-record")
+    assert second.returncode == 1
+    assert second.stderr.startswith(f"fleet: fleet fleet is up already: process {up.process.pid} on ")
+    assert second.stderr.count("\n") == 1
+
+
+def test_status_and_logs_say_what_runs(up: Up) -> None:
+    shown = up.fleet("status")
+    assert f"process {up.running('red')}" in shown.stdout
+    told = json.loads(up.fleet("status", "--json").stdout)
+    assert {"@hub", "@recorder", "@simulator", "red", "green"} == {each["name"] for each in told["processes"]}
+    assert "bringing the car to a known state" in up.fleet("logs", "red").stdout
+    assert " simulator | {" in up.fleet("logs", "simulator").stdout
+    wrong = up.fleet("logs", "gren")
+    assert wrong.returncode == 2
+    assert "there are green, " in wrong.stderr
+
+
+def test_a_command_that_is_none_is_refused(up: Up) -> None:
+    for verb, payload, words in (("up", "{}", "allowed are down, reload"), ("down", "{", "is not the JSON")):
+        (answer,) = up.bus.query(f"fleet/@supervisor/@cmd/{verb}?format=json", payload=payload.encode())
+        assert isinstance(answer, bus.Sample)
+        told = json.loads(answer.payload)
+        assert told["status"] == "rejected"
+        assert words in told["words"]
+
+
+def test_reload_of_simulated_cars_has_nothing_to_change(up: Up) -> None:
+    done = up.fleet("reload")
+    assert (done.returncode, done.stdout) == (0, "nothing has changed\n")
+
+
+def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
+    with Up(tmp_path, free_endpoint(), "--sim", "2") as started:
+        for car in ("red", "green"):
+            started.ready(car)
+        assert started.ask("drive", "red", motion="forward", duration_s=10)["status"] == "sent"
+        done = started.fleet("down")
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == "green: stopped\nred: stopped\n"
+        assert started.process.wait() == 0
+        closed = started.until("process", "@recorder", "recording closed")
+        assert closed["words"].endswith(" 0 lost")
+        assert not started.left()
+        gone = started.fleet("status")
+        assert gone.returncode == 1
+        assert "no fleet is running at" in gone.stderr
+        assert "is in a known state" in started.fleet("logs", "red").stdout
+
+
+def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(tmp_path / "state"), "TERM": "xterm"}
+    master, slave = pty.openpty()
+    termios.tcsetwinsize(slave, (40, 160))
+    command = [sys.executable, "-m", "fleet.cli", "up", "--sim", "2", "--out", str(tmp_path / "sessions")]
+    # A session of its own, whose terminal the pty becomes: Ctrl-C is typed, and comes to its foreground group.
+    program = f"import os, fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv({command[0]!r}, {command!r})"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
+        start_new_session=True,
+        env=os.environ | environment,
+    )
+    os.close(slave)
+    shown = bytearray()
+    reader = threading.Thread(target=_read, args=(master, shown))
+    reader.start()
+    try:
+        wait_for(lambda: bus.accepts(endpoint), "it is up")
+        with bus.Bus.open(endpoint) as client:
+            truths: dict[str, bus.Sample] = {}
+            client.subscribe("fleet/*/sim/truth", lambda sample: truths.__setitem__(sample.key.split("/")[1], sample))
+            wait_for(lambda: shown.count(b"is in a known state") >= 2, "the table shows both cars")
+            payload = b'{"motion": "forward", "duration_s": 10}'
+            (answer,) = client.query("fleet/red/@cmd/drive?format=json", payload=payload)
+            assert isinstance(answer, bus.Sample)
+            wait_for(lambda: truths["red"].message().motor_left, "red drives")  # type: ignore[attr-defined]
+            os.write(master, b"\x03")
+            wait_for(lambda: b"Ctrl-C: stopping every car" in shown, "it ends")
+            os.write(master, b"\x03")
+            assert process.wait(PATIENCE_S) == 0
+            reader.join()
+        said = shown.decode()
+        assert "Ctrl-C: is ending already, waits for" in said
+        assert "red: stopped" in said
+        assert "green: stopped" in said
+        assert " 0 lost" in said
+        last = truths["red"].message()
+        assert not last.motor_left  # type: ignore[attr-defined]
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        reader.join()
+
+
+def test_a_car_that_is_off_holds_up_nobody_and_costs_no_restart(fleet: Fleet, tmp_path: Path) -> None:
+    _, (link,) = fleet.simulate("red:arduino:tcp")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        off = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    file = _file(tmp_path, blue=off, red=link)
+    with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
+        started.ready("red")
+        pid = started.running("blue")
+        assert started.get("blue/state/link").state == "lost"
+        late = fleet.start("-m", "gateway.cli", "sim", "--no-truth", "--car", f"blue:arduino:{off}")
+        late.line()
+        started.ready("blue")
+        state = started.state("blue")
+        assert (state.pid, state.restarts) == (pid, 0)
+        assert started.state("@hub").state == "elsewhere"
+
+
+def test_killed_its_cars_are_stopped(fleet: Fleet, tmp_path: Path) -> None:
+    sim, (link,) = fleet.simulate("red:arduino:tcp")
+    with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link))) as started:
+        started.ready("red")
+        assert started.ask("drive", "red", motion="forward", duration_s=10)["status"] == "sent"
+        wait_for(lambda: driving(sim), "red drives")
+        theirs = {each.pid for each in started.status().processes if each.HasField("pid")}
+        began = time.monotonic()
+        started.process.kill()
+        wait_for(lambda: not driving(sim), "red is stopped")
+        assert time.monotonic() - began < 9.0, "it was stopped, its drive did not end by itself"
+        wait_for(lambda: not [pid for pid in theirs if _exists(pid)], "all end")
+
+
+def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: Fleet, tmp_path: Path) -> None:
+    _, links = fleet.simulate("red:arduino:tcp", "green:arduino:tcp", "blue:arduino:tcp")
+    red, green, blue = links
+    file = _file(tmp_path, red=red, green=green)
+    with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
+        before = {car: started.running(car) for car in ("red", "green")}
+        started.ready("green")
+
+        file.write_text("cars:\n  red: {lnk: nowhere}\n  blue: {link: 7}\n")
+        refused = started.fleet("reload")
+        assert refused.returncode == 2
+        assert refused.stderr.startswith("nothing was changed: ")
+        assert "cars.red.lnk" in refused.stderr
+        assert "cars.blue.link" in refused.stderr
+        assert {car: started.running(car) for car in before} == before
+
+        file.write_text(_text(red=red, blue=blue).replace("cars:", "name: lab\ncars:"))
+        done = started.fleet("reload")
+        assert done.returncode == 0, done.stderr
+        assert "the fleet's name cannot be changed while running" in done.stdout
+        assert "blue is added" in done.stdout
+        assert "green is taken out" in done.stdout
+        started.ready("blue")
+        wait_for(lambda: started.state("green") is None, "green's gateway has ended")
+        assert started.running("red") == before["red"]
+
+        file.write_text(_text(red=red, blue=blue).replace("blue: {", "blue: {limits: {longest_drive_s: 3}, "))
+        pid = started.running("blue")
+        assert "blue is begun anew" in started.fleet("reload").stdout
+        started.running("blue", but=pid)
+        started.ready("blue")
+        answer = started.ask("drive", "blue", motion="forward", duration_s=4)
+        assert answer["reason"] == "bad_value"
+        assert started.running("red") == before["red"]
+
+
+def test_a_gateway_that_was_told_something_wrong_is_not_started_over_and_over(fleet: Fleet, tmp_path: Path) -> None:
+    """What the fleet file lets through and the gateway does not is said once."""
+    file = tmp_path / "fleet.yaml"
+    file.write_text("cars:\n  red: {link: 'ble://name=BT04', platform: arduino}\n")
+    with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
+        started.running("red")
+        assert started.state("red").restarts == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "there is no fleet.yaml here: name a file"),
+        (("--sim", "0"), "0 is not in the range 1<=x<=200"),
+        (("none.yaml",), "none.yaml"),
+        (("--sim", "1", "--plan", "none.yaml"), "the plan none.yaml cannot be read"),
+        (("--sim", "1", "--fleet", "Über"), "fleet name"),
+        (("--sim", "1", "--connect", "here"), "endpoint 'here' is not allowed"),
+    ],
+)
+def test_wrong_use_starts_nothing(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
+    command = [sys.executable, "-m", "fleet.cli", "up", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def _file(directory: Path, **links: str) -> Path:
+    path = directory / "fleet.yaml"
+    path.write_text(_text(**links))
+    return path
+
+
+def _text(**links: str) -> str:
+    return "cars:\n" + "".join(f"  {car}: {{link: '{link}', platform: arduino}}\n" for car, link in links.items())
+
+
+def _exists(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _read(master: int, shown: bytearray) -> None:
+    while True:
+        try:
+            data = os.read(master, 4096)
+        except OSError:  # the other end is closed
+            break
+        if not data:
+            break
+        shown += data
+    os.close(master)

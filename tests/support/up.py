@@ -1,0 +1,122 @@
+"""`fleet up` as a process: what it says, its status, its processes; everything that it left behind is ended."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Self
+
+from fleet.supervise.desk import ask_status
+from schemas import messages
+from schemas.bus import Bus, BusError, Sample
+from tests.support.processes import Process, wait_for
+
+
+class Up:
+    """One `fleet up --json`; use it with `with`."""
+
+    def __init__(self, directory: Path, endpoint: str, *arguments: str) -> None:
+        self.directory = directory
+        self.endpoint = endpoint
+        self.environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(directory / "state")}
+        self.out = directory / "sessions"
+        words = ["-m", "fleet.cli", "up", *arguments, "--out", str(self.out), "--json"]
+        self.process = Process(words, directory / "up.log", self.environment)
+        self.heard: list[dict[str, Any]] = []
+        self._bus: Bus | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bus is not None:
+            self._bus.close()
+        if self.process.popen.poll() is None:
+            self.process.popen.kill()
+        self.process.wait()
+        wait_for(lambda: not self.left(ours=True), "its children end with it")
+        for pid in self.left():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGTERM)
+
+    def left(self, *, ours: bool = False) -> list[int]:
+        """Processes that still run at this endpoint, by the system's own list; `ours`: but the hub, which lingers."""
+        listed = subprocess.run(["ps", "-axwwo", "pid=,args="], capture_output=True, text=True, check=True).stdout
+        found = [line.split(None, 1) for line in listed.splitlines()]
+        mine = [(int(pid), words) for pid, words in found if self.endpoint in words and int(pid) != self.process.pid]
+        return [pid for pid, words in mine if not (ours and "schemas.hub" in words)]
+
+    @property
+    def bus(self) -> Bus:
+        """A client of the fleet's bus."""
+        if self._bus is None:
+            self._bus = wait_for(self._open, "there is a bus")
+        return self._bus
+
+    def _open(self) -> Bus | None:
+        with contextlib.suppress(BusError):
+            return Bus.open(self.endpoint)
+        return None
+
+    def until(self, what: str, name: str, words: str) -> dict[str, Any]:
+        """The next happening of this kind."""
+        while True:
+            said: dict[str, Any] = self.process.line()
+            self.heard.append(said)
+            if (said["what"], said["name"]) == (what, name) and words in said["words"]:
+                return said
+
+    def simulator(self, **fields: Any) -> Any:
+        """Say something to the simulator; its answer."""
+        assert self.process.popen.stdin is not None
+        self.process.popen.stdin.write(json.dumps(fields) + "\n")
+        self.process.popen.stdin.flush()
+        return json.loads(self.until("simulator", "@simulator", "ok")["words"])
+
+    def status(self) -> Any:
+        """The supervisor's status; None while it does not answer."""
+        return next(iter(ask_status(self.bus, "fleet")), None)
+
+    def state(self, name: str) -> Any:
+        """Of one process; None while there is none."""
+        status = self.status()
+        return next((each for each in status.processes if each.name == name), None) if status is not None else None
+
+    def running(self, name: str, but: int = 0) -> int:
+        """Wait until it runs, with another process id than that; which. A hub may be a gateway's by then: 1."""
+
+        def pid() -> int | None:
+            found = self.state(name)
+            if found is not None and found.state == "elsewhere":
+                return 1
+            return found.pid if found is not None and found.state == "running" and found.pid != but else None
+
+        return int(wait_for(pid, f"{name} runs"))
+
+    def get(self, key: str) -> Any:
+        """The latest value; None while nobody answers."""
+        for answer in self.bus.query(f"fleet/{key}", timeout_s=5.0):
+            if isinstance(answer, Sample):
+                return answer.message()
+        return None
+
+    def ready(self, car: str) -> None:
+        """Wait until the car is in a known state."""
+        wait_for(lambda: (safety := self.get(f"{car}/state/safety")) and safety.motors == "off", f"{car} is ready")
+
+    def ask(self, verb: str, car: str, **fields: Any) -> Any:
+        """Give a command as JSON; the answer."""
+        key = f"fleet/{car}/@cmd/{verb}"
+        payload = json.dumps(fields).encode()
+        (answer,) = self.bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=5.0)
+        assert isinstance(answer, Sample)
+        return json.loads(answer.payload)
+
+    def fleet(self, *arguments: str) -> "subprocess.CompletedProcess[str]":
+        """Another `fleet` command at this fleet."""
+        command = [sys.executable, "-m", "fleet.cli", *arguments]
+        environment = os.environ | self.environment
+        return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=90)
