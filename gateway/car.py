@@ -72,6 +72,7 @@ class Settings:
     retry: bool
     """Keep trying when the first attempt to open the link fails."""
     battery: Policy = field(default_factory=Policy)
+    speed_max: float = 1.0
     longest_drive_s: float = requests.LONGEST_DRIVE_S
     parent: int | None = None
     """Process id of the starter, with which this ends."""
@@ -104,6 +105,7 @@ class Car:
             auto=settings.auto,
             kept=self._store.load(time.time_ns()),
             battery_policy=settings.battery,
+            speed_max=settings.speed_max,
         )
         self._saved = self._control.safety.kept
         self._passing_on: set[asyncio.Task[None]] = set()

@@ -72,12 +72,18 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     run.add_argument(
         "--longest-drive", metavar="S", type=float, default=10.0, help="longest duration_s of a drive (default 10 s)"
     )
-    for level, default, words in (("low", "warn", "below 7.0 V"), ("critical", "refuse", "below 6.6 V")):
+    run.add_argument(
+        "--speed-max", metavar="SHARE", type=float, default=1.0, help="no step beyond this share of full speed, 0..1"
+    )
+    for level, default, volts in (("low", "warn", 7.0), ("critical", "refuse", 6.6)):
         run.add_argument(
             f"--battery-{level}",
             choices=("warn", "refuse", "stop"),
             default=default,
-            help=f"{level} battery ({words}): warn, refuse new drives and modes, or stop (default {default})",
+            help=f"{level} battery: warn, refuse new drives and modes, or stop (default {default})",
+        )
+        run.add_argument(
+            f"--battery-{level}-v", metavar="V", type=float, default=volts, help=f"below this it is {level} ({volts} V)"
         )
     run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
     run.add_argument(
@@ -97,9 +103,17 @@ def _run(arguments: argparse.Namespace) -> int:
         url, (profile, auto) = parse_url(arguments.link), parse_told(arguments.platform)
     except (BadKey, BadUrl, ValueError) as error:
         return _failed(str(error), 2)
-    longest_s = arguments.longest_drive
+    longest_s, speed_max = arguments.longest_drive, arguments.speed_max
+    low_v, critical_v = arguments.battery_low_v, arguments.battery_critical_v
     if not 0 < longest_s <= 3600:
         return _failed(f"--longest-drive {longest_s:g}: allowed are more than 0 and at most 3600 s", 2)
+    if not 0 < speed_max <= 1:
+        return _failed(f"--speed-max {speed_max:g}: allowed are more than 0 and at most 1, of full speed", 2)
+    if not 0 < critical_v <= low_v <= 30:
+        words = (
+            f"--battery-critical-v {critical_v:g}, --battery-low-v {low_v:g}: allowed are 0 < critical <= low <= 30 V"
+        )
+        return _failed(words, 2)
     try:
         with Bus.open(arguments.connect, start_hub=True) as opened:
             doors = Doors(opened, fleet, car)
@@ -122,7 +136,8 @@ def _run(arguments: argparse.Namespace) -> int:
                 fleet,
                 state_dir,
                 arguments.retry,
-                battery=Policy(Action(arguments.battery_low), Action(arguments.battery_critical)),
+                battery=Policy(Action(arguments.battery_low), Action(arguments.battery_critical), low_v, critical_v),
+                speed_max=speed_max,
                 longest_drive_s=longest_s,
                 parent=parent,
             )

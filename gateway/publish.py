@@ -135,7 +135,7 @@ class Publications:
             message = _CLASSES["sensor/battery"]()
             message.voltage_v = event.voltage_v
             message.charge, message.charge_error = battery.charge(event.voltage_v, loaded=loaded)
-            message.level = self._battery.level or battery.level(event.voltage_v)
+            message.level = self._battery.level or self._battery.policy.level(event.voltage_v)
             self._reading("sensor/battery", message, stamp_ns, published)
         if "grayscale" in measured and event.grayscale is not None:
             message = _CLASSES["sensor/grayscale"]()

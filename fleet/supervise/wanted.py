@@ -130,8 +130,14 @@ def _car(spec: CarSpec) -> WantedCar:
         spec.platform,
         (
             *("--longest-drive", f"{limits.longest_drive_s:g}"),
-            *("--battery-low", limits.on_battery_low),
-            *("--battery-critical", limits.on_battery_critical),
+            *("--speed-max", f"{limits.speed_max:g}"),
+            *("--battery-low", limits.on_battery_low, "--battery-low-v", f"{limits.battery_low_v:g}"),
+            *(
+                "--battery-critical",
+                limits.on_battery_critical,
+                "--battery-critical-v",
+                f"{limits.battery_critical_v:g}",
+            ),
         ),
     )
 

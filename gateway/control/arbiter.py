@@ -56,6 +56,10 @@ class Situation:
     """Why the battery allows no new drive, in words; empty if it does."""
     fan: bool | None
     queued: int
+    speed: float = 0.0
+    """As a number of the profile's speed model; an estimate."""
+    speed_max: float = 1.0
+    """The greatest share of full speed, 0..1, to which a step may lead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +136,7 @@ def refuse(command: Command, situation: Situation) -> Refusal | None:
 
 
 def _unknown(what: What, situation: Situation) -> str | None:
-    """Why this car could never do it."""
+    """Why this car could never do it, or must not."""
     profile = situation.profile
     match what:
         case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
@@ -141,6 +145,13 @@ def _unknown(what: What, situation: Situation) -> str | None:
         case Act(frame):
             return profile.refusal(frame)
         case ChangeSpeed(step):
+            after = profile.speed.step(situation.speed, step)
+            share = profile.speed.fraction(after)
+            if after > situation.speed and share > situation.speed_max:
+                return (
+                    f"{situation.car} would drive at about {share:.0%} of full speed, "
+                    f"and {situation.speed_max:.0%} is allowed (--speed-max)"
+                )
             return profile.refusal(General(Motion.STOP, speed=step))
         case Fan(on):
             words = profile.refusal(General(Motion.STOP, fan=True))

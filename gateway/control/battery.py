@@ -43,10 +43,21 @@ class Action(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """What each level leads to. A brownout resets the car, which stops it, so nothing is stopped by default."""
+    """What each level leads to, and where it begins, V at rest.
+
+    A brownout resets the car, which stops it, so nothing is stopped by default.
+    """
 
     low: Action = Action.WARN
     critical: Action = Action.REFUSE
+    low_v: float = LOW_V
+    critical_v: float = CRITICAL_V
+
+    def level(self, voltage_v: float) -> BatteryLevel:
+        """The level of a voltage at rest, V."""
+        if voltage_v < self.critical_v:
+            return BatteryLevel.CRITICAL
+        return BatteryLevel.LOW if voltage_v < self.low_v else BatteryLevel.OK
 
     def action(self, level: BatteryLevel | None) -> Action | None:
         """What this level leads to; nothing if it is fine, or was never measured."""
@@ -81,14 +92,15 @@ class Battery:
         if loaded:
             self._loaded_at = now
         low_v, high_v = rest_v(voltage_v, loaded=self.loaded)
+        worse, better = self.policy.level(high_v), self.policy.level(low_v - HYSTERESIS_V)
         if self.level is None:
-            self.level = level(high_v)
+            self.level = worse
             return self.level is not BatteryLevel.OK
         shown = self.level
-        if _RANK[level(high_v)] > _RANK[shown]:
-            shown = level(high_v)  # even if all of a load's sag is added
-        elif _RANK[level(low_v - HYSTERESIS_V)] < _RANK[shown]:
-            shown = level(low_v - HYSTERESIS_V)
+        if _RANK[worse] > _RANK[shown]:
+            shown = worse  # even if all of a load's sag is added
+        elif _RANK[better] < _RANK[shown]:
+            shown = better
         if shown is self.level:
             self._other = None
         elif self._other is not shown:
@@ -124,13 +136,6 @@ class Battery:
 
 
 _RANK: Final = {each: rank for rank, each in enumerate(BatteryLevel)}
-
-
-def level(voltage_v: float) -> BatteryLevel:
-    """The level of a voltage at rest, V."""
-    if voltage_v < CRITICAL_V:
-        return BatteryLevel.CRITICAL
-    return BatteryLevel.LOW if voltage_v < LOW_V else BatteryLevel.OK
 
 
 def rest_v(voltage_v: float, *, loaded: bool) -> tuple[float, float]:

@@ -315,4 +315,6 @@ class Controller(Evidence):
             battery=self.battery.refusal,
             fan=self.believed.fan,
             queued=len(self._waiting.acts),
+            speed=self.believed.speed,
+            speed_max=self._speed_max,
         )

@@ -43,6 +43,7 @@ class Execution:
         auto: bool = False,
         kept: Kept | None = None,
         battery_policy: Policy | None = None,
+        speed_max: float = 1.0,
     ) -> None:
         self.car = car
         self.profile = profile
@@ -51,6 +52,7 @@ class Execution:
         self.battery = Battery(battery_policy or Policy())
         self.pacing = Pacing(profile)
         self.believed = Believed(profile)
+        self._speed_max = speed_max
         self.safety = Safety.restored(kept or Kept())
         self.known = False
         """The last recovery is complete and no write has failed since: what is sent will be read as it is meant."""

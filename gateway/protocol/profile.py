@@ -198,6 +198,14 @@ class Profile:
             there -= {name for name, value in self.constants if getattr(event, _FIELDS[name]) == value}
         return frozenset(there)
 
+    def measurable(self, mode: Mode) -> frozenset[str]:
+        """What a car of this kind can ever measure in this mode; constants of the platform are no measurements."""
+        if mode not in self.modes or mode in self.silent_modes:
+            return frozenset()
+        if mode is not Mode.MANUAL:
+            return _MEASURED[mode]
+        return (_ALL | (self.options & OPTIONS)) - {name for name, _ in self.constants}
+
     def obstacle(self, event: Sensors, mode: Mode | None = None) -> tuple[bool, bool] | None:
         """Obstacle left, right, with the inversion of following undone; None if it is not measured here."""
         if event.obstacle is None or "obstacle" not in self.measured(event, mode):

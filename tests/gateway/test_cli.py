@@ -32,6 +32,23 @@ def test_wrong_use_is_told(command: Command, arguments: list[str]) -> None:
     assert done.stdout == ""
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "allowed"),
+    [
+        ("--longest-drive", "0", "more than 0 and at most 3600 s"),
+        ("--speed-max", "1.2", "more than 0 and at most 1"),
+        ("--battery-critical-v", "7.5", "0 < critical <= low <= 30 V"),
+        ("--battery-low-v", "nan", "0 < critical <= low <= 30 V"),
+    ],
+)
+def test_a_limit_out_of_range_is_told_with_the_range(command: Command, option: str, value: str, allowed: str) -> None:
+    done = command("run", "--car", "red", "--link", "tcp://127.0.0.1:9", option, value)
+    assert done.returncode == 2
+    assert option in done.stderr
+    assert allowed in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
 def test_run_imports_none_of_the_other_commands() -> None:
     """It is started a hundred times."""
     program = (

@@ -1,9 +1,10 @@
 """From the words of a car's description to a car in the world. Checking the words is spec.py's part."""
 
 from gateway.sim.core.arduino import ArduinoCar
+from gateway.sim.core.body import CarBody
 from gateway.sim.core.firmware import Firmware, Rng
 from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
-from gateway.sim.core.world import CarBody, World
+from gateway.sim.core.world import World
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi")
 OPTIONS = ("arm", "imu")
@@ -18,12 +19,19 @@ def build(
     options: frozenset[str] = frozenset(),
     transport: Transport = Transport.SERIAL,
     now: float = 0.0,
+    name: str = "",
 ) -> Firmware:
     """Car number `index` of the world, at rest on its start pose, its program just started.
 
-    `transport` matters to a Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART.
+    `name`: what the world knows it by, if it has a place for it there or lets it carry something. `transport` matters to a Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART.
     """
-    body = CarBody(world, world.start_pose(index), rng, now)
+    body = CarBody(world, world.start_pose(index, name), rng, now, name)
+    car: Firmware
     if platform == "raspberry_pi":
-        return RaspberryPiCar(body, rng, transport=transport, options=options, now=now)
-    return ArduinoCar(body, rng, options=options, now=now)
+        car = RaspberryPiCar(body, rng, transport=transport, options=options, now=now)
+    else:
+        car = ArduinoCar(body, rng, options=options, now=now)
+    if world.lively:
+        car.company = world.company
+        world.company.join(car)
+    return car

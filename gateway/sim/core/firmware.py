@@ -12,6 +12,7 @@ from math import ceil, inf
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from gateway.protocol.values import Mode
+from gateway.sim.core.company import Company
 from gateway.sim.core.remote import Button
 
 BYTES_PER_S: Final = 960.0
@@ -164,6 +165,8 @@ class Firmware:
         """Bytes that found the receive buffer full."""
         self._pressed: Button | None = None
         """A button of the remote that the program has not looked at."""
+        self.company: Company | None = None
+        """Whose programs run in one order with this one."""
         self._program = self._main()
         self._wait = Wait(now)
 
@@ -190,7 +193,7 @@ class Firmware:
 
     def next_event(self) -> float:
         """When something next happens by itself; inf if nothing will."""
-        due = self._wake_time()
+        due = self.due()
         return min(due, self._outgoing[0][0]) if self._outgoing else due
 
     def backlog(self, now: float) -> int:
@@ -270,7 +273,8 @@ class Firmware:
 
     # The engine.
 
-    def _wake_time(self) -> float:
+    def due(self) -> float:
+        """When the program next runs by itself; inf if it will not."""
         if not self._alive:
             return inf
         if self._wait.wakes:
@@ -281,7 +285,14 @@ class Firmware:
         return self._wait.until
 
     def _run(self, now: float) -> None:
-        while (due := self._wake_time()) <= now:
+        if self.company is None:
+            self.run_alone(now)
+        else:
+            self.company.run(now)
+
+    def run_alone(self, now: float) -> None:
+        """Run this program up to `now`, whatever others have done by then."""
+        while (due := self.due()) <= now:
             self._now = max(self._now, due)
             self._receive()
             try:

@@ -1,65 +1,85 @@
-"""The ONE flat world that all cars of a simulator share: walls, a taped line, lamps; and each car's body in it.
+"""The ONE flat world that all cars of a simulator share: walls, a taped line, lamps, things, and the cars as bodies.
 
-Poses are integrated in closed form, lazily, whenever someone looks; a car at rest costs nothing. Cars do not see
-or touch each other. REP-103: metres, x forward, y left, angles counter-clockwise.
+What a car's own sensors make of it is body.py's part. In the worlds of before (no things, cars that do not meet) each
+car is integrated by itself whenever someone looks; in a lively one all are brought to each tick of STEP_S together.
+REP-103: metres, x forward, y left, angles counter-clockwise.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from math import atan2, ceil, cos, degrees, floor, hypot, pi, radians, sin
-from typing import Final, TypeAlias
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from math import atan2, cos, floor, hypot, sin
+from typing import Final, Protocol
 
-from gateway.sim.core.firmware import Pose, Rng
+from gateway.sim.core.company import Company
+from gateway.sim.core.firmware import Pose
+from gateway.sim.core.geometry import Hit, Point, Segment, apart, box, distance, foot, loop, reach
+from gateway.sim.core.geometry import nearest, ray_to_circle
+from gateway.sim.core.things import Lamp, Thing, carried
 
-Point: TypeAlias = tuple[float, float]
-Segment: TypeAlias = tuple[float, float, float, float]
-
-TOP_SPEED_M_S: Final = 0.5
-"""Of a wheel at PWM 255."""
-TRACK_M: Final = 0.20
-"""Effective distance of the wheels; wider than the car's, since four wheels skid when they turn."""
 RADIUS_M: Final = 0.13
+"""Of a car: it is a disc to walls, things and other cars, and to their sensors."""
 STEP_S: Final = 0.04
-"""Longest stretch of driving between two looks for a wall."""
-
-SONAR_AT_M: Final = 0.10
-SONAR_REACH_CM: Final = 499.0
-"""Just below the 500 cm from which the car's own program throws a reading away."""
-SONAR_CONE: Final = tuple(radians(degree) for degree in (-15.0, -7.5, 0.0, 7.5, 15.0))
-SONAR_STEEPEST: Final = cos(radians(76))
-"""A wall hit at a flatter angle than this reflects the sound away."""
-INFRARED_REACH_M: Final = 0.20
-LINE_SENSORS: Final = ((0.08, 0.040), (0.08, 0.010), (0.08, -0.010), (0.08, -0.040))
-"""Ahead and left of the axle's middle, m: left-outer .. right-outer."""
+"""Longest stretch of driving between two looks for a wall, and the tick of a lively world."""
 TAPE_M: Final = 0.025
-LAMP_SIDE: Final = radians(30)
-LAMP_CONE: Final = radians(50)
 _BUCKET_M: Final = 0.25
+_ROUNDS: Final = 3
+"""So often a car that is pushed out of one thing is pushed out of the next."""
+_HAIR_M: Final = 1e-9
 
-FLOOR_GRAY: Final = 214
-TAPE_GRAY: Final = 740
 
+class Body(Protocol):
+    """A car as the world moves it."""
 
-@dataclass(frozen=True, slots=True)
-class Lamp:
-    """A light that a sensor sees from up to `reach_m` away."""
+    @property
+    def name(self) -> str:
+        """The car's."""
+        ...
 
-    x_m: float
-    y_m: float
-    reach_m: float = 1.5
+    @property
+    def place(self) -> Pose:
+        """Where it was when it was last moved."""
+        ...
+
+    @property
+    def driving(self) -> bool:
+        """Whether a motor is on."""
+        ...
+
+    def glide(self, now: float) -> None:
+        """Go on to `now`, at most a tick away."""
+        ...
 
 
 class World:
-    """Walls, line and lamps; nothing in it moves."""
+    """Walls and a line, which never change; lamps, things and cars, which do."""
 
-    def __init__(self, walls: Iterable[Segment] = (), line: Sequence[Point] = (), lamps: Iterable[Lamp] = ()) -> None:
+    def __init__(
+        self,
+        walls: Iterable[Segment] = (),
+        line: Sequence[Point] = (),
+        lamps: Iterable[Lamp] = (),
+        *,
+        things: Iterable[Thing] = (),
+        starts: Mapping[str, Pose] | None = None,
+        cars_meet: bool = False,
+    ) -> None:
         self.walls = tuple(walls)
         self.line = tuple(line)
         """A closed polyline; empty for none."""
         self.lamps = tuple(lamps)
+        self.things = tuple(things)
+        self.cars_meet = cars_meet
+        """Whether cars see each other and are in each other's way."""
+        self.lively = cars_meet or bool(self.things) or any(lamp.carried_by for lamp in self.lamps)
+        """Whether what one car does may matter to another, or something moves by itself."""
+        self.company = Company()
+        self.bodies: list[Body] = []
+        self._starts = dict(starts or {})
+        self._began = 0.0
+        self._tick = 0
         # What is asked for a thousand times a second of simulated time is worked out once.
         self._rays = tuple((x1, y1, x2 - x1, y2 - y1, hypot(x2 - x1, y2 - y1)) for x1, y1, x2, y2 in self.walls)
-        self._touching = tuple((wall, _reach(wall, RADIUS_M)) for wall in self.walls)
+        self._touching = tuple((wall, reach(wall, RADIUS_M)) for wall in self.walls)
         self._near: dict[tuple[int, int], list[Segment]] = {}
         self._length = 0.0
         for (x1, y1), (x2, y2) in zip(self.line, (*self.line[1:], *self.line[:1]), strict=True):
@@ -73,16 +93,18 @@ class World:
     @classmethod
     def room(cls) -> "World":
         """A room of 5.0 x 3.6 m, a box in its middle, a loop of line: small enough that every ranging has an echo."""
-        walls = (*_box(0.0, 0.0, 5.0, 3.6), *_box(0.0, 0.0, 0.5, 0.5))
-        return cls(walls, _loop(1.7, 1.05, 0.6))
+        walls = (*box(0.0, 0.0, 5.0, 3.6), *box(0.0, 0.0, 0.5, 0.5))
+        return cls(walls, loop(1.7, 1.05, 0.6))
 
     @classmethod
     def open_field(cls) -> "World":
         """Nothing at all: no ranging ever has an echo."""
         return cls()
 
-    def start_pose(self, index: int) -> Pose:
-        """Where car number `index` begins: on the line, along it; the cars spread over its length."""
+    def start_pose(self, index: int, name: str = "") -> Pose:
+        """Where a car begins: at its own place, or as number `index` on the line; the cars spread over its length."""
+        if name in self._starts:
+            return self._starts[name]
         if not self.line:
             return Pose(0.0, float(index), 0.0)
         # Multiples of the golden ratio keep any number of cars apart.
@@ -95,15 +117,20 @@ class World:
             left -= length
         return Pose(*self.line[0], 0.0)
 
+    # Walls and line.
+
     def on_line(self, x: float, y: float) -> bool:
         """Whether a point lies on the tape."""
         near = self._near.get((floor(x / _BUCKET_M), floor(y / _BUCKET_M)), ())
-        return any(_distance(x, y, segment) <= TAPE_M / 2 for segment in near)
+        return any(distance(x, y, segment) <= TAPE_M / 2 for segment in near)
 
     def ray(self, x: float, y: float, angle: float, steepest: float = 0.0) -> float | None:
         """Distance to the first wall; `steepest`: least cosine to its normal that sends something back."""
-        dx, dy = cos(angle), sin(angle)
-        best: tuple[float, float] | None = None
+        best = self._wall(x, y, cos(angle), sin(angle))
+        return None if best is None or best[1] < steepest else best[0]
+
+    def _wall(self, x: float, y: float, dx: float, dy: float) -> Hit | None:
+        best: Hit | None = None
         for x1, y1, wx, wy, length in self._rays:
             cross = dx * wy - dy * wx
             if abs(cross) < 1e-12:
@@ -112,159 +139,184 @@ class World:
             share = ((x1 - x) * dy - (y1 - y) * dx) / cross
             if along >= 0 and 0 <= share <= 1 and (best is None or along < best[0]):
                 best = (along, abs(cross) / length)
-        return None if best is None or best[1] < steepest else best[0]
+        return best
 
     def push_out(self, x: float, y: float) -> Point:
         """The nearest place at which a car does not overlap a wall."""
         for wall, (low_x, low_y, high_x, high_y) in self._touching:
             if not (low_x < x < high_x and low_y < y < high_y):
                 continue
-            fx, fy = _foot(x, y, wall)
+            fx, fy = foot(x, y, wall)
             away = hypot(x - fx, y - fy)
             if 0 < away < RADIUS_M:
                 x, y = fx + (x - fx) * RADIUS_M / away, fy + (y - fy) * RADIUS_M / away
         return x, y
 
+    # What moves.
 
-class CarBody:
-    """One car in the world."""
+    def join(self, body: Body, now: float) -> None:
+        """A car has been put into the world."""
+        if self.lively:
+            if not self.bodies:
+                self._began, self._tick = now, 0
+            self.bodies.append(body)
 
-    def __init__(self, world: World, pose: Pose, rng: Rng, now: float = 0.0) -> None:
-        self._world = world
-        self._x, self._y, self._heading = pose
-        self._now = now
-        self._left = self._right = 0
-        self._battery = 7.6 + 0.7 * rng.random()
-        self._started = now
-
-    def drive(self, now: float, left: int, right: int) -> None:
-        """From `now` on the motors have these PWM values."""
-        self._move(now)
-        self._left, self._right = left, right
-
-    def pose(self, now: float) -> Pose:
-        """The true pose; heading in -pi..pi."""
-        self._move(now)
-        return Pose(self._x, self._y, (self._heading + pi) % (2 * pi) - pi)
-
-    def _wheels(self) -> tuple[float, float]:
-        return TOP_SPEED_M_S * self._left / 255, TOP_SPEED_M_S * self._right / 255
-
-    def _move(self, now: float) -> None:
-        span = now - self._now
-        if span <= 0:
+    def settle(self, now: float) -> None:
+        """Bring all cars to the last tick up to `now`, each tick for all before the next."""
+        last = floor((now - self._began) / STEP_S)
+        if last <= self._tick:
             return
-        self._now = now
-        if self._left == self._right == 0:
-            return
-        left, right = self._wheels()
-        speed, turn = (left + right) / 2, (right - left) / TRACK_M
-        steps = 1 if speed == 0 else ceil(span / STEP_S)
-        step = span / steps
-        for _ in range(steps):
-            heading = self._heading + turn * step
-            if abs(turn) < 1e-9:
-                x = self._x + speed * step * cos(heading)
-                y = self._y + speed * step * sin(heading)
-            else:
-                radius = speed / turn
-                x = self._x + radius * (sin(heading) - sin(self._heading))
-                y = self._y - radius * (cos(heading) - cos(self._heading))
-            self._x, self._y = self._world.push_out(x, y)
-            self._heading = heading
+        if not any(body.driving for body in self.bodies) and not any(thing.moves for thing in self.things):
+            self._tick = last - 1
+        while self._tick < last:
+            self._tick += 1
+            at = self._began + self._tick * STEP_S
+            for body in self.bodies:
+                body.glide(at)
 
-    def _at(self, ahead: float, left: float) -> Point:
-        c, s = cos(self._heading), sin(self._heading)
-        return self._x + ahead * c - left * s, self._y + ahead * s + left * c
+    def others(self, me: Body | None) -> Iterator[Body]:
+        """The cars that a car meets."""
+        return (body for body in self.bodies if body is not me) if self.cars_meet else iter(())
 
-    def range_cm(self, now: float, bearing_deg: float) -> float | None:
-        """The nearest echo within the cone, from the sensor at the car's front."""
-        self._move(now)
-        x, y = self._at(SONAR_AT_M, 0.0)
-        middle = self._heading + radians(bearing_deg)
-        rays = (self._world.ray(x, y, middle + offset, SONAR_STEEPEST) for offset in SONAR_CONE)
-        nearest = min((distance for distance in rays if distance is not None), default=None)
-        return None if nearest is None or nearest * 100 > SONAR_REACH_CM else nearest * 100
+    def carrier(self, name: str) -> Body | None:
+        """A car by its name, if it is there."""
+        return next((body for body in self.bodies if body.name == name), None)
 
-    def line(self, now: float) -> tuple[bool, bool, bool, bool]:
-        """What the four line sensors see."""
-        self._move(now)
-        if not self._world.line:
-            return (False, False, False, False)
-        seen = [self._world.on_line(*self._at(ahead, left)) for ahead, left in LINE_SENSORS]
-        return (seen[0], seen[1], seen[2], seen[3])
+    def where(self, thing: Thing, now: float) -> Pose | None:
+        """Where a thing is; None if the car that carries it is not there."""
+        pose = thing.pose(now - self._began)
+        if not thing.carried_by:
+            return pose
+        car = self.carrier(thing.carried_by)
+        return None if car is None else carried(car.place, pose.x_m, pose.y_m, pose.heading_rad)
 
-    def obstacle(self, now: float) -> tuple[bool, bool]:
-        """Infrared, looking ahead and 20 degrees outwards."""
-        self._move(now)
-        seen = []
-        for side in (1, -1):
-            x, y = self._at(0.10, 0.06 * side)
-            distance = self._world.ray(x, y, self._heading + side * radians(20))
-            seen.append(distance is not None and distance <= INFRARED_REACH_M)
-        return (seen[0], seen[1])
+    def shines(self, lamp: Lamp, now: float) -> Point | None:
+        """Where a lamp is; None if what carries it is not there."""
+        if not lamp.carried_by:
+            return lamp.x_m, lamp.y_m
+        thing = next((each for each in self.things if each.name == lamp.carried_by), None)
+        car = self.carrier(lamp.carried_by)
+        base = self.where(thing, now) if thing is not None else None if car is None else car.place
+        return None if base is None else carried(base, lamp.x_m, lamp.y_m)[:2]
 
-    def light(self, now: float) -> tuple[bool, bool]:
-        """Whether a lamp stands before the left and the right light sensor."""
-        self._move(now)
-        seen = [False, False]
-        for lamp in self._world.lamps:
-            dx, dy = lamp.x_m - self._x, lamp.y_m - self._y
-            if hypot(dx, dy) <= lamp.reach_m:
-                bearing = atan2(dy, dx) - self._heading
-                for index, side in enumerate((LAMP_SIDE, -LAMP_SIDE)):
-                    off = (bearing - side + pi) % (2 * pi) - pi
-                    seen[index] = seen[index] or abs(off) <= LAMP_CONE
-        return (seen[0], seen[1])
+    def solids(self, me: Body | None, now: float) -> Iterator[tuple[Thing, Pose]]:
+        """The things that a car meets, which is not what it carries itself."""
+        for thing in self.things:
+            if me is None or thing.carried_by != me.name:
+                pose = self.where(thing, now)
+                if pose is not None:
+                    yield thing, pose
 
-    def grayscale(self, now: float) -> int:
-        """The floor under the car's middle: high on the tape."""
-        self._move(now)
-        return TAPE_GRAY if self._world.line and self._world.on_line(self._x, self._y) else FLOOR_GRAY
+    def make_room(self, me: Body, x: float, y: float, now: float) -> Point:
+        """Where a car that wants to be at x, y can be. One that is jammed stays where it is."""
+        things = [
+            (thing, pose)
+            for thing, pose in self.solids(me, now)
+            if hypot(x - pose.x_m, y - pose.y_m) < 2 * RADIUS_M + thing.extent_m
+        ]
+        cars = [
+            (other.place.x_m, other.place.y_m)
+            for other in self.others(me)
+            if hypot(x - other.place.x_m, y - other.place.y_m) < 4 * RADIUS_M
+        ]
+        wanted = x, y
+        for _ in range(_ROUNDS):
+            before = x, y
+            for ox, oy in cars:
+                away = hypot(x - ox, y - oy)
+                if 0 < away < 2 * RADIUS_M:
+                    x, y = ox + (x - ox) * 2 * RADIUS_M / away, oy + (y - oy) * 2 * RADIUS_M / away
+            for thing, pose in things:
+                x, y = thing.pushed(pose, x, y, RADIUS_M)
+            x, y = self.push_out(x, y)
+            if (x, y) == before:
+                break
+        old = me.place
+        if (x, y) == wanted and not cars:
+            return x, y  # nothing was in its way
+        if self._passes(old.x_m, old.y_m, x, y, cars):
+            return x, y
+        return old.x_m, old.y_m
 
-    def battery_v(self, now: float) -> float:
-        """Falls by 0.3 V an hour and sags by up to 0.25 V under load; not below 6.4, where its electronics cut off."""
-        load = 0.25 * (abs(self._left) + abs(self._right)) / 510
-        return max(6.4, self._battery - 0.3 * (now - self._started) / 3600 - load)
+    def _passes(self, old_x: float, old_y: float, x: float, y: float, cars: list[Point]) -> bool:
+        """Whether a car may go there: through no wall, and no deeper into one or into a car than it is."""
+        for wall, (low_x, low_y, high_x, high_y) in self._touching:
+            if max(old_x, x) < low_x or min(old_x, x) > high_x or max(old_y, y) < low_y or min(old_y, y) > high_y:
+                continue
+            after = distance(x, y, wall)
+            if after < min(RADIUS_M, distance(old_x, old_y, wall)) - _HAIR_M:
+                return False
+            if (old_x, old_y) != (x, y) and apart((old_x, old_y, x, y), wall) == 0:
+                return False
+        return all(
+            hypot(x - ox, y - oy) >= min(2 * RADIUS_M, hypot(old_x - ox, old_y - oy)) - _HAIR_M for ox, oy in cars
+        )
 
-    def yaw_rate_deg_s(self, now: float) -> float:
-        """How fast the car turns."""
-        self._move(now)
-        left, right = self._wheels()
-        return degrees((right - left) / TRACK_M)
+    # What is seen.
 
+    def met(self, me: Body | None, x: float, y: float, angle: float, reach_m: float, now: float) -> Hit | None:
+        """The first thing or car, no wall, that a ray meets within `reach_m`. All cars have to be at `now`."""
+        dx, dy = cos(angle), sin(angle)
+        hits: list[Hit | None] = []
+        for other in self.others(me):
+            place = other.place
+            if hypot(place.x_m - x, place.y_m - y) <= reach_m + RADIUS_M:
+                hits.append(ray_to_circle(x, y, dx, dy, (place.x_m, place.y_m), RADIUS_M))
+        for thing, pose in self.solids(me, now):
+            if hypot(pose.x_m - x, pose.y_m - y) <= reach_m + thing.extent_m:
+                hits.append(thing.met(pose, x, y, dx, dy))
+        hit = nearest(hits)
+        return hit if hit is not None and hit[0] <= reach_m else None
 
-def _box(x: float, y: float, width: float, depth: float) -> tuple[Segment, ...]:
-    w, d = width / 2, depth / 2
-    corners = [(x - w, y - d), (x + w, y - d), (x + w, y + d), (x - w, y + d)]
-    return tuple((*a, *b) for a, b in zip(corners, (*corners[1:], corners[0]), strict=True))
+    def clear(self, a: Point, b: Point, without: Iterable[str] = (), *, now: float = 0.0) -> bool:
+        """Whether nothing stands between two points; `without`: cars and things that do not count, by name.
 
+        The same both ways.
+        """
+        a, b = sorted((a, b))
+        sight: Segment = (*a, *b)
+        if a == b:
+            return True
+        if any(apart(sight, wall) == 0 for wall in self.walls):
+            return False
+        ignored = set(without)
+        for other in self.others(None):
+            if other.name not in ignored and distance(other.place.x_m, other.place.y_m, sight) < RADIUS_M:
+                return False
+        for thing, pose in self.solids(None, now):
+            if thing.name in ignored or thing.carried_by in ignored - {""}:
+                continue
+            if thing.radius_m:
+                if distance(pose.x_m, pose.y_m, sight) < thing.radius_m:
+                    return False
+            elif any(apart(sight, side) == 0 for side in thing.sides(pose)):
+                return False
+        return True
 
-def _loop(half_x: float, half_y: float, radius: float) -> list[Point]:
-    """A rectangle with round corners, counter-clockwise, from the middle of its lower side."""
-    points: list[Point] = [(0.0, -half_y)]
-    corners = ((1, -1, -90), (1, 1, 0), (-1, 1, 90), (-1, -1, 180))
-    for sx, sy, start in corners:
-        cx, cy = sx * (half_x - radius), sy * (half_y - radius)
-        for part in range(13):
-            angle = radians(start + 90 * part / 12)
-            points.append((cx + radius * cos(angle), cy + radius * sin(angle)))
-    return points
+    # What is changed while it runs.
 
+    def advance(self, now: float) -> None:
+        """Bring every program and every car to `now`, before something is changed or asked."""
+        self.company.run(now)
+        self.settle(now)
+        for body in self.bodies:
+            body.glide(now)
 
-def _reach(segment: Segment, away: float) -> Segment:
-    """The rectangle outside which nothing is within `away` of a segment: low x, low y, high x, high y."""
-    x1, y1, x2, y2 = segment
-    return min(x1, x2) - away, min(y1, y2) - away, max(x1, x2) + away, max(y1, y2) + away
+    def change_lamp(self, name: str, **fields: float | bool) -> None:
+        """Change fields of a lamp that is there."""
+        self.lamps = tuple(
+            replace(lamp, **fields) if lamp.name == name else lamp  # type: ignore[arg-type]  # changes.py checked them
+            for lamp in self.lamps
+        )
 
-
-def _foot(x: float, y: float, segment: Segment) -> Point:
-    x1, y1, x2, y2 = segment
-    wx, wy = x2 - x1, y2 - y1
-    share = min(1.0, max(0.0, ((x - x1) * wx + (y - y1) * wy) / (wx * wx + wy * wy)))
-    return x1 + share * wx, y1 + share * wy
-
-
-def _distance(x: float, y: float, segment: Segment) -> float:
-    fx, fy = _foot(x, y, segment)
-    return hypot(x - fx, y - fy)
+    def change_thing(self, name: str, now: float, *, speed_m_s: float | None = None, to: Point | None = None) -> None:
+        """Give a thing that is there another speed, or put it elsewhere, where it stays."""
+        at_s = now - self._began
+        changed = []
+        for thing in self.things:
+            if thing.name == name and speed_m_s is not None:
+                thing = thing.faster(speed_m_s, at_s)
+            if thing.name == name and to is not None:
+                thing = thing.put(*to)
+            changed.append(thing)
+        self.things = tuple(changed)

@@ -184,3 +184,27 @@ def test_what_came_too_late_is_stale_but_a_stop_never_is(what: What) -> None:
     assert refusal[0] is Reason.STALE
     for stop in (Stop(), EmergencyStop()):
         assert refuse(Command("c", "stop", Sender("ann"), stop, age_s=1e9, ttl_s=2.0), calm) is None
+
+
+@pytest.mark.parametrize(
+    ("platform", "speed", "step", "limit", "refused"),
+    [
+        ("arduino", 150.0, SpeedStep.UP, 1.0, False),
+        ("arduino", 150.0, SpeedStep.UP, 0.78, True),
+        ("arduino", 150.0, SpeedStep.UP, 0.79, False),
+        ("arduino", 150.0, SpeedStep.DOWN, 0.1, False),
+        ("arduino", 50.0, SpeedStep.DOWN, 0.3, True),  # protocol.md: that step goes up, to 100
+        ("raspberry_pi", 50.0, SpeedStep.UP, 0.6, True),
+    ],
+)
+def test_no_step_beyond_the_speed_that_is_allowed(
+    platform: str, speed: float, step: SpeedStep, limit: float, refused: bool
+) -> None:
+    calm = replace(next(situations()), profile=PROFILES[platform], asked=Mode.MANUAL, closing=False)
+    refusal = refuse(
+        Command("c", "speed", Sender("ann"), ChangeSpeed(step)), replace(calm, speed=speed, speed_max=limit)
+    )
+    assert (refusal is not None) is refused
+    if refusal is not None:
+        assert refusal[0] is Reason.UNSUPPORTED
+        assert f"{limit:.0%} is allowed" in refusal[1]

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.battery import HOLD_S, LOW_V, Action, Battery, BatteryLevel, Policy, charge, level
+from gateway.control.battery import HOLD_S, LOW_V, Action, Battery, BatteryLevel, Policy, charge
 
 
 @pytest.mark.parametrize(
@@ -24,8 +24,13 @@ from gateway.control.battery import HOLD_S, LOW_V, Action, Battery, BatteryLevel
     ],
 )
 def test_level_and_charge(voltage_v: float, expected: BatteryLevel, share: float) -> None:
-    assert level(voltage_v) is expected
+    assert Policy().level(voltage_v) is expected
     assert charge(voltage_v, loaded=False) == (pytest.approx(share), 0.15)
+
+
+def test_where_a_level_begins_may_be_told() -> None:
+    policy = Policy(low_v=7.4, critical_v=7.2)
+    assert [policy.level(volts) for volts in (7.4, 7.39, 7.2, 7.19)] == ["ok", "low", "low", "critical"]
 
 
 def test_under_load_the_estimate_is_of_the_voltage_at_rest_and_less_sure() -> None:

@@ -10,7 +10,7 @@ import pytest
 from gateway.sim.core.arduino import ArduinoCar
 from gateway.sim.core.firmware import Body, Truth
 from gateway.sim.core.raspberry_pi import RaspberryPiCar
-from gateway.sim.core.world import CarBody, Lamp, Pose, World
+from gateway.sim.core.world import Lamp, Pose, World
 from tests.gateway.sim.strangers import (
     FAN,
     MODE00,

@@ -5,7 +5,8 @@ from math import cos, hypot, pi, radians, sin
 
 import pytest
 
-from gateway.sim.core.world import RADIUS_M, CarBody, Lamp, Pose, World
+from gateway.sim.core.body import CarBody
+from gateway.sim.core.world import RADIUS_M, Lamp, Pose, World
 from tests.gateway.sim.strangers import opening, opening_s, virtual
 
 
