@@ -7,32 +7,48 @@ import queue
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import zenoh
 
 from fleet.client import Fleet
+from fleet.hearing import Hearing
+from fleet.kept import Keeper
 from fleet.outcome import Outcome
-from fleet.policy.decide import CarPicture, Decision, Picture, Seen, decide
+from fleet.policy.decide import Ask, Step, step
+from fleet.policy.explain import LEFT_ALONE, Decision
+from fleet.policy.memory import Memory, carried, restored, to_keep
+from fleet.policy.picture import CarPicture, Refused, topic_of
 from fleet.policy.plan import Plan
-from fleet.verbs import mode_request
+from fleet.policy.reader import BadPlan, parse
+from fleet.verbs import led_request, mode_request
 from schemas import keys, messages, topics
-from schemas.bus import BusError, Publisher, Sample, ensure_hub, reply_value
+from schemas.bus import BusError, Publisher, Sample, ensure_hub, reply, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.topics import Qos
 
 SENDER: Final = "coordinator-"
 """How the sender of every coordinator begins, so that a second one can name the first."""
 TURN_S: Final = 0.1
 HUB_GONE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 1.0
-LONGEST_WAIT_S: Final = 30.0
 AGAIN_S: Final = 10.0
 """Plan, assignment and decisions are published again so often, for a recording that began after them."""
+_ANSWERS_S: Final = 1.0
 _QUEUE: Final = 4096
-_NEEDED: Final = ("state/link", "state/mode", "state/motion", "state/safety")
+PLAN_VERB: Final = "plan"
+"""`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
 
-_Item = Sample | tuple[str, bool] | zenoh.Query
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """A sample that was asked for, so it may be old."""
+
+    sample: Sample
+
+
+_Item = Sample | _Answer | tuple[str, bool] | zenoh.Query
 
 
 class AnotherCoordinator(Exception):
@@ -40,35 +56,27 @@ class AnotherCoordinator(Exception):
 
 
 @dataclass(slots=True)
-class _Asked:
-    """What was asked of one car, and when it may be asked again."""
-
-    attempts: int = 0
-    not_before: float = 0.0
-    running: "Future[list[Outcome]] | None" = None
-    told: str = ""
-
-
-@dataclass(slots=True)
 class Coordinator:
-    """Keeps the cars of a plan in their modes. `client` is of kind coordinator, its sender begins with SENDER.
+    """Keeps a plan true. `client` is of kind coordinator, its sender begins with SENDER.
 
-    `decided` hears of every decision that changed, `failed` of a command that was not carried out.
+    `decided` hears of every decision that changed, `failed` of a command that was not carried out. `listed`: what the
+    fleet file says of its cars.
     """
 
     client: Fleet
     plan: Plan
     decided: Callable[[Decision], None]
     failed: Callable[[str], None]
+    listed: Mapping[str, CarPicture] = field(default_factory=dict)
     dropped: int = 0
     """Samples that found the queue full."""
-    _cars: dict[str, CarPicture] = field(default_factory=dict)
-    _readings: dict[tuple[str, str], Seen] = field(default_factory=dict)
-    _since: Mapping[int, float] = field(default_factory=dict)
-    _last: dict[str, Decision] = field(default_factory=dict)
-    _asked: dict[str, _Asked] = field(default_factory=dict)
+    _memory: Memory = field(default_factory=Memory)
+    _running: "dict[str, tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=dict)
+    _told: dict[str, str] = field(default_factory=dict)
     _published: dict[tuple[str, str], tuple[Publisher, Any]] = field(default_factory=dict)
-    """The last of each topic, and of each car in it: what a query is answered with."""
+    """The last of each topic, and of each subject in it: what a query is answered with."""
+    _publishers: dict[str, Publisher] = field(default_factory=dict)
+    _subscribed: set[str] = field(default_factory=set)
     _inbox: "queue.Queue[_Item]" = field(default_factory=lambda: queue.Queue(_QUEUE))
 
     def run(self, ended: Callable[[], bool]) -> None:
@@ -78,26 +86,32 @@ class Coordinator:
         if bus.tokens(token):
             raise AnotherCoordinator(self._named(self._others()))
         bus.token(token)
-        wanted = {f"{fleet}/*/state/*"} | {f"{fleet}/{rule.when.car}/{rule.when.reading}" for rule in self.plan.rules}
-        for expression in sorted(wanted):
-            bus.subscribe(expression, self._put)
+        hearing = Hearing(self.listed)
+        keeper = Keeper(fleet, bus.endpoint)
+        self._subscribe(f"{fleet}/*/state/*")
         bus.watch_tokens(keys.car_token(fleet, "*"), lambda key, alive: self._put((key, alive)))
-        publish = {name: self._publisher(name) for name in ("plan", "assignment", "decision")}
-        publish["plan"](pb.Plan(text=self.plan.text, version=self.plan.version))
+        self._follow(self.plan)
         bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._put)
+        bus.queryable(keys.command_key(fleet, keys.COORDINATOR, PLAN_VERB), self._put)
         again_at = time.monotonic() + AGAIN_S
         look_again_at: float | None = time.monotonic() + LOOK_AGAIN_S
         linked_at = time.monotonic()
-        with ThreadPoolExecutor(max_workers=min(32, len(self.plan.cars))) as pool:
+        with ThreadPoolExecutor(max_workers=32) as pool:
             try:
+                self._listen(hearing, pool, wait_s=0.0)
+                self._ask_all()
+                self._listen(hearing, pool, wait_s=0.0)
+                now = time.monotonic()
+                self._memory = restored(self.plan, hearing.picture(()), keeper.load(), now, time.time())
                 while not ended():
-                    self._drain()
+                    self._turn(hearing, pool, now)
+                    keeper.save(to_keep(self.plan, self._memory, now, time.time()))
+                    self._listen(hearing, pool)
                     now = time.monotonic()
                     linked_at = now if bus.connected else self._see_to_hub(linked_at, now)
                     if look_again_at is not None and now >= look_again_at:
                         look_again_at = None
                         self._yield_to_the_first()
-                    self._turn(pool, publish, now)
                     if now >= again_at:
                         again_at = now + AGAIN_S
                         for publisher, message in self._published.values():
@@ -107,47 +121,76 @@ class Coordinator:
 
     # ------------------------------------------------------------------ one turn
 
-    def _turn(self, pool: ThreadPoolExecutor, publish: Mapping[str, Callable[[Any], None]], now: float) -> None:
-        result = decide(self.plan, Picture(self._cars, self._readings), self._since, now)
-        self._since = result.since
-        changed = False
-        for decision in result.decisions:
-            before = self._last.get(decision.car)
-            if before is None or (before.mode, before.cause) != (decision.mode, decision.cause):
-                self._last[decision.car] = decision
-                self._asked[decision.car] = _Asked(running=self._of(decision.car).running)
-                changed = True
-                publish["decision"](_message(decision))
-                self.decided(decision)
-            self._ask(pool, decision, now)
-        if changed:
-            publish["assignment"](_assignment(result.decisions))
+    def _turn(self, hearing: Hearing, pool: ThreadPoolExecutor, now: float) -> None:
+        for car, (ask, future) in list(self._running.items()):
+            if future.done():
+                del self._running[car]
+                self._outcome(hearing, car, ask, future.result()[0], now)
+        result = step(self.plan, hearing.picture(self._running), self._memory, now)
+        before, self._memory = self._memory, result.memory
+        for decision in result.changed:
+            self._publish("decision", _message(decision))
+            self.decided(decision)
+        if result.changed or before.phase.name != result.memory.phase.name:
+            self._publish("assignment", _assignment(self.plan, result))
+        for ask in result.asks:
+            request = mode_request(ask.mode) if ask.mode is not None else led_request(*(ask.led or (0, 0, 0)))
+            future = pool.submit(self.client.ask, request, [ask.car])
+            if ask.mode is not None:
+                self._running[ask.car] = (ask, future)
 
-    def _ask(self, pool: ThreadPoolExecutor, decision: Decision, now: float) -> None:
-        """Ask for the mode if the car is not in it; again and again, ever more slowly."""
-        asked = self._of(decision.car)
-        if asked.running is not None:
-            if not asked.running.done():
-                return
-            outcome = asked.running.result()[0]
-            asked.running = None
-            words = f"{decision.car}: {outcome.reason or outcome.phase}: {outcome.words}"
-            if not outcome.ok and words != asked.told:
-                asked.told = words
-                self.failed(words)
-        if not decision.ask or decision.mode is None:
-            asked.attempts = 0
-            return
-        if now < asked.not_before:
-            return
-        asked.attempts += 1
-        asked.not_before = now + min(LONGEST_WAIT_S, 2.0 ** (asked.attempts - 1))
-        asked.running = pool.submit(self.client.ask, mode_request(decision.mode), [decision.car])
+    def _outcome(self, hearing: Hearing, car: str, ask: Ask, outcome: Outcome, now: float) -> None:
+        assert ask.mode is not None
+        refusal = None if outcome.ok else Refused(ask.mode, outcome.reason, outcome.words, now)
+        hearing.refused(car, refusal)
+        words = "" if outcome.ok else f"{car}: {outcome.reason or outcome.phase}: {outcome.words}"
+        if words and words != self._told.get(car):
+            self.failed(words)
+        self._told[car] = words
 
-    def _of(self, car: str) -> _Asked:
-        return self._asked.setdefault(car, _Asked())
+    # ------------------------------------------------------------------ the plan
+
+    def _follow(self, plan: Plan) -> None:
+        """Hear what this plan looks at, and say that it is in force."""
+        self.plan = plan
+        for topic in sorted({topic_of(name) for name in plan.names}):
+            if not topic.startswith("state/"):
+                self._subscribe(f"{self.client.name}/*/{topic}")
+        self._publish("plan", pb.Plan(text=plan.text, version=plan.version))
+
+    def _replace(self, query: zenoh.Query) -> None:
+        """Take another plan, wholly; or refuse it with all that is wrong with it."""
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        encoding = str(query.encoding) if query.encoding is not None else ""
+        result = pb.Result(status="sent")
+        try:
+            if encoding.startswith((topics.PROTOBUF, messages.JSON)):
+                given: Any = messages.parse(topics.TOPICS[f"{keys.COORDINATOR}/plan"].message, payload, encoding)
+                text = given.text
+            else:
+                text = payload.decode()
+            plan = parse(text)
+        except (BadPlan, messages.BadPayload, UnicodeDecodeError) as error:
+            result = pb.Result(status="rejected", reason="bad_value", words=str(error))
+        else:
+            result.words = f"plan {plan.version} is in force"
+            self._memory = carried(self._memory, self.plan, plan)
+            for name, subject in [*self._published]:
+                if name == "decision":
+                    del self._published[name, subject]
+            self._follow(plan)
+            self._ask_all()
+        if query.parameters.get("format") == "json":
+            reply(query, str(query.key_expr), messages.to_json(result).encode(), messages.JSON)
+        else:
+            reply(query, str(query.key_expr), result.SerializeToString(), messages.encoding_of(topics.RESULT))
 
     # ------------------------------------------------------------------ what is heard
+
+    def _subscribe(self, expression: str) -> None:
+        if expression not in self._subscribed:
+            self._subscribed.add(expression)
+            self.client.bus.subscribe(expression, self._put)
 
     def _put(self, item: _Item) -> None:
         """On a Zenoh thread."""
@@ -156,72 +199,44 @@ class Coordinator:
         except queue.Full:
             self.dropped += 1
 
-    def _drain(self) -> None:
+    def _ask_all(self, car: str = "*") -> None:
+        """What the cars (or one of them) have said last: whoever begins needs not wait until they say it again."""
+        wanted = {"state/*", *(topic_of(name) for name in self.plan.names)}
+        for topic in sorted(wanted):
+            selector = f"{self.client.name}/{car}/{topic}"
+            for answer in self.client.bus.query(selector, timeout_s=_ANSWERS_S, qos=Qos.STATE):
+                if isinstance(answer, Sample):
+                    self._put(_Answer(answer))
+
+    def _listen(self, hearing: Hearing, pool: ThreadPoolExecutor, wait_s: float = TURN_S) -> None:
         """Take what came, waiting a turn's length for the first."""
-        wait_s = TURN_S
         while True:
             try:
                 item = self._inbox.get(timeout=wait_s) if wait_s else self._inbox.get_nowait()
             except queue.Empty:
                 return
             wait_s = 0.0
-            self._take(item)
-
-    def _take(self, item: _Item) -> None:
-        if isinstance(item, zenoh.Query):
-            self._answer(item)
-            return
-        if isinstance(item, tuple):
-            car = item[0].rpartition("/")[2]
-            # What was known of a car that went may no longer be so when it is back: a hold above all.
-            self._cars[car] = CarPicture(present=item[1])
-            for topic in _NEEDED:
-                self._readings.pop((car, topic), None)
-            self._asked.pop(car, None)
-            return
-        key = keys.parse(item.key)
-        try:
-            value: Any = item.message()
-        except (messages.BadPayload, KeyError):
-            return  # not of this fleet's gateways: nothing to decide on
-        if key is None:
-            return
-        measured = {descriptor.name for descriptor, _ in value.ListFields()}
-        fields = {
-            each.name: getattr(value, each.name)
-            for each in value.DESCRIPTOR.fields
-            if not each.has_presence or each.name in measured
-        }
-        self._readings[key.car, key.topic] = Seen(fields, time.monotonic())
-        self._states(key.car)
+            now = time.monotonic()
+            if isinstance(item, zenoh.Query):
+                self._answer(item)
+            elif isinstance(item, tuple):
+                car = item[0].rpartition("/")[2]
+                hearing.token(car, alive=item[1])
+                if item[1] and self._memory.began is not None:
+                    pool.submit(self._ask_all, car)
+            elif isinstance(item, _Answer):
+                hearing.take(item.sample, now, time.time())
+            else:
+                hearing.take(item, now, None)
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
+            if str(query.key_expr).endswith(f"/@cmd/{PLAN_VERB}"):
+                self._replace(query)
+                return
             for publisher, message in self._published.values():
                 if query.key_expr.intersects(publisher.key):
                     reply_value(query, publisher.key, message.SerializeToString(), publisher.topic)
-
-    def _states(self, car: str) -> None:
-        """Make the car's picture of its states: only when all that could forbid a command are known."""
-        before = self._cars.get(car, CarPicture())
-        states = [self._readings.get((car, topic)) for topic in _NEEDED]
-        link, mode, motion, safety = states
-        if not before.present or link is None or mode is None or motion is None or safety is None:
-            return
-        hold, lease = safety.fields.get("hold"), safety.fields.get("lease")
-        estops: Any = safety.fields.get("estops") or ()
-        driver = motion.fields["owner"]
-        if not driver and isinstance(lease, pb.Lease) and lease.kind != "coordinator":
-            driver = lease.holder
-        self._cars[car] = replace(
-            before,
-            link=str(link.fields["state"]),
-            mode=str(mode.fields["asked"]),
-            verdict=str(mode.fields["verdict"]),
-            held_by=hold.by if isinstance(hold, pb.Hold) else None,
-            estopped_by=estops[0].by if estops else None,
-            driven_by=str(driver) or None,
-        )
 
     # ------------------------------------------------------------------ there is only one; and the hub
 
@@ -250,29 +265,36 @@ class Coordinator:
             self.failed(str(error))
         return now
 
-    def _publisher(self, name: str) -> Callable[[Any], None]:
+    def _publish(self, name: str, message: Any) -> None:
         topic = topics.TOPICS[f"{keys.COORDINATOR}/{name}"]
-        publisher = self.client.bus.publisher(f"{self.client.name}/{topic.name}", topic, keys.COORDINATOR)
-
-        def publish(message: Any) -> None:
-            self._published[name, getattr(message, "subject", "")] = (publisher, message)
-            publisher.put(message, time.time_ns())
-
-        return publish
+        if name not in self._publishers:
+            key = f"{self.client.name}/{topic.name}"
+            self._publishers[name] = self.client.bus.publisher(key, topic, keys.COORDINATOR)
+        self._published[name, getattr(message, "subject", "")] = (self._publishers[name], message)
+        self._publishers[name].put(message, time.time_ns())
 
 
 def _message(decision: Decision) -> pb.Decision:
     return pb.Decision(
-        subject=decision.car,
-        decided=decision.mode or "left alone",
+        subject=decision.subject,
+        decided=decision.decided,
         why=decision.why,
         readings=decision.readings,
         would_change=decision.would_change,
+        kind=decision.kind,
+        role=decision.role or "",
     )
 
 
-def _assignment(decisions: tuple[Decision, ...]) -> pb.Assignment:
+def _assignment(plan: Plan, result: Step) -> pb.Assignment:
     roles: dict[str, list[str]] = {}
-    for decision in decisions:
-        roles.setdefault(decision.mode or "left alone", []).append(decision.car)
-    return pb.Assignment(roles=[pb.Role(name=name, cars=cars) for name, cars in sorted(roles.items())])
+    for car, role in sorted(result.roles.items()):
+        roles.setdefault(role, []).append(car)
+    for decision in result.decisions:
+        if decision.car is not None and decision.car not in result.roles:
+            roles.setdefault(decision.mode or LEFT_ALONE, []).append(decision.car)
+    return pb.Assignment(
+        roles=[pb.Role(name=name, cars=cars) for name, cars in sorted(roles.items())],
+        phase=result.memory.phase.name,
+        plan_version=plan.version,
+    )

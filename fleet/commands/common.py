@@ -50,12 +50,20 @@ def with_client(function: _Function) -> _Function:
     return command
 
 
+class WrongFile(click.ClickException):
+    """A file with faults, each in a line of its own that begins with the place: shown as they are."""
+
+    exit_code = 2
+
+
 @contextmanager
 def explained() -> Iterator[None]:
     """Turn what a user can cause into click's errors: exit code 2 for wrong use, 1 for a failure."""
     try:
         yield
     except (BadEndpoint, ValueError) as error:  # BadKey is a ValueError
+        if hasattr(error, "problems"):  # a fleet.marked.BadFile, whose import would slow every other command down
+            raise WrongFile(str(error)) from None
         raise click.UsageError(str(error)) from None
     except BusError as error:
         raise click.ClickException(str(error)) from None

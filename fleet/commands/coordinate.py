@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
 
@@ -11,9 +12,12 @@ import click
 
 from fleet.client import Fleet, default_sender
 from fleet.commands.common import bus_options, json_option
+from fleet.config import FleetFile, read_fleet
 from fleet.coordinator import SENDER, AnotherCoordinator, Coordinator
-from fleet.policy.decide import Decision
-from fleet.policy.plan import Plan, parse
+from fleet.marked import read_text
+from fleet.policy.explain import Decision
+from fleet.policy.picture import CarPicture
+from fleet.policy.reader import parse
 
 
 @click.command(
@@ -23,21 +27,28 @@ example:
 
 \b
 a plan:
+  roles:
+    patrol: {mode: obstacle_avoidance, needs: battery.voltage_v > 7.0, count: 2}
   cars:
-    red: tracking
     blue: manual
   rules:
-    - when: {car: red, reading: sensor/range, field: range_m, below: 0.3, for_s: 0.5}
-      then: {car: blue, mode: obstacle_avoidance}"""
+    - when: {car: red, is: range.range_m < 0.3, for_s: 0.5}
+      then: {who: blue, mode: tracking}"""
 )
 @click.option("--plan", "path", required=True, type=click.Path(path_type=Path, dir_okay=False), help="The plan, YAML.")
+@click.option(
+    "--fleet-file", type=click.Path(path_type=Path, dir_okay=False), help="The fleet file: what its cars may do."
+)
 @click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
 @json_option
 @bus_options
-def coordinate(path: Path, connect: str | None, fleet: str, *, with_parent: bool, as_json: bool) -> None:
-    """Keep the cars of a plan in their modes, until Ctrl-C; cars on hold are left alone. One line per decision."""
+def coordinate(
+    path: Path, fleet_file: Path | None, connect: str | None, fleet: str, *, with_parent: bool, as_json: bool
+) -> None:
+    """Keep a plan true, until Ctrl-C; cars on hold are left alone. One line per decision."""
     parent = os.getppid() if with_parent else None
-    plan = _read(path)
+    plan = parse(read_text(path), str(path))
+    listed = {} if fleet_file is None else pictures(read_fleet(fleet_file))
     stop = threading.Event()
 
     def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
@@ -47,36 +58,47 @@ def coordinate(path: Path, connect: str | None, fleet: str, *, with_parent: bool
     signal.signal(signal.SIGTERM, ask_to_stop)
 
     def decided(decision: Decision) -> None:
-        click.echo(_json(decision) if as_json else _line(decision))
+        click.echo(_json(decision) if as_json else line(decision))
 
     with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True) as client:
         try:
-            Coordinator(client, plan, decided, lambda words: click.echo(f"fleet: {words}", err=True)).run(
+            Coordinator(client, plan, decided, lambda words: click.echo(f"fleet: {words}", err=True), listed).run(
                 lambda: stop.is_set() or parent not in (None, os.getppid())
             )
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None
 
 
-def _read(path: Path) -> Plan:
-    try:
-        return parse(path.read_text(encoding="utf-8"), str(path))
-    except UnicodeDecodeError:
-        raise click.UsageError(f"{path} is not a text in UTF-8: a plan is YAML") from None
-    except OSError as error:
-        raise click.UsageError(f"the plan {path} cannot be read: {error.strerror}") from None
+def pictures(file: FleetFile) -> Mapping[str, CarPicture]:
+    """What a fleet file says of its cars."""
+    return {
+        name: CarPicture(
+            platform="" if car.platform.startswith("auto") else car.platform,
+            capabilities=car.capabilities,
+            roles=None if car.roles is None else frozenset(car.roles),
+            listed=True,
+        )
+        for name, car in file.cars.items()
+    }
 
 
-def _line(decision: Decision) -> str:
+def line(decision: Decision) -> str:
+    """A decision for a person."""
     readings = f" ({', '.join(decision.readings)})" if decision.readings else ""
-    wanted = decision.mode or "left alone"
-    return f"{decision.car}: {wanted}, because of {decision.why}{readings}; would change with: {decision.would_change}"
+    return (
+        f"{decision.subject}: {decision.decided}, because of {decision.why}{readings}; "
+        f"would change with: {decision.would_change}"
+    )
 
 
 def _json(decision: Decision) -> str:
     return json.dumps(
         {
+            "subject": decision.subject,
+            "kind": decision.kind,
+            "decided": decision.decided,
             "car": decision.car,
+            "role": decision.role,
             "mode": decision.mode,
             "why": decision.why,
             "readings": decision.readings,

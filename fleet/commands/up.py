@@ -15,7 +15,7 @@ import click
 
 from fleet.commands.common import explained
 from fleet.config import read_fleet
-from fleet.policy.plan import parse as parse_plan
+from fleet.policy.reader import parse as parse_plan
 from fleet.supervise.desk import AnotherSupervisor
 from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, wanted
 from fleet.supervisor import Happening, Supervisor

@@ -1,141 +1,284 @@
-"""What mode each car of a plan should be in now, and why. Pure and deterministic: time is an argument.
+"""One step of the coordinator: what each car should do now, why, and what is asked of it. Pure and deterministic.
 
 A car that is on hold, that someone else drives, or that cannot be reached is left alone, whatever the plan says.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
-from fleet.policy.plan import Condition, Plan
+from fleet.policy import explain
+from fleet.policy.explain import Decision, Kind, Override
+from fleet.policy.memory import Held, Memory, Tried
+from fleet.policy.picture import CONTRADICTED, LOST, NOBODY, CarPicture, Picture
+from fleet.policy.plan import Effect, Plan, Rule
+from fleet.policy.rules import Cars, RuleState, follow_phase, follow_rules, targets
+from fleet.policy.staffing import Barrier, Staff, Staffing, fill, follow_needs
+from fleet.policy.steady import HYSTERESIS_S
 from gateway.protocol.values import Mode
-from schemas import topics
 
-CONTRADICTED: Final = "contradicted"
-LOST: Final = "lost"
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """The fields of one reading that were measured, and when it came."""
-
-    fields: Mapping[str, object]
-    at: float
+LONGEST_WAIT_S: Final = 30.0
+"""A mode that does not come about is asked for ever more slowly, at least so often."""
+HEARD_WITHIN_S: Final = 1.5
+"""So long after the start roles wait for cars that are on the bus and have not said yet how they are."""
+IN_VAIN: Final = 2
+"""A car that was asked so often and does not do it gives its role to one that can."""
+_UNKNOWN: Final = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
-class CarPicture:
-    """What is known of one car."""
-
-    present: bool = False
-    """Its gateway is on the bus."""
-    mode: str = ""
-    """The mode it was last asked for, as its gateway says; empty: not heard yet."""
-    verdict: str = ""
-    link: str = ""
-    """As its gateway says; empty: not heard yet."""
-    estopped_by: str | None = None
-    held_by: str | None = None
-    driven_by: str | None = None
-    """Who holds a motion; a coordinator never does."""
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """What the coordinator knows."""
-
-    cars: Mapping[str, CarPicture] = field(default_factory=dict)
-    readings: Mapping[tuple[str, str], Seen] = field(default_factory=dict)
-    """By car and topic."""
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """What is wanted of one car."""
+class Ask:
+    """A command for one car: a mode, or the colour of its LED."""
 
     car: str
-    mode: Mode | None
-    """The mode it should be in; None: it is left alone."""
-    cause: str
-    """What decided; the same as long as the same thing decides."""
-    why: str
-    readings: tuple[str, ...]
-    """Those that were used, key=value."""
-    would_change: str
-    ask: bool
-    """The car is not as it should be: ask for the mode."""
+    mode: Mode | None = None
+    led: tuple[int, int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Decisions:
-    """One for each car of the plan, and since when each rule's test has passed: give it to the next call."""
+class Step:
+    """What follows from one picture; `memory` is for the next step."""
 
-    decisions: tuple[Decision, ...]
-    since: Mapping[int, float]
+    memory: Memory
+    decisions: tuple[Decision, ...] = ()
+    """One for each car of the plan, each role that is or was not filled, and a phase that has just begun."""
+    changed: tuple[Decision, ...] = ()
+    """Those that are not what they were."""
+    asks: tuple[Ask, ...] = ()
+    roles: Mapping[str, str] = field(default_factory=dict)
 
 
-def decide(plan: Plan, picture: Picture, since: Mapping[int, float], now: float) -> Decisions:
-    """Decide for every car of the plan; `since` is that of the last call, empty at the start."""
-    passing = {
-        index: since.get(index, now) for index, rule in enumerate(plan.rules) if _passes(rule.when, picture, now)
+def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
+    """Decide; the same arguments give the same answer."""
+    memory = memory if memory.began is not None else replace(memory, began=now)
+    subjects = _subjects(plan, picture)
+    found = {car: _barrier(car, picture.cars.get(car, NOBODY)) for car in subjects}
+    barriers = {car: barrier[0] for car, barrier in found.items() if barrier is not None}
+    gone_since = {car: memory.gone_since.get(car, now) for car in barriers}
+    lately = {car for car, since in gone_since.items() if now - since < HYSTERESIS_S}
+    has = memory.roles
+    reserved = {
+        car: has[car]
+        for car, barrier in found.items()
+        if barrier is not None and not barrier[1] and car in has and car in lately
     }
-    true = {index for index, began in passing.items() if now - began >= plan.rules[index].when.for_s}
-    decisions = tuple(_of_car(car, plan, picture, true) for car in plan.cars)
-    return Decisions(decisions, passing)
+    free = tuple(car for car in subjects if car not in barriers)
+    cars = Cars(subjects, frozenset(free), frozenset({*free, *lately}), has)
+    phase = memory.phase if memory.phase.name else replace(memory.phase, name=plan.first, since=now)
+    rules = follow_rules(plan, picture, cars, phase.name, memory.rules, now)
+    phase, turn = follow_phase(plan, picture, cars, phase, rules, now)
+    needs = follow_needs(plan, picture, subjects, memory.needs, now)
+    rules_before = memory.rules
+    memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
+    assert memory.began is not None
+    if now - memory.began < HEARD_WITHIN_S and any(_unheard(picture.cars.get(car, NOBODY)) for car in subjects):
+        return Step(memory)
+
+    roles_in_force = plan.phases[phase.name].roles if phase.name else None
+    staff = Staff(
+        plan=plan,
+        picture=picture,
+        free=free,
+        reserved=reserved,
+        has=has,
+        in_vain=frozenset(car for car, tried in memory.tried.items() if tried.attempts >= IN_VAIN),
+        pinned=_pinned(plan, rules, subjects),
+        in_force=frozenset(plan.roles) if roles_in_force is None else roles_in_force,
+        needs=needs,
+        now=now,
+    )
+    staffing = fill(staff)
+    held = _held(staff, staffing, memory.held, barriers)
+    overrides = _overrides(plan, rules, subjects, staffing.roles, staff.pinned)
+    decisions = [explain.of_phase(turn, phase.since)] if turn is not None else []
+    for car in subjects:
+        if car in barriers:
+            decisions.append(explain.alone(car, barriers[car], reserved.get(car)))
+        elif car in overrides:
+            decisions.append(explain.ruled(car, overrides[car], staffing.roles.get(car)))
+        elif car in held:
+            decisions.append(explain.in_role(car, held[car], staff, staffing))
+        else:
+            decisions.append(explain.idle(car, staff, staffing))
+    decisions = [_doubted(decision, picture) for decision in decisions]
+    decisions += _vacancies(staff, staffing, memory.causes, barriers)
+    tried, asks = _asks(decisions, picture, memory.tried, now)
+    asks += _leds(plan, rules, rules_before, staff, staffing)
+    return Step(
+        replace(
+            memory, held=held, tried=tried, causes={**memory.causes, **{each.subject: each.cause for each in decisions}}
+        ),
+        tuple(decisions),
+        tuple(each for each in decisions if memory.causes.get(each.subject) != each.cause),
+        tuple(asks),
+        staffing.roles,
+    )
 
 
-def _of_car(car: str, plan: Plan, picture: Picture, true: set[int]) -> Decision:
-    known = picture.cars.get(car, CarPicture())
-    alone = _left_alone(car, known)
-    if alone is not None:
-        return alone
-    rules = [index for index, rule in enumerate(plan.rules) if rule.car == car]
-    for index in rules:
-        if index in true:
-            rule = plan.rules[index]
-            used = (f"{rule.when.car}/{rule.when.reading} {rule.when.field}={_value(rule.when, picture)}",)
-            why, change = f"rule {index + 1}: {rule.when}", "that no longer being so, or its reading growing old"
-            return _wanted(car, rule.mode, f"rule {index + 1}", why, used, change, known)
-    change = "; ".join(str(plan.rules[index].when) for index in rules) or "nothing but a hold"
-    return _wanted(car, plan.cars[car], "plan", "the plan", (), change, known)
+# ---------------------------------------------------------------------- which cars
 
 
-def _wanted(
-    car: str, mode: Mode, cause: str, why: str, used: tuple[str, ...], change: str, known: CarPicture
-) -> Decision:
-    ask = known.mode != mode or known.verdict == CONTRADICTED
-    return Decision(car, mode, cause, why, used, change, ask)
+def _subjects(plan: Plan, picture: Picture) -> tuple[str, ...]:
+    """The cars that something is decided of: those that the plan names and, if it is for any, all that there are."""
+    others = (car for car, known in picture.cars.items() if known.present or known.listed)
+    return tuple(sorted({*plan.named, *others})) if plan.open else tuple(sorted(plan.named))
 
 
-def _left_alone(car: str, known: CarPicture) -> Decision | None:
+def _unheard(known: CarPicture) -> bool:
+    return known.present and not known.mode
+
+
+def _barrier(car: str, known: CarPicture) -> tuple[Barrier, bool] | None:
+    """Why the car is left alone, and whether that is a person's word, for which its role is not kept."""
     if not known.present:
-        why, change = f"{car} is not on the bus", "its gateway coming up"
-    elif not known.mode:  # so it is not known either whether there is a hold
-        why, change = f"{car} has not said yet how it is", "its first states"
-    elif known.estopped_by is not None:
-        why, change = f"{car} is e-stopped by {known.estopped_by}", "a resume by a person or script"
-    elif known.held_by is not None:
-        why, change = f"{car} is on hold by {known.held_by}", "a drive, mode or resume by a person or script"
-    elif known.driven_by is not None:
-        why, change = f"{car} is driven by {known.driven_by}", "the end of that drive"
-    elif known.link == LOST:
-        why, change = f"the link of {car} is lost", "its return"
-    else:
-        return None
-    return Decision(car, None, why, why, (), change, ask=False)
+        return Barrier(f"{car} is not on the bus", "its gateway coming up"), False
+    if not known.mode:  # so it is not known either whether there is a hold
+        return Barrier(f"{car} has not said yet how it is", "its first states"), False
+    if known.estopped_by is not None:
+        return Barrier(f"{car} is e-stopped by {known.estopped_by}", "a resume by a person or script"), True
+    if known.held_by is not None:
+        return Barrier(f"{car} is on hold by {known.held_by}", "a drive, mode or resume by a person or script"), True
+    if known.driven_by is not None:
+        return Barrier(f"{car} is driven by {known.driven_by}", "the end of that drive"), False
+    if known.link == LOST:
+        return Barrier(f"the link of {car} is lost", "its return"), False
+    if known.motors == _UNKNOWN and known.verdict != CONTRADICTED:
+        return Barrier(f"{car} is not in a known state yet", "the end of its recovery: a reading from it"), False
+    return None
 
 
-def _passes(when: Condition, picture: Picture, now: float) -> bool:
-    """Whether the field was measured, is fresh, and passes; a field that is not there passes nothing."""
-    seen = picture.readings.get((when.car, when.reading))
-    if seen is None or when.field not in seen.fields:
-        return False
-    stale_after_s = topics.TOPICS[when.reading].stale_after_s
-    if stale_after_s is not None and now - seen.at > stale_after_s:
-        return False
-    return when.holds(seen.fields[when.field])
+# ---------------------------------------------------------------------- what rules say
 
 
-def _value(when: Condition, picture: Picture) -> object:
-    value = picture.readings[when.car, when.reading].fields[when.field]
-    return f"{value:.4g}" if isinstance(value, float) else value
+def _effects(plan: Plan, rules: Mapping[int, RuleState]) -> Iterator[tuple[int, Rule, RuleState, Effect]]:
+    for index, state in rules.items():
+        if state.on:
+            rule = plan.rules[index]
+            for effect in rule.effects:
+                yield index, rule, state, effect
+
+
+def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...]) -> dict[str, tuple[str, str]]:
+    """The one role that rules in force leave a car, and the rule: of several the first counts."""
+    found: dict[str, tuple[str, str]] = {}
+    for _, rule, state, effect in _effects(plan, rules):
+        if effect.role is not None:
+            for car in targets(effect, state, subjects, {}):
+                found.setdefault(car, (effect.role, rule.name))
+    return found
+
+
+def _overrides(
+    plan: Plan,
+    rules: Mapping[int, RuleState],
+    subjects: tuple[str, ...],
+    roles: Mapping[str, str],
+    pinned: Mapping[str, tuple[str, str]],
+) -> dict[str, Override]:
+    """The modes that rules in force give cars, whatever their roles say: of several rules the first counts."""
+    found: dict[str, Override] = {}
+    said: set[str] = set()
+    for _, rule, state, effect in _effects(plan, rules):
+        if effect.mode is not None:
+            for car in targets(effect, state, subjects, roles):
+                if car not in said:
+                    said.add(car)
+                    found[car] = Override(rule, state, effect)
+        elif effect.role is not None:
+            said |= {car for car in targets(effect, state, subjects, roles) if pinned[car][1] == rule.name}
+    return found
+
+
+# ---------------------------------------------------------------------- roles
+
+
+def _held(
+    staff: Staff, staffing: Staffing, before: Mapping[str, Held], barriers: Mapping[str, Barrier]
+) -> dict[str, Held]:
+    """Who has which role, and how each came by it."""
+    lost = {
+        name: [car for car, held in before.items() if held.role == name and staffing.roles.get(car) != name]
+        for name in staff.plan.roles
+    }
+    found: dict[str, Held] = {}
+    for car, name in sorted(staffing.roles.items()):
+        held = before.get(car)
+        if held is not None and held.role == name:
+            found[car] = held
+            continue
+        gone = lost[name].pop(0) if lost[name] else None
+        barrier = None
+        if gone is not None:
+            barrier = barriers.get(gone) or staff.barrier(gone, staff.plan.roles[name])
+        words = barrier.why if barrier is not None else f"{gone} is wanted elsewhere"
+        found[car] = explain.came_by(car, name, staff, gone, words)
+    return found
+
+
+def _vacancies(
+    staff: Staff, staffing: Staffing, causes: Mapping[str, str], barriers: Mapping[str, Barrier]
+) -> list[Decision]:
+    found = []
+    for name in staffing.places:
+        least = 1 if staff.plan.roles[name].count is None else staffing.places[name]
+        if len(staffing.holders(name)) < min(least, staffing.places[name]):
+            found.append(explain.vacancy(name, staff, staffing, barriers))
+        elif f"role {name}" in causes:
+            found.append(explain.filled(name, staffing))
+    return found
+
+
+# ---------------------------------------------------------------------- what is asked
+
+
+def _doubted(decision: Decision, picture: Picture) -> Decision:
+    known = picture.cars.get(decision.subject, NOBODY)
+    if decision.mode is None or known.mode != decision.mode or known.verdict != CONTRADICTED:
+        return decision
+    return explain.repaired(decision, known.evidence)
+
+
+def _asks(
+    decisions: Iterable[Decision], picture: Picture, before: Mapping[str, Tried], now: float
+) -> tuple[dict[str, Tried], list[Ask]]:
+    """Ask each car that is not as it should be for its mode; again and again, ever more slowly."""
+    found: dict[str, Tried] = {}
+    asks = []
+    for decision in decisions:
+        car, mode = decision.car, decision.mode
+        if car is None or mode is None:
+            continue  # a car that is left alone: what was tried is over
+        known = picture.cars.get(car, NOBODY)
+        tried = before.get(car, Tried(mode))
+        if tried.mode != mode:
+            tried = Tried(mode)
+        if known.mode == mode and known.verdict != CONTRADICTED:
+            fine_since = now if tried.fine_since is None else tried.fine_since
+            found[car] = Tried(mode) if now - fine_since >= LONGEST_WAIT_S else replace(tried, fine_since=fine_since)
+            continue
+        if decision.kind is Kind.IDLE and known.mode == _UNKNOWN:
+            found[car] = tried  # its gateway brings it to rest
+        elif known.busy or now < tried.again_at:
+            found[car] = replace(tried, fine_since=None)
+        else:
+            wait_s = min(LONGEST_WAIT_S, 2.0**tried.attempts)
+            found[car] = Tried(mode, tried.attempts + 1, now + wait_s)
+            asks.append(Ask(car, mode))
+    return found, asks
+
+
+def _leds(
+    plan: Plan, rules: Mapping[int, RuleState], before: Mapping[int, RuleState], staff: Staff, staffing: Staffing
+) -> list[Ask]:
+    """A colour is set once, when its rule comes into force."""
+    asks = []
+    subjects = tuple(sorted({*staff.free, *staff.reserved}))
+    for index, _, state, effect in _effects(plan, rules):
+        was = before.get(index)
+        if effect.led is not None and (was is None or not was.on or was.that != state.that):
+            asks += [
+                Ask(car, led=effect.led)
+                for car in targets(effect, state, subjects, staffing.roles)
+                if car in staff.free
+            ]
+    return asks

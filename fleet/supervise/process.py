@@ -50,17 +50,20 @@ class Log:
         return self.path.with_suffix(".log.1")
 
 
-def runs(fleet: str) -> Path:
-    """Where the runs of a fleet are kept: in FLEET_STATE_DIR, else in the user's state directory of the platform."""
+def state_directory() -> Path:
+    """What outlives a process lies there: FLEET_STATE_DIR, else the user's state directory of the platform."""
     if chosen := os.environ.get(STATE_VARIABLE):
-        base = Path(chosen)
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Application Support" / "zenoh-car-fleet"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "zenoh-car-fleet"
-    else:
-        base = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "zenoh-car-fleet"
-    return base / "runs" / fleet
+        return Path(chosen)
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Application Support" / "zenoh-car-fleet"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "zenoh-car-fleet"
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "zenoh-car-fleet"
+
+
+def runs(fleet: str) -> Path:
+    """Where the runs of a fleet are kept."""
+    return state_directory() / "runs" / fleet
 
 
 def new_run(fleet: str, now: float) -> Path:

@@ -467,21 +467,25 @@ class Role(_message.Message):
     def __init__(self, name: _Optional[str] = ..., cars: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Assignment(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "roles")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "roles", "phase", "plan_version")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
     ROLES_FIELD_NUMBER: _ClassVar[int]
+    PHASE_FIELD_NUMBER: _ClassVar[int]
+    PLAN_VERSION_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
     boot_id: str
     roles: _containers.RepeatedCompositeFieldContainer[Role]
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., roles: _Optional[_Iterable[_Union[Role, _Mapping]]] = ...) -> None: ...
+    phase: str
+    plan_version: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., roles: _Optional[_Iterable[_Union[Role, _Mapping]]] = ..., phase: _Optional[str] = ..., plan_version: _Optional[str] = ...) -> None: ...
 
 class Decision(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "subject", "decided", "why", "readings", "would_change")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "subject", "decided", "why", "readings", "would_change", "kind", "role")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -491,6 +495,8 @@ class Decision(_message.Message):
     WHY_FIELD_NUMBER: _ClassVar[int]
     READINGS_FIELD_NUMBER: _ClassVar[int]
     WOULD_CHANGE_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ROLE_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -500,7 +506,9 @@ class Decision(_message.Message):
     why: str
     readings: _containers.RepeatedScalarFieldContainer[str]
     would_change: str
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., subject: _Optional[str] = ..., decided: _Optional[str] = ..., why: _Optional[str] = ..., readings: _Optional[_Iterable[str]] = ..., would_change: _Optional[str] = ...) -> None: ...
+    kind: str
+    role: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., subject: _Optional[str] = ..., decided: _Optional[str] = ..., why: _Optional[str] = ..., readings: _Optional[_Iterable[str]] = ..., would_change: _Optional[str] = ..., kind: _Optional[str] = ..., role: _Optional[str] = ...) -> None: ...
 
 class Recording(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "session", "state", "bytes", "messages", "drops", "free_bytes", "error", "missed")

@@ -19,7 +19,7 @@ def want_for_ever(fleet: Fleet, directory: Path, killed: Sequence[str]) -> list[
         return fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(plan), "--json")
 
     def decided(process: Process, mode: str | None) -> None:
-        while process.line()["mode"] != mode:
+        while (line := process.line())["car"] is None or line["mode"] != mode:
             pass
 
     judge = Judge.follow(fleet.bus)

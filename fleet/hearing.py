@@ -1,0 +1,98 @@
+"""What the coordinator hears becomes a picture: tokens and messages in, values of policy/picture.py out. No Zenoh."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from fleet.policy.picture import CarPicture, Picture, Refused, Seen
+from schemas import keys, messages
+from schemas.bus import Sample
+from schemas.gen import fleet_v1_pb2 as pb
+
+NEEDED: Final = ("state/link", "state/mode", "state/motion", "state/safety")
+"""Only when all that could forbid a command is known, a car counts as heard."""
+_HEALTH: Final = "state/health"
+
+
+@dataclass(slots=True)
+class Hearing:
+    """The cars as they were last heard. `listed`: what the fleet file says of them, if there is one."""
+
+    listed: Mapping[str, CarPicture] = field(default_factory=dict)
+    cars: dict[str, CarPicture] = field(default_factory=dict)
+    readings: dict[str, dict[str, Seen]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.cars.update(self.listed)
+
+    def picture(self, busy: Iterable[str]) -> Picture:
+        """What is known now; `busy`: the cars that something was asked of, with no outcome yet."""
+        cars = {**self.cars, **{car: replace(self.cars[car], busy=True) for car in busy if car in self.cars}}
+        return Picture(cars, {car: dict(seen) for car, seen in self.readings.items()})
+
+    def token(self, car: str, *, alive: bool) -> None:
+        """A gateway came or went: what was known of its car may no longer be so, a hold above all."""
+        self.cars[car] = replace(self.listed.get(car, CarPicture()), present=alive)
+        for topic in (*NEEDED, _HEALTH):
+            self.readings.get(car, {}).pop(topic, None)
+
+    def refused(self, car: str, refusal: Refused | None) -> None:
+        """A command was not carried out, or (None) one was."""
+        if car in self.cars:
+            self.cars[car] = replace(self.cars[car], refused=refusal)
+
+    def take(self, sample: Sample, now: float, wall_s: float | None) -> None:
+        """A message of a car. `wall_s`: the wall clock, for an answer, which may be old; None: it came as published."""
+        key = keys.parse(sample.key)
+        try:
+            value: Any = sample.message()
+        except (messages.BadPayload, KeyError):
+            return  # not of this fleet's gateways: nothing to decide on
+        if key is None:
+            return
+        at = now
+        if wall_s is not None:
+            at -= max(0.0, wall_s - value.stamp.seconds - value.stamp.nanos / 1e9)
+        seen = self.readings.setdefault(key.car, {})
+        if key.topic in seen and seen[key.topic].at > at:
+            return  # an answer that was overtaken
+        measured = {descriptor.name for descriptor, _ in value.ListFields()}
+        fields = {
+            each.name: getattr(value, each.name)
+            for each in value.DESCRIPTOR.fields
+            if not each.has_presence or each.name in measured
+        }
+        seen[key.topic] = Seen(fields, at)
+        if key.topic in NEEDED or key.topic == _HEALTH:
+            self._states(key.car, seen)
+
+    def _states(self, car: str, seen: Mapping[str, Seen]) -> None:
+        before = self.cars.get(car, CarPicture())
+        health = seen.get(_HEALTH)
+        if health is not None:
+            capabilities: Any = health.fields["capabilities"]
+            before = replace(
+                before,
+                platform=str(health.fields["platform"]),
+                capabilities=before.capabilities if before.listed else frozenset(capabilities),
+            )
+            self.cars[car] = before
+        if not before.present or any(topic not in seen for topic in NEEDED):
+            return
+        link, mode, motion, safety = (seen[topic].fields for topic in NEEDED)
+        hold, lease = safety.get("hold"), safety.get("lease")
+        estops: Any = safety.get("estops") or ()
+        driver = motion["owner"]
+        if not driver and isinstance(lease, pb.Lease) and lease.kind != "coordinator":
+            driver = lease.holder
+        self.cars[car] = replace(
+            before,
+            link=str(link["state"]),
+            mode=str(mode["asked"]),
+            verdict=str(mode["verdict"]),
+            evidence=str(mode["evidence"]),
+            motors=str(safety["motors"]),
+            held_by=hold.by if isinstance(hold, pb.Hold) else None,
+            estopped_by=estops[0].by if estops else None,
+            driven_by=str(driver) or None,
+        )

@@ -1,0 +1,257 @@
+"""What can never work in a plan, before anything moves: roles that no car can fill, rules that never fire. Pure.
+
+What is wrong in the text itself reader.py says. Here is what the plan means for the cars there are: those of a fleet
+file, or (without one) cars of any platform.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from fleet.expression import contradictory
+from fleet.policy.picture import CarPicture, topic_of
+from fleet.policy.plan import ALL, OTHERS, Condition, Of, Plan, Role
+from fleet.policy.staffing import unfit
+from gateway.protocol.profile import Platform, Profile, parse_platform
+from gateway.protocol.values import Mode
+
+_ANY_CAR: Final = "a car"
+
+
+class Gravity(StrEnum):
+    """How bad it is."""
+
+    ERROR = "error"
+    """It can never work."""
+    WARNING = "warning"
+    """It works, but hardly as it is meant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong with a plan: of which part, what, and what to do."""
+
+    gravity: Gravity
+    part: str
+    words: str
+
+    def __str__(self) -> str:
+        return f"{self.part}: {self.words}"
+
+
+def check(plan: Plan, fleet: Mapping[str, CarPicture] | None = None) -> tuple[Finding, ...]:
+    """What is wrong; `fleet`: what the fleet file says of its cars, None: there is none."""
+    return tuple(_Check(plan, fleet).findings())
+
+
+class _Check:
+    def __init__(self, plan: Plan, fleet: Mapping[str, CarPicture] | None) -> None:
+        self._plan = plan
+        self._named = set(plan.named) | {condition.car for condition in plan.conditions if condition.car is not None}
+        self._known = fleet
+        # Without a fleet file: a car of each platform under every name.
+        self._cars = fleet if fleet is not None else dict.fromkeys((*sorted(self._named), _ANY_CAR), CarPicture())
+
+    def findings(self) -> Iterator[Finding]:
+        yield from self._unknown_cars()
+        yield from self._roles()
+        yield from self._rules()
+        yield from self._phases()
+
+    def _unknown_cars(self) -> Iterator[Finding]:
+        for car in sorted(self._named):
+            if self._known is not None and car not in self._known:
+                there = ", ".join(sorted(self._known)) or "none"
+                yield Finding(Gravity.ERROR, f"car {car}", f"the fleet file has no such car; it has {there}")
+
+    # ------------------------------------------------------------------ roles
+
+    def _roles(self) -> Iterator[Finding]:
+        for role in self._plan.roles.values():
+            part = f"role {role.name}"
+            if role.needs is not None and contradictory(role.needs):
+                yield Finding(Gravity.ERROR, part, f"no car can fill it: {role.needs} is never so")
+                continue
+            able = [car for car in self._cars if self._able(car, role)]
+            if not able:
+                whys = "; ".join(f"{car}: {self._why_not(car, role)}" for car in list(self._cars)[:4])
+                yield Finding(Gravity.ERROR, part, f"no car can fill it{f': {whys}' if whys else ''}")
+            elif self._known is not None and role.count is not None and len(able) < role.count:
+                words = f"it wants {role.count} cars, and only {', '.join(sorted(able))} can have it"
+                yield Finding(Gravity.WARNING, part, words)
+            if role.on_call and not self._called(role):
+                yield Finding(
+                    Gravity.ERROR,
+                    part,
+                    "it is on_call, and no rule gives it to anyone, nor does it stand in for another",
+                )
+            if not role.on_call and not self._in_some_phase(role):
+                yield Finding(Gravity.WARNING, part, "no phase has it")
+
+    def _called(self, role: Role) -> bool:
+        given = any(effect.role == role.name for rule in self._plan.rules for effect in rule.effects)
+        return given or any(other.fallback == role.name for other in self._plan.roles.values())
+
+    def _in_some_phase(self, role: Role) -> bool:
+        phases = self._plan.phases.values()
+        return not phases or any(phase.roles is None or role.name in phase.roles for phase in phases)
+
+    def _able(self, car: str, role: Role) -> bool:
+        return self._why_not(car, role) == ""
+
+    def _why_not(self, car: str, role: Role) -> str:
+        """Why this car can never have this role; empty if it can."""
+        if car != _ANY_CAR and not self._plan.may(car, role):
+            return "the plan gives it to others"
+        if car == _ANY_CAR and role.cars is not None:
+            return "only for certain cars"
+        known = self._cars.get(car)
+        if known is None:
+            return "the fleet file has no such car"
+        if known.listed:
+            barrier = unfit(known, role, 0.0)
+            if barrier is not None:
+                return barrier.why
+        if role.needs is None:
+            return ""
+        missing = self._never(role.needs.names, [(profile, mode) for profile in self._profiles(car) for mode in Mode])
+        return f"it needs {role.needs}, and {missing} is never measured on it" if missing else ""
+
+    # ------------------------------------------------------------------ rules
+
+    def _rules(self) -> Iterator[Finding]:
+        for rule in self._plan.rules:
+            for condition, word in ((rule.when, "fire"), (rule.until, "end by `until`")):
+                if condition is not None and (why := self._never_so(condition)):
+                    yield Finding(Gravity.ERROR, rule.name, f"it can never {word}: {why}")
+            for effect in rule.effects:
+                for car in self._targets(effect.who):
+                    yield from self._useless(rule.name, car, effect.mode)
+        yield from self._fights()
+        yield from self._circular()
+
+    def _targets(self, who: str) -> list[str]:
+        return [who] if who and self._plan.is_car(who) and who in self._cars else []
+
+    def _useless(self, part: str, car: str, mode: Mode | None) -> Iterator[Finding]:
+        profiles = self._profiles(car)
+        if mode is not None and not any(mode in profile.modes for profile in profiles):
+            yield Finding(Gravity.ERROR, part, f"{car} is a {profiles[0].name} car, which does not know mode {mode}")
+
+    def _never_so(self, condition: Condition) -> str:
+        """Why a condition can never be so; empty if it may be."""
+        if contradictory(condition.expression):
+            return f"{condition.expression} is never so"
+        if condition.car is not None:
+            if condition.car not in self._cars:
+                return f"there is no car {condition.car}"
+            cars = [condition.car]
+        else:
+            cars = list(self._cars)
+        names = condition.expression.names
+        missing = ""
+        for car in cars:
+            missing = self._never(names, [*self._states(car, condition)])
+            if not missing:
+                return ""
+        whom = condition.car or f"{condition.of} car{f' with role {condition.role}' if condition.role else ''}"
+        return f"{missing} is never measured on {whom}, in the modes that this plan gives it" if missing else ""
+
+    def _states(self, car: str, condition: Condition) -> Iterator[tuple[Profile, Mode]]:
+        """In which modes a car may be when the condition is looked at."""
+        if condition.role is not None:
+            modes = {self._plan.roles[condition.role].mode}
+            modes |= {effect.mode for rule in self._plan.rules for effect in rule.effects if effect.mode is not None}
+        else:
+            modes = self._modes(car)
+        return ((profile, mode) for profile in self._profiles(car) for mode in modes if mode in profile.modes)
+
+    def _modes(self, car: str) -> set[Mode]:
+        """The modes that the plan may bring a car into, and mode 0, which every car begins with."""
+        modes = {role.mode for role in self._plan.roles.values() if self._able(car, role)}
+        for rule in self._plan.rules:
+            for effect in rule.effects:
+                if (
+                    effect.mode is not None
+                    and effect.who != ""
+                    and (not self._plan.is_car(effect.who) or effect.who == car)
+                ):
+                    modes.add(effect.mode)
+        rests = self._plan.idle is Mode.MANUAL and not (car in self._plan.fixed and len(modes) == 1)
+        return modes | ({Mode.MANUAL} if rests or not modes else set())
+
+    def _profiles(self, car: str) -> list[Profile]:
+        known = self._cars.get(car)
+        profile = known.profile if known is not None else None
+        return [profile] if profile is not None else [parse_platform(kind) for kind in Platform if kind != "unknown"]
+
+    def _never(self, names: tuple[str, ...], states: list[tuple[Profile, Mode]]) -> str:
+        """A name that is measured in none of these states; empty if each is in one."""
+        for name in names:
+            family, _, topic = topic_of(name).partition("/")
+            if family == "sensor" and not any(topic in profile.measurable(mode) for profile, mode in states):
+                return name
+        return ""
+
+    def _fights(self) -> Iterator[Finding]:
+        """Two rules that are true under the same condition, and want different things of the same car."""
+        said: dict[tuple[str, str], tuple[str, str]] = {}
+        for rule in self._plan.rules:
+            for effect in rule.effects:
+                wish = str(effect.mode or effect.role or "")
+                if not wish or not effect.who:
+                    continue
+                whens = (effect.who, f"{rule.when.of} {rule.when.car} {rule.when.role} {rule.when.expression}")
+                other = said.setdefault(whens, (rule.name, wish))
+                if other[1] != wish:
+                    words = (
+                        f"it fights {other[0]}, which is true at the same time and wants {effect.who} to be {other[1]}"
+                    )
+                    yield Finding(Gravity.ERROR, rule.name, f"{words}, not {wish}: the first counts")
+
+    def _circular(self) -> Iterator[Finding]:
+        """A rule that ends itself: in the mode that it gives, what makes it true is not measured."""
+        for rule in self._plan.rules:
+            if rule.until is not None:
+                continue
+            for effect in rule.effects:
+                mode = effect.mode or (self._plan.roles[effect.role].mode if effect.role is not None else None)
+                hits = (
+                    effect.who == "that"
+                    or effect.who == ALL
+                    or (rule.when.car is not None and effect.who == rule.when.car)
+                )
+                if mode is None or not hits or effect.who == OTHERS:
+                    continue
+                cars = [rule.when.car] if rule.when.of is Of.CAR and rule.when.car in self._cars else list(self._cars)
+                states = [(profile, mode) for car in cars if car is not None for profile in self._profiles(car)]
+                missing = self._never(rule.when.expression.names, states)
+                if missing:
+                    words = f"it ends itself: in mode {mode}, {missing} is not measured; give it until"
+                    yield Finding(Gravity.WARNING, rule.name, words)
+
+    # ------------------------------------------------------------------ phases
+
+    def _phases(self) -> Iterator[Finding]:
+        plan = self._plan
+        reached = {plan.first}
+        jumps = [
+            (rule.during, effect.phase) for rule in plan.rules for effect in rule.effects if effect.phase is not None
+        ]
+        while True:
+            more = {after for name in reached for after in self._after(name)}
+            more |= {phase for during, phase in jumps if during is None or during & reached}
+            if more <= reached:
+                break
+            reached |= more
+        for name, phase in plan.phases.items():
+            part = f"phase {name}"
+            if name not in reached:
+                yield Finding(Gravity.ERROR, part, f"nothing leads to it: the plan begins with {plan.first}")
+            if phase.until is not None and phase.timeout_s is None and (why := self._never_so(phase.until)):
+                yield Finding(Gravity.ERROR, part, f"it never ends: {why}; give it timeout_s")
+
+    def _after(self, name: str) -> set[str]:
+        phase = self._plan.phases.get(name)
+        return set() if phase is None else {after for after in (phase.next, phase.on_timeout) if after is not None}

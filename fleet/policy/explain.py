@@ -1,0 +1,243 @@
+"""Decisions as values, and their reasons in words: what decided, with which readings, and what would change it. Pure.
+
+Each kind of decision stands in tests/vectors/decisions.tsv with the words expected of it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from fleet.policy.memory import Held
+from fleet.policy.picture import NOBODY
+from fleet.policy.plan import Effect, Plan, Rule
+from fleet.policy.rules import RuleState, Turn
+from fleet.policy.staffing import Barrier, Staff, Staffing
+from fleet.policy.steady import HYSTERESIS_S
+from gateway.protocol.values import Mode
+
+LEFT_ALONE: Final = "left alone"
+_NAMED: Final = 4
+"""So many roles or cars are gone into."""
+
+
+class Kind(StrEnum):
+    """What a decision is about."""
+
+    ROLE = "role"
+    RULE = "rule"
+    IDLE = "idle"
+    ALONE = "alone"
+    VACANT = "vacant"
+    FILLED = "filled"
+    PHASE = "phase"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What was decided of one subject: a car, `role NAME`, or `phase`."""
+
+    subject: str
+    kind: Kind
+    decided: str
+    """In a word or two: the mode, `left alone`, `1 of 2`, the phase."""
+    cause: str
+    """The same as long as the same thing decides."""
+    why: str
+    readings: tuple[str, ...] = ()
+    """Those that were used, with values and ages."""
+    would_change: str = ""
+    car: str | None = None
+    role: str | None = None
+    mode: Mode | None = None
+    """The mode the car should be in; None: it is left alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """A mode that a rule in force gives a car."""
+
+    rule: Rule
+    state: RuleState
+    effect: Effect
+
+
+def of_phase(turn: Turn, since: float) -> Decision:
+    """A phase has begun."""
+    return Decision(
+        "phase", Kind.PHASE, turn.after, f"{turn.after} since {since}", turn.why, turn.used, f"the end of {turn.after}"
+    )
+
+
+def alone(car: str, barrier: Barrier, kept: str | None) -> Decision:
+    """A car that cannot, or may not, be asked for anything."""
+    why = f"{barrier.why}; its role {kept} is kept for {HYSTERESIS_S:g} s" if kept else barrier.why
+    return Decision(car, Kind.ALONE, LEFT_ALONE, barrier.why, why, barrier.used, barrier.change, car=car, role=kept)
+
+
+def ruled(car: str, override: Override, role: str | None) -> Decision:
+    """A rule gives the car its mode."""
+    rule, mode = override.rule, override.effect.mode
+    end = (
+        f"{rule.until}"
+        if rule.until is not None
+        else f"that no longer being so for {HYSTERESIS_S:g} s, or not known for 5 s"
+    )
+    why = f"{rule.name}: {rule.when}"
+    if override.state.that is not None and override.state.that != rule.when.car:
+        why += f" (it is so of {override.state.that})"
+    assert mode is not None
+    return Decision(
+        car, Kind.RULE, mode, f"{rule.name} {mode}", why, override.state.used, end, car=car, role=role, mode=mode
+    )
+
+
+def in_role(car: str, held: Held, staff: Staff, staffing: Staffing) -> Decision:
+    """A role gives the car its mode."""
+    plan, name = staff.plan, held.role
+    role = plan.roles[name]
+    pinned = staff.pinned.get(car)
+    why = f"role {name} ({len(staffing.holders(name))} of {staffing.places[name]})"
+    if pinned is not None:
+        why += f", as {pinned[1]} wants"
+    elif name in staffing.stands_in:
+        why += f", which stands in for {staffing.stands_in[name]}"
+    if held.why:
+        why += f": {held.why}"
+    changes = [f"{role.needs} no longer being so"] if role.needs is not None else []
+    changes += [f"the end of {pinned[1]}"] if pinned is not None else _rules_for(car, plan)
+    changes.append("a person's stop or drive")
+    return Decision(
+        car,
+        Kind.ROLE,
+        role.mode,
+        f"role {name}",
+        why,
+        held.used,
+        "; or ".join(changes),
+        car=car,
+        role=name,
+        mode=role.mode,
+    )
+
+
+def _rules_for(car: str, plan: Plan) -> list[str]:
+    told = [
+        f"{rule.name}: {rule.when}"
+        for rule in plan.rules
+        if any(effect.who and (effect.who == car or not plan.is_car(effect.who)) for effect in rule.effects)
+    ]
+    return told[:_NAMED]
+
+
+def idle(car: str, staff: Staff, staffing: Staffing) -> Decision:
+    """A car that no role is left for."""
+    plan = staff.plan
+    whys: list[str] = []
+    changes: list[str] = []
+    used: list[str] = []
+    kinds: list[str] = []
+    nothing: tuple[str, ...] = ()
+    for name, role in plan.roles.items():
+        if not plan.may(car, role):
+            continue
+        if name not in staff.in_force:
+            words, change, seen = "it does not count in this phase", "the next phase", nothing
+        elif (barrier := staff.barrier(car, role)) is not None:
+            words, change, seen = barrier.why, barrier.change, barrier.used
+        else:
+            holders = staffing.holders(name)
+            words = (
+                f"it has its {'car' if len(holders) == 1 else 'cars'}: {', '.join(holders)}" if holders else "no place"
+            )
+            change, seen = f"a place in {name}", nothing
+        kinds.append(f"{name} {words}")
+        if len(whys) < _NAMED:
+            whys.append(f"{name}: {words}")
+            changes.append(change)
+            used += seen
+    mode = plan.idle
+    return Decision(
+        car,
+        Kind.IDLE,
+        mode or LEFT_ALONE,
+        "idle: " + "; ".join(kinds),
+        f"no role for it: {'; '.join(whys)}" if whys else "the plan has no role for it now",
+        tuple(dict.fromkeys(used)),
+        "; or ".join(dict.fromkeys(changes)) or "a rule",
+        car=car,
+        mode=mode,
+    )
+
+
+def repaired(decision: Decision, evidence: str) -> Decision:
+    """The same, of a car that does not do what it was asked for."""
+    return Decision(
+        decision.subject,
+        decision.kind,
+        decision.decided,
+        f"{decision.cause}, contradicted",
+        f"{decision.why}; but the car is not in {decision.mode} ({evidence}): it is asked for again",
+        decision.readings,
+        "a reading with the shape of that mode",
+        decision.car,
+        decision.role,
+        decision.mode,
+    )
+
+
+def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> Decision:
+    """A role with fewer cars than it wants."""
+    plan = staff.plan
+    role = plan.roles[name]
+    holders = staffing.holders(name)
+    decided = f"{len(holders)} of {staffing.places[name] if role.count is not None else 'all'}"
+    whys: list[str] = []
+    used: list[str] = []
+    kinds: list[str] = []
+    for car in sorted({*staff.free, *barriers}):
+        if car in holders or not plan.may(car, role):
+            continue
+        barrier = barriers.get(car) or staff.barrier(car, role)
+        words = barrier.why if barrier is not None else f"it has role {staffing.roles.get(car, 'none')}"
+        kinds.append(words)
+        if len(whys) < _NAMED:
+            whys.append(words if words.startswith((car, f"the link of {car}")) else f"{car}: {words}")
+            used += barrier.used if barrier is not None else ()
+    more = f"; and {len(kinds) - _NAMED} more" if len(kinds) > _NAMED else ""
+    instead = f"; {role.fallback} gets the place" if role.fallback is not None else ""
+    return Decision(
+        f"role {name}",
+        Kind.VACANT,
+        decided,
+        f"{decided}: {'; '.join(kinds)}",
+        f"no other car can: {'; '.join(whys)}{more}{instead}" if whys else f"no car there may have it{instead}",
+        tuple(dict.fromkeys(used)),
+        "one of them being able to",
+        role=name,
+    )
+
+
+def filled(name: str, staffing: Staffing) -> Decision:
+    """A role that lacked a car has what it wants."""
+    holders = staffing.holders(name)
+    return Decision(
+        f"role {name}",
+        Kind.FILLED,
+        f"{len(holders)} of {staffing.places[name]}",
+        "filled",
+        f"its places are taken: {', '.join(holders)}",
+        would_change="one of them dropping out",
+        role=name,
+    )
+
+
+def came_by(car: str, name: str, staff: Staff, before: str | None, lost: str) -> Held:
+    """Why this car has this role from now on; `before`: who had it and lost it, `lost`: why."""
+    role = staff.plan.roles[name]
+    used = staff.picture.used(role.needs, car, staff.now) if role.needs is not None else ()
+    if before is not None:
+        return Held(name, f"in place of {before}: {lost}", used)
+    if staff.picture.cars.get(car, NOBODY).mode == role.mode:
+        return Held(name, f"it is in mode {role.mode} already", used)
+    return Held(name, f"it has {role.needs}" if role.needs is not None else "", used)

@@ -1,0 +1,117 @@
+"""What the coordinator remembers from one decision to the next, and what of it outlives a change of plan. Pure."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from fleet.policy.picture import NOBODY, Picture
+from fleet.policy.plan import Plan
+from fleet.policy.rules import PhaseState, RuleState
+from fleet.policy.steady import Settled, Steady
+from gateway.protocol.values import Mode
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """How often a car was asked for one mode, and when it may be asked again."""
+
+    mode: str = ""
+    attempts: int = 0
+    again_at: float = 0.0
+    fine_since: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A role that a car has, and how it came by it."""
+
+    role: str
+    why: str = ""
+    used: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What outlives a coordinator: the roles, the phase, the rules in force and the car that made each so."""
+
+    version: str = ""
+    """Of the plan."""
+    roles: Mapping[str, str] = field(default_factory=dict)
+    phase: str = ""
+    phase_since_s: float = 0.0
+    """On the wall clock."""
+    rules: Mapping[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Everything that the next decision needs besides the picture. Times are seconds on one monotonic clock."""
+
+    began: float | None = None
+    """The first decision."""
+    phase: PhaseState = field(default_factory=PhaseState)
+    rules: Mapping[int, RuleState] = field(default_factory=dict)
+    """By position in the plan."""
+    held: Mapping[str, Held] = field(default_factory=dict)
+    """The role that each car has; it is kept for a moment for one that cannot be asked."""
+    gone_since: Mapping[str, float] = field(default_factory=dict)
+    needs: Mapping[tuple[str, str], Settled] = field(default_factory=dict)
+    tried: Mapping[str, Tried] = field(default_factory=dict)
+    causes: Mapping[str, str] = field(default_factory=dict)
+    """What decided last, by subject."""
+
+    @property
+    def roles(self) -> dict[str, str]:
+        """The role of each car."""
+        return {car: held.role for car, held in self.held.items()}
+
+
+def carried(memory: Memory, before: Plan, after: Plan) -> Memory:
+    """What still counts under another plan: roles, rules and the phase that it has, too."""
+    places = {rule: index for index, rule in enumerate(after.rules)}
+    rules = {
+        places[before.rules[index]]: state for index, state in memory.rules.items() if before.rules[index] in places
+    }
+    same = {name for name, role in after.roles.items() if before.roles.get(name) == role}
+    return replace(
+        memory,
+        phase=memory.phase if memory.phase.name in after.phases else PhaseState(),
+        rules=rules,
+        held={car: held for car, held in memory.held.items() if held.role in after.roles},
+        needs={key: settled for key, settled in memory.needs.items() if key[1] in same},
+        causes={},
+    )
+
+
+def restored(plan: Plan, picture: Picture, kept: Kept, now: float, wall_s: float) -> Memory:
+    """What a coordinator that begins takes over from the one before, as far as the cars are still as it left them.
+
+    What was kept under another plan counts only for the roles that both have; a car that is in the mode of another
+    role has been changed by somebody since.
+    """
+    modes = {role.mode for role in plan.roles.values()} - {Mode.MANUAL}
+    held = {}
+    for car, name in kept.roles.items():
+        role = plan.roles.get(name)
+        mode = picture.cars.get(car, NOBODY).mode
+        if role is not None and plan.may(car, role) and (mode == role.mode or mode not in modes):
+            held[car] = Held(name, "it had it before the coordinator was started again")
+    if kept.version != plan.version or (kept.phase and kept.phase not in plan.phases):
+        return Memory(held=held)
+    rules = {
+        index: RuleState(on=True, when={that: Steady(on=True, since=now)}, that=that or None, since=now)
+        for index, that in kept.rules.items()
+        if index < len(plan.rules)
+    }
+    age_s = max(0.0, wall_s - kept.phase_since_s)
+    return Memory(held=held, rules=rules, phase=PhaseState(kept.phase, now - age_s) if kept.phase else PhaseState())
+
+
+def to_keep(plan: Plan, memory: Memory, now: float, wall_s: float) -> Kept:
+    """What the next coordinator should know."""
+    return Kept(
+        plan.version,
+        memory.roles,
+        memory.phase.name,
+        round(wall_s - (now - memory.phase.since), 1) if memory.phase.name else 0.0,
+        {index: state.that or "" for index, state in memory.rules.items() if state.on},
+    )
