@@ -15,8 +15,10 @@ from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, S
 from gateway.protocol.encode import ColorLed, General, ModeOpen, Ptz, encode
 from gateway.protocol.profile import Platform, StopStyle
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.sim.core.body import SONAR_CONE, SONAR_STEEPEST
 from gateway.sim.core.raspberry_pi import Transport
-from gateway.sim.core.world import SONAR_CONE, SONAR_STEEPEST, Lamp, World
+from gateway.sim.core.things import Lamp
+from gateway.sim.core.world import World
 from tests.support.virtual import Pair
 
 LONGEST_S = 4.0
@@ -38,7 +40,8 @@ Load = Callable[[Pair, random.Random], None]
 def echoing() -> World:
     """The room, and lamps that are seen from everywhere, so that light seeking drives."""
     room = World.room()
-    return World(room.walls, room.line, [Lamp(9.0, 0.0, reach_m=50.0), Lamp(-9.0, 0.0, reach_m=50.0)])
+    lamps = [Lamp(x_m, 0.0, reach_m=50.0, overhead=True) for x_m in (9.0, -9.0)]
+    return World(room.walls, room.line, lamps)
 
 
 def before_a_wall() -> World:

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from gateway.control.records import SetMode
 from gateway.protocol.encode import ModeClose, ModeOpen, encode
 from gateway.protocol.values import Mode
-from gateway.sim.core.world import Lamp, Segment, World
+from gateway.sim.core.geometry import Segment
+from gateway.sim.core.things import Lamp
+from gateway.sim.core.world import World
 from tests.support.virtual import Pair
 
 

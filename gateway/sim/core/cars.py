@@ -23,7 +23,8 @@ def build(
 ) -> Firmware:
     """Car number `index` of the world, at rest on its start pose, its program just started.
 
-    `name`: what the world knows it by, if it has a place for it there or lets it carry something. `transport` matters to a Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART.
+    `name`: what the world knows it by, if it has a place for it there or lets it carry something. `transport` matters
+    to a Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART.
     """
     body = CarBody(world, world.start_pose(index, name), rng, now, name)
     car: Firmware

@@ -12,8 +12,19 @@ from typing import Final, Protocol
 
 from gateway.sim.core.company import Company
 from gateway.sim.core.firmware import Pose
-from gateway.sim.core.geometry import Hit, Point, Segment, apart, box, distance, foot, loop, reach
-from gateway.sim.core.geometry import nearest, ray_to_circle
+from gateway.sim.core.geometry import (
+    Hit,
+    Point,
+    Segment,
+    apart,
+    box,
+    distance,
+    foot,
+    loop,
+    nearest,
+    ray_to_circle,
+    reach,
+)
 from gateway.sim.core.things import Lamp, Thing, carried
 
 RADIUS_M: Final = 0.13
@@ -305,18 +316,20 @@ class World:
     def change_lamp(self, name: str, **fields: float | bool) -> None:
         """Change fields of a lamp that is there."""
         self.lamps = tuple(
-            replace(lamp, **fields) if lamp.name == name else lamp  # type: ignore[arg-type]  # changes.py checked them
+            # Their names and types are what changes.py lets through.
+            replace(lamp, **fields) if lamp.name == name else lamp  # type: ignore[arg-type]
             for lamp in self.lamps
         )
 
     def change_thing(self, name: str, now: float, *, speed_m_s: float | None = None, to: Point | None = None) -> None:
         """Give a thing that is there another speed, or put it elsewhere, where it stays."""
         at_s = now - self._began
-        changed = []
-        for thing in self.things:
-            if thing.name == name and speed_m_s is not None:
+
+        def changed(thing: Thing) -> Thing:
+            if thing.name != name:
+                return thing
+            if speed_m_s is not None:
                 thing = thing.faster(speed_m_s, at_s)
-            if thing.name == name and to is not None:
-                thing = thing.put(*to)
-            changed.append(thing)
-        self.things = tuple(changed)
+            return thing if to is None else thing.put(*to)
+
+        self.things = tuple(map(changed, self.things))

@@ -8,9 +8,11 @@ from collections.abc import Callable
 import pytest
 
 from gateway.sim.core.arduino import ArduinoCar
-from gateway.sim.core.firmware import Body, Truth
+from gateway.sim.core.body import CarBody
+from gateway.sim.core.firmware import Body, Pose, Truth
 from gateway.sim.core.raspberry_pi import RaspberryPiCar
-from gateway.sim.core.world import Lamp, Pose, World
+from gateway.sim.core.things import Lamp
+from gateway.sim.core.world import World
 from tests.gateway.sim.strangers import (
     FAN,
     MODE00,

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from gateway.sim.core.world import Lamp, World
+from gateway.sim.core.things import Lamp
+from gateway.sim.core.world import World
 from tests.gateway.sim.strangers import FAN, MODE00, RUN, STOP, VirtualStranger, opening, opening_s, virtual
 
 MOMENTS = 200
@@ -94,7 +95,7 @@ class Case:
 def lit_room() -> World:
     """A lamp that can be seen from everywhere, so that light seeking drives."""
     room = World.room()
-    return World(room.walls, room.line, [Lamp(9.0, 0.0, reach_m=50.0)])
+    return World(room.walls, room.line, [Lamp(9.0, 0.0, reach_m=50.0, overhead=True)])
 
 
 def before_a_wall() -> World:

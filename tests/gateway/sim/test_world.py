@@ -6,7 +6,9 @@ from math import cos, hypot, pi, radians, sin
 import pytest
 
 from gateway.sim.core.body import CarBody
-from gateway.sim.core.world import RADIUS_M, Lamp, Pose, World
+from gateway.sim.core.firmware import Pose
+from gateway.sim.core.things import Lamp
+from gateway.sim.core.world import RADIUS_M, World
 from tests.gateway.sim.strangers import opening, opening_s, virtual
 
 

@@ -1,0 +1,111 @@
+"""Plane geometry of the simulated world: points, segments, circles, rays. Knows no cars. Pure.
+
+REP-103: metres, x forward, y left, angles counter-clockwise.
+"""
+
+from collections.abc import Iterable
+from math import cos, hypot, radians, sin, sqrt
+from typing import Final, TypeAlias
+
+Point: TypeAlias = tuple[float, float]
+Segment: TypeAlias = tuple[float, float, float, float]
+Hit: TypeAlias = tuple[float, float]
+"""How far along a ray something is, and the cosine of the angle to its surface's normal."""
+
+_PARALLEL: Final = 1e-12
+
+
+def box(x: float, y: float, width: float, depth: float) -> tuple[Segment, ...]:
+    """The four sides of a rectangle around a point, `width` along x."""
+    w, d = width / 2, depth / 2
+    return _sides([(x - w, y - d), (x + w, y - d), (x + w, y + d), (x - w, y + d)])
+
+
+def turned_box(x: float, y: float, heading: float, width: float, depth: float) -> tuple[Segment, ...]:
+    """The four sides of a rectangle that is turned by `heading` rad."""
+    c, s, w, d = cos(heading), sin(heading), width / 2, depth / 2
+    corners = ((-w, -d), (w, -d), (w, d), (-w, d))
+    return _sides([(x + ahead * c - left * s, y + ahead * s + left * c) for ahead, left in corners])
+
+
+def _sides(corners: list[Point]) -> tuple[Segment, ...]:
+    return tuple((*a, *b) for a, b in zip(corners, (*corners[1:], corners[0]), strict=True))
+
+
+def loop(half_x: float, half_y: float, radius: float) -> list[Point]:
+    """A rectangle with round corners, counter-clockwise, from the middle of its lower side."""
+    points: list[Point] = [(0.0, -half_y)]
+    corners = ((1, -1, -90), (1, 1, 0), (-1, 1, 90), (-1, -1, 180))
+    for sx, sy, start in corners:
+        cx, cy = sx * (half_x - radius), sy * (half_y - radius)
+        for part in range(13):
+            angle = radians(start + 90 * part / 12)
+            points.append((cx + radius * cos(angle), cy + radius * sin(angle)))
+    return points
+
+
+def reach(segment: Segment, away: float) -> Segment:
+    """The rectangle outside which nothing is within `away` of a segment: low x, low y, high x, high y."""
+    x1, y1, x2, y2 = segment
+    return min(x1, x2) - away, min(y1, y2) - away, max(x1, x2) + away, max(y1, y2) + away
+
+
+def foot(x: float, y: float, segment: Segment) -> Point:
+    """The point of a segment (of a length other than 0) that is nearest."""
+    x1, y1, x2, y2 = segment
+    wx, wy = x2 - x1, y2 - y1
+    share = min(1.0, max(0.0, ((x - x1) * wx + (y - y1) * wy) / (wx * wx + wy * wy)))
+    return x1 + share * wx, y1 + share * wy
+
+
+def distance(x: float, y: float, segment: Segment) -> float:
+    """From a point to a segment."""
+    fx, fy = foot(x, y, segment)
+    return hypot(x - fx, y - fy)
+
+
+def apart(a: Segment, b: Segment) -> float:
+    """From one segment to another; 0 if they cross."""
+    if _cross(a, b):
+        return 0.0
+    ends = (distance(*a[:2], b), distance(*a[2:], b), distance(*b[:2], a), distance(*b[2:], a))
+    return min(ends)
+
+
+def _cross(a: Segment, b: Segment) -> bool:
+    def side(line: Segment, x: float, y: float) -> float:
+        return (line[2] - line[0]) * (y - line[1]) - (line[3] - line[1]) * (x - line[0])
+
+    return (
+        side(a, *b[:2]) * side(a, *b[2:]) < 0 and side(b, *a[:2]) * side(b, *a[2:]) < 0
+    )  # touching ends have a distance of 0
+
+
+def ray_to_segment(x: float, y: float, dx: float, dy: float, segment: Segment) -> Hit | None:
+    """Where a ray (of a direction of length 1) meets a segment."""
+    x1, y1, x2, y2 = segment
+    wx, wy = x2 - x1, y2 - y1
+    cross = dx * wy - dy * wx
+    if abs(cross) < _PARALLEL:
+        return None
+    along = ((x1 - x) * wy - (y1 - y) * wx) / cross
+    share = ((x1 - x) * dy - (y1 - y) * dx) / cross
+    return (along, abs(cross) / hypot(wx, wy)) if along >= 0 and 0 <= share <= 1 else None
+
+
+def ray_to_circle(x: float, y: float, dx: float, dy: float, middle: Point, radius: float) -> Hit | None:
+    """Where a ray (of a direction of length 1) meets a circle; at once if it begins inside."""
+    mx, my = middle[0] - x, middle[1] - y
+    outside = mx * mx + my * my - radius * radius
+    if outside <= 0:
+        return (0.0, 1.0)
+    ahead = mx * dx + my * dy
+    inner = ahead * ahead - outside
+    if ahead <= 0 or inner < 0:
+        return None
+    return (ahead - sqrt(inner), sqrt(inner) / radius)
+
+
+def nearest(hits: Iterable[Hit | None]) -> Hit | None:
+    """The first of several."""
+    return min((hit for hit in hits if hit is not None), default=None)
