@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
+from fleet.config import FleetFile
 from fleet.policy.picture import CarPicture, Picture, Refused, Seen
 from schemas import keys, messages
 from schemas.bus import Sample
@@ -96,3 +97,16 @@ class Hearing:
             estopped_by=estops[0].by if estops else None,
             driven_by=str(driver) or None,
         )
+
+
+def listed_cars(file: FleetFile) -> Mapping[str, CarPicture]:
+    """What a fleet file says of its cars."""
+    return {
+        name: CarPicture(
+            platform="" if car.platform.startswith("auto") else car.platform,
+            capabilities=car.capabilities,
+            roles=None if car.roles is None else frozenset(car.roles),
+            listed=True,
+        )
+        for name, car in file.cars.items()
+    }

@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
 
@@ -12,11 +11,11 @@ import click
 
 from fleet.client import Fleet, default_sender
 from fleet.commands.common import bus_options, json_option
-from fleet.config import FleetFile, read_fleet
+from fleet.config import read_fleet
 from fleet.coordinator import SENDER, AnotherCoordinator, Coordinator
+from fleet.hearing import listed_cars
 from fleet.marked import read_text
 from fleet.policy.explain import Decision
-from fleet.policy.picture import CarPicture
 from fleet.policy.reader import parse
 
 
@@ -48,7 +47,7 @@ def coordinate(
     """Keep a plan true, until Ctrl-C; cars on hold are left alone. One line per decision."""
     parent = os.getppid() if with_parent else None
     plan = parse(read_text(path), str(path))
-    listed = {} if fleet_file is None else pictures(read_fleet(fleet_file))
+    listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file))
     stop = threading.Event()
 
     def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
@@ -67,19 +66,6 @@ def coordinate(
             )
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None
-
-
-def pictures(file: FleetFile) -> Mapping[str, CarPicture]:
-    """What a fleet file says of its cars."""
-    return {
-        name: CarPicture(
-            platform="" if car.platform.startswith("auto") else car.platform,
-            capabilities=car.capabilities,
-            roles=None if car.roles is None else frozenset(car.roles),
-            listed=True,
-        )
-        for name, car in file.cars.items()
-    }
 
 
 def line(decision: Decision) -> str:
