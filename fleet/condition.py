@@ -9,6 +9,7 @@ from typing import Final, Self
 
 from fleet.expression import BadExpression, Expression, contradictory, fields_of, parse, value_in
 from fleet.expression.fields import LAST
+from fleet.expression.tree import written
 from fleet.readings import Reading
 from schemas import keys, messages, topics
 from schemas.bus import intersects
@@ -63,3 +64,11 @@ class Condition:
         """Whether it holds of this reading; None: its message has no such field, or it was not measured."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         return None if expression is None else expression.value(value_in(reading.value))
+
+    def read(self, reading: Reading) -> list[str]:
+        """What it reads in a message, as `range_m=0.5`; nothing, if the message has not what it is about."""
+        expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
+        if expression is None:
+            return []
+        values = {name: value_in(reading.value)(name) for name in expression.names}
+        return [f"{name}={'not measured' if value is None else written(value)}" for name, value in values.items()]

@@ -5,13 +5,10 @@ Readings and the time come in as arguments; nothing is asked here.
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Final
 
 from fleet.condition import Condition
 from fleet.readings import Reading
 from schemas import topics
-
-_SHOWN: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 
 
 class NotInTime(TimeoutError):
@@ -49,7 +46,7 @@ class Waiting:
             return False
         holds = self._condition.holds(reading)
         if holds is None:
-            self._undecided = reading
+            self._undecided = reading if self._condition.read(reading) else self._undecided
         elif self.last is None or self.last.time <= reading.time:
             self.last = reading
         seen = self._seen[reading.key] = _Seen(reading.time)
@@ -67,14 +64,9 @@ class Waiting:
         last = self.last or self._undecided
         if last is None:
             return NotInTime(f"{words}: nothing came under {written}", None)
-        named = [name for each in self._condition.by_message.values() for name in each.names]
-        values = last.as_dict()
-        shown = {name: values[name] for name in dict.fromkeys(named) if name in values} or {
-            name: value for name, value in values.items() if name not in _SHOWN
-        }
-        said = ", ".join(f"{name}={value}" for name, value in shown.items())
+        said = ", ".join(self._condition.read(last))
         age = f"{last.age_s(now):.1f} s ago{' (stale)' if last.stale(now) else ''}"
-        return NotInTime(f"{words}: {last.key} was {said} {age}", last)
+        return NotInTime(f"{words}: {last.key} had {said}, {age}", last)
 
 
 def _gap(reading: Reading, before: datetime) -> bool:

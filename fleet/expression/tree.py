@@ -70,11 +70,7 @@ class Literal:
         return KINDS[type(self.value)]
 
     def __str__(self) -> str:
-        if isinstance(self.value, bool):
-            return "true" if self.value else "false"
-        if isinstance(self.value, str):
-            return f'"{self.value}"' if "'" in self.value else f"'{self.value}'"
-        return repr(self.value)
+        return written(self.value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +116,15 @@ class Some:
 
 
 Node: TypeAlias = Name | Literal | Compare | Not | Every | Some
+
+
+def written(value: object) -> str:
+    """A value as it stands in a condition."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return f'"{value}"' if "'" in value else f"'{value}'"
+    return repr(value)
 
 
 def _within(side: Node) -> str:
