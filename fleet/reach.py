@@ -43,8 +43,9 @@ def look(car: CarSpec, served: Mapping[str, tuple[str, str]]) -> Reach:
     """Look at a car's link, for about `PATIENCE_S`. `served`: state and reason of the links of cars with a gateway."""
     if car.name in served:
         state, reason = served[car.name]
-        words = f"its gateway runs, the link is {state}" + (f": {reason}" if reason else "")
-        return Reach(car.name, car.link, state in ("online", "quiet"), words)
+        ok = state in ("online", "quiet")
+        words = f"its gateway runs, the link is {state}" + (f": {reason}" if reason and not ok else "")
+        return Reach(car.name, car.link, ok, words)
     ok, words = _look(parse_link(car.link), car.platform)
     return Reach(car.name, car.link, ok, words)
 
