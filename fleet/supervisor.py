@@ -11,7 +11,7 @@ import os
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +44,7 @@ RECORDER_END_S: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Happening:
-    """Something that is worth a line. what: `process`, `car`, `log`, `simulator` or `end`; name: a car, or `@hub`."""
+    """Something that is worth a line. what: `process`, `car`, `log`, `decision`, `simulator` or `end`."""
 
     what: str
     name: str
@@ -171,7 +171,9 @@ class Supervisor:
             self.crew.add(SIMULATOR, Kind.SIMULATOR, command)
         for car in self._wish.cars.values():
             self._add_car(car)
-        self._set_plan(self._wish.plan)
+        if self._wish.plan is not None:
+            command, _ = self._coordinator(self._wish.plan)
+            self.crew.add(COORDINATOR, Kind.COORDINATOR, command)
 
     def _add_car(self, car: WantedCar) -> None:
         """Start its gateway, or do it anew with what is wanted now; a simulated car's as soon as its link is known."""
@@ -180,22 +182,30 @@ class Supervisor:
         if link is not None:
             self.crew.add(car.name, Kind.GATEWAY, wanted.gateway_command(self._wish, car, link, self.endpoint))
 
-    def _set_plan(self, plan: Path | None) -> bool:
-        """See that the coordinator has this plan; whether that is new. One that begins anew repeats no mode.
+    def _coordinator(self, plan: Path) -> tuple[tuple[str, ...], str]:
+        """Its command, and its plan. It gets a copy: a file that is changed counts when it is reloaded and checked."""
+        text = plan.read_text(encoding="utf-8")
+        copy = self.crew.directory / f"plan-{hashlib.sha256(text.encode()).hexdigest()[:12]}.yaml"
+        copy.write_text(text, encoding="utf-8")
+        return wanted.coordinator_command(self._wish, copy, self.endpoint), text
 
-        Its plan is a copy: a file that is changed counts when it is reloaded, whole and checked.
-        """
+    async def _set_plan(self, plan: Path | None) -> str:
+        """See that the coordinator has this plan; what is new about it."""
         coordinator = self.crew.get(COORDINATOR)
         if plan is None:
             self.crew.remove(COORDINATOR, END_S)
-            return coordinator is not None
-        text = plan.read_bytes()
-        copy = self.crew.directory / f"plan-{hashlib.sha256(text).hexdigest()[:12]}.yaml"
-        copy.write_bytes(text)
-        command = wanted.coordinator_command(self._wish, copy, self.endpoint)
-        before = coordinator.command if coordinator is not None else None
+            return "there is no plan any more: cars keep their modes" if coordinator is not None else ""
+        command, text = self._coordinator(plan)
+        if coordinator is not None and coordinator.command == command:
+            self.crew.add(COORDINATOR, Kind.COORDINATOR, command)  # one that was given up has another chance
+            return ""
+        if coordinator is not None and self._desk is not None and coordinator.ward.state is State.RUNNING:
+            taken = await asyncio.to_thread(self._desk.take_plan, text)
+            if taken:
+                coordinator.command = command
+                return "the plan is changed"
         self.crew.add(COORDINATOR, Kind.COORDINATOR, command)
-        return before != command
+        return "the plan is changed"
 
     # ------------------------------------------------------------------ one turn
 
@@ -268,13 +278,15 @@ class Supervisor:
 
     def _said(self, process: Process, line: str) -> None:
         """A line of a process's stdout."""
-        if process.kind is Kind.RECORDER:
-            self._say("process", RECORDER, _recording(line))
-        if process.kind is not Kind.SIMULATOR:
-            return
         try:
             told = json.loads(line)
         except ValueError:
+            return  # it is in the log
+        if process.kind is Kind.RECORDER:
+            self._say("process", RECORDER, _recording(told))
+        elif process.kind is Kind.COORDINATOR:
+            self._say("decision", told["subject"], f"{told['decided']}, because {told['why']}")
+        if process.kind is not Kind.SIMULATOR:
             return
         self.crew.heard(SIMULATOR)
         if "link" in told and told.get("car") in self._wish.cars:
@@ -374,10 +386,8 @@ class Supervisor:
                 self.rows.pop(name, None)
         for name in found.begun:
             self._add_car(self._wish.cars[name])
-        if self._set_plan(self._wish.plan):
-            words.append(
-                "the plan is changed" if self._wish.plan else "there is no plan any more: cars keep their modes"
-            )
+        if planned := await self._set_plan(self._wish.plan):
+            words.append(planned)
         for line in words:
             self._say("process", SELF, f"reload by {sender}: {line}")
         return "\n".join(words or ["nothing has changed"])
@@ -386,12 +396,8 @@ class Supervisor:
         self._tell(Happening(what, name, words))
 
 
-def _recording(line: str) -> str:
-    try:
-        told = json.loads(line)
-    except ValueError:
-        return line
-    if told.get("state") == "closed":
-        lost = sum(told.get("drops", {}).values()) + sum(told.get("missed", {}).values())
-        return f"recording closed: {told['session']}, {told['messages']} messages, {lost} lost"
-    return f"recording to {told.get('session')}"
+def _recording(told: Mapping[str, Any]) -> str:
+    if told["state"] != "closed":
+        return f"recording to {told['session']}"
+    lost = sum(told["drops"].values()) + sum(told["missed"].values())
+    return f"recording closed: {told['session']}, {told['messages']} messages, {lost} lost"

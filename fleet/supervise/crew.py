@@ -76,7 +76,7 @@ class Crew:
         if process is None:
             log = Log(self.directory / f"{name}.log")
             self._processes[name] = Process(name, kind, command, Ward(PATIENCE[kind], time.monotonic()), log)
-        elif process.command != command or process.leaving:
+        elif process.command != command or process.leaving or process.ward.state is State.GIVEN_UP:
             process.command, process.leaving = command, False
             self.end(process, grace_s(None), again=True)
 

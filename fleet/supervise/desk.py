@@ -100,6 +100,16 @@ class Desk:
         answers = self.bus.query(f"{self.fleet}/{keys.COORDINATOR}/plan", timeout_s=PING_S, qos=Qos.STATE)
         return any(isinstance(answer, Sample) for answer in list(answers))
 
+    def take_plan(self, text: str) -> bool:
+        """Give the coordinator another plan; whether it took it. On a thread."""
+        key = f"{self.fleet}/{keys.COORDINATOR}/@cmd/plan"
+        payload, encoding = pb.Plan(text=text).SerializeToString(), messages.encoding_of("fleet.v1.Plan")
+        for answer in self.bus.query(key, payload=payload, encoding=encoding, timeout_s=PING_S):
+            if isinstance(answer, Sample):
+                result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)
+                return bool(result.status == "sent")
+        return False
+
     def stop_all(self) -> None:
         """Stop every car with one query; on a thread.
 

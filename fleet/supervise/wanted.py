@@ -71,6 +71,8 @@ class Wanted:
     record: bool = True
     recordings: Path = RECORDINGS
     world: Path | None = None
+    file: Path | None = None
+    """The fleet file, which the coordinator reads too: what cars may do."""
 
     @property
     def simulated(self) -> list[WantedCar]:
@@ -107,6 +109,7 @@ def wanted(file: FleetFile | None, asked: Asked) -> Wanted:
         record=(file.record if file else True) if asked.record is None else asked.record,
         recordings=asked.out or (file.recordings if file else None) or RECORDINGS,
         world=asked.world or (file.world if file else None),
+        file=file.path if file else None,
     )
 
 
@@ -180,4 +183,5 @@ def recorder_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
 def coordinator_command(wish: Wanted, plan: Path, endpoint: str) -> tuple[str, ...]:
     """The coordinator."""
     where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
-    return module("fleet.cli", "coordinate", "--plan", str(plan), "--json", *where)
+    file = () if wish.file is None else ("--fleet-file", str(wish.file))
+    return module("fleet.cli", "coordinate", "--plan", str(plan), "--json", *file, *where)

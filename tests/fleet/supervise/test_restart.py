@@ -1,0 +1,176 @@
+"""When a process is started, killed and started again: by tables, and for any order of what may happen."""
+
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.supervise.restart import (
+    FIRST_S,
+    JITTER,
+    LONGEST_S,
+    STEADY_S,
+    Act,
+    Patience,
+    State,
+    Ward,
+    delay_s,
+    grace_s,
+)
+
+PATIENCE = Patience(start_s=20.0, silence_s=4.0)
+
+
+def running(at: float = 100.0) -> Ward:
+    ward = Ward(PATIENCE, at)
+    assert ward.turn(at, None) is Act.START
+    ward.started(at)
+    assert ward.heard(at)
+    return ward
+
+
+@pytest.mark.parametrize(
+    ("falls", "delay"), [(1, 0.25), (2, 0.5), (3, 1.0), (4, 2.0), (5, 4.0), (6, 8.0), (7, 10.0), (1000, 10.0)]
+)
+def test_the_delay_doubles_to_its_longest_and_is_spread_either_way(falls: int, delay: float) -> None:
+    assert delay_s(falls, 0.5) == delay
+    assert delay_s(falls, 0.0) == pytest.approx(delay * (1 - JITTER))
+    assert delay_s(falls, 1.0) == pytest.approx(delay * (1 + JITTER))
+
+
+@pytest.mark.parametrize(("worst", "grace"), [(0.0, 5.9), (1.8, 7.7), (None, 15.0)])
+def test_a_gateway_has_its_recipe_its_worst_case_and_a_second(worst: float | None, grace: float) -> None:
+    assert grace_s(worst) == pytest.approx(grace)
+
+
+def test_what_dies_is_started_again_after_the_delay() -> None:
+    ward = running()
+    ward.ended(-9, "", 101.0, 0.5)
+    assert ward.state is State.WAITING
+    assert ward.words == "was ended by signal 9"
+    assert ward.turn(101.0 + FIRST_S - 0.01, 0.0) is Act.NOTHING
+    assert ward.turn(101.0 + FIRST_S, 0.0) is Act.START
+    ward.started(102.0)
+    assert (ward.state, ward.restarts) == (State.STARTING, 1)
+
+
+def test_who_falls_at_once_again_and_again_waits_ever_longer_and_who_ran_steadily_does_not() -> None:
+    ward, at, delays = Ward(PATIENCE, 0.0), 0.0, []
+    for _ in range(8):
+        ward.started(at)
+        ward.ended(1, "no", at + 0.1, 0.5)
+        delays.append(ward.due - at - 0.1)
+        at = ward.due
+    assert delays == sorted(delays)
+    assert delays[-1] == pytest.approx(LONGEST_S)
+    ward.started(at)
+    ward.heard(at)
+    ward.ended(1, "no", at + STEADY_S, 0.5)
+    assert ward.due - at - STEADY_S == pytest.approx(FIRST_S)
+    assert ward.words == "ended with exit code 1: no"
+
+
+def test_wrong_use_is_not_repeated() -> None:
+    ward = running()
+    ward.ended(2, "no such platform", 101.0, 0.5)
+    assert ward.state is State.GIVEN_UP
+    assert ward.turn(1e6, 0.0) is Act.NOTHING
+    ward.end(200.0, 5.0, again=True)
+    assert ward.turn(200.0, 0.0) is Act.START
+
+
+@pytest.mark.parametrize(
+    ("now", "listening_since", "act"),
+    [
+        (103.9, 0.0, Act.NOTHING),
+        (104.1, 0.0, Act.KILL),
+        (200.0, None, Act.NOTHING),  # nobody could have been heard
+        (200.0, 197.0, Act.NOTHING),  # the hub is back, or we are awake, for 3 s only
+        (200.0, 195.9, Act.KILL),
+    ],
+)
+def test_who_is_silent_hangs_if_it_could_have_been_heard(now: float, listening_since: float | None, act: Act) -> None:
+    ward = running(100.0)
+    assert ward.turn(now, listening_since) is act
+    if act is Act.KILL:
+        assert ward.words.startswith("hung: not heard for ")
+        assert ward.killed
+        assert ward.turn(now + 10, listening_since) is Act.NOTHING, "once is enough"
+        ward.ended(-9, "", now + 0.1, 0.5)
+        assert ward.words.startswith("hung"), "the reason stays the first"
+
+
+def test_who_starts_has_longer() -> None:
+    ward = Ward(PATIENCE, 0.0)
+    ward.started(100.0)
+    assert ward.turn(119.9, 0.0) is Act.NOTHING
+    assert ward.turn(120.1, 0.0) is Act.KILL
+
+
+def test_told_to_end_it_has_its_time_and_then_is_killed_and_not_started_again() -> None:
+    ward = running()
+    assert ward.end(110.0, 7.0)
+    assert not ward.end(111.0, 7.0), "told twice is told once"
+    assert ward.turn(116.9, 0.0) is Act.NOTHING
+    assert ward.turn(117.0, 0.0) is Act.KILL
+    ward.ended(-9, "", 117.1, 0.5)
+    assert ward.state is State.ENDED
+    assert ward.turn(1e6, 0.0) is Act.NOTHING
+
+
+def test_begun_anew_is_no_fall() -> None:
+    ward = running()
+    ward.end(110.0, 7.0, again=True)
+    ward.ended(0, "", 111.0, 0.5)
+    assert ward.turn(111.0, 0.0) is Act.START
+
+
+def test_what_somebody_else_does_is_not_started_until_nobody_does() -> None:
+    ward = Ward(PATIENCE, 0.0)
+    ward.elsewhere(1.0, "somebody else's")
+    assert ward.turn(100.0, 0.0) is Act.NOTHING
+    ward.wanted(101.0)
+    assert ward.turn(101.0, 0.0) is Act.START
+
+
+@dataclass
+class Process:
+    """What a ward is told of: at most one lives."""
+
+    alive: bool = False
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["turn", "heard", "die", "wrong", "end", "again", "deaf"]),
+            st.floats(0.0, 30.0),
+            st.floats(0.0, 1.0),
+        )
+    )
+)
+def test_for_any_order_there_is_at_most_one_and_what_may_run_is_due(steps: list[tuple[str, float, float]]) -> None:
+    ward, process, now = Ward(PATIENCE, 0.0), Process(), 0.0
+    for step, seconds, chance in steps:
+        now += seconds
+        if step in ("turn", "deaf"):
+            act = ward.turn(now, None if step == "deaf" else 0.0)
+            if act is Act.START:
+                assert not process.alive
+                process.alive = True
+                ward.started(now)
+            elif act is Act.KILL:
+                assert process.alive
+                process.alive = False
+                ward.ended(-9, "", now, chance)
+        elif step == "heard" and process.alive:
+            ward.heard(now)
+        elif step in ("die", "wrong") and process.alive:
+            process.alive = False
+            ward.ended(2 if step == "wrong" else 1, "", now, chance)
+        elif step in ("end", "again"):
+            assert ward.end(now, 5.0, again=step == "again") <= process.alive
+        assert ward.alive == process.alive
+        if ward.state is State.WAITING:
+            assert ward.due <= now + LONGEST_S * (1 + JITTER)

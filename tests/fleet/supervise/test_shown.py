@@ -1,0 +1,102 @@
+"""What a car's row and the table show, and what is kept in logs."""
+
+import io
+import os
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from fleet.supervise.cars import Row
+from fleet.supervise.process import RUNS, Log, new_run, runs
+from fleet.supervise.restart import State
+from fleet.supervise.table import Table
+from fleet.supervise.wanted import Kind, Wanted
+from fleet.supervisor import Supervisor
+from schemas.gen import fleet_v1_pb2 as pb
+
+
+def test_a_row_says_what_is_new_once() -> None:
+    row = Row("red")
+    online = pb.Link(state="online", reason="heard")
+    assert row.take("state/link", online, 0.0) == "link online: heard"
+    assert row.take("state/link", online, 1.0) == ""
+    assert row.take("state/mode", pb.Mode(asked="tracking", verdict="assumed"), 1.0) == "mode tracking, assumed"
+    assert row.take("state/motion", pb.Motion(motion="stop"), 1.0) == "", "as it should be at first"
+    assert row.take("state/motion", pb.Motion(motion="back", owner="ann"), 2.0) == "motion back by ann"
+    assert row.take("state/motion", pb.Motion(motion="stop"), 3.0) == "motion stop"
+    assert row.take("sensor/battery", pb.Battery(voltage_v=6.5, level="critical"), 3.0) == "battery critical"
+
+
+def test_a_row_shows_hold_and_e_stop() -> None:
+    row = Row("red")
+    assert row.take("state/safety", pb.Safety(motors="off"), 0.0) == ""
+    held = pb.Safety(hold=pb.Hold(by="ann"), worst_stop_s=1.8)
+    assert row.take("state/safety", held, 1.0) == "on hold by ann"
+    held.estops.add(id="e1", by="bob")
+    assert row.take("state/safety", held, 2.0) == "e-stop e1"
+    assert (row.hold, row.estop, row.worst_stop_s) == ("ann", "e1", 1.8)
+    assert row.take("state/safety", pb.Safety(), 3.0) == "not on hold"
+
+
+def test_the_rate_is_what_came_over_some_seconds() -> None:
+    row = Row("red")
+    for second in range(5):
+        row.take("state/link", pb.Link(state="online", rx_frames=second * 25), float(second))
+    assert row.rate_hz == 25.0
+    row.take("state/link", pb.Link(state="online", rx_frames=3), 9.0)
+    assert row.rate_hz == 25.0, "another gateway counts anew"
+    row.gone()
+    assert (row.rate_hz, row.link, row.mode) == (None, "", "")
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 200])
+def test_the_table_fits_and_names_every_car(width: int) -> None:
+    wish = Wanted(endpoint="tcp/127.0.0.1:7999")
+    supervisor = Supervisor(wish, "", lambda: wish, lambda happening: None)
+    for name, kind in (("@hub", Kind.HUB), ("red", Kind.GATEWAY), ("green", Kind.GATEWAY)):
+        supervisor.crew.add(name, kind, ())
+    for process in supervisor.crew:
+        process.ward.state = State.RUNNING
+    for name in ("red", "green"):
+        supervisor.rows[name] = Row(name, link="online", mode="obstacle_avoidance", event="x" * 300)
+    console = Console(file=io.StringIO(), width=width)
+    console.print(Table(supervisor, console).rendered())
+    assert isinstance(console.file, io.StringIO)
+    shown = console.file.getvalue()
+    assert all(word in shown for word in ("red", "green", "online", "@hub"))
+    assert all(len(line) <= width for line in shown.splitlines())
+
+
+def test_a_log_keeps_its_bounds_and_the_newest_lines(tmp_path: Path) -> None:
+    log = Log(tmp_path / "red.log", limit_bytes=10_000)
+    for number in range(2000):
+        log.add(f"line {number}", 1_700_000_000.25)
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 21_000
+    text = log.older.read_text() + log.path.read_text()
+    assert text.splitlines()[-1] == "2023-11-14T22:13:20.250Z red | line 1999"
+    assert "line 1800" in text
+
+
+def test_a_log_that_cannot_be_written_says_so_and_hurts_nobody(tmp_path: Path) -> None:
+    log = Log(tmp_path / "gone" / "red.log")
+    log.add("x", 0.0)
+    assert "cannot be written: No such file" in log.failed
+
+
+def test_the_oldest_runs_are_removed_unless_they_may_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    place = runs("lab")
+    for number in range(RUNS + 5):
+        old = place / f"20200101-0000{number:02}-1"
+        old.mkdir(parents=True)
+        (old / "red.log").write_text("x")
+        os.utime(old, (0, 0))
+    touched = place / "20190101-000000-1"
+    touched.mkdir()
+    os.utime(touched, (1_700_000_000, 1_700_000_000))
+    made = new_run("lab", 1_700_000_100.0)
+    left = sorted(each.name for each in place.iterdir())
+    assert made.name in left
+    assert touched.name in left
+    assert len(left) == RUNS + 1

@@ -1,0 +1,130 @@
+"""From a fleet file and the command line to what is to run, and from one wish to the next."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fleet.config import parse_fleet
+from fleet.supervise.reload import change
+from fleet.supervise.wanted import (
+    SIMULATED,
+    Asked,
+    Wanted,
+    WantedCar,
+    coordinator_command,
+    gateway_command,
+    recorder_command,
+    simulator_command,
+    wanted,
+)
+
+FILE = """
+name: lab
+endpoint: tcp/127.0.0.1:7999
+recordings: kept
+record: false
+defaults: {limits: {longest_drive_s: 3}}
+cars:
+  ann: {link: /dev/ttyUSB0, platform: stm32+imu}
+  bob: {link: "tcp://192.168.1.7:8888", limits: {on_battery_low: stop}}
+"""
+
+
+def test_a_file_says_it_all(tmp_path: Path) -> None:
+    wish = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), Asked())
+    assert (wish.fleet, wish.endpoint, wish.record) == ("lab", "tcp/127.0.0.1:7999", False)
+    assert wish.recordings == tmp_path / "kept"
+    assert [(car.name, car.link, car.platform) for car in wish.cars.values()] == [
+        ("ann", "/dev/ttyUSB0", "stm32+imu"),
+        ("bob", "tcp://192.168.1.7:8888", "auto"),
+    ]
+    assert not wish.simulated
+
+
+def test_the_command_line_wins(tmp_path: Path) -> None:
+    asked = Asked(plan=Path("p.yaml"), record=True, out=Path("o"), connect="tcp/127.0.0.1:7000", fleet="x")
+    wish = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), asked)
+    assert (wish.fleet, wish.endpoint, wish.record, wish.recordings, wish.plan) == (
+        "x",
+        "tcp/127.0.0.1:7000",
+        True,
+        Path("o"),
+        Path("p.yaml"),
+    )
+
+
+def test_simulated_are_first_the_files_cars_then_ours(tmp_path: Path) -> None:
+    wish = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), Asked(simulated=3))
+    assert [(car.name, car.platform) for car in wish.simulated] == [
+        ("ann", "stm32+imu"),
+        ("bob", "arduino"),
+        ("red", "arduino"),
+    ]
+    one = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), Asked(simulated=1))
+    assert [car.name for car in one.simulated] == ["ann"]
+    assert one.cars["bob"].link == "tcp://192.168.1.7:8888"
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 50, 200])
+def test_any_number_of_cars_without_a_file(count: int) -> None:
+    wish = wanted(None, Asked(simulated=count))
+    assert len(wish.cars) == len(wish.simulated) == count
+    assert next(iter(wish.cars)) == "red"
+
+
+def test_every_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
+    """Argument parsers that know their arguments complain of the last one only."""
+    wish = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), Asked(simulated=1))
+    endpoint = "tcp/127.0.0.1:1"
+    commands = [
+        gateway_command(wish, wish.cars["bob"], "tcp://127.0.0.1:1", endpoint),
+        simulator_command(wish, tmp_path, endpoint),
+        recorder_command(wish, endpoint),
+        coordinator_command(wish, tmp_path / "plan.yaml", endpoint),
+    ]
+    for command in commands:
+        assert command[0] == sys.executable
+        done = subprocess.run([*command, "--nonsense"], capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert "--nonsense" in done.stderr, done.stderr
+
+
+CARS = {name: WantedCar(name, f"/dev/{name}") for name in ("ann", "bob")}
+OLD = Wanted(cars=CARS | {"sim": WantedCar("sim", SIMULATED, "arduino")})
+
+
+def test_nothing_new_is_no_change() -> None:
+    found = change(OLD, OLD)
+    assert (found.wish, found.gone, found.begun, found.words) == (OLD, (), (), ())
+
+
+def test_cars_come_go_and_change() -> None:
+    cars = {name: car for name, car in OLD.cars.items() if name != "ann"}
+    cars |= {"bob": WantedCar("bob", "/dev/other"), "eve": WantedCar("eve", "/dev/eve")}
+    found = change(OLD, replace(OLD, cars=cars))
+    assert found.gone == ("ann",)
+    assert found.begun == ("bob", "eve")
+    assert found.wish.cars == cars
+    assert found.words == ("bob is begun anew", "eve is added", "ann is taken out")
+
+
+@pytest.mark.parametrize(
+    ("new", "words"),
+    [
+        (replace(OLD, fleet="lab"), "the fleet's name"),
+        (replace(OLD, endpoint="tcp/127.0.0.1:7"), "the endpoint"),
+        (replace(OLD, world=Path("w")), "the world"),
+        (replace(OLD, recordings=Path("r")), "where recordings go"),
+        (replace(OLD, record=False), "whether it records"),
+        (replace(OLD, cars=OLD.cars | {"two": WantedCar("two", SIMULATED)}), "two, a simulated car,"),
+        (replace(OLD, cars=OLD.cars | {"sim": WantedCar("sim", SIMULATED, "stm32")}), "sim, a simulated car,"),
+        (replace(OLD, cars=OLD.cars | {"sim": WantedCar("sim", "/dev/sim")}), "sim, a simulated car,"),
+    ],
+)
+def test_what_the_processes_are_bound_to_stays_and_is_said(new: Wanted, words: str) -> None:
+    found = change(OLD, new)
+    assert found.wish == OLD
+    assert found.words == (f"{words} cannot be changed while running (fleet down, fleet up)",)
