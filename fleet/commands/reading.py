@@ -115,18 +115,18 @@ def get(
         if not readings:
             within = f" of the last {since:g} s" if since is not None else ""
             raise click.ClickException(f"nothing under {written}{within}; {what_there_is(client, written)}")
-    _show(readings, csv_of=under[0] if as_csv else None, as_json=as_json)
+    _show(readings, csv_of=under[0] if as_csv else None, as_json=as_json, past=past)
     if past:
         _tell(history.shortfalls(readings, datetime.now(UTC), last=last, since_s=since))
 
 
-def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: bool) -> None:
+def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: bool, past: bool) -> None:
     if csv_of is not None:
         click.echo(csv_table.table(readings, csv_of).encode(), nl=False)
         return
     width = max(len(reading.key) for reading in readings)
     for reading in readings:
-        click.echo(json_text(reading) if as_json else line(reading, width))
+        click.echo(json_text(reading) if as_json else line(reading, width, past=past))
 
 
 def _tell(words: Sequence[str]) -> None:

@@ -20,8 +20,8 @@ def json_text(reading: Reading) -> str:
     return json.dumps(whole)
 
 
-def line(reading: Reading, width: int = 0) -> str:
-    """Key (padded to `width`), fields with their units, age."""
+def line(reading: Reading, width: int = 0, *, past: bool = False) -> str:
+    """Key (padded to `width`), fields with their units, age; of the `past` nobody expects that it is fresh."""
     topic = topics.of_key(reading.key)
     units = topic.units if topic is not None else {}
     fields = [
@@ -29,7 +29,7 @@ def line(reading: Reading, width: int = 0) -> str:
         for name, value in reading.as_dict().items()
         if name not in _HEADER and value not in ("", [], {})
     ]
-    age = f"{reading.age_s():.1f} s ago{' (stale)' if reading.stale() else ''}"
+    age = f"{reading.age_s():.1f} s ago{' (stale)' if not past and reading.stale() else ''}"
     return f"{reading.key:<{width}}  {'  '.join(fields)}  {age}"
 
 

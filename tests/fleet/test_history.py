@@ -84,6 +84,7 @@ def test_the_last_so_many_come_oldest_first(remembered: Remembered) -> None:
     lines = get(remembered, "red/sensor/range", "--last", "2").stdout.decode().splitlines()
     assert len(lines) == 2
     assert lines[0].startswith("fleet/red/sensor/range  range_m=1.")
+    assert lines[0].endswith(" s ago"), "of the past nobody expects that it is fresh"
 
 
 def test_a_table_has_units_in_its_header_and_is_what_rfc_4180_says(remembered: Remembered) -> None:
