@@ -119,9 +119,8 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
 
 
 def _subjects(plan: Plan, picture: Picture) -> tuple[str, ...]:
-    """The cars that something is decided of: those that the plan names and, if it is for any, all that there are."""
-    others = (car for car, known in picture.cars.items() if known.present or known.listed)
-    return tuple(sorted({*plan.named, *others})) if plan.open else tuple(sorted(plan.named))
+    """The cars that something is decided of: those that the plan names and, if it is for any, all that were ever there."""
+    return tuple(sorted({*plan.named, *picture.cars})) if plan.open else tuple(sorted(plan.named))
 
 
 def _unheard(known: CarPicture) -> bool:

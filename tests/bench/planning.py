@@ -1,0 +1,75 @@
+"""One decision of the coordinator for 50 cars and 20 rules; the floor is looking at each reading that it looks at once."""
+
+from dataclasses import replace
+from time import perf_counter
+
+from fleet.policy.decide import step
+from fleet.policy.memory import Memory
+from fleet.policy.picture import CarPicture, Picture, Seen
+from fleet.policy.reader import parse
+from tests.bench.measured import Measured, in_turns
+
+CARS = tuple(f"car{number:02}" for number in range(50))
+PLAN = parse(
+    "roles:\n"
+    + "\n".join(
+        f"  role{number}: {{mode: {mode}, needs: battery.voltage_v > 7.0, count: 5, priority: {number % 3}}}"
+        for number, mode in enumerate(("tracking", "following", "light_seeking", "obstacle_avoidance", "color_led") * 2)
+    )
+    + "\nrules:\n"
+    + "\n".join(
+        f"  - {{when: {{any: light.left and range.range_m < 0.{number + 10}, for_s: 1}}, then: {{who: that, mode: manual}}}}"
+        for number in range(20)
+    )
+)
+HERE = CarPicture(present=True, mode="manual", verdict="confirmed", link="online", motors="off", platform="arduino")
+STEPS = 100
+
+
+def _pictures() -> list[Picture]:
+    """New readings from every car in each; one car more or less in every second."""
+    found = []
+    for number in range(STEPS):
+        readings = {
+            car: {
+                "sensor/battery": Seen({"voltage_v": 7.4}, number * 0.1),
+                "sensor/light": Seen({"left": number % 3 == 0, "right": False}, number * 0.1),
+                "sensor/range": Seen({"range_m": 0.2}, number * 0.1),
+            }
+            for car in CARS
+        }
+        away = replace(HERE, held_by="ann") if number % 2 else HERE
+        found.append(Picture({**dict.fromkeys(CARS, HERE), CARS[number % 50]: away}, readings))
+    return found
+
+
+PICTURES = _pictures()
+
+
+def _ours() -> float:
+    memory = Memory()
+    worst = 0.0
+    for number, picture in enumerate(PICTURES):
+        began = perf_counter()
+        memory = step(PLAN, picture, memory, number * 0.1).memory
+        worst = max(worst, perf_counter() - began)
+    return worst * 1e3
+
+
+def _floor() -> float:
+    seen = PICTURES[0].readings
+    worst = 0.0
+    for _ in range(STEPS):
+        began = perf_counter()
+        for _ in PLAN.rules:
+            for car in CARS:
+                reading = seen[car]
+                assert reading["sensor/light"].fields["left"] in (True, False)
+                assert reading["sensor/range"].fields["range_m"] == 0.2
+        worst = max(worst, perf_counter() - began)
+    return worst * 1e3
+
+
+def run() -> list[Measured]:
+    ours, floor = in_turns(_ours, _floor)
+    return [Measured("the slowest of 100 decisions, 50 cars, 20 rules", tuple(ours), tuple(floor), "ms", 0.0, 10.0)]

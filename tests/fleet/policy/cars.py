@@ -1,0 +1,61 @@
+"""Pictures of cars for the tests of policy/; times are seconds of one clock."""
+
+from dataclasses import replace
+from typing import Any
+
+from fleet.policy.decide import Step, step
+from fleet.policy.memory import Memory
+from fleet.policy.picture import CarPicture, Picture, Seen
+from fleet.policy.plan import Plan
+
+HERE = CarPicture(present=True, mode="manual", verdict="confirmed", link="online", motors="off", platform="arduino")
+GONE = CarPicture()
+
+
+def seen(at: float, **topics: dict[str, Any]) -> dict[str, Seen]:
+    return {f"sensor/{name}": Seen(fields, at) for name, fields in topics.items()}
+
+
+class Run:
+    """A coordinator that is told what it sees, and whose cars obey at once if `obey`."""
+
+    def __init__(self, plan: Plan, *cars: str, obey: bool = True) -> None:
+        self.plan = plan
+        self.memory = Memory()
+        self.cars: dict[str, CarPicture] = dict.fromkeys(cars, HERE)
+        self.readings: dict[str, dict[str, Seen]] = {}
+        self.obey = obey
+        self.asked: list[tuple[float, str, str]] = []
+        self.now = 0.0
+        self.last = Step(self.memory)
+
+    def change(self, car: str, **fields: Any) -> None:
+        self.cars[car] = replace(self.cars[car], **fields)
+
+    def sees(self, car: str, **topics: dict[str, Any]) -> None:
+        self.readings[car] = {**self.readings.get(car, {}), **seen(self.now, **topics)}
+
+    def at(self, now: float) -> Step:
+        """One step at this time."""
+        self.now = now
+        self.last = step(self.plan, Picture(dict(self.cars), dict(self.readings)), self.memory, now)
+        self.memory = self.last.memory
+        for ask in self.last.asks:
+            if ask.mode is not None:
+                self.asked.append((now, ask.car, str(ask.mode)))
+                if self.obey:
+                    self.change(ask.car, mode=str(ask.mode), verdict="assumed")
+        return self.last
+
+    def until(self, now: float, every: float = 0.1) -> Step:
+        """Steps up to this time."""
+        while self.now + every <= now + 1e-9:
+            self.at(round(self.now + every, 6))
+        return self.last
+
+    def of(self, subject: str) -> Any:
+        return next(each for each in self.last.decisions if each.subject == subject)
+
+    @property
+    def roles(self) -> dict[str, str]:
+        return dict(self.last.roles)

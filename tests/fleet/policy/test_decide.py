@@ -1,0 +1,352 @@
+"""What follows from pictures, step by step on a clock of its own: who takes which role, and that nothing flaps."""
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.policy.decide import step
+from fleet.policy.memory import Memory, carried, restored, to_keep
+from fleet.policy.picture import CarPicture, Picture, Refused
+from fleet.policy.reader import parse
+from tests.fleet.policy.cars import GONE, HERE, Run
+
+FIXED = parse("cars: {red: tracking}")
+ONE = parse("roles: {scout: {mode: tracking}}")
+TWO = parse("roles: {patrol: {mode: obstacle_avoidance, count: 2, priority: 1}, scout: {mode: tracking}}")
+STRONG = parse("roles: {scout: {mode: tracking, needs: battery.voltage_v > 7.0}}")
+LAMP = parse("""
+roles:
+  wait: {mode: manual, count: all}
+  leader: {mode: light_seeking, on_call: true}
+  follower: {mode: following, count: all, on_call: true}
+rules:
+  - when: {any: light.left or light.right, for_s: 1}
+    then: [{who: that, role: leader}, {who: others, role: follower}]
+""")
+
+
+@pytest.mark.parametrize(
+    ("car", "mode", "asks"),
+    [
+        (HERE, "tracking", True),
+        (replace(HERE, mode="tracking"), "tracking", False),
+        (replace(HERE, mode="tracking", verdict="assumed"), "tracking", False),
+        (replace(HERE, mode="tracking", verdict="contradicted"), "tracking", True),
+        (replace(HERE, mode="unknown"), "tracking", True),
+        (replace(HERE, link="stale"), "tracking", True),
+        (replace(HERE, busy=True), "tracking", False),
+        (CarPicture(), None, False),
+        (replace(HERE, held_by="ann"), None, False),
+        (replace(HERE, estopped_by="ann"), None, False),
+        (replace(HERE, mode="tracking", verdict="contradicted", held_by="ann"), None, False),
+        (replace(HERE, driven_by="ann"), None, False),
+        (replace(HERE, present=False), None, False),
+        (replace(HERE, link="lost"), None, False),
+        (replace(HERE, motors="unknown"), None, False),
+        (replace(HERE, motors="unknown", verdict="contradicted", mode="tracking"), "tracking", True),
+    ],
+)
+def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarPicture, mode: str | None, asks: bool) -> None:
+    result = step(FIXED, Picture({"red": car}), Memory(began=-9.0), 0.0)
+    (decision, *_) = result.decisions
+    assert decision.mode == mode
+    assert bool(result.asks) is asks
+
+
+def test_a_role_goes_to_another_after_a_moment_and_does_not_come_back() -> None:
+    run = Run(ONE, "green", "red")
+    assert run.at(0.0).roles == {"green": "scout"}
+    run.change("green", present=False, mode="")
+    run.until(1.5)
+    assert run.roles == {"green": "scout"}, "it is kept for a moment"
+    run.until(1.7)
+    assert run.roles == {"red": "scout"}
+    assert run.of("red").why == "role scout (1 of 1): in place of green: green is not on the bus"
+    run.cars["green"] = HERE
+    run.until(9.0)
+    assert run.roles == {"red": "scout"}
+    assert [ask[1:] for ask in run.asked] == [("green", "tracking"), ("red", "tracking")]
+
+
+def test_a_car_that_is_away_for_less_keeps_its_role() -> None:
+    run = Run(ONE, "green", "red")
+    run.at(0.0)
+    for begin in (1.0, 4.0, 7.0):
+        run.until(begin)
+        run.change("green", link="lost")
+        run.until(begin + 1.4)
+        run.change("green", link="online")
+        run.until(begin + 2.0)
+    assert run.roles == {"green": "scout"}
+    assert len(run.asked) == 1
+
+
+def test_a_persons_word_frees_a_role_at_once() -> None:
+    run = Run(ONE, "green", "red")
+    run.at(0.0)
+    run.change("green", held_by="ann")
+    assert run.at(0.1).roles == {"red": "scout"}
+
+
+def test_the_higher_priority_is_filled_first_and_by_whom_it_costs_least() -> None:
+    run = Run(TWO, "blue", "green", "red")
+    run.change("red", mode="tracking")
+    assert run.at(0.0).roles == {"blue": "patrol", "green": "patrol", "red": "scout"}
+    run.change("blue", held_by="ann")
+    assert run.at(0.1).roles == {"green": "patrol", "red": "patrol"}
+    assert run.of("role scout").why.startswith("no other car can: ")
+
+
+def test_needs_that_flicker_change_nothing_and_old_values_count_where_nothing_measures_them() -> None:
+    run = Run(STRONG, "green", "red")
+    for car in ("green", "red"):
+        run.sees(car, battery={"voltage_v": 7.4})
+    run.at(0.0)
+    assert run.roles == {"green": "scout"}
+    for turn in range(20):
+        run.sees("green", battery={"voltage_v": 7.1 if turn % 2 else 6.9})
+        run.until(run.now + 1.0)
+    assert run.roles == {"green": "scout"}
+    assert len(run.asked) == 1
+    run.until(60.0)  # in tracking a car measures no battery
+    assert run.roles == {"green": "scout"}
+    run.sees("green", battery={"voltage_v": 6.9})
+    run.until(62.0)
+    assert run.roles == {"red": "scout"}
+    assert run.of("green").kind == "idle"
+
+
+def test_a_car_of_which_a_need_is_not_known_does_not_take_the_role() -> None:
+    run = Run(STRONG, "red")
+    run.at(0.0)
+    assert run.roles == {}
+    assert "that is not known" in run.of("role scout").why
+
+
+def test_a_contradicted_mode_is_asked_for_ever_more_slowly_and_then_another_car_takes_over() -> None:
+    run = Run(ONE, "green", "red", obey=False)
+    run.change("green", mode="tracking", verdict="contradicted", evidence="silent for 3.1 s")
+    run.change("red", mode="manual", held_by="ann")
+    run.until(20.0)
+    times = [at for at, car, _ in run.asked if car == "green"]
+    assert [round(after - before) for before, after in pairwise(times)] == [1, 2, 4, 8]
+    assert "silent for 3.1 s" in run.of("green").why
+    run.change("red", held_by=None)
+    run.until(20.2)
+    assert run.roles == {"red": "scout"}
+
+
+def test_what_a_car_refuses_another_does() -> None:
+    run = Run(ONE, "green", "red", obey=False)
+    run.at(0.0)
+    run.change("green", refused=Refused("tracking", "battery_low", "battery critical: 6.4 V", 0.2))
+    run.at(0.2)
+    assert run.roles == {"red": "scout"}
+
+
+def test_the_car_that_sees_the_lamp_leads_and_goes_on_while_it_changes_its_mode() -> None:
+    run = Run(LAMP, "blue", "green", "red")
+    for car in run.cars:
+        run.sees(car, light={"left": False, "right": False})
+    run.at(0.0)
+    assert set(run.roles.values()) == {"wait"}
+    for _ in range(12):
+        run.sees("green", light={"left": True, "right": False})
+        run.until(run.now + 0.1)
+    assert run.roles == {"blue": "follower", "green": "leader", "red": "follower"}
+    run.until(run.now + 7.0)  # 3.5 s of opening a mode, and a reading is not stale for 3 s
+    assert run.roles["green"] == "leader"
+    run.until(run.now + 3.0)
+    assert set(run.roles.values()) == {"wait"}
+
+
+def test_the_first_of_two_rules_that_are_true_counts() -> None:
+    plan = parse("""
+cars: {red: tracking, blue: manual}
+rules:
+  - {when: {car: red, is: range.range_m < 0.3, for_s: 1}, then: {who: blue, mode: obstacle_avoidance}}
+  - {when: {car: red, is: battery.level == 'critical'}, then: {who: blue, mode: color_led}}
+""")
+    run = Run(plan, "red", "blue")
+    run.sees("red", range={"range_m": 0.2}, battery={"level": "critical"})
+    run.at(0.0)
+    assert run.of("blue").mode == "color_led"
+    run.sees("red", range={"range_m": 0.2}, battery={"level": "critical"})
+    run.at(1.0)
+    assert run.of("blue").mode == "obstacle_avoidance"
+    assert run.of("blue").readings == ("red/sensor/range range_m=0.2 (1.0 s old)",)
+
+
+def test_phases_follow_conditions_and_time_outs() -> None:
+    plan = parse("""
+roles: {look: {mode: manual, count: all}, go: {mode: tracking, count: all}}
+phases:
+  search: {roles: [look], until: {any: light.left}, timeout_s: 30, next: run, on_timeout: give_up}
+  run: {roles: [go], timeout_s: 5, next: search}
+  give_up: {roles: [look]}
+""")
+    run = Run(plan, "red")
+    run.at(0.0)
+    run.until(2.0)
+    run.sees("red", light={"left": True})
+    assert run.at(2.1).roles == {"red": "go"}
+    assert run.of("phase").why == "search ends with any car: light.left"
+    run.until(7.0)
+    assert run.roles == {"red": "go"}
+    run.until(7.2)
+    assert run.roles == {"red": "look"}
+    run.until(40.0)
+    assert run.memory.phase.name == "give_up"
+
+
+def test_a_role_that_lacks_a_car_is_stood_in_for() -> None:
+    plan = parse("""
+roles:
+  strong: {mode: tracking, cars: [red], fallback: weak}
+  weak: {mode: following, on_call: true}
+""")
+    run = Run(plan, "blue", "red")
+    assert run.at(0.0).roles == {"red": "strong"}
+    run.change("red", held_by="ann")
+    assert run.at(0.1).roles == {"blue": "weak"}
+    assert "which stands in for strong" in run.of("blue").why
+    run.change("red", held_by=None)
+    assert run.at(0.2).roles == {"red": "strong"}
+
+
+def test_a_restarted_coordinator_switches_no_mode() -> None:
+    run = Run(TWO, "blue", "green", "red")
+    run.change("red", mode="obstacle_avoidance")
+    run.at(0.0)
+    before, asked = run.roles, len(run.asked)
+    run.memory = Memory()
+    run.at(10.0)
+    assert len(run.asked) == asked
+    assert run.roles == before
+    same = parse("roles: {a: {mode: tracking}, b: {mode: tracking}}")
+    run = Run(same, "green", "red")
+    run.at(0.0)
+    kept = replace(to_keep(same, run.memory, 1.0, 100.0), roles={"green": "b", "red": "a"})
+    run.memory = restored(same, Picture(run.cars), kept, 2.0, 101.0)
+    run.at(2.0)
+    assert run.roles == {"green": "b", "red": "a"}
+    assert len(run.asked) == 2
+
+
+def test_a_new_plan_keeps_the_roles_that_it_has_too() -> None:
+    run = Run(TWO, "blue", "green", "red")
+    run.at(0.0)
+    before, asked = run.roles, len(run.asked)
+    after = parse(TWO.text + "\nrules: [{when: {any: light.left}, then: {who: that, mode: manual}}]")
+    run.memory, run.plan = carried(run.memory, run.plan, after), after
+    run.at(0.1)
+    assert (run.roles, len(run.asked)) == (before, asked)
+
+
+def test_roles_wait_at_the_start_for_cars_that_have_not_said_how_they_are() -> None:
+    run = Run(ONE, "green", "red")
+    run.change("red", mode="")
+    assert run.at(0.0).decisions == ()
+    run.change("red", mode="tracking")
+    assert run.at(0.3).roles == {"red": "scout"}
+    assert run.asked == []
+
+
+CARS = ("a", "b", "c", "d")
+PLANS = (
+    TWO,
+    STRONG,
+    LAMP,
+    parse("""
+cars: {d: manual}
+roles: {x: {mode: tracking, count: 2, fallback: y}, y: {mode: following, needs: battery.voltage_v > 7, priority: 3}}
+rules: [{when: {all: not obstacle.left, for_s: 1}, then: {who: all, mode: color_led}}]
+"""),
+)
+changes = st.tuples(
+    st.sampled_from(CARS),
+    st.sampled_from(
+        [
+            {"present": False, "mode": ""},
+            {"present": True, "mode": "manual"},
+            {"held_by": "ann"},
+            {"held_by": None},
+            {"estopped_by": "ann"},
+            {"estopped_by": None},
+            {"driven_by": "bob"},
+            {"driven_by": None},
+            {"link": "lost"},
+            {"link": "online"},
+            {"verdict": "contradicted"},
+            {"platform": "raspberry_pi"},
+            {"motors": "unknown"},
+            {"motors": "off"},
+            {"light": True},
+            {"light": False},
+            {"voltage": 6.5},
+            {"voltage": 7.5},
+        ]
+    ),
+    st.sampled_from([0.1, 0.7, 1.6, 3.1]),
+)
+
+
+def _run(plan: Any, course: list[Any]) -> tuple[list[Any], Run]:
+    run = Run(plan, *CARS)
+    told = []
+    for car, fields, wait_s in course:
+        if "light" in fields:
+            run.sees(car, light={"left": fields["light"], "right": False})
+        elif "voltage" in fields:
+            run.sees(car, battery={"voltage_v": fields["voltage"]})
+        else:
+            run.change(car, **fields)
+        told.append(run.at(round(run.now + wait_s, 6)))
+    return told, run
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(PLANS), st.lists(changes, max_size=30))
+def test_whatever_happens(plan: Any, course: list[Any]) -> None:
+    told, _ = _run(plan, course)
+    again, _ = _run(plan, course)
+    assert told == again, "the same input gives the same decisions"
+    run = Run(plan, *CARS)
+    for (car, fields, wait_s), result in zip(course, told, strict=True):
+        if not {"light", "voltage"} & set(fields):
+            run.change(car, **fields)
+        run.at(round(run.now + wait_s, 6))
+        alone = {name for name, known in run.cars.items() if known.held_by or known.estopped_by or not known.present}
+        assert not {ask.car for ask in result.asks} & {
+            name for name, known in run.cars.items() if known.held_by or known.estopped_by
+        }
+        for name in alone:
+            known = run.cars[name]
+            if known.held_by or known.estopped_by:
+                assert name not in result.roles
+        for role in plan.roles.values():
+            if role.count is not None and not any(other.fallback == role.name for other in plan.roles.values()):
+                assert list(result.roles.values()).count(role.name) <= role.count
+        subjects = [decision.car for decision in result.decisions if decision.car is not None]
+        assert len(subjects) == len(set(subjects)), "no car has two decisions"
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(PLANS[:2]), st.lists(changes, max_size=12))
+def test_when_nothing_changes_any_more_nothing_is_decided_any_more(plan: Any, course: list[Any]) -> None:
+    _, run = _run(plan, course)
+    for car in CARS:
+        run.change(car, verdict="assumed", busy=False)
+    run.until(run.now + 12.0, 0.5)
+    for _ in range(20):
+        run.at(run.now + 0.5)
+        assert run.last.changed == ()
+        assert run.last.asks == ()
+
+
+def test_gone_is_gone() -> None:
+    assert step(FIXED, Picture({"red": GONE}), Memory(began=-9.0), 0.0).asks == ()

@@ -1,0 +1,135 @@
+"""Each kind of decision is explained as the table (tests/vectors/decisions.tsv) has it, on the case that it names."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from fleet.policy.explain import Kind
+from fleet.policy.picture import Refused, Seen
+from fleet.policy.reader import parse
+from tests.fleet.policy.cars import HERE, Run
+from tests.support.vectors import rows
+
+SCOUT = parse("""
+roles:
+  scout: {mode: tracking, needs: battery.voltage_v > 7.0}
+  seeker: {mode: light_seeking, on_call: true}
+rules:
+  - name: lamp
+    when: {any: light.left, for_s: 1}
+    then: [{who: that, role: seeker}, {who: others, mode: color_led}]
+""")
+STAND_IN = parse(
+    "roles: {first: {mode: tracking, cars: [red], fallback: second}, second: {mode: following, on_call: true}}"
+)
+PHASES = parse(
+    """
+roles: {any: {mode: manual}}
+phases:
+  look: {until: {any: light.left}, next: go, timeout_s: 30, on_timeout: rest}
+  go: {}
+  rest: {}
+rules: [{name: enough, when: {car: red, is: motion.fan}, then: {phase: rest}}]
+""".replace("{any: {mode", "{some: {mode")
+)
+CHANGES: dict[str, dict[str, Any]] = {
+    "free place": {},
+    "already in it": {"mode": "tracking"},
+    "battery too low": {},
+    "battery not known": {},
+    "platform": {"platform": "raspberry_pi"},
+    "not in the fleet file": {"roles": frozenset({"seeker"})},
+    "refused": {"refused": Refused("tracking", "battery_low", "6.5 V", 10.0)},
+    "contradicted": {"mode": "tracking", "verdict": "contradicted", "evidence": "silent for 3.1 s"},
+    "not on the bus": {"present": False, "mode": ""},
+    "not heard yet": {"mode": ""},
+    "in recovery": {"motors": "unknown"},
+    "link lost": {"link": "lost"},
+    "on hold": {"held_by": "ann"},
+    "e-stopped": {"estopped_by": "ann"},
+    "driven": {"driven_by": "bob"},
+}
+
+
+def _last(case: str) -> Run:
+    """A coordinator that has come to the decision."""
+    run = Run(SCOUT, "red", obey=False)
+    run.memory = replace(run.memory, began=0.0)
+    run.readings["red"] = {} if "not known" in case else {"sensor/battery": Seen({"voltage_v": 7.4}, 9.5)}
+    if "too low" in case or case == "role lacks a car":
+        run.readings["red"] = {"sensor/battery": Seen({"voltage_v": 6.8}, 9.5)}
+    match case:
+        case "in place of another" | "no place left" | "role lacks a car" | "rule gives a role" | "rule gives a mode":
+            run.cars["blue"] = HERE
+            run.readings["blue"] = {"sensor/battery": Seen({"voltage_v": 7.4}, 9.5)}
+            run.cars["red"] = replace(HERE, mode="tracking")
+    match case:
+        case "in place of another":
+            run.at(8.0)
+            run.change("red", held_by="ann")
+        case "no place left":
+            run.change("red", mode="manual")
+            run.change("blue", mode="tracking")
+        case "rule gives a role" | "rule gives a mode":
+            for at in (7.5, 8.4):
+                run.readings["red"]["sensor/light"] = Seen({"left": True}, at)
+                run.at(at)
+            run.readings["red"]["sensor/light"] = Seen({"left": True}, 9.5)
+        case "role lacks a car":
+            run.cars["blue"] = replace(HERE, present=False)
+        case "role filled again":
+            run.change("red", held_by="ann")
+            run.at(8.0)
+            run.change("red", held_by=None)
+        case "away for a moment":
+            run.at(8.0)
+            run.change("red", present=False, mode="")
+        case "contradicted":
+            run.change("red", mode="tracking")
+            run.readings["red"] = {"sensor/battery": Seen({"voltage_v": 7.4}, 7.5)}
+            run.at(8.0)
+    run.change("red", **CHANGES.get(case, {}))
+    run.at(10.0)
+    return run
+
+
+def _stand_in() -> Run:
+    run = Run(STAND_IN, "blue", "red")
+    run.change("red", held_by="ann")
+    run.at(10.0)
+    return run
+
+
+def _phase(case: str) -> Run:
+    run = Run(PHASES, "red")
+    run.at(0.0)
+    if case == "phase by condition":
+        run.readings["red"] = {"sensor/light": Seen({"left": True}, 9.5)}
+    elif case == "phase by rule":
+        run.readings["red"] = {"state/motion": Seen({"fan": True}, 9.5)}
+    run.at(30.0 if case == "phase by time-out" else 10.0)
+    return run
+
+
+TABLE = rows("decisions")
+
+
+@pytest.mark.parametrize("row", TABLE, ids=lambda row: f"{row['case']}, {row['subject']}")
+def test_a_decision_is_explained(row: dict[str, str]) -> None:
+    case, subject = row["case"], row["subject"]
+    if case.startswith("phase"):
+        run = _phase(case)
+    elif case == "stands in" or subject == "role first":
+        run = _stand_in()
+    else:
+        run = _last(case)
+    found = run.of(subject)
+    assert (found.kind, found.decided, found.why) == (row["kind"], row["decided"], row["why"])
+    assert "; ".join(found.readings) == row["with"]
+    assert found.would_change == row["changes_by"]
+    assert found in run.last.changed
+
+
+def test_the_table_has_every_kind() -> None:
+    assert {row["kind"] for row in TABLE} == set(Kind)
