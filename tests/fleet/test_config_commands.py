@@ -366,3 +366,9 @@ def test_the_text_is_cut_not_made_anew(text: str, car: str, after: str | None) -
 def test_a_link_that_is_another_cars_is_not_written() -> None:
     with pytest.raises(BadFile, match="may be the port of red"):
         with_link("cars: {red: {link: COM9}, blue: {link: COM2}}", Path("f.yaml"), "blue", "com9")
+
+
+def test_a_text_that_would_say_something_else_too_is_not_given_back() -> None:
+    text = "cars:\n  red: &both\n    platform: stm32\n  blue: *both\n"
+    with pytest.raises(CannotEdit, match='write cars.red.link: "sim"'):
+        with_link(text, Path("f.yaml"), "red", "sim")
