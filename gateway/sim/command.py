@@ -76,9 +76,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="same seed and same bytes: same behaviour (default: 0)")
     parser.add_argument(
         "--world",
-        choices=sorted(WORLDS),
+        metavar="WORLD",
         default="room",
-        help="room: walls and a line to track; open: nothing, so no ranging has an echo (default: room)",
+        help="room: walls and a line to track; open: nothing, so no ranging has an echo; or a file with lamps, things "
+        "and cars that meet, such as deploy/world.follow.yaml (default: room)",
     )
     parser.add_argument(
         "--fault",
@@ -118,12 +119,13 @@ def run(args: argparse.Namespace) -> int:
         for each in scheduled:
             targets(everyone, each.act)
         captures = _captures(replays, args)
+        world = _world(args.world, [spec.name for spec in specs])
         keys.check_name(args.fleet, "fleet name")
         endpoint = None if args.no_truth else _endpoint(args.connect)
     except (BadSpec, keys.BadKey) as error:
         return _fail(str(error), 2)
     try:
-        asyncio.run(_serve(specs, captures, scheduled, args, endpoint))
+        asyncio.run(_serve(specs, captures, world, scheduled, args, endpoint))
     except LinkError as error:
         return _fail(str(error), 1)
     return 0
@@ -154,6 +156,29 @@ def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[t
     return found
 
 
+def _world(words: str, cars: list[str]) -> World:
+    """A world by its name or from its file. Raises BadSpec."""
+    if words in WORLDS:
+        return WORLDS[words]()
+    # YAML is read for a world file only: a simulator starts faster without it.
+    from gateway.sim.marks import LARGEST_BYTES, BadWorld
+    from gateway.sim.worldfile import read_world
+
+    try:
+        with Path(words).open("rb") as file:
+            data = file.read(LARGEST_BYTES + 1)
+        text = data.decode("utf-8-sig", errors="strict" if len(data) <= LARGEST_BYTES else "replace")
+        return read_world(text, words, cars).world()
+    except OSError as error:
+        raise BadSpec(f"world {words}: {error.strerror}: write {', '.join(WORLDS)} or the path of a file") from None
+    except UnicodeDecodeError as error:
+        raise BadSpec(f"{words}: byte {error.start} is no UTF-8: save the file as UTF-8") from None
+    except BadWorld as error:
+        raise BadSpec(str(error)) from None
+    except ValueError as error:  # a NUL in the path
+        raise BadSpec(f"world {words!r} is no path: {error}") from None
+
+
 def _complain(words: str) -> None:
     sys.stderr.write(f"gateway sim: {words}\n")
 
@@ -175,6 +200,7 @@ def _endpoint(argument: str | None) -> str:
 async def _serve(
     specs: Sequence[CarSpec],
     replays: Sequence[tuple[ReplaySpec, Played]],
+    world: World,
     scheduled: Sequence[Scheduled],
     args: argparse.Namespace,
     endpoint: str | None,
@@ -183,7 +209,7 @@ async def _serve(
     parent = os.getppid()
     ended = asyncio.Event()
     _on_signals(loop, ended)
-    simulation = Simulation(specs, seed=args.seed, world=WORLDS[args.world](), replays=replays)
+    simulation = Simulation(specs, seed=args.seed, world=world, replays=replays)
     for car in simulation.cars.values():
         car.failed = lambda failed, error: _complain(f"car {failed.spec.name}: {error}")
     await simulation.start()

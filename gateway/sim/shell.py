@@ -330,7 +330,9 @@ class Simulation:
             seeded = f"{seed}:{spec.name}"
             transport = Transport.SERIAL if isinstance(spec.link, PtyLink) else Transport.TCP
             rng, options = _rng(seeded), spec.options
-            firmware = build(spec.platform, self.world, index, rng, options=options, transport=transport, now=now)
+            firmware = build(
+                spec.platform, self.world, index, rng, options=options, transport=transport, now=now, name=spec.name
+            )
             self.cars[spec.name] = SimCar(spec, firmware, seeded)
         for replay, played in replays:
             self.cars[replay.name] = SimCar(replay, played, f"{seed}:{replay.name}")

@@ -52,9 +52,13 @@ class Thing:
     speed_m_s: float = 0.0
     carried_by: str = ""
     """A car, in whose frame x (ahead) and y (left) then are."""
+    waits_for_m: float = 0.0
+    """It goes on only while a car is within so far from its middle; 0: it waits for nobody."""
     from_m: float = 0.0
     """Where on its path it was at `since_s`."""
     since_s: float = 0.0
+    going: bool = True
+    """False while it waits."""
 
     @property
     def moves(self) -> bool:
@@ -83,11 +87,18 @@ class Thing:
         if not self.path:
             return 0.0
         length = _ends(self.path)[-1]
-        return (self.from_m + self.speed_m_s * (at_s - self.since_s)) % length if length > 0 else 0.0
+        gone = self.speed_m_s * (at_s - self.since_s) if self.going else 0.0
+        return (self.from_m + gone) % length if length > 0 else 0.0
 
     def faster(self, speed_m_s: float, at_s: float) -> "Thing":
         """The same with another speed from now on."""
         return replace(self, from_m=self.along_m(at_s), since_s=at_s, speed_m_s=speed_m_s)
+
+    def waiting(self, at_s: float, *, near: bool) -> "Thing":
+        """The same when the nearest car is, or is not, as near as it waits for."""
+        if not self.waits_for_m or near == self.going:
+            return self
+        return replace(self, from_m=self.along_m(at_s), since_s=at_s, going=near)
 
     def put(self, x_m: float, y_m: float) -> "Thing":
         """The same elsewhere, where it stays: it has left its path."""

@@ -184,6 +184,14 @@ class World:
             at = self._began + self._tick * STEP_S
             for body in self.bodies:
                 body.glide(at)
+            if any(thing.waits_for_m for thing in self.things):
+                self.things = tuple(self._waiting(thing, at) for thing in self.things)
+
+    def _waiting(self, thing: Thing, now: float) -> Thing:
+        x, y, _ = thing.pose(now - self._began)
+        places = [body.place for body in self.bodies]
+        near = any(hypot(place.x_m - x, place.y_m - y) <= thing.waits_for_m for place in places)
+        return thing.waiting(now - self._began, near=near)
 
     def others(self, me: Body | None) -> Iterator[Body]:
         """The cars that a car meets."""

@@ -1,0 +1,178 @@
+"""YAML 1.2 text taken apart for a small, fixed layout: every fault with its line and column, all of them at once. Pure.
+
+Without aliases, tags and deep nesting, which no world needs, so that no text can become more than it is. Which fields
+there are is worldfile.py's part.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+import yaml
+from yamlcore import CoreLoader  # type: ignore[import-untyped]  # has no stubs
+
+LARGEST_BYTES: Final = 64 * 1024
+DEEPEST: Final = 8
+_SHOWN: Final = 50
+"""No more faults are named than somebody reads."""
+_LONGEST: Final = 40
+
+
+class BadWorld(ValueError):
+    """A world file that cannot be used; its text has every fault, one a line: `file:line:column: field: what`."""
+
+
+class Marks:
+    """The document, and the faults found so far. What is asked of a faulty value is answered, so that all are found."""
+
+    def __init__(self, text: str, source: str) -> None:
+        self._source = source
+        self._problems: list[tuple[int, int, str]] = []
+        if len(text.encode(errors="surrogatepass")) > LARGEST_BYTES:
+            raise BadWorld(f"{source}:1:1: has more than {LARGEST_BYTES // 1024} KiB: no world needs so much")
+        try:
+            _refuse(text)
+            self._loader = CoreLoader(text)
+            root = self._loader.get_single_node()
+        except yaml.reader.ReaderError as error:
+            line, column = text.count("\n", 0, error.position) + 1, error.position - text.rfind("\n", 0, error.position)
+            raise BadWorld(f"{source}:{line}:{column}: a character that is not allowed in YAML") from None
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            line, column = (1, 1) if mark is None else (mark.line + 1, mark.column + 1)
+            words = " ".join((error.problem or error.context or "it cannot be read").split())
+            raise BadWorld(f"{source}:{line}:{column}: is no YAML that is allowed here: {words}") from None
+        except ValueError:  # PyYAML's for a directive such as %YAML 999999…
+            raise BadWorld(f"{source}:1:1: is no YAML: a directive with a number that is too long") from None
+        if root is None or (isinstance(root, yaml.ScalarNode) and not root.value):
+            raise BadWorld(f"{source}:1:1: is empty")
+        self.root: yaml.Node = root
+
+    def complain(self, node: yaml.Node, field: str, words: str) -> None:
+        """Note a fault."""
+        mark = node.start_mark
+        self._problems.append((mark.line + 1, mark.column + 1, f"{field}: {words}" if field else words))
+
+    def end(self) -> None:
+        """Raise BadWorld if there was a fault."""
+        found = sorted(set(self._problems))
+        lines = [f"{self._source}:{line}:{column}: {words}" for line, column, words in found[:_SHOWN]]
+        if len(found) > _SHOWN:
+            lines.append(f"{self._source}: and {len(found) - _SHOWN} more")
+        if lines:
+            raise BadWorld("\n".join(lines))
+
+    def entries(self, node: yaml.Node, field: str) -> dict[str, yaml.Node]:
+        """A mapping of names that the file chooses."""
+        return {key.value: value for key, value in self._pairs(node, field)}
+
+    def fields(self, node: yaml.Node, field: str, known: Mapping[str, bool]) -> dict[str, yaml.Node]:
+        """A mapping of known names; True: it has to be there."""
+        found = {}
+        for key, value in self._pairs(node, field):
+            if key.value in known:
+                found[key.value] = value
+            else:
+                self.complain(key, _below(field, key.value), f"is not known here: use {', '.join(known)}")
+        if isinstance(node, yaml.MappingNode):
+            for name, needed in known.items():
+                if needed and name not in found:
+                    self.complain(node, _below(field, name), "is missing")
+        return found
+
+    def _pairs(self, node: yaml.Node, field: str) -> Iterator[tuple[yaml.ScalarNode, yaml.Node]]:
+        if not isinstance(node, yaml.MappingNode):
+            self.complain(node, field, f"{_shown(node)} is not allowed: write fields, `name: value`")
+            return
+        lines: dict[str, int] = {}
+        for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode) or not key.tag.endswith(":str"):
+                self.complain(key, field, f"key {_shown(key)} is no word: write it in quotes")
+            elif key.value in lines:
+                self.complain(key, _below(field, key.value), f"is given twice, first in line {lines[key.value]}")
+            else:
+                lines[key.value] = key.start_mark.line + 1
+                yield key, value
+
+    def items(self, node: yaml.Node, field: str) -> list[tuple[str, yaml.Node]]:
+        """A list: each item's field, and the item."""
+        if not isinstance(node, yaml.SequenceNode):
+            self.complain(node, field, f"{_shown(node)} is not allowed: write a list")
+            return []
+        return [(f"{field}[{number}]", each) for number, each in enumerate(node.value)]
+
+    def number(self, node: yaml.Node, field: str, low: float, high: float, *, above: bool = False) -> float:
+        """A number in a range, `above`: its lower end excluded; its lower end for one that is faulty."""
+        value = self._scalar(node)
+        good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if good and low <= value <= high and not (above and value == low):  # type: ignore[operator]  # good: a number
+            return float(value)  # type: ignore[arg-type]
+        ends = f"above {low:g} and up to {high:g}" if above else f"from {low:g} to {high:g}"
+        self.complain(node, field, f"{_shown(node)} is not allowed: a number {ends}")
+        return low if low or not above else high
+
+    def numbers(self, node: yaml.Node, field: str, count: int, low: float, high: float) -> tuple[float, ...]:
+        """A list of so many numbers; zeros for one of another length."""
+        items = self.items(node, field)
+        if isinstance(node, yaml.SequenceNode) and len(items) != count:
+            self.complain(node, field, f"has {len(items)} numbers, not {count}")
+        if len(items) != count:
+            return (0.0,) * count
+        return tuple(self.number(each, name, low, high) for name, each in items)
+
+    def yes(self, node: yaml.Node, field: str) -> bool:
+        """True or false; false for one that is neither."""
+        value = self._scalar(node)
+        if not isinstance(value, bool):
+            self.complain(node, field, f"{_shown(node)} is not allowed: true or false")
+        return value is True
+
+    def word(self, node: yaml.Node, field: str) -> str:
+        """Text; empty for what is none."""
+        value = self._scalar(node)
+        if isinstance(value, str):
+            return value
+        self.complain(node, field, f"{_shown(node)} is not allowed: a name")
+        return ""
+
+    def _scalar(self, node: yaml.Node) -> object:
+        if not isinstance(node, yaml.ScalarNode):
+            return None
+        try:
+            value: object = self._loader.construct_object(node)
+        except (yaml.MarkedYAMLError, ValueError, KeyError, IndexError):  # a number of five thousand digits, `0x`
+            return None
+        return value
+
+
+def _below(field: str, name: str) -> str:
+    name = name if name.isprintable() and name else repr(name)
+    return f"{field}.{name}"[:200] if field else name[:200]
+
+
+def _shown(node: yaml.Node) -> str:
+    if isinstance(node, yaml.MappingNode):
+        return "a mapping"
+    if isinstance(node, yaml.SequenceNode):
+        return "a list"
+    text = repr(str(node.value))
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def _refuse(text: str) -> None:
+    """What is refused before anything is composed, which PyYAML does by recursion. Raises yaml.MarkedYAMLError."""
+    depth = 0
+    event: yaml.Event
+    for event in yaml.parse(text, yaml.SafeLoader):
+        words = ""
+        if isinstance(event, yaml.AliasEvent) or (isinstance(event, yaml.NodeEvent) and event.anchor is not None):
+            words = "anchors and aliases: write the value out"
+        elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag not in (None, "!"):
+            words = "tags: leave it out"
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            words = f"nested more than {DEEPEST} deep"
+        if words:
+            mark: yaml.Mark | None = event.start_mark  # type: ignore[assignment]  # the stub knows the C parser's, too
+            raise yaml.MarkedYAMLError(problem=words, problem_mark=mark)
