@@ -67,16 +67,16 @@ def test_keys_are_those_alive_with_type_unit_rate_and_age(cars: Cars) -> None:
     assert {key.split("/")[1] for key in rows} == {"red", "green", "blue"}
     battery = rows["fleet/red/sensor/battery"]
     assert (battery["type"], battery["units"]["voltage_v"]) == ("fleet.v1.Battery", "V")
-    assert battery["rate_hz"] == pytest.approx(1.0, rel=0.5)
+    assert 0.2 < battery["rate_hz"] < 5, "about once a second"
     assert 0 <= battery["age_s"] < 3
     assert rows["fleet/red/event/command"]["age_s"] is None
     for car in cars.gateways:
-        assert rows[f"fleet/{car}/state/health"]["rate_hz"] == pytest.approx(1.0, rel=0.5)
+        assert 0.2 < rows[f"fleet/{car}/state/health"]["rate_hz"] < 5
     assert "fleet/blue/sensor/battery" not in rows, "a Raspberry Pi car measures none"
 
 
 def test_a_table_on_a_terminal_and_plain_text_in_a_pipe(cars: Cars) -> None:
-    plain = run(cars.endpoint, "keys", "red/sensor/range", "--for", "2.5s").stdout.splitlines()
+    plain = run(cars.endpoint, "keys", "red/sensor/range", "--for", "5s").stdout.splitlines()
     assert plain[0].split() == ["KEY", "TYPE", "UNIT", "RATE", "AGE"]
     assert plain[1].split()[:3] == ["fleet/red/sensor/range", "fleet.v1.Range", "m"]
     assert plain[1].split()[4::2] == ["Hz", "s"]
