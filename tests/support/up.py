@@ -44,10 +44,12 @@ class Up:
 
     def left(self, *, ours: bool = False) -> list[int]:
         """Processes that still run at this endpoint, by the system's own list; `ours`: but the hub, which lingers."""
+        return [pid for pid, words in self._mine() if not (ours and "schemas.hub" in words)]
+
+    def _mine(self) -> list[tuple[int, str]]:
         listed = subprocess.run(["ps", "-axwwo", "pid=,args="], capture_output=True, text=True, check=True).stdout
         found = [line.split(None, 1) for line in listed.splitlines()]
-        mine = [(int(pid), words) for pid, words in found if self.endpoint in words and int(pid) != self.process.pid]
-        return [pid for pid, words in mine if not (ours and "schemas.hub" in words)]
+        return [(int(pid), words) for pid, words in found if self.endpoint in words and int(pid) != self.process.pid]
 
     @property
     def bus(self) -> Bus:
@@ -95,6 +97,26 @@ class Up:
             return found.pid if found is not None and found.state == "running" and found.pid != but else None
 
         return int(wait_for(pid, f"{name} runs"))
+
+    def kill(self, pid: int) -> None:
+        """End a process of this fleet without a word."""
+        os.kill(pid, signal.SIGKILL)
+
+    def exists(self, pid: int) -> bool:
+        """Whether there is such a process."""
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return False
+        return True
+
+    def hub(self) -> int:
+        """The hub, the supervisor's or one that a gateway started; by the system's own list."""
+
+        def one() -> int | None:
+            return next((pid for pid, words in self._mine() if "schemas.hub" in words), None)
+
+        return int(wait_for(one, "there is a hub"))
 
     def get(self, key: str) -> Any:
         """The latest value; None while nobody answers."""

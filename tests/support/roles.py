@@ -1,0 +1,242 @@
+"""Who judges a fleet under faults: roles filled in time, in force, none twice, no held car moved, nothing unexplained.
+
+What cars truly do comes from the simulator, what was written to them from frame/tx; both with their own times.
+"""
+
+import random
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from gateway.protocol.encode import ModeOpen, encode
+from gateway.protocol.values import Mode
+from schemas import messages
+from schemas.bus import Bus, Sample
+from tests.support.judge import stamp_ns
+from tests.support.processes import wait_for
+from tests.support.up import Up
+
+ROLES: Final = {"patrol": (Mode.OBSTACLE_AVOIDANCE, 3), "track": (Mode.TRACKING, 2)}
+PLAN: Final = "roles:\n" + "".join(
+    f"  {name}: {{mode: {mode}, count: {count}}}\n" for name, (mode, count) in ROLES.items()
+)
+ABLE: Final = ("red", "green", "blue", "orange", "violet", "white")
+"""Of eight simulated cars two are Raspberry Pi, which know no modes; so one able car is always free."""
+HELD: Final = "yellow"
+FILL_S: Final = 3.0
+"""issue 5: a role that another free car can fill, and one whose only car has ended its recovery."""
+NOTICED_S: Final = 4.5
+"""What a car that reset itself does looks as asked until three of its frames, one a second, say otherwise."""
+IN_FORCE_S: Final = 3.5 + 1.0
+"""protocol.md: the longest opening, and issue 5's second."""
+STRAY_S: Final = 0.5
+_FRAMES: Final = {encode(ModeOpen(mode)): mode for mode, _ in ROLES.values()}
+
+
+@dataclass
+class Watcher:
+    """What was so, from the first moment on; times are ns since the epoch."""
+
+    modes: dict[str, list[tuple[int, str]]] = field(default_factory=dict)
+    """By car: its true mode, whenever it became another."""
+    motors: dict[str, bool] = field(default_factory=dict)
+    frames: list[tuple[int, str, Mode]] = field(default_factory=list)
+    """Openings of the plan's modes that were written to cars."""
+    known: dict[str, int] = field(default_factory=dict)
+    """When a car was last brought to a known state."""
+    twice: list[str] = field(default_factory=list)
+    """Cars that had two roles in one assignment."""
+    moved: list[tuple[int, str]] = field(default_factory=list)
+    stray: dict[str, int] = field(default_factory=dict)
+    """Since when motors are on in mode 0, where nobody drives."""
+    strays: list[str] = field(default_factory=list)
+    _poses: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @classmethod
+    def follow(cls, bus: Bus) -> "Watcher":
+        """Begin to watch."""
+        watcher = cls()
+        bus.subscribe("fleet/*/sim/truth", watcher._truth)
+        bus.subscribe("fleet/*/frame/tx", watcher._frame)
+        bus.subscribe("fleet/*/event/log", watcher._log)
+        bus.subscribe("fleet/@coordinator/assignment", watcher._assignment)
+        return watcher
+
+    def mode(self, car: str) -> str:
+        """Its true mode."""
+        with self._lock:
+            return self.modes[car][-1][1] if car in self.modes else ""
+
+    def truly(self, mode: Mode) -> list[str]:
+        """The cars that are truly in this mode."""
+        return [car for car in ABLE if self.mode(car) == mode]
+
+    @property
+    def filled(self) -> bool:
+        """Whether every role has its cars in its mode, and the others rest."""
+        return all(len(self.truly(mode)) == count for mode, count in ROLES.values())
+
+    def opened_after(self, moment_ns: int, mode: Mode) -> list[tuple[int, str]]:
+        """When a role's mode was written to, or truly taken by, a car after a moment; each car once."""
+        with self._lock:
+            found = {car: at for at, car, opened in reversed(self.frames) if at > moment_ns and opened is mode}
+            for car in ABLE:
+                for at, entered in self.modes.get(car, []):
+                    if at > moment_ns and entered == mode:
+                        found.setdefault(car, at)
+        return sorted((at, car) for car, at in found.items())
+
+    def entered_after(self, moment_ns: int, car: str, mode: Mode) -> int:
+        """When a car was first truly in a mode after a moment; 0 if not yet."""
+        with self._lock:
+            return next((at for at, entered in self.modes.get(car, []) if at > moment_ns and entered == mode), 0)
+
+    def _truth(self, sample: Sample) -> None:
+        truth: Any = sample.message()
+        at, car, on = stamp_ns(truth), truth.car, bool(truth.motor_left or truth.motor_right)
+        with self._lock:
+            seen = self.modes.setdefault(car, [])
+            if not seen or seen[-1][1] != truth.mode:
+                seen.append((at, truth.mode))
+            pose = (truth.x_m, truth.y_m)
+            if self._poses.setdefault(car, pose) != pose:
+                self.moved.append((at, car))
+                self._poses[car] = pose
+            if not on or truth.mode != "manual":
+                self.stray.pop(car, None)
+            elif at - self.stray.setdefault(car, at) > STRAY_S * 1e9:
+                self.strays.append(car)
+
+    def _frame(self, sample: Sample) -> None:
+        frame: Any = sample.message()
+        if frame.data in _FRAMES:
+            with self._lock:
+                self.frames.append((stamp_ns(frame), frame.car, _FRAMES[frame.data]))
+
+    def _log(self, sample: Sample) -> None:
+        event: Any = sample.message()
+        car, _, code = event.name.partition(" ")
+        if code == "recovered":
+            with self._lock:
+                self.known[car] = event.timestamp.seconds * 1_000_000_000 + event.timestamp.nanos
+
+    def _assignment(self, sample: Sample) -> None:
+        assignment: Any = sample.message()
+        cars = [car for role in assignment.roles for car in role.cars]
+        self.twice += sorted({car for car in cars if cars.count(car) > 1})
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What was done, and what came of it, s after it; None: no role was left."""
+
+    what: str
+    filled_s: float | None
+    in_force_s: float | None
+    limit_s: float
+
+    @property
+    def late(self) -> bool:
+        """Whether a role was filled, or in force, later than allowed."""
+        if self.filled_s is None or self.in_force_s is None:
+            return False
+        return self.filled_s > self.limit_s or self.in_force_s > self.filled_s + IN_FORCE_S
+
+
+class Stage:
+    """A fleet with a plan, a held car, and faults one after another, each judged."""
+
+    def __init__(self, up: Up, chance: random.Random) -> None:
+        self.up = up
+        self.chance = chance
+        self.watcher = Watcher.follow(up.bus)
+        self.faults: list[Fault] = []
+        self.held_ns = 0
+
+    def begin(self) -> None:
+        """Wait until the plan is in force; a person stops one car, which is then held."""
+        wait_for(lambda: all(car in self.watcher.known for car in (*ABLE, HELD)), "all cars are known", 90.0)
+        assert self.up.ask("stop", HELD, sender="ann", kind="person")["status"] in ("sent", "queued")
+        wait_for(lambda: self.watcher.filled, "the plan is in force", 90.0)
+        self.held_ns = time.time_ns()
+
+    def strike(self, what: str) -> Fault:
+        """One fault, and what came of it; returns when the fleet is whole again."""
+        watcher = self.watcher
+        car = self.chance.choice(ABLE)
+        before = {mode: set(watcher.truly(mode)) for mode, _ in ROLES.values()}
+        mode = next((mode for mode, cars in before.items() if car in cars), None)
+        name = {"gateway": car, "coordinator": "@coordinator", "hub": "@hub"}.get(what)
+        at_ns = time.time_ns()
+        if name is not None:
+            self._kill(name)
+        else:
+            fields = {"fault": "link_drop", "for_s": 4.0} if what == "link" else {"fault": "brownout"}
+            assert self.up.simulator(car=car, **fields)["ok"]
+        hit = name is None or name == car
+        limit_s = FILL_S + (NOTICED_S if what == "brownout" else 0.0)
+        filled_s = in_force_s = None
+        if hit and mode is not None:
+            opened = wait_for(lambda: watcher.opened_after(at_ns, mode), f"{what} {car}: {mode} is given")
+            filled_s = (opened[0][0] - at_ns) / 1e9
+            taken = wait_for(lambda: watcher.entered_after(at_ns, opened[0][1], mode), f"{mode} is in force")
+            in_force_s = (taken - at_ns) / 1e9
+        if hit and what in ("gateway", "link"):
+            wait_for(lambda: watcher.known.get(car, 0) > at_ns, f"{car} is known again", 60.0)
+        for process in ("@hub", "@coordinator", *ABLE):
+            self.up.running(process)
+        wait_for(lambda: watcher.filled, "all roles are filled", 60.0)
+        if not hit:
+            changed = [other for opened in before for at, other in watcher.opened_after(at_ns, opened)]
+            assert not changed, f"{what}: a needless switch of {changed}"
+            assert before == {opened: set(watcher.truly(opened)) for opened in before}, what
+        fault = Fault(f"{what} {car if hit else ''}", filled_s, in_force_s, limit_s)
+        self.faults.append(fault)
+        return fault
+
+    def _kill(self, name: str) -> None:
+        pid = self.up.hub() if name == "@hub" else self.up.running(name)
+        self.up.kill(pid)
+        wait_for(lambda: not self.up.exists(pid), f"{name} is gone")
+
+    def judge(self, *, slack_s: float = 0.0) -> None:
+        """Raise for what must never be."""
+        watcher = self.watcher
+        assert not watcher.twice, f"two roles: {watcher.twice}"
+        assert not watcher.strays, f"motors on in mode 0 with nobody driving: {watcher.strays}"
+        moved = [car for at, car in watcher.moved if car == HELD and at > self.held_ns]
+        assert not moved, f"{HELD} was held and moved"
+        late = [fault for fault in self.faults if fault.late and (fault.filled_s or 0) > fault.limit_s + slack_s]
+        assert not late, late
+
+
+def unexplained(sessions: Path) -> tuple[int, list[str]]:
+    """Openings in the recordings, and those of which no decision and no command tells."""
+    decided: dict[str, set[str]] = {}
+    commands: set[str] = set()
+    frames: list[tuple[str, Mode, str]] = []
+    for path in sorted(sessions.glob("*/*.mcap")):
+        with path.open("rb") as file:
+            try:
+                for schema, channel, message in make_reader(file).iter_messages():
+                    if schema is None or not channel.topic.endswith(("frame/tx", "event/command", "/decision")):
+                        continue
+                    value: Any = messages.message_class(schema.name)()
+                    value.ParseFromString(message.data)
+                    if channel.topic.endswith("frame/tx") and value.data in _FRAMES:
+                        frames.append((value.car, _FRAMES[value.data], value.command_id))
+                    elif channel.topic.endswith("event/command") and value.verb == "mode":
+                        commands.add(value.id)
+                    elif channel.topic.endswith("/decision"):
+                        decided.setdefault(value.subject, set()).add(value.decided)
+            except McapError:
+                continue
+    return len(frames), [
+        f"{car} {mode}" for car, mode, command in frames if command not in commands or mode not in decided.get(car, ())
+    ]
