@@ -238,7 +238,8 @@ def test_only_fleet_files_know_simulated_links() -> None:
 
 
 def test_the_one_in_the_readme_is_right() -> None:
-    _, _, section = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8").partition("### The fleet file")
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    section = readme.partition("### The fleet file")[2]
     fleet = _fleet(section.partition("```yaml\n")[2].partition("```")[0])
     assert {name: car.platform for name, car in fleet.cars.items()} == {"red": "arduino+arm", "blue": "raspberry_pi"}
 

@@ -370,5 +370,5 @@ def test_a_link_that_is_another_cars_is_not_written() -> None:
 
 def test_a_text_that_would_say_something_else_too_is_not_given_back() -> None:
     text = "cars:\n  red: &both\n    platform: stm32\n  blue: *both\n"
-    with pytest.raises(CannotEdit, match='write cars.red.link: "sim"'):
+    with pytest.raises(CannotEdit, match=r'write cars\.red\.link: "sim"'):
         with_link(text, Path("f.yaml"), "red", "sim")
