@@ -1,5 +1,6 @@
 """What a gateway answers of what it has published, on a real bus."""
 
+import queue
 from pathlib import Path
 
 import zenoh
@@ -10,7 +11,7 @@ from gateway.protocol.readings import ImuReading
 from gateway.publish import SLICE, Publications
 from schemas.bus import Bus
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet
+from tests.support.processes import PATIENCE_S, Fleet, wait_for
 
 
 def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
@@ -21,14 +22,18 @@ def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
             out = Publications(opened, "fleet", "red", Controller("red", parse_platform("arduino")), "tcp://x")
             for number in range(3 * SLICE + 1):
                 out.event(ImuReading(b"", float(number), (number, 0, 0), (0, 0, 0)), number + 1, None, loaded=False)
-            pauses: list[int] = []
+            pauses: queue.Queue[int] = queue.Queue()
 
             def answer(query: zenoh.Query) -> None:
-                pauses.append(len(list(out.answers("sensor", query))))
+                pauses.put(len(list(out.answers("sensor", query))))
+
+            def ask(parameters: str) -> int:
+                return len(list(fleet.bus.query(f"fleet/red/sensor/*?{parameters}", timeout_s=20.0)))
 
             opened.queryable("fleet/red/sensor/*", answer)
+            wait_for(lambda: ask(""), "the queryable is known")
+            assert pauses.get(timeout=PATIENCE_S) == 0
             for parameters, count, paused in (("last=1500", 3 * SLICE + 1, 3), ("format=json", 1, 0), ("last=x", 1, 0)):
-                found = list(fleet.bus.query(f"fleet/red/sensor/*?{parameters}", timeout_s=20.0))
-                assert (len(found), pauses.pop()) == (count, paused), parameters
+                assert (ask(parameters), pauses.get(timeout=PATIENCE_S)) == (count, paused), parameters
     finally:
         fleet.close()
