@@ -17,7 +17,7 @@ from fleet.hearing import Hearing
 from fleet.kept import Keeper
 from fleet.outcome import Outcome
 from fleet.policy.decide import Ask, Step, step
-from fleet.policy.explain import LEFT_ALONE, Decision
+from fleet.policy.decision import LEFT_ALONE, Decision
 from fleet.policy.memory import Memory, carried, restored, to_keep
 from fleet.policy.picture import CarPicture, Refused, topic_of
 from fleet.policy.plan import Plan

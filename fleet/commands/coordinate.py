@@ -15,7 +15,7 @@ from fleet.config import read_fleet
 from fleet.coordinator import SENDER, AnotherCoordinator, Coordinator
 from fleet.hearing import listed_cars
 from fleet.marked import read_text
-from fleet.policy.explain import Decision
+from fleet.policy.decision import Decision
 from fleet.policy.reader import parse
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from fleet.policy import explain
-from fleet.policy.explain import Decision, Kind, Override
+from fleet.policy.decision import Decision, Kind
+from fleet.policy.explain import Override
 from fleet.policy.memory import Held, Memory, Tried
 from fleet.policy.picture import CONTRADICTED, LOST, NOBODY, CarPicture, Picture
 from fleet.policy.plan import Effect, Plan, Rule
@@ -97,19 +98,17 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
         elif car in overrides:
             decisions.append(explain.ruled(car, overrides[car], staffing.roles.get(car)))
         elif car in held:
-            decisions.append(explain.in_role(car, held[car], staff, staffing))
+            decisions.append(explain.in_role(car, held[car], staff, staffing, memory.said))
         else:
-            decisions.append(explain.idle(car, staff, staffing))
+            decisions.append(explain.idle(car, staff, staffing, memory.said))
     decisions = [_doubted(decision, picture) for decision in decisions]
-    decisions += _vacancies(staff, staffing, memory.causes, barriers)
+    decisions += _vacancies(staff, staffing, memory.said, barriers)
     tried, asks = _asks(decisions, picture, memory.tried, now)
     asks += _leds(plan, rules, rules_before, staff, staffing)
     return Step(
-        replace(
-            memory, held=held, tried=tried, causes={**memory.causes, **{each.subject: each.cause for each in decisions}}
-        ),
+        replace(memory, held=held, tried=tried, said={**memory.said, **{each.subject: each for each in decisions}}),
         tuple(decisions),
-        tuple(each for each in decisions if memory.causes.get(each.subject) != each.cause),
+        tuple(each for each in decisions if explain.new(each, memory.said)),
         tuple(asks),
         staffing.roles,
     )
@@ -119,7 +118,7 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
 
 
 def _subjects(plan: Plan, picture: Picture) -> tuple[str, ...]:
-    """The cars that something is decided of: those that the plan names and, if it is for any, all that were ever there."""
+    """The cars that something is decided of: those that the plan names or, if it is for any, all."""
     return tuple(sorted({*plan.named, *picture.cars})) if plan.open else tuple(sorted(plan.named))
 
 
@@ -215,14 +214,14 @@ def _held(
 
 
 def _vacancies(
-    staff: Staff, staffing: Staffing, causes: Mapping[str, str], barriers: Mapping[str, Barrier]
+    staff: Staff, staffing: Staffing, said: Mapping[str, Decision], barriers: Mapping[str, Barrier]
 ) -> list[Decision]:
     found = []
     for name in staffing.places:
         least = 1 if staff.plan.roles[name].count is None else staffing.places[name]
         if len(staffing.holders(name)) < min(least, staffing.places[name]):
             found.append(explain.vacancy(name, staff, staffing, barriers))
-        elif f"role {name}" in causes:
+        elif f"role {name}" in said:
             found.append(explain.filled(name, staffing))
     return found
 

@@ -1,56 +1,22 @@
-"""Decisions as values, and their reasons in words: what decided, with which readings, and what would change it. Pure.
+"""The reasons of decisions in words: what decided, with which readings, and what would change it. Pure.
 
 Each kind of decision stands in tests/vectors/decisions.tsv with the words expected of it.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
+from fleet.policy.decision import LEFT_ALONE, Decision, Kind
 from fleet.policy.memory import Held
 from fleet.policy.picture import NOBODY
 from fleet.policy.plan import Effect, Plan, Rule
 from fleet.policy.rules import RuleState, Turn
 from fleet.policy.staffing import Barrier, Staff, Staffing
 from fleet.policy.steady import HYSTERESIS_S
-from gateway.protocol.values import Mode
 
-LEFT_ALONE: Final = "left alone"
 _NAMED: Final = 4
 """So many roles or cars are gone into."""
-
-
-class Kind(StrEnum):
-    """What a decision is about."""
-
-    ROLE = "role"
-    RULE = "rule"
-    IDLE = "idle"
-    ALONE = "alone"
-    VACANT = "vacant"
-    FILLED = "filled"
-    PHASE = "phase"
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """What was decided of one subject: a car, `role NAME`, or `phase`."""
-
-    subject: str
-    kind: Kind
-    decided: str
-    """In a word or two: the mode, `left alone`, `1 of 2`, the phase."""
-    cause: str
-    """The same as long as the same thing decides."""
-    why: str
-    readings: tuple[str, ...] = ()
-    """Those that were used, with values and ages."""
-    would_change: str = ""
-    car: str | None = None
-    role: str | None = None
-    mode: Mode | None = None
-    """The mode the car should be in; None: it is left alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,18 +38,18 @@ def of_phase(turn: Turn, since: float) -> Decision:
 def alone(car: str, barrier: Barrier, kept: str | None) -> Decision:
     """A car that cannot, or may not, be asked for anything."""
     why = f"{barrier.why}; its role {kept} is kept for {HYSTERESIS_S:g} s" if kept else barrier.why
-    return Decision(car, Kind.ALONE, LEFT_ALONE, barrier.why, why, barrier.used, barrier.change, car=car, role=kept)
+    return Decision(car, Kind.ALONE, LEFT_ALONE, barrier.why, why, (), barrier.change, car=car, role=kept)
 
 
 def ruled(car: str, override: Override, role: str | None) -> Decision:
     """A rule gives the car its mode."""
     rule, mode = override.rule, override.effect.mode
     end = (
-        f"{rule.until}"
+        rule.until.text
         if rule.until is not None
         else f"that no longer being so for {HYSTERESIS_S:g} s, or not known for 5 s"
     )
-    why = f"{rule.name}: {rule.when}"
+    why = f"{rule.name}: {rule.when.text}"
     if override.state.that is not None and override.state.that != rule.when.car:
         why += f" (it is so of {override.state.that})"
     assert mode is not None
@@ -92,11 +58,25 @@ def ruled(car: str, override: Override, role: str | None) -> Decision:
     )
 
 
-def in_role(car: str, held: Held, staff: Staff, staffing: Staffing) -> Decision:
+def new(decision: Decision, said: Mapping[str, Decision]) -> bool:
+    """Whether something else decides than before."""
+    return _same(said, decision.subject, decision.cause) is None
+
+
+def _same(said: Mapping[str, Decision], subject: str, cause: str) -> Decision | None:
+    """What was decided already: nobody is told again, so it needs no new words."""
+    before = said.get(subject)
+    return before if before is not None and before.cause == cause else None
+
+
+def in_role(car: str, held: Held, staff: Staff, staffing: Staffing, said: Mapping[str, Decision]) -> Decision:
     """A role gives the car its mode."""
     plan, name = staff.plan, held.role
     role = plan.roles[name]
     pinned = staff.pinned.get(car)
+    cause = f"role {name}, {pinned[1]}" if pinned is not None else f"role {name}"
+    if (same := _same(said, car, cause)) is not None:
+        return same
     why = f"role {name} ({len(staffing.holders(name))} of {staffing.places[name]})"
     if pinned is not None:
         why += f", as {pinned[1]} wants"
@@ -104,14 +84,14 @@ def in_role(car: str, held: Held, staff: Staff, staffing: Staffing) -> Decision:
         why += f", which stands in for {staffing.stands_in[name]}"
     if held.why:
         why += f": {held.why}"
-    changes = [f"{role.needs} no longer being so"] if role.needs is not None else []
+    changes = [f"{role.needs_text} no longer being so"] if role.needs is not None else []
     changes += [f"the end of {pinned[1]}"] if pinned is not None else _rules_for(car, plan)
     changes.append("a person's stop or drive")
     return Decision(
         car,
         Kind.ROLE,
         role.mode,
-        f"role {name}",
+        cause,
         why,
         held.used,
         "; or ".join(changes),
@@ -123,47 +103,49 @@ def in_role(car: str, held: Held, staff: Staff, staffing: Staffing) -> Decision:
 
 def _rules_for(car: str, plan: Plan) -> list[str]:
     told = [
-        f"{rule.name}: {rule.when}"
+        f"{rule.name}: {rule.when.text}"
         for rule in plan.rules
         if any(effect.who and (effect.who == car or not plan.is_car(effect.who)) for effect in rule.effects)
     ]
     return told[:_NAMED]
 
 
-def idle(car: str, staff: Staff, staffing: Staffing) -> Decision:
+def idle(car: str, staff: Staff, staffing: Staffing, said: Mapping[str, Decision]) -> Decision:
     """A car that no role is left for."""
     plan = staff.plan
     whys: list[str] = []
     changes: list[str] = []
-    used: list[str] = []
     kinds: list[str] = []
-    nothing: tuple[str, ...] = ()
+    looked: list[Barrier] = []
     for name, role in plan.roles.items():
         if not plan.may(car, role):
             continue
         if name not in staff.in_force:
-            words, change, seen = "it does not count in this phase", "the next phase", nothing
+            words, change = "it does not count in this phase", "the next phase"
         elif (barrier := staff.barrier(car, role)) is not None:
-            words, change, seen = barrier.why, barrier.change, barrier.used
+            words, change = barrier.why, barrier.change
+            looked.append(barrier)
         else:
             holders = staffing.holders(name)
             words = (
                 f"it has its {'car' if len(holders) == 1 else 'cars'}: {', '.join(holders)}" if holders else "no place"
             )
-            change, seen = f"a place in {name}", nothing
+            change = f"a place in {name}"
         kinds.append(f"{name} {words}")
         if len(whys) < _NAMED:
             whys.append(f"{name}: {words}")
             changes.append(change)
-            used += seen
+    cause = "idle: " + "; ".join(kinds)
+    if (same := _same(said, car, cause)) is not None:
+        return same
     mode = plan.idle
     return Decision(
         car,
         Kind.IDLE,
         mode or LEFT_ALONE,
-        "idle: " + "; ".join(kinds),
+        cause,
         f"no role for it: {'; '.join(whys)}" if whys else "the plan has no role for it now",
-        tuple(dict.fromkeys(used)),
+        tuple(dict.fromkeys(told for barrier in looked for told in staff.seen(car, barrier))),
         "; or ".join(dict.fromkeys(changes)) or "a rule",
         car=car,
         mode=mode,
@@ -203,7 +185,7 @@ def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
         kinds.append(words)
         if len(whys) < _NAMED:
             whys.append(words if words.startswith((car, f"the link of {car}")) else f"{car}: {words}")
-            used += barrier.used if barrier is not None else ()
+            used += staff.seen(car, barrier)
     more = f"; and {len(kinds) - _NAMED} more" if len(kinds) > _NAMED else ""
     instead = f"; {role.fallback} gets the place" if role.fallback is not None else ""
     return Decision(
@@ -240,4 +222,4 @@ def came_by(car: str, name: str, staff: Staff, before: str | None, lost: str) ->
         return Held(name, f"in place of {before}: {lost}", used)
     if staff.picture.cars.get(car, NOBODY).mode == role.mode:
         return Held(name, f"it is in mode {role.mode} already", used)
-    return Held(name, f"it has {role.needs}" if role.needs is not None else "", used)
+    return Held(name, f"it has {role.needs_text}" if role.needs is not None else "", used)

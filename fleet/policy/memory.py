@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from fleet.policy.decision import Decision
 from fleet.policy.picture import NOBODY, Picture
 from fleet.policy.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
@@ -56,8 +57,8 @@ class Memory:
     gone_since: Mapping[str, float] = field(default_factory=dict)
     needs: Mapping[tuple[str, str], Settled] = field(default_factory=dict)
     tried: Mapping[str, Tried] = field(default_factory=dict)
-    causes: Mapping[str, str] = field(default_factory=dict)
-    """What decided last, by subject."""
+    said: Mapping[str, Decision] = field(default_factory=dict)
+    """The last decision of each subject."""
 
     @property
     def roles(self) -> dict[str, str]:
@@ -78,7 +79,7 @@ def carried(memory: Memory, before: Plan, after: Plan) -> Memory:
         rules=rules,
         held={car: held for car, held in memory.held.items() if held.role in after.roles},
         needs={key: settled for key, settled in memory.needs.items() if key[1] in same},
-        causes={},
+        said={},
     )
 
 

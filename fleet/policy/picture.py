@@ -5,6 +5,7 @@ How it is heard is coordinator.py's, what follows from it decide.py's.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -93,10 +94,15 @@ class CarPicture:
     @property
     def profile(self) -> Profile | None:
         """What its platform can do; None if that is not known."""
-        try:
-            return parse_platform(self.platform) if self.platform else None
-        except ValueError:  # of a gateway that is newer than this
-            return None
+        return _profile(self.platform)
+
+
+@cache
+def _profile(platform: str) -> Profile | None:
+    try:
+        return parse_platform(platform) if platform else None
+    except ValueError:  # of a gateway that is newer than this
+        return None
 
 
 NOBODY: Final = CarPicture()

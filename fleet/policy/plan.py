@@ -5,7 +5,7 @@ It is read from a text in reader.py; what can never work in it, check.py finds; 
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
@@ -38,8 +38,13 @@ class Condition:
     role: str | None = None
     """Only of the cars that have this role."""
     for_s: float = 0.0
+    text: str = field(init=False, compare=False)
+    """As it is told."""
 
-    def __str__(self) -> str:
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text", self._text())  # asked for ten times a second, for each car
+
+    def _text(self) -> str:
         who = self.car if self.of is Of.CAR else f"{self.of} {f'with role {self.role}' if self.role else 'car'}"
         lasting = f" for {self.for_s:g} s" if self.for_s else ""
         return f"{who}: {self.expression}{lasting}"
@@ -61,6 +66,10 @@ class Role:
     platforms: tuple[str, ...] | None = None
     fallback: str | None = None
     on_call: bool = False
+    needs_text: str = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "needs_text", "" if self.needs is None else str(self.needs))
 
 
 @dataclass(frozen=True, slots=True)

@@ -170,7 +170,7 @@ def follow_phase(
                     continue
                 assert effect.phase is not None
                 return PhaseState(effect.phase, now), Turn(
-                    phase.name, effect.phase, f"{rule.name}: {rule.when}", state.used
+                    phase.name, effect.phase, f"{rule.name}: {rule.when.text}", state.used
                 )
     return _by_itself(phase, picture, cars, before, lasted_s, now)
 
@@ -182,7 +182,9 @@ def _by_itself(
     true = [car for car, steady in until.items() if steady.on]
     if phase.until is not None and phase.next is not None and true and lasted_s >= HYSTERESIS_S:
         used = _used(phase.until, picture, cars, true[0] or None, now)
-        return PhaseState(phase.next, now), Turn(phase.name, phase.next, f"{phase.name} ends with {phase.until}", used)
+        return PhaseState(phase.next, now), Turn(
+            phase.name, phase.next, f"{phase.name} ends with {phase.until.text}", used
+        )
     if phase.timeout_s is not None and phase.on_timeout is not None and lasted_s >= phase.timeout_s:
         why = f"{phase.name} lasts at most {phase.timeout_s:g} s"
         return PhaseState(phase.on_timeout, now), Turn(phase.name, phase.on_timeout, why)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from fleet.expression import Expression
 from fleet.policy.assign import assign
 from fleet.policy.picture import CONTRADICTED, NOBODY, CarPicture, Picture
 from fleet.policy.plan import Plan, Role
@@ -29,7 +30,8 @@ class Barrier:
 
     why: str
     change: str
-    used: tuple[str, ...] = ()
+    looks_at: Expression | None = None
+    """What it was seen by."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,12 @@ class Staff:
     needs: Mapping[tuple[str, str], Settled]
     now: float
 
+    def seen(self, car: str, barrier: Barrier | None) -> tuple[str, ...]:
+        """The readings that a barrier was seen by."""
+        if barrier is None or barrier.looks_at is None:
+            return ()
+        return self.picture.used(barrier.looks_at, car, self.now)
+
     def barrier(self, car: str, role: Role) -> Barrier | None:
         """Why this car may not have this role."""
         name = role.name
@@ -70,13 +78,13 @@ class Staff:
         settled = self.needs.get((car, role.name))
         if settled is not None and settled.value:
             return None
-        used = self.picture.used(role.needs, car, self.now)
         if settled is not None:
-            return Barrier(f"it needs {role.needs}", f"{role.needs}", used)
+            return Barrier(f"it needs {role.needs_text}", role.needs_text, role.needs)
         # In most modes little is measured: what is in the role's mode already is not taken out of it to find out.
         if self.has.get(car) == role.name or (car not in self.has and known.mode == role.mode):
             return None
-        return Barrier(f"it needs {role.needs}, and that is not known", f"{role.needs} being measured", used)
+        why, change = f"it needs {role.needs_text}, and that is not known", f"{role.needs_text} being measured"
+        return Barrier(why, change, role.needs)
 
 
 def unfit(known: CarPicture, role: Role, now: float) -> Barrier | None:
@@ -126,12 +134,16 @@ def follow_needs(
 ) -> dict[tuple[str, str], Settled]:
     """Whether each car has what each role needs; a value that nothing measures now counts as it was."""
     found = {}
+    values: dict[tuple[str, str], bool | None] = {}
     for role in plan.roles.values():
         if role.needs is None:
             continue
         for car in cars:
             if plan.may(car, role):
-                so = picture.holds(role.needs, car, now, old=True)
+                same = role.needs_text, car
+                if same not in values:
+                    values[same] = picture.holds(role.needs, car, now, old=True)
+                so = values[same]
                 settled = settle(before.get((car, role.name)), so, now)
                 if settled is not None:
                     found[car, role.name] = settled

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from fleet.policy.explain import Kind
+from fleet.policy.decision import Kind
 from fleet.policy.picture import Refused, Seen
 from fleet.policy.reader import parse
 from tests.fleet.policy.cars import HERE, Run
