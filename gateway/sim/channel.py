@@ -9,6 +9,7 @@ import sys
 import threading
 from typing import Final
 
+from gateway.sim.changes import change_of
 from gateway.sim.core.played import Played
 from gateway.sim.faults import fault_of, press_of
 from gateway.sim.links import LinkError
@@ -65,6 +66,11 @@ async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
         fields = json.loads(line)
         if isinstance(fields, dict) and fields.get("ask") == "truth":
             return _truth(simulation, fields.get("car"))
+        if isinstance(fields, dict) and fields.get("ask") == "world":
+            return {"ok": True, **simulation.world_as_it_is()}
+        if isinstance(fields, dict) and ("lamp" in fields or "thing" in fields):
+            simulation.change(change_of(fields, simulation.world))
+            return {"ok": True, **{word: fields[word] for word in ("lamp", "thing") if word in fields}}
         if isinstance(fields, dict) and "ir" in fields:
             press = press_of(fields)
             return {"ok": True, "ir": press.button.value, "obeyed": simulation.press(press)}

@@ -51,8 +51,13 @@ cut_write end as link_drop does); without "for_s" it lasts until then:
 infrared remote, which only an Arduino or STM32 car in mode remote_control obeys; buttons: forward, back, left, right,
 spin_left, spin_right, stop, whistle, faster, slower; a motion holds until the next button:
   --ir red:forward@5                    or on stdin {"car": "red", "ir": "forward"}
+worlds: lamps that light sensors see, things to bump into and to follow, cars that see each other and are in each
+other's way come from a file; deploy/world.follow.yaml has a comment for each field. On stdin:
+  {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (of a carried one: ahead, left)
+  {"thing": "cart", "x_m": 1, "y_m": 0} stays there, off its path; or "speed_m_s" along it
 what is so:
   {"car": "red", "ask": "truth"}        mode, motors, pose, ...; of a replay: bytes sent and ignored, rounds
+  {"ask": "world"}                      every lamp and thing: where, whether it is on, how large, how fast
 replay: a file that `gateway monitor --raw` kept plays as a car, with its timing; what is written to it is ignored. Over
 TCP it begins when a host connects, over a pty at once:
   gateway sim --replay red.raw:red:tcp --loop --rate 2

@@ -137,14 +137,14 @@ def fault_of(fields: object) -> Fault:
     _check_words(fields, {"fault", "car"}, set(known), kind)
     given: dict[str, object] = {**known, **fields}
     numbers = {
-        word: _number(word, given[word], *_RANGES[word])
+        word: number(word, given[word], *_RANGES[word])
         for word in known.keys() & _RANGES.keys()
         if (word, given[word]) != ("for_s", None)
     }
     count, path = 0, given.get("path")
     if "bytes" in known:
         low, high = (0, CUT_LIMIT) if kind is FaultKind.CUT_WRITE else (1, GARBAGE_LIMIT)
-        count = int(_number("bytes", given["bytes"], low, high))
+        count = int(number("bytes", given["bytes"], low, high))
     if path is not None and (not isinstance(path, str) or not path):
         raise BadSpec(f"path {path!r} is not allowed: write where the symlink is to be made")
     ways = ["host", "car"] if kind is FaultKind.GARBAGE else list(_WAYS)
@@ -192,7 +192,8 @@ def _choice(what: str, value: object, allowed: list[str]) -> str:
     raise BadSpec(f"{what} {value!r} is not allowed: use {', '.join(allowed[:-1])} or {allowed[-1]}")
 
 
-def _number(what: str, value: object, low: float, high: float) -> float:
+def number(what: str, value: object, low: float, high: float) -> float:
+    """A number of the control channel if it is in its range; raises BadSpec."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise BadSpec(f"{what} {value!r} is not allowed: a number from {low:.12g} to {high:.12g}")
     return float(value)

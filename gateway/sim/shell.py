@@ -9,6 +9,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from math import inf
 from typing import Final, Protocol
 
+from gateway.sim.changes import Change, as_it_is
 from gateway.sim.core.cars import build
 from gateway.sim.core.firmware import Firmware, Pose, Truth
 from gateway.sim.core.line import Line, Way
@@ -357,6 +358,18 @@ class Simulation:
         for name in names:
             await self.cars[name].inflict(fault)
         return names
+
+    def change(self, change: Change) -> None:
+        """Change the world now."""
+        now = asyncio.get_running_loop().time()
+        self.world.advance(now)
+        change(self.world, now)
+
+    def world_as_it_is(self) -> dict[str, object]:
+        """Lamps and things now."""
+        now = asyncio.get_running_loop().time()
+        self.world.advance(now)
+        return as_it_is(self.world, now)
 
     def press(self, press: Press) -> list[str]:
         """Press a button before one car or all; the names of those that obey. Raises BadSpec as `inflict`."""

@@ -14,16 +14,12 @@ import yaml
 
 from gateway.sim.core.firmware import Pose
 from gateway.sim.core.geometry import Point, Segment, box, distance, loop
-from gateway.sim.core.things import Lamp, Thing
+from gateway.sim.core.things import FAR_M, FASTEST_M_S, Lamp, Thing
 from gateway.sim.core.world import RADIUS_M, World
 from gateway.sim.marks import Marks
 from schemas import keys
 
-FAR_M: Final = 100.0
-"""No place in a world is farther from its middle, in x or in y."""
 SMALLEST_M: Final = 0.02
-FASTEST_M_S: Final = 0.5
-"""Of a thing: a car's own top speed. Faster ones would step over a car between two ticks."""
 MOST: Final = 200
 """Of walls, boxes, things or lamps, and of the points of a path or line."""
 

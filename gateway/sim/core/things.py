@@ -7,10 +7,16 @@ world began.
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from math import atan2, cos, hypot, sin, sqrt
+from math import cos, hypot, sin, sqrt
+from typing import Final
 
 from gateway.sim.core.firmware import Pose
 from gateway.sim.core.geometry import Hit, Point, Segment, foot, nearest, ray_to_circle, ray_to_segment, turned_box
+
+FAR_M: Final = 100.0
+"""No place in a world is farther from its middle, in x or in y."""
+FASTEST_M_S: Final = 0.5
+"""Of a thing: a car's own top speed. A much faster one would step over a car between two ticks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +165,3 @@ def carried(carrier: Pose, ahead: float, left: float, turn: float = 0.0) -> Pose
     """Where something is that is carried at a place in its carrier's frame."""
     c, s = cos(carrier.heading_rad), sin(carrier.heading_rad)
     return Pose(carrier.x_m + ahead * c - left * s, carrier.y_m + ahead * s + left * c, carrier.heading_rad + turn)
-
-
-def bearing(x: float, y: float, point: Point) -> float:
-    """The direction from a place to a point, rad."""
-    return atan2(point[1] - y, point[0] - x)

@@ -329,15 +329,16 @@ class World:
             for lamp in self.lamps
         )
 
-    def change_thing(self, name: str, now: float, *, speed_m_s: float | None = None, to: Point | None = None) -> None:
-        """Give a thing that is there another speed, or put it elsewhere, where it stays."""
+    def speed_thing(self, name: str, speed_m_s: float, now: float) -> None:
+        """Give a thing that has a path another speed."""
         at_s = now - self._began
+        self.things = tuple(each.faster(speed_m_s, at_s) if each.name == name else each for each in self.things)
 
-        def changed(thing: Thing) -> Thing:
-            if thing.name != name:
-                return thing
-            if speed_m_s is not None:
-                thing = thing.faster(speed_m_s, at_s)
-            return thing if to is None else thing.put(*to)
+    def put_thing(self, name: str, x_m: float | None, y_m: float | None, now: float) -> None:
+        """Put a thing elsewhere (None: as it is), where it stays; one that is carried: elsewhere on its car."""
 
-        self.things = tuple(map(changed, self.things))
+        def put(thing: Thing) -> Thing:
+            pose = thing.pose(now - self._began)
+            return thing.put(pose.x_m if x_m is None else x_m, pose.y_m if y_m is None else y_m)
+
+        self.things = tuple(put(each) if each.name == name else each for each in self.things)
