@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from fleet.config import FleetFile, parse_fleet
-from fleet.found import quoted
+from fleet.found import key, quoted
 from fleet.marked import BadFile, Document
 
 
@@ -32,8 +32,7 @@ def with_link(text: str, path: Path, car: str, link: str) -> str:
         assert isinstance(entry, yaml.MappingNode)
         after = _first(text, entry, f"link: {quoted(link)}")
     else:
-        key = car if car[0].isalpha() else quoted(car)
-        after = _last(text, cars, f"{key}: {{link: {quoted(link)}}}")
+        after = _last(text, cars, f"{key(car)}: {{link: {quoted(link)}}}")
     by_hand = CannotEdit(f"{path} cannot be changed here without changing more: write cars.{car}.link: {quoted(link)}")
     try:
         now = parse_fleet(after, path, unbound=True)

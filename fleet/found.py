@@ -83,6 +83,11 @@ def quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
+def key(name: str) -> str:
+    """A car's name as a key that YAML takes for a word: `10` would be a number, `null` nothing."""
+    return name if name[0].isalpha() and name not in ("null", "true", "false") else quoted(name)
+
+
 def new_file(cars: Sequence[NewCar], name: str) -> str:
     """The text of a fleet file with these cars."""
     lines = [
@@ -101,9 +106,8 @@ def new_file(cars: Sequence[NewCar], name: str) -> str:
         "cars:",
     ]
     for car in cars:
-        lines.append(
-            f"  {quoted(car.name) if not car.name[0].isalpha() else car.name}:" + f"  # {car.words}".rstrip(" #")
-        )
+        about = car.words.partition(":")[0]
+        lines.append(f"  {key(car.name)}:" + (f"  # {about}" if about else ""))
         lines.append(f"    link: {quoted(car.link)}")
         lines.append(f"    platform: {car.platform}" + ("  # its gateway finds out" if car.platform == AUTO else ""))
         lines.append(f"    colour: {quoted(car.colour)}")

@@ -14,8 +14,9 @@ from typing import Any
 
 import pytest
 
-from fleet.config import read_fleet
+from fleet.config import parse_fleet, read_fleet
 from fleet.edit import CannotEdit, with_link
+from fleet.found import NewCar, new_file
 from fleet.marked import BadFile
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, Process, TcpCar
@@ -238,6 +239,14 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
     assert list(read_fleet(tmp_path / "fleet.yaml").cars) == ["red"]
 
 
+def test_any_name_and_any_word_of_a_device_make_a_right_file() -> None:
+    cars = [NewCar(name, "COM1" if name == "red" else f"tcp://pi:{number}", "auto", "#000000", "a # 'car': \"x\"")
+            for number, name in enumerate(("red", "10", "null", "true", "0x1", "on", "a-b"), 1)]  # fmt: skip
+    fleet = parse_fleet(new_file(cars, "null"), Path("f.yaml"))
+    assert [*fleet.cars] == [car.name for car in cars]
+    assert fleet.name == "null"
+
+
 def test_nothing_found_says_what_to_do(command: Command, port: Port, tmp_path: Path) -> None:
     done = command("init", "--yes", "--seconds", "0.5", "--link", port.path)
     assert done.returncode == 1
@@ -351,6 +360,7 @@ def test_no_unknown_link(command: Command, port: Port, tmp_path: Path) -> None:
             "1",
             'cars:\n  red: {link: COM1}\n  "1": {link: "COM9"}\n\n# end\nname: x',
         ),
+        ("cars:\n  red: {link: COM1}", "null", 'cars:\n  red: {link: COM1}\n  "null": {link: "COM9"}'),
         ("cars: {red: &r {platform: stm32}, b: *r}", "red", None),
         ("cars:\n  red: &r {link: COM1}\n", "red", 'cars:\n  red: &r {link: "COM9"}\n'),
     ],
