@@ -157,6 +157,9 @@ class Expression:
         return _truth(self.root, lookup)
 
 
+_VALUES: Final = (bool, int, float, str)
+
+
 def _names(node: Node) -> Iterator[str]:
     match node:
         case Name(name):
@@ -174,25 +177,25 @@ def _names(node: Node) -> Iterator[str]:
 
 
 def _truth(node: Node, lookup: Lookup) -> bool | None:
-    match node:
-        case Name() | Literal():
-            found = _value(node, lookup)
-            return None if found is None else bool(found)
-        case Compare(left, op, right):
-            one, other = _value(left, lookup), _value(right, lookup)
-            return None if one is None or other is None else _TESTS[op](one, other)
-        case Not(inner):
-            held = _truth(inner, lookup)
-            return None if held is None else not held
-        case Every(parts):
-            return _first((_truth(part, lookup) for part in parts), decisive=False)
-        case Some(parts):
-            return _first((_truth(part, lookup) for part in parts), decisive=True)
+    # A coordinator asks a thousand times in a decision: no `match`, which takes three times as long here.
+    if isinstance(node, Compare):
+        one, other = _value(node.left, lookup), _value(node.right, lookup)
+        return None if one is None or other is None else _TESTS[node.op](one, other)
+    if isinstance(node, Every):
+        return _first(node.parts, lookup, decisive=False)
+    if isinstance(node, Some):
+        return _first(node.parts, lookup, decisive=True)
+    if isinstance(node, Not):
+        held = _truth(node.inner, lookup)
+        return None if held is None else not held
+    found = _value(node, lookup)
+    return None if found is None else bool(found)
 
 
-def _first(parts: Iterator[bool | None], *, decisive: bool) -> bool | None:
+def _first(parts: tuple[Node, ...], lookup: Lookup, *, decisive: bool) -> bool | None:
     unknown = False
-    for held in parts:
+    for part in parts:
+        held = _truth(part, lookup)
         if held is decisive:
             return decisive
         unknown = unknown or held is None
@@ -207,7 +210,7 @@ def _value(node: Node, lookup: Lookup) -> Value | None:
     found = lookup(node.name)
     if found is None:
         return None
-    if not isinstance(found, bool | int | float | str) or KINDS.get(type(found)) is not node.kind:
+    if not isinstance(found, _VALUES) or KINDS.get(type(found)) is not node.kind:
         raise TypeError(f"{node.name} should be {node.kind}, and is {found!r}")
     return None if isinstance(found, float) and math.isnan(found) else found
 

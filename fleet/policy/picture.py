@@ -3,6 +3,7 @@
 How it is heard is coordinator.py's, what follows from it decide.py's.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -38,6 +39,12 @@ def _fields() -> dict[str, tuple[str, str, type]]:
 _FIELDS: Final = _fields()
 NAMES: Final[Mapping[str, type]] = MappingProxyType({name: kind for name, (_, _, kind) in _FIELDS.items()})
 """What an expression of a plan may name: `battery.voltage_v`, `light.left`, `mode.asked`, and its type."""
+
+
+_STALE_S: Final = {
+    topic: math.inf if (after_s := topics.TOPICS[topic].stale_after_s) is None else after_s
+    for topic, _, _ in _FIELDS.values()
+}
 
 
 def topic_of(name: str) -> str:
@@ -130,10 +137,8 @@ class Picture:
             one = seen.get(topic)
             if one is None:
                 return None
-            if not old:
-                stale_after_s = topics.TOPICS[topic].stale_after_s
-                if stale_after_s is not None and now - one.at > stale_after_s:
-                    return None
+            if not old and now - one.at > _STALE_S[topic]:
+                return None
             return one.fields.get(member)
 
         return expression.value(lookup)

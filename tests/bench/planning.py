@@ -1,4 +1,4 @@
-"""One decision of the coordinator for 50 cars and 20 rules; the floor is looking at each reading that it looks at once."""
+"""One decision of the coordinator for 50 cars and 20 rules; the floor is looking at each reading once."""
 
 from dataclasses import replace
 from time import perf_counter
@@ -7,7 +7,7 @@ from fleet.policy.decide import step
 from fleet.policy.memory import Memory
 from fleet.policy.picture import CarPicture, Picture, Seen
 from fleet.policy.reader import parse
-from tests.bench.measured import Measured, in_turns
+from tests.bench.measured import Measured, in_turns, percentile
 
 CARS = tuple(f"car{number:02}" for number in range(50))
 PLAN = parse(
@@ -18,7 +18,8 @@ PLAN = parse(
     )
     + "\nrules:\n"
     + "\n".join(
-        f"  - {{when: {{any: light.left and range.range_m < 0.{number + 10}, for_s: 1}}, then: {{who: that, mode: manual}}}}"
+        f"  - when: {{any: light.left and range.range_m < 0.{number + 10}, for_s: 1}}\n"
+        "    then: {who: that, mode: manual}"
         for number in range(20)
     )
 )
@@ -48,17 +49,17 @@ PICTURES = _pictures()
 
 def _ours() -> float:
     memory = Memory()
-    worst = 0.0
+    took = []
     for number, picture in enumerate(PICTURES):
         began = perf_counter()
         memory = step(PLAN, picture, memory, number * 0.1).memory
-        worst = max(worst, perf_counter() - began)
-    return worst * 1e3
+        took.append(perf_counter() - began)
+    return percentile(took, 0.95) * 1e3
 
 
 def _floor() -> float:
     seen = PICTURES[0].readings
-    worst = 0.0
+    took = []
     for _ in range(STEPS):
         began = perf_counter()
         for _ in PLAN.rules:
@@ -66,10 +67,10 @@ def _floor() -> float:
                 reading = seen[car]
                 assert reading["sensor/light"].fields["left"] in (True, False)
                 assert reading["sensor/range"].fields["range_m"] == 0.2
-        worst = max(worst, perf_counter() - began)
-    return worst * 1e3
+        took.append(perf_counter() - began)
+    return percentile(took, 0.95) * 1e3
 
 
 def run() -> list[Measured]:
     ours, floor = in_turns(_ours, _floor)
-    return [Measured("the slowest of 100 decisions, 50 cars, 20 rules", tuple(ours), tuple(floor), "ms", 0.0, 10.0)]
+    return [Measured("one decision, 50 cars, 20 rules: p95 of 100", tuple(ours), tuple(floor), "ms", 0.0, 10.0)]
