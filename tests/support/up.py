@@ -103,12 +103,9 @@ class Up:
         os.kill(pid, signal.SIGKILL)
 
     def exists(self, pid: int) -> bool:
-        """Whether there is such a process."""
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return False
-        return True
+        """Whether there is such a process; one that only waits for its parent to look is none (a gateway's hub)."""
+        listed = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False)
+        return listed.stdout.strip()[:1] not in ("", "Z")
 
     def hub(self) -> int:
         """The hub, the supervisor's or one that a gateway started; by the system's own list."""

@@ -1,0 +1,145 @@
+"""A fleet of simulated cars as `fleet up` runs it: what a car costs, how long a question and a stop of all take.
+
+The floors: a bare process that answers at once; for what grows with the fleet, the smallest fleet. PSS is Linux's.
+"""
+
+import contextlib
+import statistics
+import time
+from pathlib import Path
+from time import perf_counter
+
+from fleet.client import Fleet
+from schemas.bus import Sample
+from tests.bench.measured import Measured, percentile
+from tests.bench.stage import scratch
+from tests.support.judge import stamp_ns
+from tests.support.ports import free_endpoint
+from tests.support.processes import wait_for
+from tests.support.up import Up
+
+SIZES = (1, 50, 100)
+GOALS = 50
+"""The size that issue 5 sets its goals for."""
+QUERIES = 40
+STOPS = 12
+WINDOW_S = 5.0
+QUERY_MS, STOP_MS = 100.0, 150.0
+
+
+def _cpu_s(pids: list[int]) -> float:
+    """Time on a processor of these processes, by the scheduler's own count."""
+    total = 0
+    for pid in pids:
+        for thread in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            with contextlib.suppress(OSError):  # a thread that has just ended
+                total += int(thread.read_text(encoding="ascii").split()[0])
+    return total / 1e9
+
+
+def _pss_mb(pid: int) -> float:
+    """Memory, what is shared divided among those who share it."""
+    for line in Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines():
+        if line.startswith("Pss:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    return 0.0
+
+
+class _Fleet:
+    """So many cars, up and at rest."""
+
+    def __init__(self, up: Up, size: int) -> None:
+        self.up = up
+        self.size = size
+        began = perf_counter()
+        wait_for(lambda: self.at_rest() == size, f"{size} cars are at rest", 300.0)
+        self.up_s = perf_counter() - began
+
+    def at_rest(self) -> int:
+        """Cars that are known to stand."""
+        answers = list(self.up.bus.query("fleet/*/state/safety", timeout_s=5.0))
+        return sum(isinstance(each, Sample) and each.message().motors == "off" for each in answers)  # type: ignore[attr-defined]
+
+    def pids(self) -> list[int]:
+        """The gateways' processes."""
+        return [each.pid for each in self.up.status().processes if each.kind == "gateway" and each.HasField("pid")]
+
+    def cpu(self) -> float:
+        """Of one gateway, percent of a core."""
+        pids = self.pids()
+        before, began = _cpu_s(pids), perf_counter()
+        time.sleep(WINDOW_S)
+        return (_cpu_s(pids) - before) / (perf_counter() - began) / self.size * 100
+
+    def pss(self) -> float:
+        """Of one gateway, MB."""
+        return statistics.fmean(_pss_mb(pid) for pid in self.pids())
+
+    def queries(self) -> list[float]:
+        """A wildcard query for one reading of every car, until its last answer, ms."""
+        times = []
+        for _ in range(QUERIES):
+            began = perf_counter()
+            answers = list(self.up.bus.query("fleet/*/state/link", timeout_s=5.0))
+            times.append((perf_counter() - began) * 1e3)
+            assert len(answers) == self.size
+        return times
+
+    def track(self, client: Fleet) -> None:
+        """Bring all that can into tracking; the others (a Raspberry Pi) go on in mode 0."""
+        outcomes = [client.car(car).mode("tracking") for car in client.cars() if self._may_track(car)]
+        assert all(outcome.ok for outcome in outcomes), [outcome for outcome in outcomes if not outcome.ok]
+
+    def _may_track(self, car: str) -> bool:
+        return not self.up.get(f"{car}/state/health").platform.startswith("raspberry")
+
+    def stops(self, client: Fleet) -> list[float]:
+        """From asking all cars to stop until the first frame of it is on a car's wire, ms, one for each car."""
+        wires: dict[str, int] = {}
+
+        def wire(sample: Sample) -> None:
+            frame = sample.message()
+            if frame.why == "stop":  # type: ignore[attr-defined]  # a fleet.v1.TxFrame
+                wires.setdefault(sample.key, stamp_ns(frame))
+
+        subscriber = self.up.bus.subscribe("fleet/*/frame/tx", wire)
+        time.sleep(0.2)  # until all gateways know of it
+        asked = time.time_ns()
+        outcomes = client.stop()  # until all have carried it out: a stop that joins another writes nothing
+        assert all(outcome.ok for outcome in outcomes), outcomes
+        wait_for(lambda: len(wires) == self.size, "a stop is on every wire", 30.0)
+        subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+        return [(at - asked) / 1e6 for at in wires.values()]
+
+
+def run() -> list[Measured]:
+    found: list[Measured] = []
+    idle: dict[int, tuple[float, float]] = {}
+    for size in SIZES:
+        with scratch() as directory, Up(directory, free_endpoint(), "--sim", str(size), "--no-record") as up:
+            fleet = _Fleet(up, size)
+            idle[size] = fleet.cpu(), fleet.pss()
+            first = idle[SIZES[0]]
+            found += [
+                Measured(f"gateway CPU, 1 report/s, {size} cars", (idle[size][0],), (first[0],), "%", None),
+                Measured(f"gateway PSS, {size} cars", (idle[size][1],), (first[1],), "MB", None),
+            ]
+            if size == GOALS:
+                found += _goals(fleet)
+    return found
+
+
+def _goals(fleet: _Fleet) -> list[Measured]:
+    found = []
+    with Fleet(fleet.up.endpoint) as client:
+        assert len(client.cars()) == fleet.size
+        for what in ("1 report/s", "tracking"):
+            if what == "tracking":
+                fleet.track(client)
+                found.append(Measured(f"gateway CPU, tracking, {fleet.size} cars", (fleet.cpu(),), (1.0,), "%", None))
+            p50 = percentile(fleet.queries(), 0.5)
+            found.append(Measured(f"wildcard query p50, {fleet.size} cars, {what}", (p50,), (QUERY_MS,), "ms", 1.0))
+            stops = [each for _ in range(STOPS if what == "1 report/s" else 1) for each in fleet.stops(client)]
+            p95 = percentile(stops, 0.95)
+            found.append(Measured(f"stop on all wires p95, {fleet.size} cars, {what}", (p95,), (STOP_MS,), "ms", 1.0))
+    return found
