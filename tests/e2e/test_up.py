@@ -249,13 +249,27 @@ def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: Flee
         assert started.running("red") == before["red"]
 
 
-def test_a_gateway_that_was_told_something_wrong_is_not_started_over_and_over(fleet: Fleet, tmp_path: Path) -> None:
-    """What the fleet file lets through and the gateway does not is said once."""
-    file = tmp_path / "fleet.yaml"
-    file.write_text("cars:\n  red: {link: 'ble://name=BT04', platform: arduino}\n")
-    with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
-        started.running("red")
-        assert started.state("red").restarts == 0
+def test_another_plan_is_taken_by_the_coordinator_that_runs_and_a_bad_one_by_nobody(
+    fleet: Fleet, tmp_path: Path
+) -> None:
+    _, (link,) = fleet.simulate("red:arduino:tcp")
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("cars: {red: tracking}\n")
+    with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--plan", str(plan), "--no-record") as started:
+        started.ready("red")
+        wait_for(lambda: started.get("red/state/mode").asked == "tracking", "red is told to track")
+        pid = started.running("@coordinator")
+        plan.write_text("cars: {red: trakking}\n")
+        refused = started.fleet("reload")
+        assert refused.returncode == 2
+        assert "trakking" in refused.stderr
+        plan.write_text("cars: {red: light_seeking}\n")
+        assert started.fleet("reload").stdout == "the plan is changed\n"
+        wait_for(lambda: started.get("red/state/mode").asked == "light_seeking", "red seeks light")
+        os.kill(pid, signal.SIGKILL)
+        assert started.running("@coordinator", but=pid)
+        answer = started.get("@coordinator/plan")
+        assert answer is None or "light_seeking" in answer.text, "the one after it has the new plan, too"
 
 
 @pytest.mark.parametrize(
