@@ -35,7 +35,7 @@ from gateway.control.records import (
 from gateway.control.safety import LEASE_S, Estop
 from gateway.control.senders import PAUSE_S
 from gateway.control.waiting import Held
-from gateway.protocol.encode import ColorLed, General
+from gateway.protocol.encode import ColorLed, Frame, General
 from gateway.protocol.values import Mode, Motion
 
 
@@ -96,11 +96,17 @@ class Controller(Evidence):
             case ChangeSpeed(step):
                 pending.frames.append(General(Motion.STOP, speed=step))
             case Find():
-                whistle = General(Motion.STOP, whistle=True)
-                blinks = (whistle, ColorLed(255, 255, 255), whistle, self.believed.led)
-                pending.frames.extend(frame for frame in blinks if self.profile.refusal(frame) is None)
+                pending.frames.extend(frame for frame in self._blinks() if self.profile.refusal(frame) is None)
         self._waiting.acts.append(pending)
         return self._queued(pending, now)
+
+    def _blinks(self) -> tuple[Frame, ...]:
+        """The frames of `find`: the LED is at last what it will be after all that waits, also another `find`."""
+        waiting = [each for act in self._waiting.acts for each in act.frames if isinstance(each, ColorLed)]
+        led = waiting[-1] if waiting else self.believed.led
+        other = ColorLed(255, 255, 255) if led != ColorLed(255, 255, 255) else ColorLed(0, 0, 0)
+        whistle = General(Motion.STOP, whistle=True)
+        return whistle, other, whistle, led
 
     def refused(self, command: Command, reason: Reason, words: str, now: float) -> Answer:
         """Record a command that was no command, as its parser says."""

@@ -1,0 +1,79 @@
+"""Which car is which: `find` blinks and beeps, by the simulated car's truth, and leaves the car as it was."""
+
+import pytest
+
+from gateway.control.records import Act, Drive, Find, Phase
+from gateway.protocol.encode import ColorLed
+from gateway.protocol.values import Motion
+from tests.support.virtual import Pair
+
+WHITE, COLOUR = "#ffffff", "#0a141e"
+
+
+def seen(pair: Pair, seconds: float) -> list[str]:
+    """What the LED shows, one after the other, while time passes."""
+    shown = [pair.car.truth.led]
+    end = pair.now + seconds
+    while pair.now < end:
+        pair.run(0.01)
+        if pair.car.truth.led != shown[-1]:
+            shown.append(pair.car.truth.led)
+    return shown
+
+
+def beeps(pair: Pair, before: int) -> int:
+    """Frames that whistle, of those written since."""
+    return sum(data.split(b",")[2:3] == [b"1"] and data.startswith(b"$") for _, data in pair.sent[before:])
+
+
+@pytest.mark.parametrize("platform", ["arduino", "stm32", "raspberry_pi"])
+def test_a_car_at_rest_blinks_and_beeps_and_never_moves(platform: str) -> None:
+    pair = Pair(platform).ready()
+    moved, sent = len(pair.car.motor_log), len(pair.sent)
+    pair.ask(Find(), identity="f")
+    assert seen(pair, 3.0) == ["off", WHITE, "off"]
+    assert beeps(pair, sent) == 2
+    assert len(pair.car.motor_log) == moved, "its motors were switched"
+    assert pair.phases("f")[-1] is Phase.SENT
+
+
+@pytest.mark.parametrize("platform", ["arduino", "stm32", "raspberry_pi"])
+def test_a_car_that_drives_blinks_and_beeps_and_drives_on(platform: str) -> None:
+    pair = Pair(platform).ready()
+    pair.ask(Drive(Motion.FORWARD, 9.0))
+    pair.run(2.0)
+    moved, sent = len(pair.car.motor_log), len(pair.sent)
+    pair.ask(Find())
+    assert seen(pair, 3.0) == ["off", WHITE, "off"]
+    assert beeps(pair, sent) == 2
+    assert len(pair.car.motor_log) == moved, "its motors were switched"
+    assert pair.car.truth.motor_left > 0
+    assert pair.car.truth.motor_right > 0
+
+
+def test_the_led_is_what_it_was_before_also_after_two() -> None:
+    pair = Pair().ready()
+    pair.ask(Act(ColorLed(10, 20, 30)))
+    pair.run(3.0)
+    pair.ask(Find())
+    pair.run(0.6)
+    assert pair.car.truth.led == WHITE
+    pair.ask(Find())
+    assert seen(pair, 5.0) == [WHITE, COLOUR, WHITE, COLOUR]
+
+
+def test_a_colour_that_still_waits_is_what_is_left() -> None:
+    pair = Pair().ready()
+    pair.ask(Find())
+    pair.ask(Act(ColorLed(10, 20, 30)))
+    pair.ask(Find())
+    pair.run(6.0)
+    assert pair.car.truth.led == COLOUR
+
+
+def test_a_white_led_goes_dark_to_be_seen() -> None:
+    pair = Pair().ready()
+    pair.ask(Act(ColorLed(255, 255, 255)))
+    pair.run(3.0)
+    pair.ask(Find())
+    assert seen(pair, 3.0) == [WHITE, "off", WHITE]
