@@ -157,3 +157,79 @@ def test_plan_assignment_and_decisions_can_be_asked_for(cars: Cars, tmp_path: Pa
     assert found["Plan"].text == "cars: {red: manual}"
     assert found["Decision"].subject == "red"
     assert [role.name for role in found["Assignment"].roles] == ["manual"]
+
+
+TEAM = """
+roles:
+  scout: {mode: tracking}
+  rest: {mode: manual, count: all, priority: -1}
+"""
+
+
+def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_all(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", TEAM)
+    lines = Lines(process)
+    lines.until("green", "manual", "role rest")
+    lines.until("red", "tracking", "role scout")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    why = cars.start("-m", "fleet.cli", "why", "red", "--json")
+    told = why.line()
+    assert (told["decided"], told["kind"], told["role"]) == ("tracking", "role", "scout")
+    assert why.wait() == 0
+    nobody = cars.start("-m", "fleet.cli", "why", "purple")
+    assert nobody.wait() == 1
+    assert "nothing was decided of purple; there are decisions of blue, green, red" in nobody.stderr
+
+    key = "fleet/@coordinator/@cmd/plan"
+    (refused,) = cars.bus.query(key, payload=b"cars: {red: fast}\nroles: {x: {}}", timeout_s=5.0)
+    assert isinstance(refused, bus.Sample)
+    answer: Any = refused.message()
+    assert (answer.status, answer.reason) == ("rejected", "bad_value")
+    assert "roles.x.mode: is missing" in answer.words
+    (plan,) = cars.get("fleet/@coordinator/plan")
+    assert plan.text == TEAM, "nothing is half applied"
+
+    changed = TEAM + "  dance: {mode: light_seeking, cars: [red], priority: 5}\n"
+    (taken,) = cars.bus.query(key, payload=changed.encode(), timeout_s=5.0)
+    assert isinstance(taken, bus.Sample)
+    assert taken.message().status == "sent"  # type: ignore[attr-defined]  # a fleet.v1.Result
+    lines.until("red", "light_seeking", "role dance")
+    wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
+    assert process.end(signal.SIGTERM) == 0
+
+
+def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", TEAM)
+    Lines(process).until("red", "tracking", "role scout")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    asked: list[bus.Sample] = []
+    cars.bus.subscribe("fleet/*/event/command", asked.append)
+    process.kill()
+    process.wait()
+    following = coordinator(cars, tmp_path / "plan.yaml", TEAM)
+    Lines(following).until("red", "tracking", "role scout (1 of 1): it had it before")
+    # What it has asked for would have come before what is asked for now.
+    with Fleet(cars.endpoint, sender="ann", kind="person") as client:
+        assert client.car("blue").stop().ok
+    Lines(following).until("blue", None, "on hold by ann")
+    verbs = {sample.message().verb for sample in asked}  # type: ignore[attr-defined]  # a fleet.v1.CommandEvent
+    assert verbs == {"stop"}
+    with Fleet(cars.endpoint, sender="ann", kind="person") as client:
+        assert client.car("blue").resume().ok
+    assert truth(cars, "red") == "tracking"
+    assert following.end(signal.SIGTERM) == 0
+
+
+def test_a_role_goes_to_another_car_when_a_gateway_dies(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "roles: {watch: {mode: manual, cars: [green, blue]}}")
+    lines = Lines(process)
+    lines.until("green", "manual", "role watch")
+    killed = cars.gateways["green"]
+    killed.kill()
+    killed.wait()
+    lines.until("green", None, "green is not on the bus; its role watch is kept for 1.5 s")
+    lines.until("blue", "manual", "role watch (1 of 1): in place of green: green is not on the bus")
+    cars.gateways["green"] = cars.serve("green")
+    cars.ready("green")
+    lines.until("green", "manual", "no role for it: watch: it has its car: blue")
+    assert process.end(signal.SIGTERM) == 0

@@ -1,0 +1,41 @@
+"""A plan of ours finds the leader by light and lets the others follow, in the simulated world; judged by true poses."""
+
+from math import dist
+from pathlib import Path
+
+import pytest
+
+from tests.support.processes import Fleet, Process, wait_for
+
+DEPLOY = Path(__file__).parents[2] / "deploy"
+ROW = ("red", "green", "blue")
+MODES = {"red": "light_seeking", "green": "following", "blue": "following"}
+
+
+def _truth(sim: Process) -> dict[str, tuple[str, tuple[float, float]]]:
+    said = {car: sim.say({"car": car, "ask": "truth"}) for car in ROW}
+    return {car: (str(each["mode"]), (float(each["x_m"]), float(each["y_m"]))) for car, each in said.items()}
+
+
+@pytest.mark.timeout(240)
+def test_who_sees_the_lamp_leads_and_the_others_follow(fleet: Fleet) -> None:
+    sim, links = fleet.simulate(*(f"{car}:arduino:pty" for car in ROW), world=str(DEPLOY / "world.follow.yaml"))
+    for car, link in zip(ROW, links, strict=True):
+        fleet.gateway(link, car=car)
+    for car in ROW:
+        fleet.ready(car)
+    began = _truth(sim)
+    coordinator = fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(DEPLOY / "plan.follow.yaml"), "--json")
+    wait_for(lambda: {car: mode for car, (mode, _) in _truth(sim).items()} == MODES, "red leads, the others follow")
+    roles = {role.name: list(role.cars) for role in fleet.get("fleet/@coordinator/assignment")[0].roles}
+    assert roles == {"leader": ["red"], "follower": ["blue", "green"]}
+
+    def moved() -> bool:
+        return all(dist(_truth(sim)[car][1], began[car][1]) > 0.4 for car in ROW)
+
+    wait_for(moved, "all three have moved on behind the lamp", 90.0)
+    now = _truth(sim)
+    assert {car: mode for car, (mode, _) in now.items()} == MODES
+    for before, after in (("red", "green"), ("green", "blue")):
+        assert dist(now[before][1], now[after][1]) < 0.5, "nobody is left behind"
+    assert coordinator.end() == 0
