@@ -91,12 +91,12 @@ def unfit(known: CarPicture, role: Role, now: float) -> Barrier | None:
     """What a car is, or has said, that keeps it from a role whatever its readings."""
     if known.roles is not None and role.name not in known.roles:
         return Barrier("the fleet file does not let it take this role", "the fleet file")
-    if known.listed and role.mode not in known.capabilities:
-        return Barrier(f"the fleet file does not let it do mode {role.mode}", "the fleet file")
     profile = known.profile
     if profile is not None and role.mode not in profile.modes:
         knows = ", ".join(sorted(profile.modes))
         return Barrier(f"{known.platform} cars do not know mode {role.mode}; they know {knows}", "another car")
+    if known.listed and role.mode not in known.capabilities:
+        return Barrier(f"the fleet file does not let it do mode {role.mode}", "the fleet file")
     if role.platforms is not None and (profile is None or not {profile.kind, profile.name} & set(role.platforms)):
         return Barrier(
             f"it wants platform {' or '.join(role.platforms)}, this is {known.platform or 'not known'}", "another car"

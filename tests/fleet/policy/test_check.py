@@ -1,0 +1,98 @@
+"""What can never work in a plan is found before anything moves; what can work is let alone."""
+
+import pytest
+
+from fleet.policy.check import Gravity, check
+from fleet.policy.picture import CarPicture
+from fleet.policy.reader import parse
+from gateway.protocol.profile import parse_platform
+
+
+def listed(platform: str, *roles: str) -> CarPicture:
+    profile = parse_platform(platform)
+    able = frozenset(str(word) for word in (*profile.capabilities, *profile.modes))
+    return CarPicture(platform=platform, capabilities=able, roles=frozenset(roles) or None, listed=True)
+
+
+FLEET = {"red": listed("arduino"), "green": listed("arduino", "scout"), "pi": listed("raspberry_pi")}
+SCOUT = "roles: {scout: {mode: tracking}}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "part", "told"),
+    [
+        ("roles: {x: {mode: tracking, cars: [pi]}}", "role x", "raspberry_pi"),
+        ("roles: {x: {mode: tracking, capabilities: [arm]}}", "role x", "no car can fill it: red: it cannot arm"),
+        (
+            "roles: {x: {mode: tracking, needs: battery.voltage_v > 8 and battery.voltage_v < 7}}",
+            "role x",
+            "is never so",
+        ),
+        (
+            "roles: {x: {mode: manual, cars: [pi], needs: battery.voltage_v > 7}}",
+            "role x",
+            "battery.voltage_v is never measured on it",
+        ),
+        ("roles: {x: {mode: tracking, on_call: true}}", "role x", "it is on_call, and no rule gives it"),
+        ("cars: {purple: manual}", "car purple", "the fleet file has no such car; it has green, pi, red"),
+        (SCOUT + "rules: [{when: {car: zed, is: light.left}, then: {who: red, mode: manual}}]", "rule 1", "no car zed"),
+        (
+            SCOUT + "rules: [{when: {any: range.range_m < 1 and range.range_m > 2}, then: {who: red, mode: manual}}]",
+            "rule 1",
+            "it can never fire: range.range_m < 1 and range.range_m > 2 is never so",
+        ),
+        (
+            SCOUT + "rules: [{when: {any: light.left, role: scout}, then: {who: all, mode: tracking}}]",
+            "rule 1",
+            "it can never fire: light.left is never measured on any car with role scout",
+        ),
+        (
+            SCOUT + "rules: [{when: {car: red, is: line.left_outer}, then: {who: pi, mode: tracking}}]",
+            "rule 1",
+            "pi is a raspberry_pi car, which does not know mode tracking",
+        ),
+        (
+            SCOUT
+            + "rules:\n  - {when: {any: line.left_outer}, then: {who: red, mode: manual}}\n"
+            + "  - {when: {any: line.left_outer}, then: {who: red, mode: following}}",
+            "rule 2",
+            "it fights rule 1",
+        ),
+        (SCOUT + "phases: {x: {}, y: {}}", "phase y", "nothing leads to it"),
+        (
+            SCOUT + "phases: {x: {until: {car: red, is: imu.gyro_x_raw > 3}, next: x}}",
+            "phase x",
+            "it never ends: imu.gyro_x_raw is never measured on red",
+        ),
+    ],
+)
+def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> None:
+    errors = [each for each in check(parse(text), FLEET) if each.gravity is Gravity.ERROR]
+    assert [each.part for each in errors if told in each.words] == [part], [str(each) for each in errors]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("roles: {x: {mode: tracking, count: 3}}", "it wants 3 cars, and only red can have it"),
+        (
+            SCOUT + "rules: [{when: {car: red, is: range.range_m < 0.3}, then: {who: red, mode: tracking}}]",
+            "it ends itself: in mode tracking, range.range_m is not measured; give it until",
+        ),
+        ("roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {p: {roles: [x]}}", "no phase has it"),
+    ],
+)
+def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
+    found = check(parse(text), FLEET)
+    assert [each.gravity for each in found if told in each.words] == [Gravity.WARNING], [str(each) for each in found]
+    assert not [each for each in found if each.gravity is Gravity.ERROR]
+
+
+def test_a_good_plan_is_let_alone_with_and_without_a_fleet_file() -> None:
+    plan = parse("""
+roles: {scout: {mode: tracking, needs: battery.voltage_v > 7}, rest: {mode: manual, count: all, priority: -1}}
+rules: [{when: {any: line.left_outer, role: scout, for_s: 1}, then: {who: others, mode: color_led}}]
+phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_outer}, next: one}}
+""")
+    assert check(plan) == ()
+    assert check(plan, FLEET) == ()
