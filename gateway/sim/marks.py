@@ -111,13 +111,13 @@ class Marks:
         self.complain(node, field, f"{_shown(node)} is not allowed: a number {ends}")
         return low if low or not above else high
 
-    def numbers(self, node: yaml.Node, field: str, count: int, low: float, high: float) -> tuple[float, ...]:
-        """A list of so many numbers; zeros for one of another length."""
+    def numbers(self, node: yaml.Node, field: str, count: int, low: float, high: float) -> tuple[float, ...] | None:
+        """A list of so many numbers; None for one of another length."""
         items = self.items(node, field)
         if isinstance(node, yaml.SequenceNode) and len(items) != count:
             self.complain(node, field, f"has {len(items)} numbers, not {count}")
         if len(items) != count:
-            return (0.0,) * count
+            return None
         return tuple(self.number(each, name, low, high) for name, each in items)
 
     def yes(self, node: yaml.Node, field: str) -> bool:

@@ -88,10 +88,13 @@ class _Reader:
             at = (self._place(parts, name, field) for name in ("x_m", "y_m"))
             self._walls += box(*at, *(self._size(parts, name, field) for name in ("width_m", "depth_m")))
         for field, node in self._few(top, "walls"):
-            x1, y1, x2, y2 = marks.numbers(node, field, 4, -FAR_M, FAR_M)
+            wall = marks.numbers(node, field, 4, -FAR_M, FAR_M)
+            if wall is None:
+                continue
+            x1, y1, x2, y2 = wall
             if hypot(x2 - x1, y2 - y1) >= SMALLEST_M:
                 self._walls.append((x1, y1, x2, y2))
-            elif isinstance(node, yaml.SequenceNode):
+            else:
                 marks.complain(node, field, f"is shorter than {SMALLEST_M:g} m: write [x1, y1, x2, y2]")
         line = self._line(top["line"]) if "line" in top else ()
         things = {name: self._thing(name, node) for name, node in self._named(top, "things").items()}
@@ -123,9 +126,12 @@ class _Reader:
     def _thing(self, name: str, node: yaml.Node) -> Thing:
         marks, field = self._marks, f"things.{name}"
         parts = marks.fields(node, field, _THING)
-        disc, boxed = "radius_m" in parts, "width_m" in parts or "depth_m" in parts
-        if isinstance(node, yaml.MappingNode) and disc == boxed:
+        disc, boxed = "radius_m" in parts, {"width_m", "depth_m"} <= parts.keys()
+        if isinstance(node, yaml.MappingNode) and disc == bool({"width_m", "depth_m"} & parts.keys()):
             marks.complain(node, field, "is a disc or a box: write radius_m, or width_m and depth_m")
+        elif isinstance(node, yaml.MappingNode) and not disc and not boxed:
+            lacks = "depth_m" if "width_m" in parts else "width_m"
+            marks.complain(node, f"{field}.{lacks}", "is missing: a box has both")
         path = self._points(parts["path"], f"{field}.path") if "path" in parts else ()
         if "path" in parts and len(set(path)) < 2:
             marks.complain(parts["path"], f"{field}.path", "has at least 2 points [x, y] that differ")
@@ -198,7 +204,8 @@ class _Reader:
                 marks.complain(node, field, f"begins in a wall: at least {RADIUS_M:g} m from each")
             for thing in things:
                 at = thing.pose(0.0)
-                if not thing.carried_by and thing.depth(at, pose.x_m, pose.y_m, RADIUS_M) > 0:
+                # One without an extent is faulty itself.
+                if thing.extent_m and not thing.carried_by and thing.depth(at, pose.x_m, pose.y_m, RADIUS_M) > 0:
                     marks.complain(node, field, f"begins in {thing.name}, a thing: at least {RADIUS_M:g} m from it")
         for (one, first), (other, second) in combinations(found.items(), 2):
             away = hypot(first.x_m - second.x_m, first.y_m - second.y_m)
@@ -232,8 +239,9 @@ class _Reader:
             self._marks.complain(items[MOST][1], field, f"has {len(items)} points: at most {MOST}")
         points = []
         for name, each in items[:MOST]:
-            x, y = self._marks.numbers(each, name, 2, -FAR_M, FAR_M)
-            points.append((x, y))
+            point = self._marks.numbers(each, name, 2, -FAR_M, FAR_M)
+            if point is not None:
+                points.append((point[0], point[1]))
         return tuple(points)
 
     def _place(self, parts: Mapping[str, yaml.Node], name: str, field: str) -> float:
@@ -241,15 +249,8 @@ class _Reader:
 
     def _size(self, parts: Mapping[str, yaml.Node], name: str, field: str) -> float:
         if name not in parts:
-            if field.startswith("things."):
-                self._marks.complain(*self._box_lacks(parts, name, field))
-            return 1.0
+            return 1.0  # and `fields` has said so
         return self._marks.number(parts[name], f"{field}.{name}", SMALLEST_M, FAR_M)
-
-    @staticmethod
-    def _box_lacks(parts: Mapping[str, yaml.Node], name: str, field: str) -> tuple[yaml.Node, str, str]:
-        other = parts["depth_m" if name == "width_m" else "width_m"]
-        return other, f"{field}.{name}", "is missing: a box has both"
 
     def _heading(self, parts: Mapping[str, yaml.Node], field: str) -> float:
         if "heading_deg" not in parts:

@@ -51,10 +51,13 @@ def reach(segment: Segment, away: float) -> Segment:
 
 
 def foot(x: float, y: float, segment: Segment) -> Point:
-    """The point of a segment (of a length other than 0) that is nearest."""
+    """The point of a segment that is nearest."""
     x1, y1, x2, y2 = segment
     wx, wy = x2 - x1, y2 - y1
-    share = min(1.0, max(0.0, ((x - x1) * wx + (y - y1) * wy) / (wx * wx + wy * wy)))
+    square = wx * wx + wy * wy
+    if square == 0:  # also that of a length of 1e-200
+        return x1, y1
+    share = min(1.0, max(0.0, ((x - x1) * wx + (y - y1) * wy) / square))
     return x1 + share * wx, y1 + share * wy
 
 
@@ -76,9 +79,8 @@ def _cross(a: Segment, b: Segment) -> bool:
     def side(line: Segment, x: float, y: float) -> float:
         return (line[2] - line[0]) * (y - line[1]) - (line[3] - line[1]) * (x - line[0])
 
-    return (
-        side(a, *b[:2]) * side(a, *b[2:]) < 0 and side(b, *a[:2]) * side(b, *a[2:]) < 0
-    )  # touching ends have a distance of 0
+    # Ends that only touch have a distance of 0 anyway.
+    return side(a, *b[:2]) * side(a, *b[2:]) < 0 and side(b, *a[:2]) * side(b, *a[2:]) < 0
 
 
 def ray_to_segment(x: float, y: float, dx: float, dy: float, segment: Segment) -> Hit | None:

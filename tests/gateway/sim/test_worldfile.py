@@ -1,0 +1,269 @@
+"""World files: what each field becomes, each fault with its line and column, and that no text is a traceback."""
+
+import random
+import subprocess
+import sys
+from math import radians
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.sim.core.firmware import Pose
+from gateway.sim.core.things import Lamp, Thing
+from gateway.sim.core.world import World
+from gateway.sim.marks import LARGEST_BYTES, BadWorld
+from gateway.sim.worldfile import WorldSpec, read_world
+
+DEPLOY = Path(__file__).parents[3] / "deploy"
+EVERYTHING = """\
+room: {width_m: 6, depth_m: 0x04}
+boxes:
+  - {x_m: 1, y_m: 1, width_m: 0.5, depth_m: 0.5}
+walls: [[0, 0, 1, 0.5]]
+line: [[0, 0], [1, 0], [1, 1]]
+cars_meet: false
+cars:
+  red: {x_m: -1, y_m: -1, heading_deg: 90}
+  "011": {x_m: -2, y_m: -1}
+things:
+  cart: {radius_m: 0.1, path: [[0, 0], [1, 0], [2, 0]], there_and_back: true, speed_m_s: 0.1, waits_for_m: 1}
+  crate: {x_m: 1, y_m: 2, width_m: 0.4, depth_m: 0.2, heading_deg: -90}
+  mast: {carried_by: red, x_m: -0.1, radius_m: 0.02}
+lamps:
+  sun: {x_m: 0, y_m: 0, reach_m: 10, brightness: 4, on: false, overhead: true}
+  back: {carried_by: red, x_m: -0.1}
+  top: {carried_by: cart}
+"""
+
+
+def test_every_field() -> None:
+    spec = read_world(EVERYTHING, "w.yaml", ["red"])
+    assert len(spec.walls) == 9
+    assert spec.walls[8] == (0, 0, 1, 0.5)
+    assert spec.line == ((0, 0), (1, 0), (1, 1))
+    assert not spec.cars_meet
+    assert spec.starts == {"red": Pose(-1, -1, radians(90)), "011": Pose(-2, -1, 0)}
+    assert spec.things == (
+        Thing(
+            "cart",
+            radius_m=0.1,
+            path=((0, 0), (1, 0), (2, 0), (1, 0)),
+            speed_m_s=0.1,
+            waits_for_m=1,
+        ),
+        Thing("crate", 1, 2, width_m=0.4, depth_m=0.2, heading_rad=radians(-90)),
+        Thing("mast", -0.1, 0, radius_m=0.02, carried_by="red"),
+    )
+    assert spec.lamps == (
+        Lamp(0, 0, 10, 4, on=False, overhead=True, name="sun"),
+        Lamp(-0.1, 0, name="back", carried_by="red"),
+        Lamp(0, 0, name="top", carried_by="cart"),
+    )
+    assert spec.world().start_pose(5, "red") == Pose(-1, -1, radians(90))
+    assert spec.world().lively
+
+
+def test_the_room_of_the_file_is_the_room() -> None:
+    spec, room = read_world((DEPLOY / "world.room.yaml").read_text(), "room"), World.room()
+    world = spec.world()
+    assert (world.walls, world.line, world.lively) == (room.walls, room.line, False)
+    assert [world.start_pose(index, "red") for index in range(9)] == [room.start_pose(index) for index in range(9)]
+
+
+def test_the_follow_world_begins_with_room_for_all() -> None:
+    spec = read_world((DEPLOY / "world.follow.yaml").read_text(), "follow", ["red", "green", "blue"])
+    assert list(spec.starts) == ["red", "green", "blue"]
+    assert spec.cars_meet
+
+
+FAULTS = [
+    ("room: {width_m: 6, depth_m: 0}", ["1:29: room.depth_m: '0' is not allowed: a number from 0.02 to 100"]),
+    ("room: {width_m: 6}", ["1:7: room.depth_m: is missing"]),
+    ("room: 5", ["1:7: room: '5' is not allowed: write fields"]),
+    ("rooms: {}", ["1:1: rooms: is not known here: use room, walls"]),
+    ("cars_meet: yes", ["1:12: cars_meet: 'yes' is not allowed: true or false"]),
+    ("cars_meet: true\ncars_meet: false", ["2:1: cars_meet: is given twice, first in line 1"]),
+    (
+        "walls: [[1, 2, 3], [0, 0, 0, 0], [1, 2, 3, .inf], 7]",
+        ["1:9: walls[0]: has 3 numbers, not 4", "1:20: walls[1]:", "1:44: walls[2][3]: '.inf'", "1:51: walls[3]: '7'"],
+    ),
+    ("walls: {}", ["1:8: walls: a mapping is not allowed: write a list"]),
+    ("line: [[0, 0], [1, 0]]", ["1:7: line: is a closed loop: at least 3 points"]),
+    (
+        "line: {width_m: 2, depth_m: 1, radius_m: 0.6}",
+        ["1:42: line.radius_m: 0.6 is not allowed: up to half of the shorter side, 0.5"],
+    ),
+    ("lamps: {a: {x_m: 1}}", ["1:12: lamps.a.y_m: is missing"]),
+    ("lamps: {A: {x_m: 1, y_m: 1}}", ["1:12: lamps: name 'A' is not allowed"]),
+    ("lamps: {1: {x_m: 1, y_m: 1}}", ["1:9: lamps: key '1' is no word: write it in quotes"]),
+    (
+        "lamps: {a: {x_m: 1, y_m: 1, on: 1, reach_m: 0, brightness: true}}",
+        [
+            "1:33: lamps.a.on: '1'",
+            "1:45: lamps.a.reach_m: '0' is not allowed: a number above 0 and up to 100",
+            "1:60: lamps.a.brightness: 'true'",
+        ],
+    ),
+    (
+        "lamps: {a: {carried_by: pink}}",
+        ["1:25: lamps.a.carried_by: no car or thing 'pink' is simulated here: use red, green"],
+    ),
+    ("things: {a: {x_m: 1, y_m: 1}}", ["1:13: things.a: is a disc or a box"]),
+    ("things: {a: {x_m: 1, y_m: 1, radius_m: 1, width_m: 1}}", ["1:13: things.a: is a disc or a box"]),
+    ("things: {a: {x_m: 1, y_m: 1, width_m: 1}}", ["things.a.depth_m: is missing: a box has both"]),
+    (
+        "things: {a: {radius_m: 1}}",
+        ["things.a.x_m: is missing: where it stands, or a path", "things.a.y_m: is missing"],
+    ),
+    (
+        "things: {a: {radius_m: 1, path: [[0, 0], [0, 0]]}}",
+        ["1:33: things.a.path: has at least 2 points [x, y] that differ"],
+    ),
+    (
+        "things: {a: {radius_m: 1, x_m: 0, y_m: 0, speed_m_s: 0.1}}",
+        ["1:54: things.a.speed_m_s: is not allowed without a path"],
+    ),
+    (
+        "things: {a: {radius_m: 1, path: [[0, 0], [1, 0]], speed_m_s: 0.6, x_m: 1, carried_by: red}}",
+        [
+            "a number from 0 to 0.5",
+            "things.a.x_m: is not allowed beside a path",
+            "things.a.carried_by: is not allowed beside",
+        ],
+    ),
+    ("cars: {red: {x_m: 0}}", ["1:13: cars.red.y_m: is missing"]),
+    (
+        "cars: {red: {x_m: 0, y_m: 0}, green: {x_m: 0.2, y_m: 0}}",
+        ["1:38: cars.green: begins 0.2 m from red: at least 0.26 m"],
+    ),
+    ("walls: [[0, 0, 1, 0]]\ncars: {red: {x_m: 0, y_m: 0.1}}", ["2:13: cars.red: begins in a wall"]),
+    (
+        "things: {b: {x_m: 0, y_m: 0, width_m: 1, depth_m: 1}}\ncars: {red: {x_m: 0.1, y_m: 0.1}}",
+        ["2:13: cars.red: begins in b"],
+    ),
+    ("cars: &a {red: {x_m: 0, y_m: 0}}\nlamps: *a", ["1:7: is no YAML that is allowed here: anchors and aliases"]),
+    ("cars: !!map {}", ["1:7: is no YAML that is allowed here: tags"]),
+    ("[" * 5000, ["1:9: is no YAML that is allowed here: nested more than 8 deep"]),
+    ("room:\n\t- 1", ["2:1: is no YAML"]),
+    ("a: 1\n---\nb: 2", ["2:1: is no YAML"]),
+    ("", ["1:1: is empty"]),
+    ("# nothing", ["1:1: is empty"]),
+    ("\x00", ["1:1: a character that is not allowed"]),
+    ("%YAML " + "9" * 5000 + ".1\n---\na: 1", ["is no YAML"]),
+    ("room: {width_m: " + "9" * 5000 + ", depth_m: 1}", ["1:17: room.width_m: '9999"]),
+    ("#" * (LARGEST_BYTES + 1), ["1:1: has more than 64 KiB"]),
+    ("walls: [" + "[0, 0, 1, 1], " * 250 + "]", ["walls: has 250 of them: at most 200"]),
+    ("- 1", ["1:1: a list is not allowed: write fields"]),
+]
+
+
+@pytest.mark.parametrize(("text", "faults"), FAULTS, ids=[text[:40] for text, _ in FAULTS])
+def test_faults(text: str, faults: list[str]) -> None:
+    with pytest.raises(BadWorld) as error:
+        read_world(text, "w.yaml", ["red", "green"])
+    lines = str(error.value).splitlines()
+    assert len(lines) == len(faults), lines
+    for line, words in zip(lines, faults, strict=True):
+        assert line.startswith("w.yaml:")
+        assert words in line
+
+
+def test_all_faults_are_told_at_once_in_their_order() -> None:
+    text = EVERYTHING.replace("width_m: 6", "width_m: six").replace("on: false", "on: maybe")
+    with pytest.raises(BadWorld) as error:
+        read_world(text, "w.yaml", ["red"])
+    assert [line.split(": ")[:2] for line in str(error.value).splitlines()] == [
+        ["w.yaml:1:17", "room.width_m"],
+        ["w.yaml:15:57", "lamps.sun.on"],
+    ]
+
+
+SCRAPS = st.sampled_from(
+    [
+        *EVERYTHING.split(),
+        "{",
+        "}",
+        "[",
+        "]",
+        ":",
+        "- ",
+        "\n",
+        "\n  ",
+        "&a",
+        "*a",
+        "!!int",
+        "!x",
+        "|",
+        ">",
+        "'",
+        '"',
+        "---",
+        "...",
+        "?",
+        ",",
+        "%YAML",
+        "0x",
+        "1e999",
+        ".nan",
+        "~",
+        "<<",
+        "\t",
+        "\ufeff",
+        "\ud800",
+        "9" * 400,
+    ]
+)
+
+
+def read(text: str) -> WorldSpec | None:
+    try:
+        return read_world(text, "w.yaml", ["red"])
+    except BadWorld as error:
+        assert all(line.startswith("w.yaml:") for line in str(error).splitlines())  # noqa: PT017 - either is fine
+        return None
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(SCRAPS, max_size=40).map(" ".join) | st.text(max_size=80))
+def test_no_text_is_a_traceback(text: str) -> None:
+    read(text)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.randoms(use_true_random=False), st.integers(1, 4))
+def test_a_good_file_with_something_changed_is_a_world_or_a_list_of_faults(chance: random.Random, count: int) -> None:
+    text = EVERYTHING
+    for _ in range(count):
+        at = chance.randrange(len(text))
+        end = min(len(text), at + chance.choice((0, 1, 1, 3, 20)))
+        text = (
+            text[:at]
+            + chance.choice(("", "9", "-", "x", "{", "]", "\n", " ", ": ", "true", "1e9", "null"))
+            + text[end:]
+        )
+    spec = read(text)
+    if spec is not None:
+        spec.world()
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("nothing.yaml", None, "No such file or directory: write room, open or the path of a file"),
+        ("bytes.yaml", b"room: \xff", "is no UTF-8"),
+        ("large.yaml", b"\xff" * 2 * LARGEST_BYTES, "has more than 64 KiB"),
+        ("faulty.yaml", b"foo: 1\nbar: 2\n", "faulty.yaml:2:1: bar: is not known here"),
+        ("carried.yaml", b"lamps: {a: {carried_by: blue}}", "no car or thing 'blue' is simulated here: use red"),
+    ],
+)
+def test_gateway_sim_refuses_a_faulty_world(tmp_path: Path, name: str, data: bytes | None, words: str) -> None:
+    path = tmp_path / name
+    if data is not None:
+        path.write_bytes(data)
+    command = [sys.executable, "-m", "gateway.sim", "--no-truth", "--car", "red:arduino:pty", "--world", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
