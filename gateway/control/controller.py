@@ -191,7 +191,13 @@ class Controller(Evidence):
     def _lease(self, command: Command, now: float) -> None:
         """The car is the sender's while it drives; who had it is told by whom it was taken."""
         sender, before = command.sender, self.safety.leased(now)
-        lasts_s = command.what.duration_s if isinstance(command.what, Drive) else 0.0
+        match command.what:
+            case Drive(duration_s=lasts_s):
+                pass
+            case SetMode():
+                lasts_s = 0.0
+            case _:  # what is asked on the way does not shorten it
+                lasts_s = self.expires_in_s(now) if self.owner == sender.name else 0.0
         self.safety.grant(sender, now + lasts_s)
         if before is None or before.holder == sender:
             return

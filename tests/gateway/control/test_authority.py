@@ -4,6 +4,7 @@ import pytest
 
 from gateway.control.records import (
     Act,
+    ChangeSpeed,
     Drive,
     EmergencyStop,
     Kind,
@@ -14,10 +15,11 @@ from gateway.control.records import (
     SetMode,
     Stop,
     TakeLease,
+    What,
 )
 from gateway.control.safety import Estop, Kept
 from gateway.protocol.encode import ColorLed
-from gateway.protocol.values import Mode, Motion
+from gateway.protocol.values import Mode, Motion, SpeedStep
 from tests.gateway.control.desk import COORDINATOR, MODE00, PERSON, RUN, SCRIPT, STOP, TRACKING, Desk
 
 SENT, QUEUED, REJECTED, SUPERSEDED = Phase.SENT, Phase.QUEUED, Phase.REJECTED, Phase.SUPERSEDED
@@ -145,6 +147,15 @@ def test_between_persons_the_holder_keeps_it_unless_it_is_taken(desk: Desk) -> N
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert desk.ask(FORWARD, PERSON).reason is Reason.LEASED
     assert desk.ask(FORWARD, SCRIPT, take=True).reason is Reason.LEASED, "only a person may take"
+
+
+@pytest.mark.parametrize("what", [TakeLease(), ChangeSpeed(SpeedStep.UP)])
+def test_what_is_asked_on_the_way_does_not_shorten_the_lease(desk: Desk, what: What) -> None:
+    desk.ask(FORWARD, PERSON)
+    desk.run(0.5)
+    assert desk.ask(what, PERSON).status in (SENT, QUEUED)
+    desk.run(3.5)
+    assert desk.ask(FORWARD, BOB).reason is Reason.LEASED, "mia drives still"
 
 
 def test_taking_the_lease_alone_stops_what_the_other_drove(desk: Desk) -> None:
