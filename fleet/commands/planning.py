@@ -47,7 +47,7 @@ def _told(reading: Reading) -> str:
     return "\n".join(lines)
 
 
-@click.group()
+@click.group(epilog="\b\nexample:\n  fleet plan check deploy/plan.yaml --fleet-file fleet.yaml")
 def plan() -> None:
     """Plans: what the coordinator keeps true."""
 
