@@ -28,11 +28,14 @@ class Pair:
         told: str | None = None,
         transport: Transport = Transport.SERIAL,
         start_s: float = 0.0,
+        name: str = "red",
     ) -> None:
         self.now = 0.0
-        self.car: Firmware = build(platform, world or World.room(), 0, random.Random(seed), transport=transport)
+        self.car: Firmware = build(
+            platform, world or World.room(), 0, random.Random(seed), transport=transport, name=name
+        )
         self.transport = transport
-        self.control = Controller("red", parse_platform(told or platform))
+        self.control = Controller(name, parse_platform(told or platform))
         self.decoder = Decoder()
         self.sent: list[tuple[float, bytes]] = []
         self.records: list[CommandRecord] = []

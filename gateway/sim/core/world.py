@@ -265,7 +265,7 @@ class World:
             after = distance(x, y, wall)
             if after < min(RADIUS_M, distance(old_x, old_y, wall)) - _HAIR_M:
                 return False
-            if (old_x, old_y) != (x, y) and apart((old_x, old_y, x, y), wall) == 0:
+            if (old_x, old_y) != (x, y) and apart((old_x, old_y, x, y), wall) <= _HAIR_M:
                 return False
         return all(
             hypot(x - ox, y - oy) >= min(2 * RADIUS_M, hypot(old_x - ox, old_y - oy)) - _HAIR_M for ox, oy in cars
@@ -296,7 +296,7 @@ class World:
         sight: Segment = (*a, *b)
         if a == b:
             return True
-        if any(apart(sight, wall) == 0 for wall in self.walls):
+        if any(apart(sight, wall) <= _HAIR_M for wall in self.walls):
             return False
         ignored = set(without)
         for other in self.others(None):
@@ -308,7 +308,7 @@ class World:
             if thing.radius_m:
                 if distance(pose.x_m, pose.y_m, sight) < thing.radius_m:
                     return False
-            elif any(apart(sight, side) == 0 for side in thing.sides(pose)):
+            elif any(apart(sight, side) <= _HAIR_M for side in thing.sides(pose)):
                 return False
         return True
 
