@@ -49,6 +49,8 @@ TOGETHER_S: Final = 0.2
 HEALTH_EVERY_S: Final = 1.0
 TURN_BYTES: Final = 1024
 """Bytes that are looked at before others get their turn, a stop above all; a car sends 960 a second."""
+CANCEL_S: Final = 0.5
+"""A task that goes on for so long after it was cancelled is cancelled again."""
 FRESH_S: Final = 0.25
 """Bytes that could not be looked at so soon are not looked at: what comes after them matters more."""
 FLOOD_OVER_S: Final = 10.0
@@ -162,8 +164,13 @@ class Car:
                 await asyncio.wait([stopped, tasks[1]], return_when=asyncio.FIRST_COMPLETED)
                 failed[0].result()
         finally:
-            for task in (stopped, *tasks):
-                task.cancel()
+            running = {stopped, *tasks}
+            while (
+                running
+            ):  # Python 3.11's wait_for may swallow one: a link that closes at that moment opened again for ever
+                for task in running:
+                    task.cancel()
+                _, running = await asyncio.wait(running, timeout=CANCEL_S)
             await asyncio.gather(stopped, *tasks, return_exceptions=True)
             if self._link is not None:
                 await self._link.close()
