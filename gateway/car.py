@@ -49,6 +49,8 @@ TOGETHER_S: Final = 0.2
 HEALTH_EVERY_S: Final = 1.0
 TURN_BYTES: Final = 1024
 """Bytes that are looked at before others get their turn, a stop above all; a car sends 960 a second."""
+PAUSE_S: Final = 0.002
+"""Between the slices of a long answer: the link takes one meanwhile, and drops what it has no room for."""
 CANCEL_S: Final = 0.5
 """A task that goes on for so long after it was cancelled is cancelled again."""
 FRESH_S: Final = 0.25
@@ -165,9 +167,8 @@ class Car:
                 failed[0].result()
         finally:
             running = {stopped, *tasks}
-            while (
-                running
-            ):  # Python 3.11's wait_for may swallow one: a link that closes at that moment opened again for ever
+            # Python 3.11's wait_for may swallow a cancellation: a link that closes at that moment opened again for ever.
+            while running:
                 for task in running:
                     task.cancel()
                 _, running = await asyncio.wait(running, timeout=CANCEL_S)
@@ -337,7 +338,7 @@ class Car:
     def _answer(self, rest: Iterator[None]) -> None:
         """Answer a query of readings, the car's own work in between."""
         for _ in rest:
-            self._loop.call_soon(self._answer, rest)
+            self._loop.call_later(PAUSE_S, self._answer, rest)
             return
 
     def _query(self, query: zenoh.Query) -> None:
