@@ -310,6 +310,46 @@ def test_it_says_what_it_hosts_takes_faults_and_ends_clean(
     assert sim.popen.stderr.read() == ""
 
 
+def test_lamps_are_switched_and_things_moved_while_it_runs(started: list[Process]) -> None:
+    cars = [word for name in ("red", "green", "blue") for word in ("--car", f"{name}:arduino:pty")]
+    sim = Process(*cars, "--no-truth", "--world", str(Path(__file__).parents[3] / "deploy" / "world.follow.yaml"))
+    started.append(sim)
+    red, _, _ = (sim.line() for _ in range(3))
+    with serial.Serial(red["link"].removeprefix("serial://"), timeout=PATIENCE) as port:
+        assert b",GM11#" in port.read_until(b"#")
+        assert sim.ask(lamp="beacon", on=False) == {"ok": True, "lamp": "beacon"}
+        port.reset_input_buffer()
+        port.read_until(b"#")  # the one that may have begun before
+        assert b",GM00#" in port.read_until(b"#")
+        port.write(RUN)
+        assert sim.ask(thing="cart", x_m=0.9, y_m=1) == {"ok": True, "thing": "cart"}
+        while sim.ask(car="red", ask="truth")["x_m"] < 1.0:  # where the cart was
+            time.sleep(0.01)
+    world = sim.ask(ask="world")
+    assert world["things"]["cart"] == {
+        "x_m": 0.9,
+        "y_m": 1.0,
+        "heading_rad": 0.0,
+        "radius_m": 0.06,
+        "speed_m_s": 0.0,
+        "carried_by": "",
+    }
+    lamp = world["lamps"]["beacon"]
+    assert (lamp["x_m"], lamp["y_m"], lamp["on"], lamp["carried_by"]) == (0.9, 1.0, False, "cart")
+    for fields, words in (
+        ({"lamp": "sun"}, "lamp 'sun' is not in this world: use beacon"),
+        ({"thing": ["cart"], "x_m": 1}, "is not in this world: use cart"),
+        ({"lamp": "beacon"}, "nothing to change in lamp 'beacon': give on, x_m"),
+        ({"lamp": "beacon", "on": 1}, "on 1 is not allowed: true or false"),
+        ({"lamp": "beacon", "color": 1}, "field 'color' is not allowed in lamp: use on, x_m"),
+        ({"thing": "cart", "x_m": 1e9}, "a number from -100 to 100"),
+        ({"thing": "cart", "speed_m_s": 0.1}, "speed_m_s 0.1 is not allowed: cart has no path"),
+    ):
+        answer = sim.ask(**fields)
+        assert not answer["ok"]
+        assert words in answer["error"]
+
+
 def test_faults_of_the_command_line_come_at_their_time(started: list[Process], tmp_path: Path) -> None:
     path = tmp_path / "red"
     sim = Process("--car", f"red:arduino:pty:{path}", "--no-truth", "--fault", "red:link_drop@0.2+0.3")
