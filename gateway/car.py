@@ -49,7 +49,7 @@ TOGETHER_S: Final = 0.2
 HEALTH_EVERY_S: Final = 1.0
 TURN_BYTES: Final = 1024
 """Bytes that are looked at before others get their turn, a stop above all; a car sends 960 a second."""
-PAUSE_S: Final = 0.002
+PAUSE_S: Final = 0.005
 """Between the slices of a long answer: the link takes one meanwhile, and drops what it has no room for."""
 CANCEL_S: Final = 0.5
 """A task that goes on for so long after it was cancelled is cancelled again."""
@@ -167,7 +167,7 @@ class Car:
                 failed[0].result()
         finally:
             running = {stopped, *tasks}
-            # Python 3.11's wait_for may swallow a cancellation: a link that closes at that moment opened again for ever.
+            # Python 3.11's wait_for may swallow a cancellation: a link that closed just then was opened again for ever.
             while running:
                 for task in running:
                     task.cancel()
