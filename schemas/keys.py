@@ -11,6 +11,7 @@ _NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 COORDINATOR: Final = "@coordinator"
 RECORDER: Final = "@recorder"
 SUPERVISOR: Final = "@supervisor"
+SIMULATOR: Final = "@sim"
 OPERATOR: Final = "@operator"
 
 
@@ -68,7 +69,7 @@ def operator_token(fleet: str, sender: str) -> str:
 
 def recorded(fleet: str) -> tuple[str, ...]:
     """What a recorder subscribes to: `**` does not match chunks that begin with @."""
-    services = (f"{fleet}/{service}/**" for service in (COORDINATOR, RECORDER, SUPERVISOR))
+    services = (f"{fleet}/{service}/**" for service in (COORDINATOR, RECORDER, SUPERVISOR, SIMULATOR))
     return (f"{fleet}/**", *services, f"{fleet}/*/@cmd/drive")
 
 

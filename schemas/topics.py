@@ -233,6 +233,15 @@ SERVICE_TOPICS: Final = (
         {"uptime_s": "s"},
         entity="supervisor",
     ),
+    Topic(
+        "@sim/world",
+        "fleet.v1.World",
+        "a simulated world with lamps, things or cars that meet: where all is but the cars",
+        Qos.READING,
+        10.0,
+        _STATE,
+        entity="sim/world",
+    ),
 )
 
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({topic.name: topic for topic in CAR_TOPICS + SERVICE_TOPICS})

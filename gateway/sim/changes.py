@@ -4,7 +4,7 @@ How a lamp or a thing is made is worldfile.py's part.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from gateway.sim.core.things import FAR_M, FASTEST_M_S, Lamp, Thing
 from gateway.sim.core.world import World
@@ -13,6 +13,8 @@ from gateway.sim.spec import BadSpec
 
 Change = Callable[[World, float], None]
 """Carried out on a world at a time."""
+Said = Mapping[str, Mapping[str, Mapping[str, Any]]]
+"""`lamps` and `things`: by name, their fields."""
 
 _Kind = TypeVar("_Kind", Lamp, Thing)
 _PLACE: Final = {"x_m": (-FAR_M, FAR_M), "y_m": (-FAR_M, FAR_M)}
@@ -72,9 +74,10 @@ def _numbers(
     return {word: number(word, fields[word], *ranges[word]) for word in ranges if word in fields}
 
 
-def as_it_is(world: World, now: float) -> dict[str, object]:
+def as_it_is(world: World, now: float) -> Said:
     """Lamps and things as they are, for the control channel; without those whose carrier is not there."""
-    lamps, things = {}, {}
+    lamps: dict[str, dict[str, Any]] = {}
+    things: dict[str, dict[str, Any]] = {}
     for lamp in world.lamps:
         at = world.shines(lamp, now)
         if at is not None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from math import inf
 from typing import Final, Protocol
 
-from gateway.sim.changes import Change, as_it_is
+from gateway.sim.changes import Change, Said, as_it_is
 from gateway.sim.core.cars import build
 from gateway.sim.core.firmware import Firmware, Pose, Truth
 from gateway.sim.core.line import Line, Way
@@ -365,7 +365,7 @@ class Simulation:
         self.world.advance(now)
         change(self.world, now)
 
-    def world_as_it_is(self) -> dict[str, object]:
+    def world_as_it_is(self) -> Said:
         """Lamps and things now."""
         now = asyncio.get_running_loop().time()
         self.world.advance(now)

@@ -1,13 +1,20 @@
 """What is so, published: `<fleet>/<car>/sim/truth` at 10 Hz and on every change, as long as there is a hub.
 
+Of a world with lamps, things or cars that meet also `<fleet>/@sim/world`: at 10 Hz while it changes, else at 1 Hz.
+
 The simulator runs without a bus just as well; this waits for a hub, never starts one.
 """
 
 import asyncio
 import threading
 import time
+from collections.abc import Callable
+from math import inf
 from typing import Final
 
+from gateway.sim.changes import Said
+from gateway.sim.core.geometry import Point
+from gateway.sim.core.world import World
 from gateway.sim.shell import SimCar, Simulation
 from schemas import keys
 from schemas.bus import Bus, BusError, Publisher
@@ -15,6 +22,7 @@ from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
 
 PERIOD_S: Final = 0.1
+REPEAT_S: Final = 1.0
 LOOK_AGAIN_S: Final = 0.3
 OPEN_WITHIN_S: Final = 0.3
 
@@ -40,10 +48,12 @@ class TruthPublisher:
                 key = keys.topic_key(self._fleet, name, topic.name)
                 self._publishers[name] = self._bus.publisher(key, topic, name)
                 car.watchers.append(self._put)
+            publish_world = self._world_publisher()
             due = loop.time()
             while True:
                 for car in cars.values():
                     self._put(car)
+                publish_world(loop.time())
                 # From one origin, so that the rate does not drift; a stalled loop does not catch up.
                 due = max(due + PERIOD_S, loop.time())
                 await asyncio.sleep(due - loop.time())
@@ -53,6 +63,26 @@ class TruthPublisher:
                     car.watchers.remove(self._put)
             if self._bus is not None:
                 self._bus.close()
+
+    def _world_publisher(self) -> Callable[[float], None]:
+        """What publishes the world, if it is one of which more is to be said than where its cars are."""
+        world, topic = self._simulation.world, TOPICS["@sim/world"]
+        if self._bus is None or not (world.lively or world.lamps):
+            return lambda _: None
+        key = keys.topic_key(self._fleet, keys.SIMULATOR, "world")
+        publisher = self._bus.publisher(key, topic, keys.SIMULATOR)
+        last, said_at = fleet_v1_pb2.World(), -inf
+
+        def publish(now: float) -> None:
+            nonlocal last, said_at
+            message = world_message(world, self._simulation.world_as_it_is())
+            if message == last and now - said_at < REPEAT_S:
+                return
+            last.CopyFrom(message)
+            said_at = now
+            publisher.put(message, time.time_ns())
+
+        return publish
 
     async def _open(self, loop: asyncio.AbstractEventLoop) -> Bus:
         """Opening blocks, so it has a thread; a daemon, since a hub that is not there must not hold up our end."""
@@ -98,3 +128,18 @@ class TruthPublisher:
             led=truth.led,
         )
         self._publishers[car.spec.name].put(message, time.time_ns())
+
+
+def world_message(world: World, said: Said) -> fleet_v1_pb2.World:
+    """The world as it is: what never moves, and lamps and things as the control channel has them."""
+    walls = [((x1, y1), (x2, y2)) for x1, y1, x2, y2 in world.walls]
+    return fleet_v1_pb2.World(
+        lamps=[fleet_v1_pb2.SimLamp(name=name, **fields) for name, fields in said["lamps"].items()],
+        things=[fleet_v1_pb2.SimThing(name=name, **fields) for name, fields in said["things"].items()],
+        walls=[fleet_v1_pb2.SimWall(begin=_point(begin), end=_point(end)) for begin, end in walls],
+        line=[_point(point) for point in world.line],
+    )
+
+
+def _point(point: Point) -> fleet_v1_pb2.SimPoint:
+    return fleet_v1_pb2.SimPoint(x_m=point[0], y_m=point[1])

@@ -442,6 +442,82 @@ class Truth(_message.Message):
     led: str
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., heading_rad: _Optional[float] = ..., mode: _Optional[str] = ..., motor_left: _Optional[int] = ..., motor_right: _Optional[int] = ..., blocked: _Optional[bool] = ..., fan: _Optional[bool] = ..., led: _Optional[str] = ...) -> None: ...
 
+class SimLamp(_message.Message):
+    __slots__ = ("name", "x_m", "y_m", "on", "brightness", "reach_m", "carried_by")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    Y_M_FIELD_NUMBER: _ClassVar[int]
+    ON_FIELD_NUMBER: _ClassVar[int]
+    BRIGHTNESS_FIELD_NUMBER: _ClassVar[int]
+    REACH_M_FIELD_NUMBER: _ClassVar[int]
+    CARRIED_BY_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    x_m: float
+    y_m: float
+    on: bool
+    brightness: float
+    reach_m: float
+    carried_by: str
+    def __init__(self, name: _Optional[str] = ..., x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., on: _Optional[bool] = ..., brightness: _Optional[float] = ..., reach_m: _Optional[float] = ..., carried_by: _Optional[str] = ...) -> None: ...
+
+class SimThing(_message.Message):
+    __slots__ = ("name", "x_m", "y_m", "heading_rad", "radius_m", "width_m", "depth_m", "speed_m_s", "carried_by")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    Y_M_FIELD_NUMBER: _ClassVar[int]
+    HEADING_RAD_FIELD_NUMBER: _ClassVar[int]
+    RADIUS_M_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_M_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_M_FIELD_NUMBER: _ClassVar[int]
+    SPEED_M_S_FIELD_NUMBER: _ClassVar[int]
+    CARRIED_BY_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    x_m: float
+    y_m: float
+    heading_rad: float
+    radius_m: float
+    width_m: float
+    depth_m: float
+    speed_m_s: float
+    carried_by: str
+    def __init__(self, name: _Optional[str] = ..., x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., heading_rad: _Optional[float] = ..., radius_m: _Optional[float] = ..., width_m: _Optional[float] = ..., depth_m: _Optional[float] = ..., speed_m_s: _Optional[float] = ..., carried_by: _Optional[str] = ...) -> None: ...
+
+class SimPoint(_message.Message):
+    __slots__ = ("x_m", "y_m")
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    Y_M_FIELD_NUMBER: _ClassVar[int]
+    x_m: float
+    y_m: float
+    def __init__(self, x_m: _Optional[float] = ..., y_m: _Optional[float] = ...) -> None: ...
+
+class SimWall(_message.Message):
+    __slots__ = ("begin", "end")
+    BEGIN_FIELD_NUMBER: _ClassVar[int]
+    END_FIELD_NUMBER: _ClassVar[int]
+    begin: SimPoint
+    end: SimPoint
+    def __init__(self, begin: _Optional[_Union[SimPoint, _Mapping]] = ..., end: _Optional[_Union[SimPoint, _Mapping]] = ...) -> None: ...
+
+class World(_message.Message):
+    __slots__ = ("stamp", "car", "seq", "boot_id", "lamps", "things", "walls", "line")
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    CAR_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    LAMPS_FIELD_NUMBER: _ClassVar[int]
+    THINGS_FIELD_NUMBER: _ClassVar[int]
+    WALLS_FIELD_NUMBER: _ClassVar[int]
+    LINE_FIELD_NUMBER: _ClassVar[int]
+    stamp: _timestamp_pb2.Timestamp
+    car: str
+    seq: int
+    boot_id: str
+    lamps: _containers.RepeatedCompositeFieldContainer[SimLamp]
+    things: _containers.RepeatedCompositeFieldContainer[SimThing]
+    walls: _containers.RepeatedCompositeFieldContainer[SimWall]
+    line: _containers.RepeatedCompositeFieldContainer[SimPoint]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., lamps: _Optional[_Iterable[_Union[SimLamp, _Mapping]]] = ..., things: _Optional[_Iterable[_Union[SimThing, _Mapping]]] = ..., walls: _Optional[_Iterable[_Union[SimWall, _Mapping]]] = ..., line: _Optional[_Iterable[_Union[SimPoint, _Mapping]]] = ...) -> None: ...
+
 class Plan(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "text", "version")
     STAMP_FIELD_NUMBER: _ClassVar[int]

@@ -142,6 +142,7 @@ def make(path: Path, seconds: int = 20, writer: type[Writer] = Writer) -> Counte
         )
         supervised = pb.Supervised(name="red", kind="gateway", state="running", pid=4711)
         made.put("fleet/@supervisor/status", pb.Supervision(state="running", processes=[supervised]), second)
+        made.put("fleet/@sim/world", pb.World(lamps=[pb.SimLamp(name="beacon", on=True)]), second)
     made.close()
     return made.counts
 

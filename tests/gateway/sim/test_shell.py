@@ -418,10 +418,12 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Proce
     link = sim.line()["link"]
     hub = subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", endpoint])
     seen: list[Sample] = []
+    worlds: list[Sample] = []
     try:
         end = time.monotonic() + PATIENCE
         with Bus.open(endpoint, start_hub=True) as bus:
             bus.subscribe("mine/*/sim/truth", seen.append)
+            bus.subscribe("mine/@sim/world", worlds.append)
             while not seen:
                 assert time.monotonic() < end
                 time.sleep(0.01)
@@ -436,8 +438,42 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Proce
         assert truth.y_m == pytest.approx(-1.05)
         sequences = [sample.sequence for sample in seen]
         assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+        assert not worlds  # nothing in the room but cars
     finally:
         sim.popen.terminate()
         assert sim.popen.wait(PATIENCE) == 0
         hub.terminate()
         hub.wait(PATIENCE)
+
+
+def test_lamps_and_things_are_on_the_bus_too(started: list[Process]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    world = str(Path(__file__).parents[3] / "deploy" / "world.follow.yaml")
+    sim = Process("--car", "red:arduino:pty", "--world", world, "--connect", endpoint)
+    started.append(sim)
+    sim.line()
+    seen: list[Sample] = []
+    end = time.monotonic() + PATIENCE
+    try:
+        with Bus.open(endpoint, start_hub=True) as bus:
+            bus.subscribe("fleet/@sim/world", seen.append)
+            while not seen:
+                assert time.monotonic() < end
+                time.sleep(0.01)
+            message = seen[0].message()
+            assert (message.car, len(message.walls), message.lamps[0].name, message.lamps[0].on) == (
+                "@sim",
+                4,
+                "beacon",
+                True,
+            )
+            assert (message.lamps[0].x_m, message.lamps[0].y_m) == (message.things[0].x_m, message.things[0].y_m)
+            assert message.things[0].radius_m == pytest.approx(0.06)
+            assert sim.ask(lamp="beacon", on=False)["ok"]
+            while seen[-1].message().lamps[0].on:
+                assert time.monotonic() < end
+                time.sleep(0.01)
+    finally:
+        sim.popen.terminate()
+        assert sim.popen.wait(PATIENCE) == 0
