@@ -115,7 +115,13 @@ class Fleet:
         Sorted by key, each key's oldest first. A gateway keeps 1500 of each reading and the latest of each state:
         `history.shortfalls` says what is missing. Raises ValueError.
         """
-        return self._read(history.selector(self.expression(expression), last=last, since_s=since_s), history.ANSWER_S)
+        selector = history.selector(self.expression(expression), last=last, since_s=since_s)
+        found: list[Reading] = []
+        for _ in range(history.TRIES):
+            found = history.united(found, self._read(selector, history.ANSWER_S), last)
+            if not history.gaps(found):
+                break
+        return found
 
     def _read(self, selector: str, timeout_s: float) -> list[Reading]:
         written = selector.partition("?")[0]

@@ -10,6 +10,7 @@ from schemas import topics
 
 ANSWER_S: Final = 10.0
 """How long the whole history of many cars may take."""
+TRIES: Final = 4
 LONGEST_S: Final = 7 * 86_400.0
 
 
@@ -25,12 +26,42 @@ def selector(written: str, *, last: int | None = None, since_s: float | None = N
     return f"{written}?{';'.join(asked + ([] if last is None else [f'last={last}']))}"
 
 
+def united(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None = None) -> list[Reading]:
+    """The readings of two answers to one question: sorted by key, each key's oldest first, at most its `last`.
+
+    Answers are dropped where a link has no room for them (a blocked gateway would be worse): who sees a gap asks again.
+    """
+    boots: dict[str, int] = {}
+    found: dict[tuple[str, int, int], Reading] = {}
+    for reading in (*earlier, *more):
+        boot = boots.setdefault(reading.value.boot_id, len(boots))
+        found[(reading.key, boot, reading.value.seq)] = reading
+    ordered = [found[place] for place in sorted(found)]
+    if last is None:
+        return ordered
+    groups = itertools.groupby(ordered, key=lambda reading: reading.key)
+    return [reading for _, group in groups for reading in list(group)[-last:]]
+
+
+def gaps(readings: Iterable[Reading]) -> dict[str, int]:
+    """How many are missing between the readings of each key (sorted as `united` does), where some are."""
+    missing: dict[str, int] = {}
+    for one, other in itertools.pairwise(readings):
+        if (one.key, one.value.boot_id) == (other.key, other.value.boot_id):
+            lost = other.value.seq - one.value.seq - 1
+            if lost > 0:
+                missing[one.key] = missing.get(one.key, 0) + lost
+    return missing
+
+
 def shortfalls(
     readings: Iterable[Reading], now: datetime, *, last: int | None = None, since_s: float | None = None
 ) -> list[str]:
     """For each key (readings sorted by key) of which less came than was asked, why, if it is known; states at once."""
     said, states = [], 0
-    for key, group in itertools.groupby(readings, key=lambda reading: reading.key):
+    every = list(readings)
+    said += [f"{key}: {count} in between were lost on the way, ask again" for key, count in gaps(every).items()]
+    for key, group in itertools.groupby(every, key=lambda reading: reading.key):
         found, topic = list(group), topics.of_key(key)
         if topic is None or topic.kept <= 1:
             states += topic is not None

@@ -48,6 +48,10 @@ _QOS: Final[dict[Qos, dict[str, Any]]] = {
 }
 
 
+_ANSWERS: Final = 1 << 16
+"""Answers that wait for who asked: beyond them the link stands still, and what comes is dropped on the way."""
+
+
 class BusError(Exception):
     """The bus cannot be had; its text names the endpoint and what to do."""
 
@@ -424,6 +428,7 @@ class Bus:
         """Ask everyone (target all, no consolidation), yield the answers as they come; a time-out yields a Failure."""
         replies = self._session.get(
             selector,
+            zenoh.handlers.FifoChannel(_ANSWERS),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
@@ -443,17 +448,20 @@ class Bus:
         self._session.put(key, payload, encoding=encoding, source_info=source, **_QOS[Qos.COMMAND])
 
 
-def reply(query: zenoh.Query, key: str, payload: bytes, encoding: str) -> None:
-    """Answer a query with one value under a concrete key."""
-    query.reply(key, payload, encoding=encoding, express=True)
+def reply(query: zenoh.Query, key: str, payload: bytes, encoding: str, *, express: bool = True) -> None:
+    """Answer a query with one value under a concrete key; `express`: at once, not batched with others."""
+    query.reply(key, payload, encoding=encoding, express=express)
 
 
-def reply_value(query: zenoh.Query, key: str, payload: bytes, topic: Topic) -> None:
-    """Answer a query with a value of a topic, as protobuf or as JSON as it asks (`?format=json`)."""
+def reply_value(query: zenoh.Query, key: str, payload: bytes, topic: Topic, *, express: bool = True) -> None:
+    """Answer a query with a value of a topic, as protobuf or as JSON as it asks (`?format=json`).
+
+    Of many values each must not be express: each would be a batch of its own, and what finds no room is dropped.
+    """
     if query.parameters.get("format") == "json":
         from schemas import messages
 
         text = messages.to_json(messages.parse(topic.message, payload, topic.encoding))
-        reply(query, key, text.encode(), messages.JSON)
+        reply(query, key, text.encode(), messages.JSON, express=express)
     else:
-        reply(query, key, payload, topic.encoding)
+        reply(query, key, payload, topic.encoding, express=express)
