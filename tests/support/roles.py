@@ -34,7 +34,8 @@ NOTICED_S: Final = 4.5
 """What a car that reset itself does looks as asked until three of its frames, one a second, say otherwise."""
 IN_FORCE_S: Final = 3.5 + 1.0
 """protocol.md: the longest opening, and issue 5's second."""
-STRAY_S: Final = 0.5
+STRAY_S: Final = 2.5
+"""protocol.md: while a mode closes, 2 s, the motors go on as they were; recovery can only stop them after that."""
 _FRAMES: Final = {encode(ModeOpen(mode)): mode for mode, _ in ROLES.values()}
 
 
