@@ -4,12 +4,16 @@ The blocking calls run in threads; a watch is an asynchronous iterator fed throu
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Coroutine, Iterable, Sequence
-from contextlib import asynccontextmanager
+import weakref
+from collections.abc import Callable, Coroutine, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
-from typing import Any, Self
+from functools import partial
+from types import TracebackType
+from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from fleet import client
+from fleet import lease as leases
 from fleet.condition import Condition
 from fleet.outcome import Outcome
 from fleet.readings import QUEUE_LIMIT, Reading, Wanted, reading_of
@@ -17,6 +21,11 @@ from fleet.verbs import Request, Verbs
 from fleet.waiting import Waiting
 from schemas import keys, messages
 from schemas.bus import Handover, Sample
+
+_THREADS: Final = 256
+"""Calls that may wait at the same time: a drive waits until it is over, and no stop may wait for a free thread."""
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class Fleet:
@@ -33,13 +42,22 @@ class Fleet:
     ) -> None:
         self._open = lambda: client.Fleet(endpoint, name, sender=sender, kind=kind, start_hub=start_hub)
         self._client: client.Fleet | None = None
+        self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
+        self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="fleet-aio")
 
     async def __aenter__(self) -> Self:
-        self._client = await asyncio.to_thread(self._open)
+        self._client = await self.call(self._open)
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await asyncio.to_thread(self.sync.close)
+        for watch in list(self._watches):
+            watch.close()
+        await self.call(self.sync.close)
+        self._threads.shutdown(wait=False)
+
+    async def call(self, function: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
+        """What a blocking call returns or raises; in a thread, where it runs on if the task is cancelled."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(function, *args, **options))
 
     @property
     def sync(self) -> client.Fleet:
@@ -50,7 +68,7 @@ class Fleet:
 
     async def cars(self) -> list[str]:
         """The cars whose gateway is on the bus."""
-        return await asyncio.to_thread(self.sync.cars)
+        return await self.call(self.sync.cars)
 
     def car(self, name: str) -> "Car":
         """One car, there or not."""
@@ -58,25 +76,22 @@ class Fleet:
 
     async def get(self, expression: str) -> list[Reading]:
         """The latest value under every key that matches."""
-        return await asyncio.to_thread(self.sync.get, expression)
+        return await self.call(self.sync.get, expression)
 
     async def history(self, expression: str, *, last: int | None = None, since_s: float | None = None) -> list[Reading]:
         """The last so many values of every key that matches, or of the last so many seconds; each oldest first."""
-        return await asyncio.to_thread(self.sync.history, expression, last=last, since_s=since_s)
+        return await self.call(self.sync.history, expression, last=last, since_s=since_s)
 
-    @asynccontextmanager
-    async def watch(self, expression: str, *, when: str | None = None) -> AsyncIterator["Watch"]:
-        """Readings as they are published: `async with fleet.watch("red") as stream: async for reading in stream`.
+    def watch(self, expression: str, *, when: str | None = None) -> "Watch":
+        """Readings as they are published: `async for reading in fleet.watch("*/sensor/range")`; as `when` says.
 
-        Only those of which `when` holds, if it is given.
+        Use it with `async with` if the fleet stays open longer: it takes readings until it, or the fleet, is closed.
         """
         written = self.sync.expression(expression)
-        stream = Watch(None if when is None else Condition.of(when, written).holds)
-        subscriber = self.sync.bus.subscribe(written, stream.hand_over)
-        try:
-            yield stream
-        finally:
-            await asyncio.to_thread(subscriber.undeclare)
+        watch = Watch(None if when is None else Condition.of(when, written).holds)
+        watch.begin(self.sync.bus.subscribe(written, watch.hand_over).undeclare)
+        self._watches.add(watch)
+        return watch
 
     async def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
         """Wait until `when` holds of a fresh reading, and return that; raises waiting.NotInTime."""
@@ -96,42 +111,76 @@ class Fleet:
 
     async def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Stop these cars, or every car."""
-        return await asyncio.to_thread(self.sync.stop, cars)
+        return await self.call(self.sync.stop, cars)
 
     async def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
         """Emergency stop of these cars, or of the fleet."""
-        return await asyncio.to_thread(self.sync.estop, cars, why)
+        return await self.call(self.sync.estop, cars, why)
 
     async def resume(self, cars: Iterable[str], ids: Sequence[str] = ()) -> list[Outcome]:
         """End the e-stops of these ids; without ids, the hold."""
-        return await asyncio.to_thread(self.sync.resume, cars, ids)
+        return await self.call(self.sync.resume, cars, ids)
 
     async def ask(self, request: Request, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Ask the cars and wait for what becomes of it."""
-        return await asyncio.to_thread(self.sync.ask, request, cars)
+        return await self.call(self.sync.ask, request, cars)
 
 
 class Car(Verbs[Coroutine[Any, Any, Outcome]]):
-    """One car of an Fleet: `await fleet.car("red").drive("forward", 2.0)`."""
+    """One car of a Fleet: `await fleet.car("red").drive("forward", 2.0)`. Made by `Fleet.car`."""
 
-    def __init__(self, fleet: Fleet, name: str) -> None:
+    def __init__(self, fleet: Fleet, name: str, leased: client.LeasedCar | None = None) -> None:
         super().__init__(name)
         self._fleet = fleet
+        self._leased = leased
 
     async def get(self, topic: str = "sensor/*") -> list[Reading]:
         """The latest readings of this car."""
         return await self._fleet.get(f"{self.name}/{topic}")
 
-    async def _do(self, request: Request) -> Outcome:
-        return (await self._fleet.ask(request, [self.name]))[0]
+    def lease(self, *, take: bool = False) -> "Lease":
+        """Have the car while a block runs: `async with fleet.car("red").lease() as car: await car.drive("forward")`.
+
+        As fleet.client.Car.lease; a task that is cancelled stops the car, too.
+        """
+        return Lease(self._fleet, self.name, take=take)
+
+    async def do(self, request: Request) -> Outcome:
+        """Ask for one command and say what became of it."""
+        return await self._fleet.call((self._leased or self._fleet.sync.car(self.name)).do, request)
+
+
+class Lease:
+    """Made by `Car.lease`; use it with `async with`, which raises LeaseLost if the car is another's."""
+
+    def __init__(self, fleet: Fleet, name: str, *, take: bool) -> None:
+        self._fleet = fleet
+        self._name = name
+        self._lease = leases.Lease(fleet.sync, name, take=take)
+
+    async def __aenter__(self) -> Car:
+        entering = asyncio.ensure_future(self._fleet.call(self._lease.__enter__))
+        try:
+            return Car(self._fleet, self._name, await asyncio.shield(entering))
+        except asyncio.CancelledError:
+            await entering
+            await self.__aexit__(None, None, None)
+            raise
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await asyncio.shield(self._fleet.call(self._lease.__exit__, kind, error, trace))
 
 
 class Watch:
-    """Readings as they come; a reader that is too slow loses the oldest."""
+    """Readings as they come. `async for`; `close` (or `async with`) ends it. Who reads too slowly loses the oldest."""
 
     def __init__(self, wanted: Wanted | None = None) -> None:
         self._wanted = wanted
-        self._waiting: asyncio.Queue[Sample] = asyncio.Queue(QUEUE_LIMIT)
+        self._waiting: asyncio.Queue[Sample | None] = asyncio.Queue(QUEUE_LIMIT)
+        self._closed = False
+        self._undeclare: Callable[[], object] = lambda: None
         self.hand_over: Handover[Sample] = Handover(asyncio.get_running_loop(), self._take, limit=QUEUE_LIMIT)
         self._full = 0
         self.unreadable = 0
@@ -142,21 +191,47 @@ class Watch:
         """Samples that made room for newer ones, or came while the loop stood still."""
         return self._full + self.hand_over.dropped
 
+    def begin(self, undeclare: Callable[[], object]) -> None:
+        """It is subscribed; `undeclare` is called at the end."""
+        self._undeclare = undeclare
+
+    def close(self) -> None:
+        """End the stream; the iteration stops."""
+        if not self._closed:
+            self._closed = True
+            self._undeclare()
+            self._put(None)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> Reading:
-        while True:
+        while not self._closed:
+            sample = await self._waiting.get()
+            if sample is None:
+                break
             try:
-                reading = reading_of(await self._waiting.get())
+                reading = reading_of(sample)
             except (messages.BadPayload, KeyError):
                 self.unreadable += 1
                 continue
             if self._wanted is None or self._wanted(reading):
                 return reading
+        raise StopAsyncIteration
 
     def _take(self, sample: Sample) -> None:
-        if self._waiting.full():
+        self._full += self._put(sample)
+
+    def _put(self, sample: Sample | None) -> bool:
+        """Whether the oldest made room."""
+        full = self._waiting.full()
+        if full:
             self._waiting.get_nowait()
-            self._full += 1
         self._waiting.put_nowait(sample)
+        return full

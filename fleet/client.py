@@ -11,6 +11,7 @@ import re
 import socket
 import time
 import uuid
+import weakref
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
@@ -18,6 +19,7 @@ from typing import Any, Final, Self
 
 from fleet import history
 from fleet.condition import Condition
+from fleet.lease import Lease
 from fleet.outcome import Outcome, Progress
 from fleet.readings import Reading, Watch, reading_of
 from fleet.verbs import Request, Verbs, estop_request, resume_request, stop_request
@@ -49,6 +51,10 @@ def default_sender() -> str:
 class Fleet:
     """One operator on the bus; use it with `with`. Its methods may be called from several threads.
 
+    `endpoint`: `tcp/HOST:PORT` of the bus; else FLEET_ENDPOINT, else loopback port 7447. `name`: of the fleet.
+    `sender`: who asks, as others are told; else user@host-pid. `kind`: `script`, `person` (outranks scripts) or
+    `coordinator`.
+
     While it is open it holds the token `<fleet>/@operator/<sender>`: when that is lost, gateways stop what it drives.
     Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
     """
@@ -68,6 +74,7 @@ class Fleet:
         token = keys.operator_token(self.name, self.sender)
         self.bus = Bus.open(endpoint, start_hub=start_hub)
         self._inboxes: dict[str, queue.Queue[_Item]] = {}
+        self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
         self.dropped = 0
         """Command events that were lost because nobody took them in time."""
@@ -85,7 +92,9 @@ class Fleet:
         self.close()
 
     def close(self) -> None:
-        """Leave the bus; what is still waited for ends as not known."""
+        """Leave the bus; what is still waited for ends as not known, and every watch ends."""
+        for watch in list(self._watches):
+            watch.close()
         for inbox in list(self._inboxes.values()):
             inbox.put((time.monotonic(), _CLOSED))
         self._pool.shutdown(cancel_futures=True)
@@ -139,7 +148,9 @@ class Fleet:
         return sorted(found, key=lambda reading: reading.key)
 
     def watch(self, expression: str, *, when: str | None = None) -> Watch:
-        """Readings as they are published under matching keys, until closed; only those of which `when` holds.
+        """Readings as they are published: `for reading in fleet.watch("*/sensor/range")`, if `when` holds of them.
+
+        Use it with `with` if the fleet stays open longer: it takes readings until it, or the fleet, is closed.
 
         `when` is about the fields of one message, as `range_m < 0.3`; raises expression.BadExpression.
         """
@@ -149,7 +160,9 @@ class Fleet:
         def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
             return self.bus.subscribe(written, take).undeclare
 
-        return Watch(wanted).begin(subscribe)
+        watch = Watch(wanted).begin(subscribe)
+        self._watches.add(watch)
+        return watch
 
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
         """Wait until `when` holds of a fresh reading, the current one included, and return that.
@@ -214,6 +227,7 @@ class Fleet:
         message.id = uuid.uuid4().hex
         message.sender = self.sender
         message.kind = self.kind
+        message.take = request.take
         message.asked.seconds, message.asked.nanos = divmod(time.time_ns(), 1_000_000_000)
         return message, message.id
 
@@ -255,7 +269,7 @@ class Fleet:
 
 
 class Car(Verbs[Outcome]):
-    """One car of a Fleet: `fleet.car("red").drive("forward", 2.0)`."""
+    """One car of a Fleet: `fleet.car("red").drive("forward", 2.0)`. Made by `Fleet.car`."""
 
     def __init__(self, fleet: Fleet, name: str) -> None:
         super().__init__(name)
@@ -265,8 +279,32 @@ class Car(Verbs[Outcome]):
         """The latest readings of this car."""
         return self._fleet.get(f"{self.name}/{topic}")
 
-    def _do(self, request: Request) -> Outcome:
+    def lease(self, *, take: bool = False) -> Lease:
+        """Have the car while a block runs: `with fleet.car("red").lease() as car: car.drive("forward", 1.5)`.
+
+        When the block ends, however it does, the car is stopped and given back. In it nobody of the same rank drives
+        the car, and a command that is not carried out raises NotCarriedOut; once another has taken or stopped the car,
+        every command raises LeaseLost. Entering raises them, too. `take`: as a person (`Fleet(kind="person")`), also
+        from another person.
+        """
+        return Lease(self._fleet, self.name, take=take)
+
+    def do(self, request: Request) -> Outcome:
+        """Ask for one command and say what became of it."""
         return self._fleet.ask(request, [self.name])[0]
+
+
+class LeasedCar(Car):
+    """A car within `with fleet.car("red").lease() as car`: what is not carried out raises."""
+
+    def __init__(self, fleet: Fleet, name: str, lease: Lease) -> None:
+        super().__init__(fleet, name)
+        self._lease = lease
+
+    def do(self, request: Request) -> Outcome:
+        """Ask for one command; raises NotCarriedOut, or LeaseLost once another has the car."""
+        self._lease.check()
+        return self._lease.checked(super().do(request))
 
 
 class _Over:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, Self
 
 QUEUED: Final = "queued"
 SENT: Final = "sent"
@@ -46,6 +46,28 @@ class Outcome:
     """A stop's: the longest it could take until the motors are off, as announced."""
     took_s: float = 0.0
     """From asking until this was known, here."""
+
+    def check(self) -> Self:
+        """Itself; raises NotCarriedOut if it was not carried out."""
+        if not self.ok:
+            raise NotCarriedOut(self)
+        return self
+
+    def __str__(self) -> str:
+        said = (self.reason or ("" if self.phase == NO_ANSWER else self.phase), self.words)
+        return ": ".join((self.car, "carried out" if self.ok else "not carried out", *filter(None, said)))
+
+
+class NotCarriedOut(Exception):
+    """A command was not carried out; `outcome` says on which car, and why."""
+
+    def __init__(self, outcome: Outcome, words: str = "") -> None:
+        super().__init__(words or str(outcome))
+        self.outcome = outcome
+
+
+class LeaseLost(NotCarriedOut):
+    """The car is another's, or was stopped by another; its words say by whom."""
 
 
 class Progress:

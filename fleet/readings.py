@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final, Self, TypeAlias
 
+from fleet.expression import fields_of, value_in
 from schemas import messages, topics
 from schemas.bus import Sample
 
@@ -27,6 +28,21 @@ class Reading:
     """When its publisher had it, UTC: the message's own stamp, else the time Zenoh put on it."""
     value: Any
     """The protobuf message, e.g. `fleet.v1.Range`; optional fields that were not measured are not set."""
+
+    @property
+    def car(self) -> str:
+        """The car's name; empty for what is the fleet's."""
+        return getattr(self.value, "car", "")
+
+    def __getitem__(self, field: str) -> Any:
+        """A field of the message by name, as `range_m` or `hold.by`; None if it was not measured, or is not there.
+
+        Of what is repeated, or a message of its own, whether it is there. Raises KeyError with the names there are.
+        """
+        known = fields_of(type(self.value))
+        if field not in known:
+            raise KeyError(f"{self.key} has no {field}; it has {', '.join(known)}")
+        return value_in(self.value)(field)
 
     def age_s(self, now: datetime | None = None) -> float:
         """How old it is, s, by this machine's clock; at least 0, since clocks differ."""

@@ -28,9 +28,11 @@ class Request:
     until: Until = Until.SENT
     lasts_s: float = 0.0
     """How long a drive holds, s."""
+    take: bool = False
+    """As a person, also if another person drives the car."""
 
 
-def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = False) -> Request:
+def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) -> Request:
     """Hold a motion for `duration_s` (at most 10 s, or what its gateway allows); `wait`: until the drive is over."""
     if not (math.isfinite(duration_s) and 0 < duration_s <= LONGEST_DRIVE_S):
         raise ValueError(
@@ -93,6 +95,11 @@ def fan_request(state: str | None = None) -> Request:
     return Request("fan", pb.FanCommand(state=state or ""))
 
 
+def lease_request(*, take: bool = False, release: bool = False) -> Request:
+    """Have the car for 2 s, or give it back; `take`: as a person, also from another person."""
+    return Request("lease", pb.LeaseCommand(release=release), take=take)
+
+
 def find_request() -> Request:
     """Blink and beep."""
     return Request("find", pb.FindCommand())
@@ -129,61 +136,62 @@ class Verbs(ABC, Generic[R]):
         self.name = name
 
     @abstractmethod
-    def _do(self, request: Request) -> R: ...
+    def do(self, request: Request) -> R:
+        """Ask for one command; the methods below make the requests."""
 
-    def drive(self, motion: str, duration_s: float = 0.5, *, wait: bool = False) -> R:
-        """Hold `forward, back, left, right, spin_left, spin_right` for `duration_s`; `stop` releases.
+    def drive(self, motion: str, duration_s: float = 0.5, *, wait: bool = True) -> R:
+        """Hold `forward, back, left, right, spin_left, spin_right` for `duration_s`; `stop` ends the motion.
 
-        At most 10 s, unless the gateway was started with a longer `--longest-drive`.
-
-        Returns when the motion was sent; with `wait`, when the drive is over.
+        More than 0 s and at most 10, unless the gateway was started with a longer `--longest-drive`; then the gateway
+        stops the car. Returns when the drive is over; with `wait=False` when the motion was sent, so that another can
+        follow: a drive replaces the one before without a stop between them.
         """
-        return self._do(drive_request(motion, duration_s, wait=wait))
+        return self.do(drive_request(motion, duration_s, wait=wait))
 
     def mode(self, mode: str) -> R:
         """`manual, remote_control, tracking, obstacle_avoidance, color_led, light_seeking` or `following`."""
-        return self._do(mode_request(mode))
+        return self.do(mode_request(mode))
 
     def led(self, r: int, g: int, b: int) -> R:
         """The colour LED, 0..255 each."""
-        return self._do(led_request(r, g, b))
+        return self.do(led_request(r, g, b))
 
     def light(self, light: str) -> R:
         """`white, red, green, blue, cyan, magenta, yellow` or `off`."""
-        return self._do(light_request(light))
+        return self.do(light_request(light))
 
     def servo(self, servo: str, action: str = "", deg: int | None = None) -> R:
         """`front`, `horizontal`: left, right, reset; `vertical`: up, down, reset; `front` instead to `deg` (0..180)."""
-        return self._do(servo_request(servo, action, deg))
+        return self.do(servo_request(servo, action, deg))
 
     def arm(self, joint_deg: Sequence[int]) -> R:
         """Six joints, 0..180 degrees each."""
-        return self._do(arm_request(joint_deg))
+        return self.do(arm_request(joint_deg))
 
     def whistle(self) -> R:
         """Sound once."""
-        return self._do(whistle_request())
+        return self.do(whistle_request())
 
     def speed(self, step: str) -> R:
         """One step `up` or `down`: the car knows no absolute speed."""
-        return self._do(speed_request(step))
+        return self.do(speed_request(step))
 
     def fan(self, state: str | None = None) -> R:
         """Toggle the fan; `on` or `off` only while the gateway knows its state."""
-        return self._do(fan_request(state))
+        return self.do(fan_request(state))
 
     def stop(self) -> R:
         """Stop, and hold against the coordinator; waits until the stop is complete."""
-        return self._do(stop_request())
+        return self.do(stop_request())
 
     def estop(self, why: str = "") -> R:
         """Emergency stop of this car."""
-        return self._do(estop_request(why, "car"))
+        return self.do(estop_request(why, "car"))
 
     def resume(self, ids: Sequence[str] = ()) -> R:
         """End the e-stops of these ids; without ids, the hold."""
-        return self._do(resume_request(ids))
+        return self.do(resume_request(ids))
 
     def find(self) -> R:
         """Blink and beep, without moving."""
-        return self._do(find_request())
+        return self.do(find_request())

@@ -6,7 +6,7 @@ from typing import Any, Final
 import click
 
 from fleet.client import Fleet
-from fleet.commands.common import carry_out, cars_argument, json_option, with_client
+from fleet.commands.common import carry_out, cars_argument, json_option, take_option, with_client
 from fleet.verbs import (
     Request,
     arm_request,
@@ -103,6 +103,7 @@ def light(client: Fleet, cars: tuple[str, ...], light: str, *, as_json: bool) ->
 @cars_argument
 @click.argument("servo", type=click.Choice(["front", "vertical", "horizontal"]))
 @click.argument("request", metavar="left|right|up|down|reset|DEG", callback=_servo, required=False)
+@take_option
 @json_option
 @with_client
 def servo(
@@ -111,23 +112,25 @@ def servo(
     servo: str,  # noqa: ARG001 - it is in the request already
     request: Request,
     *,
+    take: bool,
     as_json: bool,
 ) -> None:
     """Move a servo: left, right or reset (vertical: up, down or reset); the front one also to 0..180 degrees.
 
     The number is sent unchanged; the front servo goes to 180 minus it.
     """
-    carry_out(client, request, cars, as_json=as_json)
+    carry_out(client, request, cars, take=take, as_json=as_json)
 
 
 @click.command(epilog=f"\b\nexample:\n  {_ARM_EXAMPLE}", context_settings=_NEGATIVE_NUMBERS)
 @cars_argument
 @click.argument("request", nargs=-1, metavar="J1 J2 J3 J4 J5 J6", callback=_arm)
+@take_option
 @json_option
 @with_client
-def arm(client: Fleet, cars: tuple[str, ...], request: Request, *, as_json: bool) -> None:
+def arm(client: Fleet, cars: tuple[str, ...], request: Request, *, take: bool, as_json: bool) -> None:
     """Move the arm's six joints to 0..180 degrees each."""
-    carry_out(client, request, cars, as_json=as_json)
+    carry_out(client, request, cars, take=take, as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet whistle red")
@@ -142,21 +145,23 @@ def whistle(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
 @click.command(epilog="\b\nexample:\n  fleet speed red up")
 @cars_argument
 @click.argument("step", type=click.Choice([str(step) for step in SpeedStep]))
+@take_option
 @json_option
 @with_client
-def speed(client: Fleet, cars: tuple[str, ...], step: str, *, as_json: bool) -> None:
+def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_json: bool) -> None:
     """One step faster or slower: cars know no absolute speed."""
-    carry_out(client, speed_request(step), cars, as_json=as_json)
+    carry_out(client, speed_request(step), cars, take=take, as_json=as_json)
 
 
 @click.command(epilog="\b\nexamples:\n  fleet fan red\n  fleet fan red off")
 @cars_argument
 @click.argument("state", type=click.Choice(["on", "off"]), required=False)
+@take_option
 @json_option
 @with_client
-def fan(client: Fleet, cars: tuple[str, ...], state: str | None, *, as_json: bool) -> None:
+def fan(client: Fleet, cars: tuple[str, ...], state: str | None, *, take: bool, as_json: bool) -> None:
     """Toggle the fan; `on` and `off` only while the gateway knows its state."""
-    carry_out(client, fan_request(state), cars, as_json=as_json)
+    carry_out(client, fan_request(state), cars, take=take, as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet find red")

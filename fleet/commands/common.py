@@ -6,13 +6,13 @@ import re
 import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, Final, Never
 
 import click
 
 from fleet.client import Fleet
-from fleet.outcome import NO_ANSWER, Outcome
+from fleet.outcome import Outcome
 from fleet.verbs import LONGEST_DRIVE_S, Request
 from schemas import keys
 from schemas.bus import BadEndpoint, BusError
@@ -101,11 +101,12 @@ class Seconds(click.ParamType[float]):
 
 
 cars_argument = click.argument("cars", type=Cars(), metavar="CAR[,CAR...]")
+take_option = click.option("--take", is_flag=True, help="Also if another person drives the car: it is yours then.")
 
 
-def carry_out(client: Fleet, request: Request, cars: Iterable[str], *, as_json: bool) -> None:
+def carry_out(client: Fleet, request: Request, cars: Iterable[str], *, as_json: bool, take: bool = False) -> None:
     """Ask the cars, say for each what became of it, and end with the exit code that says whether all was done."""
-    end_with(client.ask(request, cars), as_json=as_json)
+    end_with(client.ask(replace(request, take=take), cars), as_json=as_json)
 
 
 def end_with(outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
@@ -127,8 +128,8 @@ def say(outcomes: Iterable[Outcome], *, as_json: bool) -> None:
 
 def _words(outcome: Outcome) -> str:
     if not outcome.ok:
-        why = outcome.reason or ("" if outcome.phase == NO_ANSWER else outcome.phase)
-        return f"{outcome.car}: not carried out: {': '.join(part for part in (why, outcome.words) if part)}"
+        # Who asks here is a person, so that only another person keeps the car from them.
+        return f"{outcome}{' (--take)' if outcome.reason == 'leased' else ''}"
     notes = [outcome.words] if outcome.words else []
     if outcome.worst_case_s:
         notes.append(f"motors off within {outcome.worst_case_s:.2f} s at worst")

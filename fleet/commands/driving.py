@@ -1,5 +1,7 @@
 """`fleet drive, mode, stop, estop, resume`: what moves cars, and what keeps them from moving."""
 
+from dataclasses import replace
+
 import click
 
 from fleet.client import Fleet
@@ -13,6 +15,7 @@ from fleet.commands.common import (
     json_option,
     say,
     sigterm_interrupts,
+    take_option,
     with_client,
 )
 from fleet.outcome import Outcome
@@ -36,13 +39,14 @@ examples:
     show_default=True,
     help="How long; at most 10s, or what the car's gateway allows.",
 )
+@take_option
 @json_option
 @with_client
-def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, as_json: bool) -> None:
+def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, take: bool, as_json: bool) -> None:
     """Hold a motion for a time, then stop; stays until the drive is over. Ctrl-C stops the car."""
     with sigterm_interrupts():
         try:
-            outcomes = client.ask(drive_request(motion, duration_s, wait=True), cars)
+            outcomes = client.ask(replace(drive_request(motion, duration_s), take=take), cars)
         except KeyboardInterrupt:
             say(client.ask(drive_request("stop"), cars), as_json=as_json)
             raise SystemExit(INTERRUPTED) from None
@@ -57,11 +61,12 @@ example:
 )
 @cars_argument
 @click.argument("mode", type=click.Choice([str(mode) for mode in Mode]))
+@take_option
 @json_option
 @with_client
-def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, as_json: bool) -> None:
+def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json: bool) -> None:
     """Bring cars into a mode; `manual` ends whatever they do by themselves."""
-    carry_out(client, mode_request(mode), cars, as_json=as_json)
+    carry_out(client, mode_request(mode), cars, take=take, as_json=as_json)
 
 
 @click.command(

@@ -16,7 +16,7 @@ from fleet.condition import Condition, topics_under
 from fleet.readings import Reading
 from schemas import keys, topics
 
-_COLUMNS: Final = ("car", "link", "mode", "verdict", "motion", "hold", "battery")
+_COLUMNS: Final = ("car", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
 _TOLD: Final = 5
 
 
@@ -24,7 +24,7 @@ _TOLD: Final = 5
 @json_option
 @with_client
 def list_cars(client: Fleet, *, as_json: bool) -> None:
-    """The cars on the bus: link, mode and how sure that is, motion, who holds the car, battery."""
+    """The cars on the bus: link, mode and how sure that is, motion, who drives it and who stopped it, battery."""
     cars = client.cars()
     said: dict[str, dict[str, Reading]] = {car: {} for car in cars}
     for reading in client.get("*/*/*"):  # one query: a gateway that hangs is waited for once
@@ -53,6 +53,8 @@ def _row(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
         "mode": mode.asked if mode else None,
         "verdict": mode.verdict if mode else None,
         "motion": motion.motion if motion else None,
+        "driver": safety.lease.holder if safety and safety.HasField("lease") else None,
+        "driver_kind": safety.lease.kind if safety and safety.HasField("lease") else None,
         "hold": safety.hold.by if safety and safety.HasField("hold") else None,
         "estops": [estop.id for estop in safety.estops] if safety else [],
         "motors": safety.motors if safety else None,
@@ -71,6 +73,8 @@ def _shown(name: str, row: Mapping[str, Any]) -> str:
         return f"{row['battery_v']:.2f} V {row['battery_level']}{age}"
     if name == "hold" and row["estops"]:
         return f"e-stop {' '.join(row['estops'])}"
+    if name == "driver" and row["driver"]:
+        return f"{row['driver']} ({row['driver_kind']})"
     old = " (stale)" if name in ("link", "mode", "motion") and f"state/{name}" in row["stale"] else ""
     return f"{row[name]}{old}" if row[name] else "-"
 

@@ -77,7 +77,7 @@ def test_the_next_command_line_need_not_wait_for_the_last_ones_lease(fleet: Flee
     fleet.ready()
     for sender in ("mia-1", "mia-2", "mia-3"):
         with Client(fleet.endpoint, sender=sender, kind="person") as client:
-            assert client.car("red").drive("forward", 0.2, wait=True).ok
+            assert client.car("red").drive("forward", 0.2).ok
             assert fleet.state("safety").lease.holder == sender
         wait_for(lambda: not fleet.state("safety").HasField("lease"), "given back")
 

@@ -38,7 +38,7 @@ def test_a_command_is_carried_out_and_seen_in_the_car(client: Fleet, cars: Cars)
 
 
 def test_a_drive_that_is_waited_for_ends_complete_and_not_before_its_time(client: Fleet, cars: Cars) -> None:
-    outcome = client.car("green").drive("forward", 0.7, wait=True)
+    outcome = client.car("green").drive("forward", 0.7)
     assert (outcome.ok, outcome.phase) == (True, "complete")
     assert outcome.took_s >= 0.7
     wait_for(lambda: not driving(cars.sim, "green"), "green stands")
@@ -46,7 +46,7 @@ def test_a_drive_that_is_waited_for_ends_complete_and_not_before_its_time(client
 
 def test_a_stop_supersedes_a_drive_and_is_waited_for_until_it_is_complete(client: Fleet, cars: Cars) -> None:
     ended: list[object] = []
-    drive = threading.Thread(target=lambda: ended.append(client.car("blue").drive("forward", 10, wait=True)))
+    drive = threading.Thread(target=lambda: ended.append(client.car("blue").drive("forward", 10)))
     drive.start()
     wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
     (outcome,) = client.stop(["blue"])
@@ -92,7 +92,7 @@ def test_a_person_stop_holds_the_car_against_the_coordinator_until_resumed(clien
 
 def test_whoever_goes_while_driving_leaves_no_car_driving(cars: Cars) -> None:
     with Fleet(cars.endpoint, sender="gone", kind="script") as client:
-        assert client.car("blue").drive("forward", 10).ok
+        assert client.car("blue").drive("forward", 10, wait=False).ok
         wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
     began = time.monotonic()
     wait_for(lambda: not driving(cars.sim, "blue"), "blue stands")

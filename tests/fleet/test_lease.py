@@ -1,0 +1,223 @@
+"""A lease: the car is stopped and given back on any exit, and who lost it is told by whom, never driving on."""
+
+import asyncio
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from fleet import Fleet, LeaseLost, NotCarriedOut
+from fleet.aio import Fleet as AsyncFleet
+from fleet.client import Car
+from fleet.lease import Ours
+from fleet.outcome import Outcome
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.fleet.conftest import Cars
+from tests.support.processes import driving, wait_for
+
+# ---------------------------------------------------------------- whether it is ours
+
+
+def safety(holder: str = "", *, hold: str = "", since_s: int = 1, estop: str = "") -> pb.Safety:
+    message = pb.Safety(car="red")
+    if holder:
+        message.lease.holder, message.lease.kind = holder, "person"
+    if hold:
+        message.hold.by = hold
+        message.hold.since.seconds = since_s
+    if estop:
+        message.estops.add(id="e", by=estop)
+    return message
+
+
+@pytest.mark.parametrize(
+    ("heard", "lost"),
+    [
+        ([safety()], ""),
+        ([safety("mia")], ""),  # from before we had it
+        ([safety("mia"), safety("bot")], ""),
+        ([safety("bot"), safety()], ""),  # it lapsed: nobody else has it
+        ([safety("bot"), safety("mia")], "red was taken by mia (person)"),
+        ([safety("bot"), safety("mia"), safety("bot")], "red was taken by mia (person)"),  # lost stays lost
+        ([safety("bot", hold="mia")], ""),  # from before we had it
+        ([safety("bot", hold="mia"), safety("bot", hold="mia")], ""),
+        ([safety("bot"), safety("bot", hold="mia")], "red was stopped by mia"),
+        ([safety("bot", hold="mia"), safety("bot"), safety("bot", hold="mia", since_s=2)], "red was stopped by mia"),
+        ([safety("bot"), safety("bot", hold="bot")], ""),  # we did
+        ([safety("bot"), safety("bot", hold="mia", estop="mia")], "red was e-stopped by mia"),
+    ],
+)
+def test_what_a_gateway_says_of_a_car(heard: list[pb.Safety], lost: str) -> None:
+    ours = Ours("red", "bot")
+    for message in heard:
+        ours.heard(message)
+    assert ours.lost == lost
+
+
+def test_a_refusal_says_who_has_it() -> None:
+    ours = Ours("red", "bot")
+    ours.refused(Outcome("red", ok=False, phase="rejected", reason="unsupported", words="no arm"))
+    assert not ours.lost
+    ours.refused(Outcome("red", ok=False, phase="rejected", reason="leased", words="red is driven by mia"))
+    assert ours.lost == "red is driven by mia"
+
+
+# ---------------------------------------------------------------- with real cars
+
+
+@pytest.fixture
+def fleet(cars: Cars) -> Iterator[Fleet]:
+    with Fleet(cars.endpoint, sender="bot") as opened:
+        yield opened
+
+
+def holder(cars: Cars, car: str) -> str:
+    found: str = cars.state("safety", car).lease.holder
+    return found
+
+
+def test_a_leased_car_drives_and_is_given_back(fleet: Fleet, cars: Cars) -> None:
+    with fleet.car("red").lease() as car:
+        assert car.drive("forward", 0.5).phase == "complete"
+        assert holder(cars, "red") == "bot"
+    assert holder(cars, "red") == ""
+
+
+def test_it_is_held_as_long_as_the_block_runs(fleet: Fleet, cars: Cars) -> None:
+    with fleet.car("red").lease(), Fleet(cars.endpoint, sender="other") as other:
+        for _ in range(4):
+            with pytest.raises(TimeoutError):
+                other.wait("red/state/safety", "not lease", timeout_s=1.0)
+        with pytest.raises(LeaseLost, match="red is driven by bot") as error, other.car("red").lease():
+            pass
+        assert error.value.outcome.reason == "leased"
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, SystemExit])
+def test_the_car_stops_on_any_exit(fleet: Fleet, cars: Cars, error: type[BaseException]) -> None:
+    def block() -> None:
+        with fleet.car("blue").lease() as car:
+            car.drive("forward", 10, wait=False)
+            wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
+            raise error
+
+    with pytest.raises(error):
+        block()
+    assert not driving(cars.sim, "blue")
+    assert holder(cars, "blue") == ""
+    assert not cars.state("safety", "blue").HasField("hold"), "a coordinator may go on"
+
+
+def test_a_mode_ends_with_the_block(fleet: Fleet, cars: Cars) -> None:
+    with fleet.car("red").lease() as car:
+        car.mode("tracking")
+        wait_for(lambda: cars.sim.say({"car": "red", "ask": "truth"})["mode"] == "tracking", "red tracks")
+    assert cars.sim.say({"car": "red", "ask": "truth"})["mode"] == "manual"
+    assert not driving(cars.sim, "red")
+
+
+def test_what_is_not_carried_out_raises(fleet: Fleet, cars: Cars) -> None:
+    with pytest.raises(NotCarriedOut, match=r"green: not carried out: bad_value: .*allowed are white"):
+        fleet.car("green").light("pink").check()
+    with fleet.car("green").lease() as car, pytest.raises(NotCarriedOut, match="allowed are white") as error:
+        car.light("pink")
+    assert not isinstance(error.value, LeaseLost)
+    with pytest.raises(NotCarriedOut, match="no car purple on the bus"), fleet.car("purple").lease():
+        pass
+
+
+def test_a_person_takes_a_car_and_keeps_it(fleet: Fleet, cars: Cars) -> None:
+    with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
+
+        def block() -> None:
+            with fleet.car("red").lease() as car:
+                car.drive("spin_left", 10, wait=False)
+                wait_for(lambda: driving(cars.sim, "red"), "red drives")
+                mia.car("red").drive("forward", 9, wait=False).check()
+                go_on(car)
+
+        with pytest.raises(LeaseLost, match=r"red was taken by mia \(person\)"):
+            block()
+        assert cars.state("motion").owner == "mia", "the end of the block stopped a car that was another's"
+        mia.stop(["red"])
+    fleet.resume(["red"])
+
+
+def go_on(car: Car) -> None:
+    """Ask for one thing after the other until that raises."""
+    wait_for(lambda: not car.led(1, 2, 3).ok, "the lease is lost")
+
+
+def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars) -> None:
+    with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
+
+        async def at_once() -> None:
+            async with AsyncFleet(cars.endpoint, sender="eve") as other, other.car("blue").lease() as car:
+                drive = asyncio.create_task(car.drive("forward", 10))
+                await asyncio.to_thread(wait_for, lambda: driving(cars.sim, "blue"), "blue drives")
+                await asyncio.to_thread(mia.stop, ["blue"])
+                await drive
+
+        with pytest.raises(LeaseLost, match="blue was stopped by mia"):
+            asyncio.run(at_once())
+    fleet.resume(["blue"])
+
+
+def test_between_persons_only_who_takes_it_gets_it(cars: Cars) -> None:
+    with (
+        Fleet(cars.endpoint, sender="ann", kind="person") as ann,
+        Fleet(cars.endpoint, sender="mia", kind="person") as mia,
+    ):
+
+        def block() -> None:
+            with ann.car("green").lease() as car:
+                with pytest.raises(LeaseLost, match="or take it"), mia.car("green").lease():
+                    pass
+                with mia.car("green").lease(take=True):
+                    go_on(car)
+
+        with pytest.raises(LeaseLost, match="green was taken by mia"):
+            block()
+        assert holder(cars, "green") == ""
+
+
+async def test_a_cancelled_task_stops_its_car(cars: Cars) -> None:
+    async with AsyncFleet(cars.endpoint, sender="eve") as fleet:
+
+        async def drive() -> None:
+            async with fleet.car("blue").lease() as car:
+                await car.drive("forward", 10)
+
+        task = asyncio.create_task(drive())
+        await asyncio.to_thread(wait_for, lambda: driving(cars.sim, "blue"), "blue drives")
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert not await asyncio.to_thread(driving, cars.sim, "blue")
+
+
+async def test_readings_come_to_an_async_for_and_end_with_the_fleet(cars: Cars) -> None:
+    async with AsyncFleet(cars.endpoint, sender="eve") as fleet:
+        async for reading in fleet.watch("*/state/safety", when="motors == 'off'"):
+            assert (reading.car, reading["motors"], reading["hold.by"]) == (reading.key.split("/")[1], "off", None)
+            break
+        last = fleet.watch("red/state/safety")
+    assert [reading async for reading in last] == []
+
+
+def test_readings_by_field(cars: Cars, fleet: Fleet) -> None:
+    (reading,) = fleet.get("red/sensor/range")
+    assert reading["range_m"] is None or reading["range_m"] > 0
+    with pytest.raises(KeyError, match="fleet/red/sensor/range has no distance; it has range_m, no_echo"):
+        reading["distance"]
+    watch = fleet.watch("red")
+    fleet.close()
+    assert list(watch) == []
+
+
+def test_the_package_is_imported_without_what_it_does_not_need(cars: Cars) -> None:
+    looked = "import sys, fleet; print(sorted({'zenoh', 'google.protobuf', 'asyncio'} & set(sys.modules)))"
+    process = cars.start("-c", looked)
+    assert process.wait() == 0, process.stderr
+    assert process.line() == []
+    assert sys.modules["fleet"].Fleet is Fleet
