@@ -48,6 +48,11 @@ class Marks:
             raise BadWorld(f"{source}:1:1: is empty")
         self.root: yaml.Node = root
 
+    @property
+    def faulty(self) -> bool:
+        """Whether there was a fault so far."""
+        return bool(self._problems)
+
     def complain(self, node: yaml.Node, field: str, words: str) -> None:
         """Note a fault."""
         mark = node.start_mark

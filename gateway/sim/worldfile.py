@@ -76,17 +76,23 @@ class _Reader:
         self._marks = marks
         self._cars = cars
         self._walls: list[Segment] = []
+        self._boxes: list[tuple[float, float, float, float]] = []
+        self._room: tuple[float, float] | None = None
 
     def read(self) -> WorldSpec:
         marks = self._marks
         top = marks.fields(marks.root, "", {**_TOP, "lamps": False, "things": False})
         if "room" in top:
             parts = marks.fields(top["room"], "room", {"width_m": True, "depth_m": True})
-            self._walls += box(0.0, 0.0, *(self._size(parts, name, "room") for name in ("width_m", "depth_m")))
+            room = self._size(parts, "width_m", "room"), self._size(parts, "depth_m", "room")
+            if not marks.faulty:  # else every car would begin outside it, too
+                self._room = room
+                self._walls += box(0.0, 0.0, *room)
         for field, node in self._few(top, "boxes"):
             parts = marks.fields(node, field, _BOX)
-            at = (self._place(parts, name, field) for name in ("x_m", "y_m"))
-            self._walls += box(*at, *(self._size(parts, name, field) for name in ("width_m", "depth_m")))
+            x, y = self._place(parts, "x_m", field), self._place(parts, "y_m", field)
+            self._boxes.append((x, y, self._size(parts, "width_m", field), self._size(parts, "depth_m", field)))
+            self._walls += box(*self._boxes[-1])
         for field, node in self._few(top, "walls"):
             wall = marks.numbers(node, field, 4, -FAR_M, FAR_M)
             if wall is None:
@@ -200,7 +206,10 @@ class _Reader:
             if not parts.keys() >= {"x_m", "y_m"}:
                 continue
             found[name] = pose
-            if any(distance(pose.x_m, pose.y_m, wall) < RADIUS_M for wall in self._walls):
+            inside = any(abs(x - bx) < w / 2 and abs(y - by) < d / 2 for bx, by, w, d in self._boxes)
+            if self._room is not None and (abs(x) > self._room[0] / 2 or abs(y) > self._room[1] / 2):
+                marks.complain(node, field, "begins outside the room")
+            elif inside or any(distance(x, y, wall) < RADIUS_M for wall in self._walls):
                 marks.complain(node, field, f"begins in a wall: at least {RADIUS_M:g} m from each")
             for thing in things:
                 at = thing.pose(0.0)

@@ -7,7 +7,7 @@ REP-103: metres, x forward, y left, angles counter-clockwise.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from math import atan2, cos, floor, hypot, sin
+from math import atan2, ceil, cos, floor, hypot, sin
 from typing import Final, Protocol
 
 from gateway.sim.core.company import Company
@@ -36,6 +36,10 @@ _BUCKET_M: Final = 0.25
 _ROUNDS: Final = 3
 """So often a car that is pushed out of one thing is pushed out of the next."""
 _HAIR_M: Final = 1e-9
+_APART_M: Final = 0.4
+"""Between two places where cars begin that have none of their own."""
+_SPREAD_M: Final = 4.0
+"""How far out they are if there are no walls."""
 
 
 class Body(Protocol):
@@ -113,9 +117,44 @@ class World:
         return cls()
 
     def start_pose(self, index: int, name: str = "") -> Pose:
-        """Where a car begins: at its own place, or as number `index` on the line; the cars spread over its length."""
+        """Where a car begins: at its own place, or as number `index` on the line; the cars spread over its length.
+
+        In a lively world one without a place of its own that would begin in something begins where there is room.
+        """
         if name in self._starts:
             return self._starts[name]
+        pose = self._spread(index)
+        if not self.lively:
+            return pose
+        return next((each for each in (pose, *self._grid()) if self._free(each)), pose)
+
+    def _grid(self) -> list[Pose]:
+        """Places to begin, the innermost first."""
+        xs = [x for wall in self.walls for x in wall[::2]] or [-_SPREAD_M, _SPREAD_M]
+        ys = [y for wall in self.walls for y in wall[1::2]] or [-_SPREAD_M, _SPREAD_M]
+        spots = [
+            Pose(_APART_M * column, _APART_M * row, 0.0)
+            for column in range(ceil(min(xs) / _APART_M), floor(max(xs) / _APART_M) + 1)
+            for row in range(ceil(min(ys) / _APART_M), floor(max(ys) / _APART_M) + 1)
+        ]
+        return sorted(spots, key=lambda pose: hypot(pose.x_m, pose.y_m))
+
+    def _free(self, pose: Pose) -> bool:
+        """Whether a car can begin there: in nothing, and not shut off from all cars that have a place of their own."""
+        x, y, _ = pose
+        cars = (*self._starts.values(), *(body.place for body in self.bodies)) if self.cars_meet else ()
+        return (
+            all(distance(x, y, wall) >= RADIUS_M for wall in self.walls)
+            and all(thing.depth(at, x, y, RADIUS_M) <= 0 for thing, at in self.solids(None, self._began))
+            and all(hypot(x - car.x_m, y - car.y_m) >= 2 * RADIUS_M for car in cars)
+            and (not self._starts or any(self._reachable(pose, start) for start in self._starts.values()))
+        )
+
+    def _reachable(self, pose: Pose, other: Pose) -> bool:
+        sight: Segment = (*pose[:2], *other[:2])
+        return all(apart(sight, wall) > _HAIR_M for wall in self.walls)
+
+    def _spread(self, index: int) -> Pose:
         if not self.line:
             return Pose(0.0, float(index), 0.0)
         # Multiples of the golden ratio keep any number of cars apart.

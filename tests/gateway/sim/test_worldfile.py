@@ -3,16 +3,18 @@
 import random
 import subprocess
 import sys
-from math import radians
+from itertools import combinations
+from math import hypot, radians
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gateway.sim.core.body import CarBody
 from gateway.sim.core.firmware import Pose
 from gateway.sim.core.things import Lamp, Thing
-from gateway.sim.core.world import World
+from gateway.sim.core.world import RADIUS_M, World
 from gateway.sim.marks import LARGEST_BYTES, BadWorld
 from gateway.sim.worldfile import WorldSpec, read_world
 
@@ -78,6 +80,22 @@ def test_the_follow_world_begins_with_room_for_all() -> None:
     assert spec.cars_meet
 
 
+def test_cars_without_a_place_begin_where_there_is_room_before_those_that_have_one() -> None:
+    text = (DEPLOY / "world.follow.yaml").read_text()
+    text += "\nboxes: [{x_m: 0, y_m: 0, width_m: 1, depth_m: 1}]\n"
+    world = read_world(text, "follow").world()
+    bodies: list[CarBody] = []
+    for number, name in enumerate(["red", *(f"car{number}" for number in range(20)), "green", "blue"]):
+        bodies.append(CarBody(world, world.start_pose(number, name), random.Random(1), name=name))
+    places = [body.place for body in bodies]
+    assert min(hypot(a.x_m - b.x_m, a.y_m - b.y_m) for a, b in combinations(places, 2)) >= 2 * RADIUS_M
+    assert all(abs(place.x_m) < 3 and abs(place.y_m) < 2.2 for place in places)
+    assert all(max(abs(place.x_m), abs(place.y_m)) > 0.5 + RADIUS_M - 1e-9 for place in places)
+    cart = world.where(world.things[0], 0.0)
+    assert cart is not None
+    assert all(hypot(place.x_m - cart.x_m, place.y_m - cart.y_m) > RADIUS_M for place in places)
+
+
 FAULTS = [
     ("room: {width_m: 6, depth_m: 0}", ["1:29: room.depth_m: '0' is not allowed: a number from 0.02 to 100"]),
     ("room: {width_m: 6}", ["1:7: room.depth_m: is missing"]),
@@ -132,6 +150,11 @@ FAULTS = [
             "things.a.x_m: is not allowed beside a path",
             "things.a.carried_by: is not allowed beside",
         ],
+    ),
+    ("room: {width_m: 2, depth_m: 2}\ncars: {red: {x_m: 1.5, y_m: 0}}", ["2:13: cars.red: begins outside the room"]),
+    (
+        "boxes: [{x_m: 1, y_m: 0, width_m: 1, depth_m: 1}]\ncars: {red: {x_m: 1, y_m: 0}}",
+        ["2:13: cars.red: begins in a wall"],
     ),
     ("cars: {red: {x_m: 0}}", ["1:13: cars.red.y_m: is missing"]),
     (
