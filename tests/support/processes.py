@@ -57,6 +57,13 @@ class Process:
         """Its next line of JSON."""
         return json.loads(self._lines.get(timeout=PATIENCE_S))
 
+    def lines(self) -> list[str]:
+        """Its lines that nobody has read; all, once it has ended."""
+        found = []
+        while not self._lines.empty():
+            found.append(self._lines.get().rstrip("\n"))
+        return found
+
     def say(self, fields: dict[str, Any]) -> Any:
         """Give it a line of JSON, get its answer."""
         assert self.popen.stdin is not None

@@ -1,0 +1,26 @@
+"""A policy of our own: the car with most room ahead avoids obstacles, the others rest; 3 rounds of 5 s.
+
+`python -m fleet.examples.custom_policy`
+"""
+
+import time
+
+from fleet import Fleet
+
+
+def main() -> None:
+    """As a coordinator: a car that a person has stopped or drives is refused to us, and the next one is asked."""
+    with Fleet(kind="coordinator") as fleet:
+        for _ in range(3):
+            room = {reading.car: reading["range_m"] or 0.0 for reading in fleet.get("*/sensor/range")}
+            for car in sorted(fleet.cars(), key=lambda car: room.get(car, 0.0), reverse=True):
+                outcome = fleet.car(car).mode("obstacle_avoidance")
+                print(outcome, flush=True)
+                if outcome.ok:
+                    time.sleep(5)
+                    fleet.car(car).mode("manual")  # closes the mode, and stops
+                    break
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,21 @@
+"""Drive one car in a square: `python -m fleet.examples.drive_one red`."""
+
+import sys
+
+from fleet import Fleet, NotCarriedOut
+
+
+def main(name: str) -> None:
+    """The car is ours while the block runs; however that ends, it is stopped and given back."""
+    with Fleet() as fleet, fleet.car(name).lease() as car:
+        for _ in range(4):
+            car.drive("forward", 0.5)
+            car.drive("spin_left", 0.3)
+        car.light("green")
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:])
+    except NotCarriedOut as error:  # on which car, why, and by whom if another took it
+        sys.exit(str(error))

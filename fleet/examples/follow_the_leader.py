@@ -1,0 +1,24 @@
+"""A car does what another does, until Ctrl-C: `python -m fleet.examples.follow_the_leader red blue`."""
+
+import asyncio
+import sys
+from contextlib import suppress
+
+from fleet.aio import Fleet
+
+
+async def main(leader: str, follower: str) -> None:
+    """A motion is held for 1.5 s at most, and asked again every second: were we killed, the car would stop."""
+    async with Fleet() as fleet, fleet.car(follower).lease() as car:
+        motion = "stop"
+        async for reading in fleet.watch(f"{leader}/state/motion"):  # at each change, and once a second
+            before, motion = motion, reading["motion"].replace("unknown", "stop")
+            if motion != before:
+                print(f"{follower}: {motion}", flush=True)
+            if "stop" not in (before, motion) or motion != before:
+                await car.drive(motion, 1.5, wait=False)
+
+
+if __name__ == "__main__":
+    with suppress(KeyboardInterrupt):  # the car is stopped by then
+        asyncio.run(main(*sys.argv[1:]))
