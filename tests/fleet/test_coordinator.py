@@ -74,7 +74,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
         lines.until("red", "tracking", "role tracking")
         wait_for(lambda: truth(cars, "red") == "tracking", "red tracks again")
         # A rule.
-        drive = threading.Thread(target=lambda: client.car("green").drive("spin_left", 3.0, wait=True))
+        drive = threading.Thread(target=lambda: client.car("green").drive("spin_left", 3.0))
         drive.start()
         ruled = lines.until("red", "light_seeking", "rule 1")
         assert ruled["readings"][0].startswith("green/state/motion motion=spin_left (0.")
