@@ -1,0 +1,174 @@
+"""Two operators, one car: who drives is never in doubt, on the command line, in the SDK and in the record.
+
+Each operator is a process of its own; the simulated car says what it truly does.
+"""
+
+import json
+import threading
+from typing import Any
+
+import pytest
+
+from tests.support.processes import Fleet, Process, driving, wait_for
+
+SCRIPT = """
+import sys, time
+from fleet import Fleet, LeaseLost
+with Fleet(sender="bot") as fleet:
+    try:
+        with fleet.car("red").lease() as car:
+            while True:
+                car.drive("spin_left", 0.5)
+    except LeaseLost as error:
+        sys.exit(f"lost: {error}")
+"""
+
+
+class Record:
+    """What is published of commands and events while a test runs."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._lock = threading.Lock()
+        self._events: list[Any] = []
+        self._logs: list[Any] = []
+        fleet.bus.subscribe("fleet/red/event/command", lambda sample: self._take(self._events, sample.message()))
+        fleet.bus.subscribe("fleet/red/event/log", lambda sample: self._take(self._logs, sample.message()))
+
+    def _take(self, kept: list[Any], message: Any) -> None:
+        with self._lock:
+            kept.append(message)
+
+    def of(self, sender: str, verb: str = "drive") -> list[tuple[str, str, str]]:
+        """Phase, reason and words of what one sender asked with a verb."""
+        with self._lock:
+            return [
+                (event.phase, event.reason, event.words)
+                for event in self._events
+                if event.sender.startswith(sender) and event.verb == verb
+            ]
+
+    def taken(self) -> list[str]:
+        """Each change of hands, in words."""
+        with self._lock:
+            return [log.message for log in self._logs if log.name.endswith("lease_taken")]
+
+
+@pytest.fixture
+def sim(fleet: Fleet) -> Process:
+    started, (red,) = fleet.simulate("red:arduino:tcp")
+    fleet.gateway(red)
+    fleet.ready()
+    return started
+
+
+def operator(fleet: Fleet, who: str, *arguments: str) -> Process:
+    """A person's command line."""
+    fleet.environment["LOGNAME"] = who
+    return fleet.start("-m", "fleet.cli", *arguments)
+
+
+def ended(process: Process) -> tuple[int, str]:
+    """Its exit code and what it said of it; a success says it on stdout."""
+    code = process.wait()
+    return code, (process.stderr or "\n".join(process.lines())).strip()
+
+
+def listed(fleet: Fleet) -> dict[str, Any]:
+    """The car as `fleet list --json` shows it."""
+    process = operator(fleet, "eve", "list", "--json")
+    assert process.wait() == 0, process.stderr
+    row: dict[str, Any] = json.loads(process.lines()[0])
+    return row
+
+
+def drives(fleet: Fleet, who: str) -> bool:
+    """Whether the gateway says that the motion is theirs."""
+    motion = fleet.state("motion")
+    return motion is not None and motion.owner.startswith(who)
+
+
+def test_on_the_command_line(fleet: Fleet, sim: Process) -> None:
+    record = Record(fleet)
+    ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "10s")
+    wait_for(lambda: drives(fleet, "ann@"), "ann drives")
+    row = listed(fleet)
+    assert row["driver"].startswith("ann@")
+    assert row["driver"].endswith(f"-{ann.pid}")
+    assert row["driver_kind"] == "person"
+    table = operator(fleet, "eve", "list")
+    assert table.wait() == 0
+    assert f"{row['driver']} (person)" in table.lines()[1]
+
+    code, words = ended(operator(fleet, "bob", "drive", "red", "back"))
+    assert code == 1
+    assert words.startswith(f"red: not carried out: leased: red is driven by {row['driver']} (person), for ")
+    assert words.endswith("wait, or take it (--take)")
+    assert drives(fleet, "ann@"), "a refusal changed who drives"
+
+    bob = operator(fleet, "bob", "drive", "red", "back", "--for", "8s", "--take")
+    code, words = ended(ann)
+    assert code == 1
+    assert words.startswith("red: not carried out: superseded: back by bob@")
+    assert drives(fleet, "bob@")
+    assert driving(sim), "between the two it was driven on"
+    assert listed(fleet)["driver"].startswith("bob@")
+
+    assert operator(fleet, "ann", "stop", "red").wait() == 0
+    code, words = ended(bob)
+    assert code == 1
+    assert words.startswith("red: not carried out: superseded: stop by ann@")
+    assert not driving(sim)
+    assert listed(fleet)["hold"].startswith("ann@")
+
+    assert [(phase, reason) for phase, reason, _ in record.of("ann@")] == [
+        ("asked", ""),
+        ("queued", ""),
+        ("sent", ""),
+        ("superseded", "superseded"),
+    ]
+    (taken,) = record.taken()
+    assert taken.startswith("red: taken over by bob@")
+    assert f"from {row['driver']} (person)" in taken
+
+
+@pytest.mark.parametrize("verb", [("mode", "red", "tracking"), ("servo", "red", "front", "90"), ("fan", "red")])
+def test_what_moves_a_car_can_be_taken(fleet: Fleet, sim: Process, verb: tuple[str, ...]) -> None:
+    ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "10s")
+    wait_for(lambda: drives(fleet, "ann@"), "ann drives")
+    code, words = ended(operator(fleet, "bob", *verb))
+    assert (code, words.endswith("(--take)")) == (1, True), words
+    assert ended(operator(fleet, "bob", *verb, "--take"))[0] == 0
+    code, words = ended(ann)
+    assert code == 1
+    assert "by bob@" in words
+
+
+def test_a_person_and_a_script(fleet: Fleet, sim: Process) -> None:
+    record = Record(fleet)
+    script = fleet.start("-c", SCRIPT)
+    wait_for(lambda: drives(fleet, "bot"), "the script drives")
+    assert (listed(fleet)["driver"], listed(fleet)["driver_kind"]) == ("bot", "script")
+
+    ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "8s")
+    assert script.wait() == 1
+    assert script.stderr.startswith("lost: red was taken by ann@"), script.stderr
+    assert drives(fleet, "ann@"), "the script that went stopped what ann drives"
+    assert driving(sim)
+    assert fleet.ask("drive", motion="back", sender="bot", kind="script")["reason"] == "leased"
+    assert drives(fleet, "ann@")
+    assert ended(ann)[0] == 0
+    assert not driving(sim)
+
+    assert all(reason in ("", "superseded", "leased") for _, reason, _ in record.of("bot"))
+    assert "forward by ann@" in next(words for phase, _, words in record.of("bot") if phase == "superseded")
+    (taken,) = record.taken()
+    assert taken.startswith("red: taken over by ann@")
+    assert taken.endswith("from bot (script)")
+
+
+def test_a_script_that_is_killed_leaves_no_car_driving_and_no_lease(fleet: Fleet, sim: Process) -> None:
+    script = fleet.start("-c", SCRIPT.replace('drive("spin_left", 0.5)', 'drive("spin_left", 10)'))
+    wait_for(lambda: drives(fleet, "bot") and driving(sim), "the script drives")
+    script.kill()
+    wait_for(lambda: not driving(sim), "it stands", 8.0)
+    wait_for(lambda: listed(fleet)["driver"] is None, "nobody has it")
