@@ -243,6 +243,8 @@ class Publications:
         match name:
             case "state/link":
                 _fill_link(message, health, self._url, now)
+                if control.disobeyed:
+                    message.rejects["not_obeyed"] = control.disobeyed
             case "state/mode":
                 _fill_mode(message, control, now)
             case "state/motion":

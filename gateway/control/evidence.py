@@ -2,7 +2,6 @@
 
 from typing import Final
 
-from gateway.control import stop
 from gateway.control.battery import Action, BatteryLevel
 from gateway.control.execution import Execution
 from gateway.control.mode import MANUAL_SILENCE_S, Verdict
@@ -22,6 +21,8 @@ STALL_S: Final = 0.5
 """A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
 UNDER_WAY_S: Final = 0.06
 """A reading that came sooner after a frame was under way when the frame was sent."""
+CLOSING_S: Final = (0.2, 0.95)
+"""protocol.md: `x0` blocks for about 1.0 s. A reading between shows that it did not; a sooner one was under way."""
 FAN_SETTLED_S: Final = 2.0
 """Readings this long after a toggle were sent with the fan as it is now."""
 
@@ -59,8 +60,30 @@ class Evidence(Execution):
                 self._gave_up = False
                 self._ledger.log(Level.INFO, "answers_again", "a reading came: recovery begins again", now)
                 self._begin(self._recovery(now), Why.RECOVERY, now)
-        elif running.frames_sent and event.at > running.last_at + UNDER_WAY_S:
+        elif not running.disobeyed and self._shows_disobedience(event):
+            self._disobeyed(running, event.at - self._closed_at, now)
+        elif running.frames_sent and not running.disobeyed and event.at > running.last_at + UNDER_WAY_S:
             self._finish(running, now)
+
+    def _shows_disobedience(self, event: Sensors) -> bool:
+        """Whether a mode-0 reading came in the second for which a car that obeys `MODE00` is blocked.
+
+        One without an echo does not show it: it took a second, and had begun before.
+        """
+        return bool(event.range_cm) and CLOSING_S[0] < event.at - self._closed_at < CLOSING_S[1]
+
+    def _disobeyed(self, running: Running, after_s: float, now: float) -> None:
+        self.disobeyed += 1
+        words = (
+            f"{self.car} reported {after_s:.2f} s after it was sent MODE00, which blocks a car that obeys it for 1 s: "
+            "it did not get it, and perhaps nothing else (a link that loses what is written); stopping it again"
+        )
+        self._ledger.log(Level.WARNING, "not_obeyed", words, now)
+        if running.recipe.confirmed:
+            running.disobeyed = True  # no reading confirms it any more: it tries again
+        else:
+            self.known = False
+            self._recover(now)
 
     def _settle(self, now: float) -> None:
         """Treat the car as what its bytes have shown it to be; between stops only, each of which is one platform's."""
@@ -110,10 +133,7 @@ class Evidence(Execution):
         words = f"{self.car} is heard again: it is stopped first"
         self._ledger.log(Level.INFO, "answers_again", words, now)
         self._waiting.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
-        recipe, before = self._recovery(now), self._running  # whose frames may be among what was held up
-        worst_at = now + stop.worst_s(recipe, self._for_stop(now), self.pacing, now)
-        why, commands = (before.why, before.commands) if before is not None else (Why.RECOVERY, [])
-        self._running = Running(recipe, why, now, commands, worst_at=worst_at)
+        self._recover(now)  # what ran may have its frames among what was held up
 
     def stalled(self, gap_s: float, now: float) -> None:
         """The loop slept for `gap_s`: with motion held the car is stopped first."""

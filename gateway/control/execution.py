@@ -75,6 +75,10 @@ class Execution:
         """A mode whose effect has not been seen yet, and when its frame went out."""
         self._senders = Senders()
         self._waiting = Waiting(self._ledger, self._senders, self.safety)
+        self._closed_at = float("-inf")
+        """When `MODE00` was written last, if a car in mode 0 must have been awake to get it, and was blocked by it."""
+        self.disobeyed = 0
+        """How often what was heard has shown that a frame was lost."""
         self._left_at = self._left_until = float("-inf")
         """When the frame was written that leaves a mode, and when the car has left it at the latest."""
 
@@ -195,6 +199,8 @@ class Execution:
             # A turn of the mode that is left may be deaf for longer than the closing takes; only a stop may meet it.
             deaf_until = max(now, self.pacing.block_until) + self._for_stop(now).turn_s
             self._left_at, self._left_until = now, deaf_until + self.profile.block_s(write.frame) + FLIGHT_S
+        if isinstance(write.frame, ModeClose):
+            self._closed_at = now if self._awake(now) else float("-inf")
         self.pacing.wrote(write.frame, now)
         self._note_frame(write.frame, now)
         match source:
@@ -333,6 +339,19 @@ class Execution:
             if running.first_at is not None and pending is not None:
                 self._ledger.sent(pending, now, f"joined the {running.recipe.name} stop under way")
 
+    def _recover(self, now: float) -> None:
+        """Bring the car to a known state, whatever runs: whoever waits for that waits for this."""
+        recipe, before = self._recovery(now), self._running
+        worst_at = now + stop.worst_s(recipe, self._for_stop(now), self.pacing, now)
+        why, commands = (before.why, before.commands) if before is not None else (Why.RECOVERY, [])
+        self._running = Running(recipe, why, now, commands, worst_at=worst_at)
+
+    def _awake(self, now: float) -> bool:
+        """No block of ours runs in mode 0, and none that we know nothing of: so a frame is obeyed at once."""
+        if self._for_stop(now).style is not StopStyle.MODE_FRAME or now < self.pacing.block_until:
+            return False
+        return self._manual if self.known else now >= self.pacing.written_at + recipes.SILENCE_S - 0.1
+
     def _step(self, now: float) -> Write | None:
         running = self._running
         assert running is not None
@@ -368,6 +387,10 @@ class Execution:
         """No mode-0 reading since the last frame: a stop is over in time; a recovery tries again, three times."""
         if not running.recipe.confirmed:
             if now < running.obeyed_at:
+                return
+            if self.mode.verdict is Verdict.CONTRADICTED and self._recovery(now).confirmed:
+                self.known = False
+                self._recover(now)
                 return
             if not self._unheard:
                 self._finish(running, now)

@@ -67,6 +67,8 @@ class Running:
     first_at: float | None = None
     last_at: float = float("-inf")
     retries: int = 0
+    disobeyed: bool = False
+    """What was heard meanwhile shows that one of its frames was lost."""
     worst_at: float = float("-inf")
     """When the motors are off at the latest, if no step is late."""
     due: float = float("inf")

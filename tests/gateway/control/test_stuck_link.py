@@ -1,9 +1,14 @@
 """A link that is open and delivers nothing: what is said of the car meanwhile, and what is done when it is back."""
 
+import random
+from collections.abc import Callable
+
 import pytest
 
-from gateway.control.records import Drive, Phase, Reason, SetMode, Stop
+from gateway.control.records import Act, Drive, Phase, Reason, SetMode, Stop
+from gateway.protocol.encode import ColorLed
 from gateway.protocol.values import Mode, Motion
+from gateway.sim.core.world import World
 from tests.support.virtual import Pair
 
 FORWARD = Drive(Motion.FORWARD, 3.0)
@@ -105,3 +110,51 @@ def test_a_stop_in_obstacle_avoidance_takes_its_time_and_is_no_silence() -> None
         pair.ask(SetMode(Mode.OBSTACLE_AVOIDANCE))
         pair.run(8.7)
     assert not [log for log in pair.logs if log.code in ("unheard", "mode_contradicted")]
+
+
+# ---------------------------------------------------------------------- a link that loses what is written
+
+
+def deaf(pair: Pair) -> list[bytes]:
+    """From now on nothing that is written reaches the car; what was kept from it."""
+    lost: list[bytes] = []
+    pair.car.feed = lambda data, now: lost.append(data)  # type: ignore[method-assign]
+    return lost
+
+
+@pytest.mark.parametrize("platform", ["arduino", "stm32"])
+def test_a_stop_that_is_lost_on_the_way_is_noticed_by_a_report_that_should_not_come(platform: str) -> None:
+    """protocol.md: `MODE00` blocks for 1.0 s. Of the reports, one a second, most come where that cannot be."""
+    noticed, tries = 0, 40
+    for seed in range(tries):
+        pair = Pair(platform, seed=seed, start_s=2.0).ready()
+        pair.run(seed / tries)
+        pair.ask(Drive(Motion.FORWARD, 9.0))
+        pair.run(1.5)
+        hears = pair.car.feed
+        deaf(pair)
+        pair.ask(Stop(), identity="stop")
+        pair.run(40.0)
+        assert pair.car.truth.motor_left
+        if Phase.COMPLETE not in pair.phases("stop"):
+            noticed += 1
+            assert "not_obeyed" in [log.code for log in pair.logs]
+            assert pair.control.motors == "unknown"
+            assert pair.control.disobeyed
+            pair.car.feed = hears  # type: ignore[method-assign]
+            pair.until(lambda pair=pair: pair.control.motors == "off", 25.0)
+            assert not pair.car.truth.motor_left, "stopped when it hears again, without being asked"
+    assert noticed > 0.6 * tries, f"{noticed} of {tries}"
+
+
+@pytest.mark.parametrize("world", [World.room, World.open_field], ids=["echo", "no-echo"])
+@pytest.mark.parametrize("platform", ["arduino", "stm32", "raspberry_pi"])
+def test_no_stop_that_was_obeyed_is_thought_to_be_lost(platform: str, world: Callable[[], World]) -> None:
+    pair = Pair(platform, world=world(), start_s=2.0).ready()
+    moments = random.Random(7)
+    for _ in range(60):
+        pair.ask(moments.choice([Drive(Motion.FORWARD, 2.0), Act(ColorLed(1, 2, 3)), SetMode(Mode.MANUAL)]))
+        pair.run(2.5 * moments.random())
+        pair.ask(Stop())
+        pair.run(4.0 * moments.random())
+    assert pair.control.disobeyed == 0
