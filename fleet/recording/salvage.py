@@ -1,10 +1,10 @@
 """What is whole of one MCAP file, and where and why the rest is not. No sessions here, and nothing is repaired.
 
-The mcap library reads every record, and checks and takes apart every chunk. Only the way from record to record is our
-own, because the library's is made for whole files: it allocates what a damaged length says, reads to the end for a
-negative one, gives up at the first damage without saying where, and takes eight times as long (1.0 instead of 0.12 us
-a message) because it reads each message's index. A file with an end is not walked at all: its index says where chunks
-are, so that a damaged one hides no other.
+The mcap library reads every record but the messages. The way from record to record is our own, because the library's is
+made for whole files: it allocates what a damaged length says, reads to the end for a negative one, gives up at the
+first damage without saying where, and takes eight times as long (1.0 instead of 0.12 us a message) as it reads each
+message's index. So is the way within a chunk, for its speed. A file with an end is not walked at all: its index
+(index.py) says where chunks are, so that a damaged one hides no other, and only those that are asked for are read.
 """
 
 import os
@@ -15,23 +15,23 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]  # it has no types
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Message, Schema
-from mcap.stream_reader import CRCValidationError, breakup_chunk, get_chunk_data_stream
-from mcap.summary import Summary
+from mcap.records import Channel, Chunk, DataEnd, Footer, Schema
+from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+
+from fleet.recording import index as mcap_index
+from fleet.recording.index import HEAD as _HEAD
+from fleet.recording.index import LIMIT, Index, Place
+from fleet.recording.selection import EVERYTHING, Selection
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-LIMIT: Final = 16 * 2**20
-"""No record, and no chunk when uncompressed, is read if it is larger: 16 times the chunks that we write."""
-
-_HEAD: Final = struct.Struct("<BQ")  # opcode, length
+_MESSAGE: Final = struct.Struct("<BQHIQQ")  # the head, channel, sequence, log time, publish time
 _FOOTER_SIZE: Final = _HEAD.size + 20
 _DATA_END_SIZE: Final = _HEAD.size + 4
 _BLOCK: Final = 2**20
@@ -42,6 +42,17 @@ _BROKEN: Final = (McapError, ValueError, struct.error, zstandard.ZstdError, Runt
 
 class NotMcap(Exception):
     """A file of another kind, or none; its text says why."""
+
+
+class Lane(NamedTuple):
+    """A channel and its schema, if it has one."""
+
+    channel: Channel
+    schema: Schema | None
+
+
+Row = tuple[Lane, int, int, int, bytes]
+"""One message: lane, sequence, log time and publish time in ns, payload. A plain tuple: there are millions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,37 +163,38 @@ class Salvage:
         except OSError as error:
             self._unreadable(error)
 
-    def messages(self) -> Iterator[tuple[Schema | None, Channel, Message]]:
-        """Every message that is whole, in the order of writing. Never holds more than one chunk."""
+    def messages(self, selection: Selection = EVERYTHING) -> Iterator[Row]:
+        """Every whole message that is selected, in the order of writing. Never holds more than one chunk.
+
+        With a whole index only the chunks are read that can have one; without, all are.
+        """
         self._begin()
         try:
             with self.path.open("rb") as file:
-                _, summary = self._index(file)
-                channels = {} if summary is None else dict(summary.channels)
-                schemas: dict[int, Schema | None] = {0: None} if summary is None else {0: None, **summary.schemas}
+                _, index = self._index(file)
+                channels = {} if index is None else dict(index.channels)
+                schemas: dict[int, Schema | None] = {0: None} if index is None else {0: None, **index.schemas}
+                lanes = _Lanes(channels, schemas, selection)
                 strays: list[int] = []
-                for piece in self._pieces(file, summary):
+                for piece in self._pieces(file, index, selection):
                     try:
-                        records = breakup_chunk(piece.chunk(), validate_crc=True)
+                        records = _records(piece.chunk())
                     except _BROKEN as error:
                         self.damage.append(piece.lost(error))
                         continue
-                    for record in records:
-                        if isinstance(record, Message):
-                            channel = channels.get(record.channel_id)
-                            if channel is None or channel.schema_id not in schemas:
-                                strays.append(piece.at)
-                            else:
-                                yield schemas[channel.schema_id], channel, record
-                        elif isinstance(record, Channel):
-                            channels[record.id] = record
-                        elif isinstance(record, Schema):
-                            schemas[record.id] = record
+                    yield from lanes.rows(records, piece.at, strays)
                 if strays:
                     words = f"{len(strays)} messages from there on are of channels that were described in what is lost"
                     self.damage.append(Damage(strays[0], words))
         except OSError as error:
             self._unreadable(error)
+
+    def index(self) -> Index | None:
+        """What stands at its end, if it is whole and names every chunk; raises OSError."""
+        self._begin()
+        with self.path.open("rb") as file:
+            _, index = self._index(file)
+        return index if index is not None and index.complete else None
 
     def _begin(self) -> None:
         self.damage, self.cut = [], False
@@ -190,7 +202,7 @@ class Salvage:
     def _unreadable(self, error: OSError) -> None:
         self.damage.append(Damage(0, f"it cannot be read: {error.strerror}"))
 
-    def _index(self, file: IO[bytes]) -> tuple[Footer | None, Summary | None]:
+    def _index(self, file: IO[bytes]) -> tuple[Footer | None, Index | None]:
         """What stands at the end of a file, if its checksum says that it is whole."""
         size = file.seek(0, os.SEEK_END)
         at = size - _FOOTER_SIZE - len(MAGIC)
@@ -211,33 +223,40 @@ class Salvage:
             self.damage.append(Damage(footer.summary_start, "the index there fails its checksum"))
             return None, None
         try:
-            file.seek(0)
-            return footer, SeekingReader(file, record_size_limit=LIMIT).get_summary()
+            return footer, mcap_index.read(file, footer.summary_start, at)
         except _BROKEN:
             self.damage.append(Damage(footer.summary_start, "the index there cannot be taken apart"))
             return None, None
 
-    def _pieces(self, file: IO[bytes], summary: Summary | None) -> Iterator[_Piece]:
+    def _pieces(self, file: IO[bytes], index: Index | None, selection: Selection = EVERYTHING) -> Iterator[_Piece]:
         """What holds messages, by the index or, without one, from record to record."""
-        statistics = summary.statistics if summary is not None else None
-        if summary is not None and statistics and 0 < statistics.chunk_count == len(summary.chunk_indexes):
-            for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
-                yield from self._indexed(file, index)
-        else:
+        if index is None or not index.complete:
             yield from self._walk(file)
+            return
+        places = index.places
+        if index.describes:
+            wanted = frozenset(number for number, one in index.channels.items() if selection.has_key(one.topic))
+            every = len(wanted) == len(index.channels)
+            places = [
+                place
+                for place in places
+                if selection.overlaps(place.first_ns, place.last_ns) and (every or place.holds(wanted))
+            ]
+        for place in places:
+            yield from self._indexed(file, place)
 
-    def _indexed(self, file: IO[bytes], index: ChunkIndex) -> Iterator[_Piece]:
-        at, length = index.chunk_start_offset, index.chunk_length - _HEAD.size
+    def _indexed(self, file: IO[bytes], place: Place) -> Iterator[_Piece]:
+        at, length = place.at, place.length - _HEAD.size
         if length > LIMIT:
             self.damage.append(Damage(at, f"the chunk there has {length} bytes: no more than {LIMIT} are read"))
             return
-        if length < 0 or at + index.chunk_length > file.seek(0, os.SEEK_END):
+        if length < 0 or at + place.length > file.seek(0, os.SEEK_END):
             self.damage.append(Damage(at, "the index says that a chunk is there, where none can be"))
             return
-        record = _read(file, at, index.chunk_length)
+        record = _read(file, at, place.length)
         if record[: _HEAD.size] != _HEAD.pack(Opcode.CHUNK, length):
             self.damage.append(Damage(at, "the head of the chunk there is damaged, its messages are shown if whole"))
-        yield _Piece(at, Opcode.CHUNK, record[_HEAD.size :], _span(index))
+        yield _Piece(at, Opcode.CHUNK, record[_HEAD.size :], _span(place))
 
     def _walk(self, file: IO[bytes]) -> Iterator[_Piece]:
         """Step from record to record until the end or to where none can be."""
@@ -292,6 +311,79 @@ class Salvage:
             self.damage.append(Damage(at, words))
 
 
+class _Lanes:
+    """The channels of a file as they become known, and whether each is selected."""
+
+    def __init__(self, channels: dict[int, Channel], schemas: dict[int, Schema | None], selection: Selection) -> None:
+        self._channels = channels
+        self._schemas = schemas
+        self._selection = selection
+        self._found: dict[int, Lane | None] = {}
+
+    def rows(self, records: list[tuple[int, int, int, int, bytes]], at: int, strays: list[int]) -> Iterator[Row]:
+        """The selected messages of one chunk; each of an unknown channel adds `at` to `strays`."""
+        found, selection = self._found, self._selection
+        timed = selection.start_ns is not None or selection.end_ns is not None
+        for number, sequence, log_ns, publish_ns, data in records:
+            if number < 0:
+                self._describe(-number, data)
+                continue
+            try:
+                lane = found[number]
+            except KeyError:
+                channel = self._channels.get(number)
+                if channel is None or channel.schema_id not in self._schemas:
+                    strays.append(at)
+                    continue
+                wanted = selection.has_key(channel.topic)
+                lane = found[number] = Lane(channel, self._schemas[channel.schema_id]) if wanted else None
+            if lane is not None and (not timed or selection.has_time(log_ns)):
+                yield lane, sequence, log_ns, publish_ns, data
+
+    def _describe(self, opcode: int, body: bytes) -> None:
+        stream = ReadDataStream(BytesIO(body))
+        if opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            if self._channels.get(channel.id) != channel:
+                self._channels[channel.id] = channel
+                self._found.pop(channel.id, None)
+        else:
+            schema = Schema.read(stream)
+            if self._schemas.get(schema.id) != schema:
+                self._schemas[schema.id] = schema
+                self._found.clear()
+
+
+def _records(chunk: Chunk) -> list[tuple[int, int, int, int, bytes]]:
+    """A chunk's messages as (channel, sequence, log time, publish time, payload); raises one of _BROKEN.
+
+    What describes channels stands between them as (minus the opcode, 0, 0, 0, body).
+    """
+    stream, end = get_chunk_data_stream(chunk, validate_crc=True)
+    data = chunk.data if not chunk.compression else stream.read(end)
+    found: list[tuple[int, int, int, int, bytes]] = []
+    unpack = _MESSAGE.unpack_from
+    at = 0
+    while at < end:
+        if data[at] == Opcode.MESSAGE:
+            _, length, channel, sequence, log_ns, publish_ns = unpack(data, at)
+            begin, at = at + _MESSAGE.size, at + _HEAD.size + length
+            if at < begin or at > end:
+                raise EndOfFile
+            found.append((channel, sequence, log_ns, publish_ns, data[begin:at]))
+        else:
+            opcode, length = _HEAD.unpack_from(data, at)
+            begin, at = at + _HEAD.size, at + _HEAD.size + length
+            if at > end:
+                raise EndOfFile
+            if opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+                body = data[begin:at]
+                # Taken apart here too: a chunk of which one record is broken gives none.
+                (Channel if opcode == Opcode.CHANNEL else Schema).read(ReadDataStream(BytesIO(body)))
+                found.append((-opcode, 0, 0, 0, body))
+    return found
+
+
 def _read(file: IO[bytes], at: int, length: int) -> bytes:
     file.seek(at)
     return file.read(length)
@@ -313,11 +405,10 @@ def _named(opcode: int) -> str:
         return "record"
 
 
-def _span(index: ChunkIndex) -> str:
+def _span(place: Place) -> str:
     try:
         first, last = (
-            datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3]
-            for ns in (index.message_start_time, index.message_end_time)
+            datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3] for ns in (place.first_ns, place.last_ns)
         )
     except (OverflowError, ValueError, OSError):
         return ""  # somebody else's clock

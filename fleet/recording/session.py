@@ -3,16 +3,17 @@
 A session is a directory (directory.py) or a bare .mcap, also somebody else's. What is whole of a file is salvage.py's.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from mcap.records import Channel, Message, Schema
 from mcap.writer import Writer
 
 from fleet.recording import directory
-from fleet.recording.salvage import NotMcap, Salvage
+from fleet.recording.index import Index
+from fleet.recording.salvage import Lane, NotMcap, Row, Salvage
+from fleet.recording.selection import EVERYTHING, Selection
 
 
 class NoSession(Exception):
@@ -116,7 +117,7 @@ class Session:
             writer = Writer(file)
             writer.start(library="zenoh-car-fleet rescue")
             for segment in self.segments:
-                for schema, channel, message in self._whole(segment):
+                for (channel, schema), sequence, log_ns, publish_ns, data in self._whole(segment, EVERYTHING):
                     schema_id = 0
                     if schema is not None:
                         kind = (schema.name, schema.encoding, schema.data)
@@ -126,38 +127,59 @@ class Session:
                     where = (channel.topic, channel.message_encoding, schema_id, tuple(channel.metadata.items()))
                     if where not in channels:
                         channels[where] = writer.register_channel(*where[:3], channel.metadata)
-                    writer.add_message(
-                        channels[where], message.log_time, message.data, message.publish_time, message.sequence
-                    )
+                    writer.add_message(channels[where], log_ns, data, publish_ns, sequence)
                     count += 1
             writer.finish()  # type: ignore[no-untyped-call]  # mcap's has no return type
         if not count:
             raise NoSession(f"{self.path} holds no message that is whole: {self.damage_words}")
         return Session(self.path, (out,), self.description)
 
-    def messages(self) -> Iterator[Recorded]:
-        """Every whole message, in the order of writing; see `damage` afterwards."""
-        for segment in self.segments:
-            yield from self._read(segment)
+    def messages(
+        self, keys: Iterable[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Recorded]:
+        """Every whole message, in the order of writing; see `damage` afterwards.
 
-    def _read(self, segment: Path) -> Iterator[Recorded]:
-        for schema, channel, message in self._whole(segment):
+        `keys`: only of these keys or key expressions (`fleet/red/**`, `fleet/*/sensor/range`). `start_ns`, `end_ns`:
+        only from then until before then, by the recorder's clock. Of a whole file only the chunks are read that can
+        have some, so that the last minute of a long session takes no longer than a minute's messages.
+        """
+        for lane, sequence, log_ns, publish_ns, data in self.rows(Selection.of(keys, start_ns, end_ns)):
             yield Recorded(
-                key=channel.topic,
-                payload=message.data,
-                message=schema.name if schema is not None and schema.encoding == "protobuf" else "",
-                encoding=channel.message_encoding,
-                published_ns=message.publish_time,
-                recorded_ns=message.log_time,
-                sequence=message.sequence,
+                key=lane.channel.topic,
+                payload=data,
+                message=message_of(lane),
+                encoding=lane.channel.message_encoding,
+                published_ns=publish_ns,
+                recorded_ns=log_ns,
+                sequence=sequence,
             )
 
-    def _whole(self, segment: Path) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    def rows(self, selection: Selection = EVERYTHING) -> Iterator[Row]:
+        """As `messages`, as plain tuples with channel and schema as they are in the file: a third of the time."""
+        for segment in self.segments:
+            yield from self._whole(segment, selection)
+
+    def indexes(self) -> dict[Path, Index | None]:
+        """What stands at the end of each segment; None where it is not whole, or cannot be read."""
+        found: dict[Path, Index | None] = {}
+        for segment in self.segments:
+            try:
+                found[segment] = Salvage(segment).index()
+            except (NotMcap, OSError):
+                found[segment] = None
+        return found
+
+    def _whole(self, segment: Path, selection: Selection) -> Iterator[Row]:
         try:
             salvage = Salvage(segment)
         except NotMcap as error:
             self.damage[segment] = str(error)
             return
-        yield from salvage.messages()
+        yield from salvage.messages(selection)
         if salvage.damage:
             self.damage[segment] = salvage.words
+
+
+def message_of(lane: Lane) -> str:
+    """Full protobuf name of a lane's messages; empty where the file has no schema for it."""
+    return lane.schema.name if lane.schema is not None and lane.schema.encoding == "protobuf" else ""

@@ -142,7 +142,7 @@ def test_a_chunk_that_grows_when_uncompressed_is_not_followed(tmp_path: Path) ->
         for data in (out.getvalue(), out.getvalue()[:-8]):
             path.write_bytes(data)
             salvage = Salvage(path)
-            assert [message.sequence for _, _, message in salvage.messages()] == [1]
+            assert [row[1] for row in salvage.messages()] == [1]
             assert f"byte {at}: " in salvage.words
             assert str(LIMIT) in salvage.words
 
@@ -165,7 +165,7 @@ def test_lz4_and_no_compression_and_no_chunks_are_read_too(tmp_path: Path) -> No
             writer.finish()  # type: ignore[no-untyped-call]  # it has no return type
         salvage = Salvage(path)
         salvage.check()
-        assert [message.sequence for _, _, message in salvage.messages()] == list(range(100)), options
+        assert [row[1] for row in salvage.messages()] == list(range(100)), options
         assert not salvage.words, options
         whole = path.read_bytes()
         for length in range(8, len(whole), 7):
