@@ -53,8 +53,9 @@ proto: .venv/.ready ## generate schemas/gen from schemas/proto
 picture: .venv/.ready ## the README's picture, of the newest session (needs a Vulkan driver, which may be software)
 	$(BIN)/python -m fleet.replay.picture "$$(ls -td sessions/*/ | head -n 1)session.rrd" .github/demo.png
 
-readme: .venv/.ready ## generate the tables and help texts of the README
+readme: .venv/.ready ## generate the tables and help texts of the README, and the SDK's reference
 	$(BIN)/python -m tests.readme
+	$(BIN)/python -m tests.reference
 
 clean: ## remove everything that is not tracked
 	rm -rf .venv .cache .tmp .state .hypothesis .pytest_cache .mypy_cache .ruff_cache sessions

@@ -81,6 +81,11 @@ def any_client() -> str:
     return "```python\n" + (ROOT / "tests" / "e2e" / "any_client.py").read_text(encoding="utf-8").strip() + "\n```"
 
 
+def sdk() -> str:
+    """The first example; tests/fleet/test_examples.py runs it."""
+    return "```python\n" + (ROOT / "fleet" / "examples" / "drive_one.py").read_text(encoding="utf-8").strip() + "\n```"
+
+
 _STATES = {
     "manual, nothing unread": "driving or at rest",
     "manual, a frame may be unread": "the same, just after another command",
@@ -252,6 +257,7 @@ PARTS = {
     "modes": mode_table,
     "help": help_text,
     "any_client": any_client,
+    "sdk": sdk,
 }
 
 
