@@ -20,9 +20,10 @@ Generated from the docstrings by `make readme`; examples that run are in [exampl
 distances meters, angles degrees unless a name says otherwise; what was not measured is None.
 
 ```python
-from fleet import Fleet, LeaseLost, NotCarriedOut   # blocking
-from fleet.aio import Fleet                         # the same names for asyncio, each call awaited
+from fleet import Fleet, LeaseLost, NotCarriedOut
 ```
+
+`from fleet.aio import Fleet` has the same names for asyncio, each call awaited.
 """
 _CLASSES: tuple[tuple[str, type], ...] = (
     ("Fleet", client.Fleet),
