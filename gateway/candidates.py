@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from gateway.link.url import BleUrl, LinkUrl, SerialUrl, UsbUrl
+from gateway.link.usb import listed
 
 if TYPE_CHECKING:
     from bleak.backends.scanner import AdvertisementData
@@ -50,10 +51,8 @@ class NoBluetooth(Exception):
 
 
 def serial_ports() -> list[Port]:
-    """The serial ports of this computer, by name."""
-    from serial.tools import list_ports
-
-    return described(list_ports.comports(), by_id(BY_ID))
+    """The serial ports of this computer, by name; raises CannotOpen if the system does not list them."""
+    return described(listed(), by_id(BY_ID))
 
 
 def by_id(directory: Path) -> dict[str, str]:

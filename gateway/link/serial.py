@@ -167,13 +167,17 @@ class SerialLink(Link):
     # ------------------------------------------------------------------ in the thread
 
     def _run(self) -> None:
+        port: serial.Serial | CannotOpen
         try:
             port = self._open_port()
         except CannotOpen as error:
-            _opening.discard(str(self._url))
-            self._tell(self._failed_to_open, error)
+            port = error
+        except Exception as error:  # noqa: BLE001 - whatever a driver does: the thread must not end without a word
+            port = CannotOpen(f"{self._url}: the port cannot be opened ({_cause(error)})")
+        _opening.discard(str(self._url))  # before anybody is told, who may try again at once
+        if isinstance(port, CannotOpen):
+            self._tell(self._failed_to_open, port)
             return
-        _opening.discard(str(self._url))
         with self._hold:
             self._port = port
         self._tell(self._succeeded)
@@ -291,7 +295,10 @@ def _cause(error: Exception) -> str:
 
 
 def _ports() -> str:
-    found = sorted(port.device for port in plugged())
+    try:
+        found = sorted(port.device for port in plugged())
+    except CannotOpen as error:
+        return str(error)
     return f"there are: {', '.join(found)}" if found else "no serial port is plugged in"
 
 

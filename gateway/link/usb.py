@@ -1,10 +1,18 @@
 """Which serial port a USB device has now: it may have another at each plugging in. Nothing is opened here."""
 
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
 
 from gateway.link.base import CannotOpen
 from gateway.link.url import UsbUrl
+
+if TYPE_CHECKING:
+    from serial.tools.list_ports_common import ListPortInfo
+
+LISTINGS: Final = 3
+LIST_AGAIN_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +31,24 @@ class Plugged:
 
 
 def plugged() -> list[Plugged]:
-    """The serial ports of this computer. It reads the system's lists of devices, which can take a while."""
+    """The serial ports of this computer; raises CannotOpen. It reads the system's lists, which can take a while."""
+    return [Plugged(port.device, port.vid, port.pid, port.serial_number) for port in listed()]
+
+
+def listed() -> "list[ListPortInfo]":
+    """The same in pyserial's words."""
     from serial.tools import list_ports
 
-    return [Plugged(port.device, port.vid, port.pid, port.serial_number) for port in list_ports.comports()]
+    failure: Exception | None = None
+    for _ in range(LISTINGS):
+        try:
+            return list(list_ports.comports())
+        except (OSError, TypeError, ValueError) as error:
+            # A device that goes while it is looked at: pyserial takes the number of what it could not read.
+            failure = error
+            time.sleep(LIST_AGAIN_S)
+    words = " ".join(str(failure).split()) or type(failure).__name__
+    raise CannotOpen(f"the serial ports cannot be listed ({words}): is a device just being unplugged?")
 
 
 def choose(url: UsbUrl, ports: Iterable[Plugged]) -> str:
@@ -41,12 +63,12 @@ def choose(url: UsbUrl, ports: Iterable[Plugged]) -> str:
         return fit[0].device
     if fit:
         raise CannotOpen(
-            f"{url}: {len(fit)} devices fit, {_listed(fit)}: add a serial= that only one has, or give its device path"
+            f"{url}: {len(fit)} devices fit, {_named(fit)}: add a serial= that only one has, or give its device path"
         )
-    found = f"there are: {_listed(there)}" if there else "no serial port is plugged in"
+    found = f"there are: {_named(there)}" if there else "no serial port is plugged in"
     raise CannotOpen(f"{url}: no such USB device is plugged in; {found}")
 
 
-def _listed(ports: list[Plugged]) -> str:
+def _named(ports: list[Plugged]) -> str:
     """For one line, without what a device has chosen to be called that cannot be printed."""
     return "".join(each if each.isprintable() else "?" for each in ", ".join(map(str, ports)))

@@ -18,6 +18,7 @@ UNO_1 = Plugged("/dev/ttyACM0", 0x2341, 0x0043, "7573")
 UNO_2 = Plugged("/dev/ttyACM1", 0x2341, 0x0043, "9912")
 BOARD = Plugged("/dev/ttyS0")
 THERE = [UNO_2, CH340, BOARD, UNO_1]
+PATIENCE_S = 20.0
 FRAME = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
 
 Usb = Callable[..., None]
@@ -101,6 +102,43 @@ async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: 
     assert await link.read() == FRAME
     await link.close()
     second.close()
+
+
+@pytest.mark.parametrize("asked", ["serial://?vid=2341", "serial:///no/such/ttyACM0"])
+@pytest.mark.parametrize("failure", [TypeError("int() can't convert None"), OSError(19, "No such device"), KeyError()])
+async def test_a_device_that_goes_while_the_ports_are_listed_costs_one_try(
+    asked: str, failure: Exception, tmp_path: Path, plug: Usb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """pyserial reads a device's numbers from files that go with it. The next try must find nothing that hangs."""
+
+    def half_gone() -> list[ListPortInfo]:
+        raise failure
+
+    monkeypatch.setattr(list_ports, "comports", half_gone)
+    for _ in range(2):
+        with pytest.raises(CannotOpen, match=r"cannot be listed|cannot be opened"):
+            await open_link(parse_url(asked), timeout_s=PATIENCE_S)
+    peer = PtyPeer(tmp_path)
+    plug(Plugged(path(peer), 0x2341, 0x0043, "7573"))
+    link = await open_link(UsbUrl(vid=0x2341))
+    await link.close()
+    peer.close()
+
+
+async def test_a_listing_that_fails_once_is_asked_for_again(
+    tmp_path: Path, plug: Usb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peer = PtyPeer(tmp_path)
+    plug(Plugged(path(peer), 0x2341, 0x0043, "7573"))
+    whole, failures = list_ports.comports, [TypeError("half gone")]
+    monkeypatch.setattr(list_ports, "comports", lambda: _raise(failures.pop()) if failures else whole())
+    link = await open_link(UsbUrl(pid=0x0043))
+    await link.close()
+    peer.close()
+
+
+def _raise(error: Exception) -> list[ListPortInfo]:
+    raise error
 
 
 async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> None:
