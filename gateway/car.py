@@ -21,7 +21,7 @@ from typing import Any, Final
 import zenoh
 
 from gateway import requests
-from gateway.control import backoff
+from gateway.control.backoff import Attempts
 from gateway.control.battery import Policy
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
@@ -119,6 +119,7 @@ class Car:
         self._decoder = Decoder()
         self._flood_until = now
         self._link: Link | None = None
+        self._attempts = Attempts()
         self._out = Publications(opened, settings.fleet, settings.car, self._control, str(settings.url))
         self._asked: list[_Asked] = []
         self._sent: set[str] = set()
@@ -201,7 +202,6 @@ class Car:
 
     async def _connect(self) -> None:
         """Keep the link open, and read it."""
-        failures = 0
         may_fail = self._settings.retry
         while True:
             try:
@@ -209,26 +209,29 @@ class Car:
             except LinkError as error:
                 if not may_fail:
                     raise
-                failures += 1
-                self._lost(str(error), once=failures == 1)
-                await asyncio.sleep(backoff.delay_s(failures, random.random()))  # noqa: S311 - jitter, no secret
+                self._lost(str(error))
+                await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
                 continue
-            may_fail, failures = True, 0
+            may_fail = True
             now = self._loop.time()
             self._link = link
             self._decoder = Decoder()
             self._health.up(now)
             self._control.link_up(now)
-            self._log(Level.INFO, "link_open", f"{self._settings.url} is open: bringing the car to a known state")
+            if self._attempts.opened(now):
+                self._tell_open()
             self._wake.set()
             try:
                 await self._read(link)
             except LinkLost as error:
                 self._events(self._decoder.end())
                 if self._link is link:
-                    self._lost(str(error), once=True)
+                    self._lost(str(error))
             await link.close()
-            await asyncio.sleep(backoff.delay_s(1, random.random()))  # noqa: S311 - jitter, no secret
+            await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
+
+    def _tell_open(self) -> None:
+        self._log(Level.INFO, "link_open", f"{self._settings.url} is open: bringing the car to a known state")
 
     async def _read(self, link: Link) -> None:
         """Bytes to events, until the link is lost."""
@@ -272,13 +275,15 @@ class Car:
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.rejected(event.cause)
+            elif self._attempts.proven(event.at, heard=True):
+                self._tell_open()
 
-    def _lost(self, reason: str, *, once: bool) -> None:
+    def _lost(self, reason: str) -> None:
         now = self._loop.time()
         self._link = None
         self._health.down(reason, now)
         self._control.link_down(reason, now)
-        if once:
+        if self._attempts.failed(reason):
             self._log(Level.WARNING, "link_lost", reason)
         self._wake.set()
 
@@ -325,7 +330,7 @@ class Car:
                 reason = f"a write failed: {error}"
                 self._out.written(write, time.time_ns(), whole=False)
                 self._control.write_failed(reason, self._loop.time())
-                self._lost(reason, once=True)
+                self._lost(reason)
                 await link.close()  # what reads it wakes, and opens it again
                 return
             now = self._loop.time()
@@ -521,6 +526,8 @@ class Car:
             worst = max(worst, now - due)
             self._woke(now - due, now)
             self._alive_at = now
+            if self._attempts.proven(now, heard=False):
+                self._tell_open()
             if self._settings.parent not in (None, os.getppid()) and not self._ending:
                 self._log(Level.WARNING, "parent_gone", "the process that started this gateway has ended: ending, too")
                 self.stop()

@@ -13,7 +13,7 @@ import pytest
 import serial
 
 from schemas import bus
-from tests.support.processes import Fleet, Process, TcpCar, driving, wait_for
+from tests.support.processes import PATIENCE_S, Fleet, Process, TcpCar, driving, wait_for
 
 ANY_CLIENT = Path(__file__).parent / "any_client.py"
 
@@ -389,6 +389,23 @@ def test_a_link_that_drops_comes_back_by_itself(fleet: Fleet, tmp_path: Path) ->
     assert [(end.phase, end.reason) for end in ends if end.id == "long"] == [("failed", "link_down")]
     assert fleet.ask("drive", motion="forward", duration_s=0.3)["status"] in TAKEN
     assert gateway.end() == 0
+
+
+def test_a_link_that_opens_and_dies_at_once_is_not_opened_many_times_a_second(fleet: Fleet) -> None:
+    """Each opening of a real port may reset the car's board; and a log that says it each time says nothing else."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE_S)
+        gateway = fleet.gateway(f"tcp://127.0.0.1:{server.getsockname()[1]}")
+        times = []
+        for _ in range(9):
+            peer, _ = server.accept()
+            times.append(time.monotonic())
+            peer.close()
+        assert times[8] - times[3] > 2.0, "at least half a second each, once it has happened a few times"
+        assert gateway.stderr.count("is open: bringing the car to a known state") == 1
+        said = [line.partition("WARNING ")[2] for line in gateway.stderr.splitlines() if "WARNING" in line]
+        assert len(said) == len(set(said)) > 0
+    gateway.end()
 
 
 def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: Fleet) -> None:
