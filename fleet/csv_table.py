@@ -23,7 +23,7 @@ def table(readings: Sequence[Reading], topic: topics.Topic) -> str:
     fields = list(_fields(readings))
     lines = io.StringIO(newline="")
     writer = csv.writer(lines)
-    writer.writerow(["time", "key", *(_column(name, index, topic) for name, index in fields)])
+    writer.writerow(["time", "key", *(column_name(name, topic.units.get(name, ""), index) for name, index in fields)])
     for reading in readings:
         writer.writerow([iso(reading.time), reading.key, *(_cell(reading.value, *field) for field in fields)])
     return lines.getvalue()
@@ -46,8 +46,8 @@ def _fields(readings: Sequence[Reading]) -> Iterable[tuple[str, int | None]]:
             yield field.name, None
 
 
-def _column(name: str, index: int | None, topic: topics.Topic) -> str:
-    unit = topic.units.get(name, "")
+def column_name(name: str, unit: str, index: int | None = None) -> str:
+    """The name of a field's column: with its unit if it does not end in that; an item of a list has its number."""
     unit = _UNITS.get(unit, unit).lower()
     numbered = name if index is None else f"{name}_{index + 1}"
     return numbered if not unit or name.endswith(f"_{unit}") or name == unit else f"{numbered}_{unit}"

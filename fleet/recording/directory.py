@@ -43,6 +43,8 @@ class Description:
     missed: Mapping[str, int] = field(default_factory=dict)
     error: str = ""
     format: int = FORMAT
+    origin: Mapping[str, Any] = field(default_factory=dict)
+    """Of what it was made, by what (`recover`, `cut`), and what could not be saved; empty: it was recorded."""
 
     @classmethod
     def read(cls, directory: Path) -> Self | None:

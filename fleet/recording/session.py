@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from mcap.writer import Writer
-
 from fleet.recording import directory
+from fleet.recording.copying import Copy
 from fleet.recording.index import Index
 from fleet.recording.salvage import Lane, NotMcap, Row, Salvage
 from fleet.recording.selection import EVERYTHING, Selection
@@ -110,27 +109,10 @@ class Session:
 
         For what is cut or damaged: other readers stop early there, or show what fails its checksum.
         """
-        channels: dict[tuple[str, str, int, tuple[tuple[str, str], ...]], int] = {}
-        schemas: dict[tuple[str, str, bytes], int] = {}
-        count = 0
-        with out.open("xb") as file:
-            writer = Writer(file)
-            writer.start(library="zenoh-car-fleet rescue")
-            for segment in self.segments:
-                for (channel, schema), sequence, log_ns, publish_ns, data in self._whole(segment, EVERYTHING):
-                    schema_id = 0
-                    if schema is not None:
-                        kind = (schema.name, schema.encoding, schema.data)
-                        if kind not in schemas:
-                            schemas[kind] = writer.register_schema(*kind)
-                        schema_id = schemas[kind]
-                    where = (channel.topic, channel.message_encoding, schema_id, tuple(channel.metadata.items()))
-                    if where not in channels:
-                        channels[where] = writer.register_channel(*where[:3], channel.metadata)
-                    writer.add_message(channels[where], log_ns, data, publish_ns, sequence)
-                    count += 1
-            writer.finish()  # type: ignore[no-untyped-call]  # mcap's has no return type
-        if not count:
+        with Copy(out) as copy:
+            for row in self.rows():
+                copy.add(row)
+        if not copy.messages:
             raise NoSession(f"{self.path} holds no message that is whole: {self.damage_words}")
         return Session(self.path, (out,), self.description)
 

@@ -1,0 +1,1 @@
+"""What `fleet sessions` does: list, look into, verify, recover, cut and export recordings."""

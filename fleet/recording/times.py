@@ -1,0 +1,43 @@
+"""Times within a session as people write them: an offset from its start or end, or a date. Pure."""
+
+import re
+from datetime import UTC, datetime
+from typing import Final
+
+RULE: Final = "an offset from the start (90s, 1m30s, 1h, 500ms), from the end with - (-60s), or 2026-03-14T15:16:17Z"
+_PARTS: Final = {"h": 3_600_000_000_000, "m": 60_000_000_000, "s": 1_000_000_000, "ms": 1_000_000}
+_OFFSET: Final = re.compile(r"-?(?:\d+(?:\.\d+)?(?:ms|h|m|s))+|-?\d+(?:\.\d+)?")
+
+
+def at_ns(text: str, start_ns: int, end_ns: int) -> int:
+    """The time that is meant, ns since the epoch; a date without a zone is UTC. Raises ValueError, naming the rule."""
+    if _OFFSET.fullmatch(text):
+        size = 0.0
+        for number, unit in re.findall(r"(\d+(?:\.\d+)?)(ms|h|m|s|)", text):
+            size += float(number) * _PARTS[unit or "s"]
+        return end_ns - round(size) if text.startswith("-") else start_ns + round(size)
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a time: write {RULE}") from None
+    if when.tzinfo is None:
+        when = when.replace(tzinfo=UTC)
+    whole = int(when.replace(microsecond=0).timestamp())
+    return whole * 1_000_000_000 + when.microsecond * 1000
+
+
+def iso(ns: int) -> str:
+    """A time in ISO 8601, UTC, with milliseconds."""
+    try:
+        when = datetime.fromtimestamp(ns // 1_000_000_000, UTC)
+    except (OverflowError, ValueError, OSError):
+        return f"{ns} ns"  # somebody else's clock
+    return f"{when:%Y-%m-%dT%H:%M:%S}.{ns // 1_000_000 % 1000:03d}Z"
+
+
+def words(seconds: float) -> str:
+    """A length as people write it: 59.2s, 1m30s, 2h05m."""
+    if seconds < 60:
+        return f"{seconds:.1f}s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}m{rest:02d}s" if minutes < 60 else f"{minutes // 60}h{minutes % 60:02d}m"
