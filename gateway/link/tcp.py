@@ -4,7 +4,9 @@ import asyncio
 import contextlib
 import os
 import socket
+import threading
 from collections.abc import Iterable
+from concurrent.futures import Future
 from typing import Any, Final
 
 from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkLost
@@ -14,6 +16,11 @@ HELD_BYTES: Final = 64 * 1024
 """Bytes that may wait for a loop that does not read; then the socket is not read, and the car's side waits."""
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
 """A peer that has vanished without a word is noticed within about five seconds, where the system allows."""
+
+_Addresses = list[tuple[int, Any]]
+"""(family, socket address), as getaddrinfo gives them."""
+_asked: Final[dict[TcpUrl, "Future[_Addresses]"]] = {}
+"""What the name server was asked last for each link."""
 
 
 class TcpLink(asyncio.Protocol, Link):
@@ -106,11 +113,9 @@ class TcpLink(asyncio.Protocol, Link):
 
 async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
     """Connect; raises CannotOpen."""
-    loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(timeout_s):
-            found = await loop.getaddrinfo(url.host, url.port, type=socket.SOCK_STREAM)
-            return await connect_first(url, [(family, address) for family, _, _, _, address in found])
+            return await connect_first(url, await _look_up(url))
     except TimeoutError:
         raise CannotOpen(f"{url}: no answer within {timeout_s:g} s: is the car on, and in this network?") from None
     except (socket.gaierror, UnicodeError):  # UnicodeError: a label too long for a host name
@@ -123,6 +128,30 @@ async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
         raise CannotOpen(f"{url}: {words}") from None
     except OSError as error:
         raise CannotOpen(f"{url}: no connection, {_cause(error)}") from None
+
+
+async def _look_up(url: TcpUrl) -> _Addresses:
+    """Where the name leads; raises what getaddrinfo raises.
+
+    A name server that is silent holds getaddrinfo for a minute, which nothing can end: not on one of the loop's own
+    threads, for which the process would wait, and not once more for each try, which waits for the same answer.
+    """
+    found = _asked.get(url)
+    if found is None or found.done():
+        found = Future()
+        found.set_running_or_notify_cancel()  # one who waits no longer does not cancel it
+        threading.Thread(target=_ask, args=(url, found), name=f"look up {url}", daemon=True).start()
+        _asked[url] = found
+    return await asyncio.wrap_future(found)
+
+
+def _ask(url: TcpUrl, found: "Future[_Addresses]") -> None:
+    try:
+        answers = socket.getaddrinfo(url.host, url.port, type=socket.SOCK_STREAM)
+    except Exception as error:  # noqa: BLE001 - it is raised again where it is waited for
+        found.set_exception(error)
+    else:
+        found.set_result([(family, address) for family, _, _, _, address in answers])
 
 
 async def connect_first(url: TcpUrl, addresses: Iterable[tuple[int, Any]]) -> Link:

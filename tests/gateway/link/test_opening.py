@@ -6,7 +6,9 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 import serial
@@ -255,6 +257,48 @@ def test_bluetooth_that_is_not_installed_is_one_line_and_nothing_is_started() ->
         "gateway: link 'ble://AA:BB:CC:DD:EE:FF' needs Bluetooth, which is not installed: "
         "pip install 'zenoh-car-fleet[ble]'\n"
     )
+
+
+WITH_A_SILENT_NAME_SERVER = """
+import asyncio, socket, sys, threading
+from gateway.link import CannotOpen, open_link
+from gateway.link.url import TcpUrl
+socket.getaddrinfo = lambda *_, **__: threading.Event().wait()  # nothing can end it
+async def main():
+    for _ in range(3):
+        try:
+            await open_link(TcpUrl("car.local", 8888), timeout_s=0.1)
+        except CannotOpen as error:
+            print(error)
+    print(sum(thread is not threading.main_thread() for thread in threading.enumerate()))
+asyncio.run(main())
+"""
+
+
+def test_a_name_server_that_does_not_answer_holds_one_thread_and_not_the_end_of_the_process() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITH_A_SILENT_NAME_SERVER], capture_output=True, text=True, timeout=60, check=False
+    )
+    words = "tcp://car.local:8888: no answer within 0.1 s: is the car on, and in this network?\n"
+    assert (done.stdout, done.stderr) == (3 * words + "1\n", "")
+
+
+async def test_a_name_server_that_answers_late_is_of_use_to_the_next_try(monkeypatch: pytest.MonkeyPatch) -> None:
+    answered = threading.Event()
+    ask = socket.getaddrinfo
+
+    def late(*arguments: Any, **more: Any) -> Any:
+        assert answered.wait(20.0)
+        return ask(*arguments, **more)
+
+    monkeypatch.setattr(socket, "getaddrinfo", late)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = TcpUrl("127.0.0.1", server.getsockname()[1])
+        await refused(url, timeout_s=0.1)
+        answered.set()
+        for _ in range(2):
+            link = await open_link(url, timeout_s=20.0)
+            await link.close()
 
 
 async def test_a_tcp_car_that_does_not_answer() -> None:
