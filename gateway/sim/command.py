@@ -18,7 +18,7 @@ from gateway.sim.channel import obey, say
 from gateway.sim.core.played import Played
 from gateway.sim.core.world import World
 from gateway.sim.faults import Fault, Scheduled, parse_fault, parse_press, targets
-from gateway.sim.links import LinkError
+from gateway.sim.links import LinkError, Taken
 from gateway.sim.shell import SimCar, Simulation
 from gateway.sim.spec import BadSpec, CarSpec, ReplaySpec, parse_cars, parse_replay, refuse_twins
 from schemas import keys
@@ -132,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         asyncio.run(_serve(specs, captures, world, scheduled, args, endpoint))
     except LinkError as error:
-        return _fail(str(error), 1)
+        return _fail(str(error), 2 if isinstance(error, Taken) else 1)
     return 0
 
 

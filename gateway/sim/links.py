@@ -7,17 +7,26 @@ takes is swallowed, as by a wire.
 import asyncio
 import contextlib
 import os
+import re
 import socket
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 READ_SIZE = 128
+_TERMINAL = re.compile(r"/dev/(pts/|ttys)\d+")
+_CLOCKS_S = 2.0
+"""A file system may keep whole seconds only."""
 
 
 class LinkError(Exception):
     """A link cannot be opened; its text says why and what to do."""
+
+
+class Taken(LinkError):
+    """Something else is at the path that a link was to have: wrong use."""
 
 
 class Owner(Protocol):
@@ -126,15 +135,31 @@ class PtySimLink:
             raise LinkError(f"no pseudo terminal to be had: {error.strerror}") from None
 
     def _point(self, path: Path) -> None:
-        """A symlink to a device may be replaced (a killed simulator leaves one), anything else may not."""
-        if path.is_symlink() and str(path.readlink()).startswith("/dev/"):
+        """What a killed simulator has left may be replaced, anything else may not."""
+        if self._left_over(path):
             path.unlink(missing_ok=True)
         try:
             path.symlink_to(self._name)
         except FileExistsError:
-            raise LinkError(f"{path} is there already and no symlink to a device: name another path") from None
+            what = "is there already"
+            if path.is_symlink():
+                used = ", which is in use, perhaps by another simulator" if path.exists() else ""
+                what = f"leads to {path.readlink()}{used}"
+            raise Taken(f"{path} {what}: name another path, or remove it") from None
         except OSError as error:
             raise LinkError(f"no symlink can be made at {path}: {error.strerror}") from None
+
+    def _left_over(self, path: Path) -> bool:
+        """Whether this symlink's terminal is gone, or its number another's by now, opened after the link was made."""
+        if not path.is_symlink() or not _TERMINAL.fullmatch(target := str(path.readlink())):
+            return False
+        try:
+            opened_s = path.stat().st_ctime
+        except OSError:
+            return True
+        # macOS keeps the nodes of its terminals.
+        newer = sys.platform == "linux" and opened_s > path.lstat().st_mtime + _CLOCKS_S
+        return target == self._name or newer
 
     def _readable(self) -> None:
         try:

@@ -345,7 +345,7 @@ class Simulation:
                 await car.start()
             except LinkError as error:
                 await self.stop()
-                raise LinkError(f"car {name}: {error}") from None
+                raise type(error)(f"car {name}: {error}") from None
 
     async def stop(self) -> None:
         """Close every link."""

@@ -4,6 +4,8 @@ import asyncio
 import contextlib
 import itertools
 import json
+import os
+import pty
 import signal
 import socket
 import subprocess
@@ -18,7 +20,7 @@ import serial
 
 from gateway.sim.core.line import Way
 from gateway.sim.faults import Fault, FaultKind
-from gateway.sim.links import LinkError
+from gateway.sim.links import LinkError, Taken
 from gateway.sim.shell import Simulation
 from gateway.sim.spec import parse_cars
 from schemas.bus import Bus, Sample
@@ -221,7 +223,7 @@ async def test_a_port_in_use_and_a_path_in_use(tmp_path: Path) -> None:
         with pytest.raises(LinkError, match=rf"car red: cannot listen on 127.0.0.1:{port}"):
             await Simulation(parse_cars(["ok:arduino:pty", f"red:arduino:tcp://127.0.0.1:{port}"])).start()
     (tmp_path / "file").write_text("precious")
-    with pytest.raises(LinkError, match="no symlink to a device"):
+    with pytest.raises(LinkError, match="file is there already: name another path"):
         await Simulation(parse_cars([f"red:arduino:pty:{tmp_path / 'file'}"])).start()
     assert (tmp_path / "file").read_text() == "precious"
     with pytest.raises(LinkError, match="No such file"):
@@ -236,6 +238,43 @@ async def test_a_symlink_that_a_killed_simulator_left_is_replaced(tmp_path: Path
     serial.Serial(str(path)).close()
     await simulation.stop()
     assert not path.is_symlink()
+
+
+async def test_a_number_that_a_newer_terminal_has_is_no_reason_to_keep_a_symlink(tmp_path: Path) -> None:
+    """A killed simulator's terminal is gone, and its number is given to the next program that asks for one."""
+    path = tmp_path / "red"
+    controller, device = pty.openpty()
+    path.symlink_to(os.ttyname(device))
+    os.utime(path, (1e9, 1e9), follow_symlinks=False)
+    simulation = Simulation(parse_cars([f"red:arduino:pty:{path}"]))
+    await simulation.start()
+    assert str(path.readlink()) != os.ttyname(device)
+    await simulation.stop()
+    os.close(device)
+    os.close(controller)
+
+
+async def test_a_live_simulators_symlink_is_not_taken(pair: Simulation, tmp_path: Path) -> None:
+    path = tmp_path / "red"
+    first = path.readlink()
+    with serial.Serial(str(path)):  # a host does not change whose it is
+        with pytest.raises(Taken, match=f"car blue: {path} leads to {first}, which is in use, .* name another path"):
+            await Simulation(parse_cars([f"blue:arduino:pty:{path}"])).start()
+        assert path.readlink() == first
+    await pair.stop()
+    assert not path.is_symlink()
+
+
+@pytest.mark.parametrize("target", ["/dev/null", "/dev/pts/ptmx", "nowhere"])
+def test_a_symlink_of_somebody_else_is_left_alone(target: str, tmp_path: Path) -> None:
+    path = tmp_path / "precious"
+    path.symlink_to(target)
+    command = [sys.executable, "-m", "gateway.sim", "--no-truth", "--car", f"red:arduino:pty:{path}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"gateway sim: car red: {path} leads to {target}")
+    assert done.stderr.endswith(": name another path, or remove it\n")
+    assert str(path.readlink()) == target
 
 
 # The process.
