@@ -138,16 +138,24 @@ def _lenses() -> list[Any]:
 
 def _line(fields: Iterable[str]) -> Callable[[Any], Any]:
     def join(messages: Any) -> Any:
-        parts = [pc.cast(messages.field(name), pa.string()) for name in fields]
+        parts = [_text(messages.field(name)) for name in fields]
         joined = pc.binary_join_element_wise(*parts, "  ", null_handling="replace", null_replacement="")
         return pc.utf8_trim_whitespace(pc.replace_substring_regex(joined, r" {3,}", "  "))
 
     return join
 
 
+def _text(values: Any) -> Any:
+    """A field as text; raw frames need not be any: what is no ASCII stands as its number."""
+    if pa.types.is_binary(values.type) or pa.types.is_large_binary(values.type):
+        words = [None if value is None else value.decode("ascii", "backslashreplace") for value in values.to_pylist()]
+        return pa.array(words, pa.string())
+    return pc.cast(values, pa.string())
+
+
 def _level(alarms: frozenset[str]) -> Callable[[Any], Any]:
     def level(values: Any) -> Any:
-        return pc.if_else(pc.is_in(values, pa.array(sorted(alarms))), "WARN", "INFO")
+        return pc.if_else(pc.is_in(values, pa.array(sorted(alarms), pa.string())), "WARN", "INFO")
 
     return level
 
