@@ -33,6 +33,7 @@ class TcpLink(asyncio.Protocol, Link):
         self._came = asyncio.Event()
         self._ended = asyncio.Event()
         self._lost: str | None = None
+        self._heard = False
         self._paused = False
 
     async def read(self) -> bytes:
@@ -52,7 +53,9 @@ class TcpLink(asyncio.Protocol, Link):
     async def write(self, data: bytes) -> None:
         """Send these bytes in a segment of their own; raises LinkLost."""
         transport = self._transport
-        if transport is None or self._lost is not None or transport.is_closing():
+        if transport is not None and self._lost is None and transport.is_closing():
+            await self._ended.wait()  # which says why
+        if transport is None or self._lost is not None:
             raise LinkLost(self._lost or f"{self._url} is closed")
         if transport.get_write_buffer_size():
             # What waits would go out together with this, and a car obeys only the first frame of a segment.
@@ -98,6 +101,7 @@ class TcpLink(asyncio.Protocol, Link):
 
     def data_received(self, data: bytes) -> None:
         """Keep bytes until they are read, so many and no more."""
+        self._heard = True
         self._data += data
         self._came.set()
         if len(self._data) > HELD_BYTES and not self._paused and self._transport is not None:
@@ -106,7 +110,11 @@ class TcpLink(asyncio.Protocol, Link):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Note why."""
-        self._lost = self._lost or f"{self._url} is gone: " + ("the car closed it" if exc is None else _cause(exc))
+        why = "the car closed it" if exc is None else _cause(exc)
+        if not self._heard and (exc is None or isinstance(exc, ConnectionResetError)):
+            # A car has one client, and sends the next away.
+            why += " before it sent anything: perhaps its gateway, or another program, has it"
+        self._lost = self._lost or f"{self._url} is gone: {why}"
         self._came.set()
         self._ended.set()
 

@@ -9,6 +9,7 @@ import gc
 import random
 import re
 import socket
+import struct
 import sys
 import threading
 import time
@@ -361,6 +362,25 @@ async def test_a_write_while_the_port_goes_is_lost_and_nothing_worse(tmp_path: P
     finally:
         sys.setswitchinterval(usual)
     peer.close()
+
+
+@pytest.mark.parametrize("says", [b"", FRAME])
+@pytest.mark.parametrize("reset", [False, True])
+async def test_a_second_client_is_told_that_another_may_have_the_car(says: bytes, reset: bool) -> None:
+    """A car has one client. One that has spoken and then hangs up has other reasons."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = await open_link(TcpUrl("127.0.0.1", server.getsockname()[1]))
+        peer, _ = server.accept()
+        if reset:
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        if says:
+            peer.sendall(says)
+            assert await read(link, len(says)) == says
+        peer.close()
+        words = await lost(link)
+        assert ("another program, has it" in words) == (not says)
+        assert ("connection reset by peer" if reset else "the car closed it") in words
+        await link.close()
 
 
 async def test_a_frame_never_waits_for_the_acknowledgement_of_the_one_before_it() -> None:
