@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -84,14 +85,17 @@ def test_the_unit_gives_cars_the_time_to_stop(tmp_path: Path) -> None:
     verifier = shutil.which("systemd-analyze")
     if verifier:
         # It looks whether the program is there: this one is, at the home of whoever runs the test.
-        home, runtime = tmp_path / "home", tmp_path / "run"
+        home, runtime = (
+            tmp_path / "home",
+            Path(tempfile.mkdtemp(dir="/tmp")),
+        )  # the path of a socket is at most 107 long
         program = home / "zenoh-car-fleet" / ".venv" / "bin" / "fleet"
         (home / ".config" / "fleet").mkdir(parents=True)
         program.parent.mkdir(parents=True)
         program.symlink_to("/bin/true")
-        runtime.mkdir()
         environment = os.environ | {"HOME": str(home), "XDG_RUNTIME_DIR": str(runtime)}
         done = subprocess.run(
             [verifier, "verify", "--user", str(path)], check=False, capture_output=True, text=True, env=environment
         )
+        shutil.rmtree(runtime)
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")  # an unknown key only prints

@@ -157,7 +157,8 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
         with bus.Bus.open(endpoint) as client:
             truths: dict[str, bus.Sample] = {}
             client.subscribe("fleet/*/sim/truth", lambda sample: truths.__setitem__(sample.key.split("/")[1], sample))
-            wait_for(lambda: shown.count(b"is in a known state") >= 2, "the table shows both cars")
+            wait_for(lambda: _known(client) == 2, "both cars are in a known state")
+            wait_for(lambda: b"red" in shown and b"green" in shown, "the table shows them")
             payload = b'{"motion": "forward", "duration_s": 10}'
             (answer,) = client.query("fleet/red/@cmd/drive?format=json", payload=payload)
             assert isinstance(answer, bus.Sample)
@@ -308,6 +309,12 @@ def _exists(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def _known(client: bus.Bus) -> int:
+    """How many cars were brought to a known state."""
+    answers = [each for each in client.query("fleet/*/state/safety") if isinstance(each, bus.Sample)]
+    return sum(answer.message().motors == "off" for answer in answers)  # type: ignore[attr-defined]
 
 
 def _read(master: int, shown: bytearray) -> None:
