@@ -330,7 +330,8 @@ class Car:
                 reason = f"a write failed: {error}"
                 self._out.written(write, time.time_ns(), whole=False)
                 self._control.write_failed(reason, self._loop.time())
-                self._lost(reason)
+                if self._link is link:  # what reads it may have met its end first
+                    self._lost(reason)
                 await link.close()  # what reads it wakes, and opens it again
                 return
             now = self._loop.time()
