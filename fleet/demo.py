@@ -423,6 +423,6 @@ def _free_endpoint() -> str:
 
 
 def _can_view() -> bool:
-    from fleet.replay.command import has_display
+    from fleet.replay.viewer import has_display
 
     return sys.stdin.isatty() and has_display()

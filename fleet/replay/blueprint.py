@@ -1,6 +1,6 @@
 """The layout of a session in Rerun's viewer: a tab for the fleet and one per car, only with views that have data."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import rerun as rr
@@ -8,56 +8,32 @@ import rerun.blueprint as rrb
 from rerun.blueprint.components import LinkAxis
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from fleet.replay import mapping
+from fleet.replay import colours, mapping
+from fleet.replay.colours import Rgb, colour
+from fleet.replay.drawing import Drawing
+from fleet.replay.lenses import component
 from fleet.replay.mapping import Contents, Curve, Lane, Panel
 from schemas import keys
-from schemas.topics import TOPICS
 
 TIMELINE: Final = "message_publish_time"
 """When a message was published, by its publisher's clock; the recorder's own is `message_log_time`."""
 
-_COLOURS: Final = {
-    "red": (235, 80, 80), "green": (90, 200, 110), "blue": (90, 150, 250), "yellow": (235, 205, 70),
-    "orange": (245, 150, 60), "white": (230, 230, 230), "black": (130, 130, 130), "pink": (245, 130, 190),
-}  # fmt: skip
-_OTHERS: Final = ((80, 200, 200), (190, 130, 240), (245, 150, 60), (160, 200, 80), (230, 120, 160), (120, 160, 200))
-
-# One meaning has one colour in every lane.
-_STATES: Final = {
-    "true": 0x4FB477FF, "false": 0x30343BFF,
-    "online": 0x4FB477FF, "quiet": 0x5C7FA3FF, "stale": 0xE0A030FF, "lost": 0xD9534FFF,
-    "confirmed": 0x4FB477FF, "assumed": 0x8A8F98FF, "contradicted": 0xD9534FFF, "unknown": 0x555A63FF,
-    "manual": 0x5C7FA3FF, "tracking": 0x8E6BBFFF, "obstacle_avoidance": 0xD08A3CFF, "light_seeking": 0xC9B037FF,
-    "following": 0x3C9D9BFF, "color_led": 0xC0689FFF, "remote_control": 0xA0522DFF,
-    "stop": 0x30343BFF, "forward": 0x4FB477FF, "back": 0xD08A3CFF, "left": 0x5C7FA3FF, "right": 0x8E6BBFFF,
-    "spin_left": 0x3C9D9BFF, "spin_right": 0xC0689FFF,
-}  # fmt: skip
-
-
+_THRESHOLDS: Final[Mapping[mapping.How, Rgb]] = {mapping.How.LOW: (224, 160, 48), mapping.How.CRITICAL: (217, 83, 79)}
 _LEAST_HEIGHT_M: Final = 1.5
+_LEDS: Final = frozenset({mapping.LED_ASKED.name, mapping.LED_TRUE.name})
+
+_View = rrb.View | rrb.Container
 _Shown = dict[Any, list[Any]]
 """Visualizers by entity; Any, because Rerun's mapping is invariant in a union of its own."""
 
 
-def colour(car: str, index: int) -> tuple[int, int, int]:
-    """A car's colour: the one it is named after, else one of its own."""
-    return _COLOURS.get(car, _OTHERS[index % len(_OTHERS)])
-
-
-@dataclass(frozen=True, slots=True)
-class Ground:
-    """The part of the world that the cars were in, m."""
-
-    x_m: float
-    y_m: float
-    size_m: float
-
-
-def layout(session: Contents, ground: Ground | None) -> rrb.Blueprint:
-    """The whole layout of a session; `ground`: where the simulated cars were, None if there were none."""
-    tabs = [_fleet_tab(session, ground)] + [_car_tab(session, car) for car in session.cars]
+def layout(drawing: Drawing, tab: str = "") -> rrb.Blueprint:
+    """The layout of what a drawing has seen; `tab`: the car whose tab is in front, none: the fleet's."""
+    session = drawing.contents()
+    shown = _Layout(session, colours.leds(drawing.leds))
+    tabs = [shown.fleet_tab(drawing.ground()), *(shown.car_tab(car) for car in session.cars)]
     return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=0),
+        rrb.Tabs(*tabs, active_tab=1 + list(session.cars).index(tab) if tab else 0),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE),
@@ -66,27 +42,138 @@ def layout(session: Contents, ground: Ground | None) -> rrb.Blueprint:
     )
 
 
-def _entity(session: Contents, car: str, topic: str) -> str:
-    return mapping.entity(keys.topic_key(session.fleet, car, topic))
+class _Layout:
+    """The tabs of one session."""
+
+    def __init__(self, session: Contents, leds: Mapping[str, int]) -> None:
+        self._session = session
+        self._leds = leds
+
+    def fleet_tab(self, ground: tuple[tuple[float, float], tuple[float, float]] | None) -> _View:
+        """The fleet at a glance, and beside it its services."""
+        session = self._session
+        left: list[_View] = [self._world(*ground)] if ground is not None else []
+        texts = [view for name, ours, theirs in mapping.FLEET_TEXTS if (view := self._fleet_text(name, ours, theirs))]
+        if mapping.PLAN in session.services:
+            plan = mapping.entity(f"{session.fleet}/{mapping.PLAN}")
+            texts.append(rrb.TextDocumentView(origin=plan, contents=[plan], name="Plan"))
+        if texts:
+            left.append(rrb.Tabs(*texts, active_tab=0))
+        right: list[_View] = []
+        lanes = [view for name, each in mapping.FLEET_LANES if (view := self._fleet_lanes(name, each))]
+        if lanes:
+            right.append(rrb.Tabs(*lanes, active_tab=0))
+        for name, curve in mapping.FLEET_CURVES:
+            shown = {
+                self._entity(car, curve.topic): [_curve(curve, car, colour(car, index))]
+                for index, (car, topics) in enumerate(session.cars.items())
+                if curve.topic in topics
+            }
+            if shown:
+                right.append(_curves(name, shown))
+        # The lanes of every car need room; the curves share a view.
+        shares = [2 if isinstance(view, rrb.Tabs) else 1 for view in right]
+        columns = [
+            rrb.Vertical(*column, row_shares=parts)
+            for column, parts in ((left, [1] * len(left)), (right, shares))
+            if column
+        ]
+        services = [view for panel in mapping.SERVICE_PANELS if (view := self._panel("", panel))]
+        return _two_pages("Fleet", rrb.Horizontal(*columns, name="Cars"), services, "Services")
+
+    def car_tab(self, car: str) -> _View:
+        """One car: what matters most, and beside it the rest."""
+        main = [view for panel in mapping.MAIN_PANELS if (view := self._panel(car, panel))]
+        more = [view for panel in mapping.MORE_PANELS if (view := self._panel(car, panel))]
+        return _two_pages(car, rrb.Grid(*main, grid_columns=2, name="Car"), more, "More")
+
+    def _entity(self, car: str, topic: str) -> str:
+        """The entity of a topic: a service's has its own name in front, and no car."""
+        if topic.startswith("@"):
+            return mapping.entity(f"{self._session.fleet}/{topic}")
+        return mapping.entity(keys.topic_key(self._session.fleet, car, topic))
+
+    def _has(self, car: str, topic: str) -> bool:
+        if topic.startswith("@"):
+            return topic in self._session.services
+        return topic in self._session.cars.get(car, ())
+
+    def _fleet_text(self, name: str, ours: Iterable[str], theirs: Iterable[str]) -> rrb.View | None:
+        shown = [self._entity(car, topic) for topic in ours for car in self._session.cars if self._has(car, topic)]
+        shown += [self._entity("", topic) for topic in theirs if self._has("", topic)]
+        return _text(name, shown) if shown else None
+
+    def _fleet_lanes(self, name: str, lanes: Iterable[Lane]) -> rrb.View | None:
+        shown: _Shown = {}
+        for car in self._session.cars:
+            for lane in lanes:
+                if self._has(car, lane.topic):
+                    shown.setdefault(self._entity(car, lane.topic), []).append(self._lane(lane, car))
+        return _lanes(name, shown) if shown else None
+
+    def _panel(self, car: str, panel: Panel) -> rrb.View | None:
+        """One view of a car; of a service with an empty name."""
+        if panel.texts:
+            texts = [self._entity(car, topic) for topic in panel.texts if self._has(car, topic)]
+            return _text(panel.name, texts) if texts else None
+        shown: _Shown = {}
+        alone = sum(curve.how is None for curve in panel.curves) == 1
+        for curve in panel.curves:
+            if self._has(car, curve.topic):
+                own = colour(car, sorted(self._session.cars).index(car)) if alone and car else None
+                rgb = _THRESHOLDS.get(curve.how, own) if curve.how is not None else own
+                shown.setdefault(self._entity(car, curve.topic), []).append(_curve(curve, curve.name, rgb))
+        for lane in panel.lanes:
+            if self._has(car, lane.topic):
+                shown.setdefault(self._entity(car, lane.topic), []).append(self._lane(lane, car))
+        if not shown:
+            return None
+        return _lanes(panel.name, shown) if panel.lanes else _curves(panel.name, shown)
+
+    def _lane(self, lane: Lane, car: str) -> rrb.Visualizer:
+        name = f"{lane.name} {car}" if lane == mapping.ROLE else lane.name
+        tints = self._leds if lane.name in _LEDS else colours.MARKS if lane == mapping.MARKS else colours.STATES
+        style = rr.StateConfiguration(values=list(tints), colors=list(tints.values()))
+        source = VisualizerComponentMapping(
+            "StateChange:state", ComponentSourceKind.SourceComponent, source_component=name
+        )
+        return style.visualizer(mappings=[source])
+
+    def _world(self, low: tuple[float, float], high: tuple[float, float]) -> rrb.Spatial3DView:
+        session = self._session
+        contents = [
+            f"{self._entity(car, mapping.TRUTH)}/**" for car, topics in session.cars.items() if mapping.TRUTH in topics
+        ]
+        if mapping.WORLD in session.services:
+            contents.append(f"{self._entity('', mapping.WORLD)}/**")
+        (x, y), size = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2), max(high[0] - low[0], high[1] - low[1])
+        # Not straight down: Rerun's eye has no sides when it looks along its own up.
+        eye = rrb.EyeControls3D(
+            position=(x, y - 0.01, max(_LEAST_HEIGHT_M, 1.3 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
+        )
+        name = "World, from above (simulated cars)"
+        return rrb.Spatial3DView(origin="/", contents=contents, name=name, eye_controls=eye)
 
 
-def _curve(curve: Curve, name: str, rgb: tuple[int, int, int] | None) -> rrb.Visualizer:
+def _two_pages(name: str, first: rrb.Container, others: list[rrb.View], what: str) -> rrb.Container:
+    if others:
+        return rrb.Tabs(first, rrb.Grid(*others, name=what), name=name, active_tab=0)
+    return rrb.Tabs(first, name=name)
+
+
+def _curve(curve: Curve, name: str, rgb: Rgb | None) -> rrb.Visualizer:
+    width = 2.0 if curve.how not in _THRESHOLDS else 1.0
     style = (
-        rr.SeriesLines(names=name, widths=2.0) if rgb is None else rr.SeriesLines(names=name, widths=2.0, colors=rgb)
+        rr.SeriesLines(names=name, widths=width)
+        if rgb is None
+        else rr.SeriesLines(names=name, widths=width, colors=rgb)
     )
+    made = curve.how is not None
     source = VisualizerComponentMapping(
         "Scalars:scalars",
         ComponentSourceKind.SourceComponent,
-        source_component=f"{TOPICS[curve.topic].message}:message",
-        selector=f".{curve.field}",
-    )
-    return style.visualizer(mappings=[source])
-
-
-def _lane(lane: Lane) -> rrb.Visualizer:
-    style = rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values()))
-    source = VisualizerComponentMapping(
-        "StateChange:state", ComponentSourceKind.SourceComponent, source_component=lane.name
+        source_component=curve.name if made else component(curve.topic),
+        selector="." if made else f".{curve.field}",
     )
     return style.visualizer(mappings=[source])
 
@@ -114,82 +201,3 @@ def _text(name: str, entities: list[str]) -> rrb.TextLogView:
         name=name,
         columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=columns),
     )
-
-
-def _world(session: Contents, ground: Ground) -> rrb.Spatial3DView:
-    cars = [car for car, topics in session.cars.items() if mapping.TRUTH in topics]
-    contents = [f"{_entity(session, car, mapping.TRUTH)}/**" for car in cars]
-    height = max(_LEAST_HEIGHT_M, 1.3 * ground.size_m)
-    # Not straight down: Rerun's eye has no sides when it looks along its own up.
-    eye = rrb.EyeControls3D(
-        position=(ground.x_m, ground.y_m - 0.01, height),
-        look_target=(ground.x_m, ground.y_m, 0.0),
-        eye_up=(0.0, 1.0, 0.0),
-    )
-    return rrb.Spatial3DView(origin="/", contents=contents, name="World, from above (simulated cars)", eye_controls=eye)
-
-
-def _fleet_tab(session: Contents, ground: Ground | None) -> rrb.Container:
-    rows: list[rrb.View | rrb.Container] = []
-    lanes: _Shown = {}
-    for car, topics in session.cars.items():
-        for lane in (mapping.MODE_ASKED, mapping.MODE_INFERRED, mapping.LINK):
-            if lane.topic in topics:
-                lanes.setdefault(_entity(session, car, lane.topic), []).append(_lane(lane))
-    for name, curve in (("Distance (m)", mapping.DISTANCE), ("Battery (V)", mapping.BATTERY)):
-        shown = {
-            _entity(session, car, curve.topic): [_curve(curve, car, colour(car, index))]
-            for index, (car, topics) in enumerate(session.cars.items())
-            if curve.topic in topics
-        }
-        if shown:
-            rows.append(_curves(name, shown))
-    texts = [
-        _entity(session, car, topic)
-        for car, topics in session.cars.items()
-        for topic in ("event/command", "event/log")
-        if topic in topics
-    ]
-    texts += [mapping.entity(f"{session.fleet}/{topic}") for topic in sorted(session.services & _worded())]
-    left: list[rrb.View | rrb.Container] = [_world(session, ground)] if ground is not None else []
-    if texts:
-        left.append(_text("Commands, log, decisions", texts))
-    if lanes:
-        rows.insert(0, _lanes("Mode and link", lanes))
-    # The lanes of every car need room; the curves share a view.
-    shares = [2 if isinstance(view, rrb.StateTimelineView) else 1 for view in rows]
-    columns = [
-        rrb.Vertical(*column, row_shares=parts) for column, parts in ((left, [1] * len(left)), (rows, shares)) if column
-    ]
-    return rrb.Horizontal(*columns, name="Fleet")
-
-
-def _worded() -> frozenset[str]:
-    return frozenset(words.topic for words in mapping.WORDS)
-
-
-def _car_tab(session: Contents, car: str) -> rrb.Container:
-    main = [view for panel in mapping.CAR_PANELS[: mapping.MAIN_PANELS] if (view := _panel(session, car, panel))]
-    more = [view for panel in mapping.CAR_PANELS[mapping.MAIN_PANELS :] if (view := _panel(session, car, panel))]
-    grid = rrb.Grid(*main, grid_columns=2, name="Car")
-    if not more:
-        return rrb.Grid(*main, grid_columns=2, name=car)
-    return rrb.Tabs(grid, rrb.Grid(*more, name="More"), name=car, active_tab=0)
-
-
-def _panel(session: Contents, car: str, panel: Panel) -> rrb.View | None:
-    has = session.cars[car]
-    if panel.texts:
-        texts = [_entity(session, car, topic) for topic in panel.texts if topic in has]
-        return _text(panel.name, texts) if texts else None
-    shown: _Shown = {}
-    for curve in panel.curves:
-        if curve.topic in has:
-            rgb = colour(car, sorted(session.cars).index(car)) if len(panel.curves) == 1 else None
-            shown.setdefault(_entity(session, car, curve.topic), []).append(_curve(curve, curve.name, rgb))
-    for lane in panel.lanes:
-        if lane.topic in has:
-            shown.setdefault(_entity(session, car, lane.topic), []).append(_lane(lane))
-    if not shown:
-        return None
-    return _lanes(panel.name, shown) if panel.lanes else _curves(panel.name, shown)

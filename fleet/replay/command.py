@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 def replay(session: Path, save: Path | None) -> None:  # fmt: skip
     """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun."""
     from fleet.recording.session import NoSession, Session
+    from fleet.replay.viewer import has_display
 
     try:
         found = Session.open(session)
@@ -62,13 +63,6 @@ def _refuse_target(save: Path, segments: Iterable[Path]) -> None:
             raise click.UsageError(f"--save {save}: this is the recording itself: name another file")
 
 
-def has_display() -> bool:
-    """Whether a window can be opened, as far as one can tell without opening one."""
-    if sys.platform in ("darwin", "win32"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
 def _rescue(session: "Session", out: Path) -> "Session":
     try:
         return session.rescue(out)
@@ -95,7 +89,7 @@ def _export(session: "Session", out: Path) -> None:
 
 def _view(rrd: Path) -> int:
     """Rerun's viewer until its window is closed; it listens on loopback only."""
-    from fleet.replay.to_rerun import environment, program
+    from fleet.replay.viewer import environment, program
 
     viewer = subprocess.Popen([str(program()), "--bind", "127.0.0.1", "--port", "auto", str(rrd)], env=environment())
     try:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import click
 
-from fleet.replay.to_rerun import environment, program
+from fleet.replay.viewer import environment, program
 
 SIZE: Final = "1600x900"
 UP_WITHIN_S: Final = 30.0

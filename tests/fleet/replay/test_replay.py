@@ -54,8 +54,8 @@ def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]
             for name in ("mode asked", "mode inferred"):
                 if name in batch.schema.names:
                     lanes.setdefault(name, []).extend(row[0] for row in batch.column(name).to_pylist())
-    assert "red  drive  asked  forward for 3 s" in texts
-    assert "red  drive  sent" in texts
+    assert "red  drive  asked  forward for 3 s  by ann" in texts
+    assert "red  drive  sent  by ann" in texts
     messages = [m for m in Session.open(made[0]).messages() if m.key == "fleet/red/state/mode"]
     assert len(lanes["mode asked"]) == len(lanes["mode inferred"]) == len(messages)
     assert set(lanes["mode inferred"]) == {"manual", "tracking", "unknown"}
@@ -64,16 +64,23 @@ def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]
 def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
     from schemas.messages import message_class
 
-    for panel in mapping.CAR_PANELS:
-        for part in (*panel.curves, *panel.lanes):
-            fields = message_class(TOPICS[part.topic].message).DESCRIPTOR.fields_by_name
-            name = part.field.rstrip("!").partition("[")[0]
-            assert name in fields, part
-            # What may be missing must not be drawn as the zero that stands for it.
-            assert not isinstance(part, mapping.Curve) or fields[name].has_presence == part.field.endswith("!"), part
-        assert panel.topics <= set(TOPICS)
+    for part in mapping.parts():
+        fields = message_class(TOPICS[part.topic].message).DESCRIPTOR.fields_by_name
+        names = part.field.rstrip("!").partition("[")[0].split(".")
+        assert names[0] in fields, part
+        assert len(names) == 1 or names[1] in fields[names[0]].message_type.fields_by_name, part
+        # What may be missing must not be drawn as the zero that stands for it.
+        assert not isinstance(part, mapping.Curve) or fields[names[0]].has_presence == part.field.endswith("!"), part
     for words in mapping.WORDS:
-        assert set(words.fields) <= set(message_class(TOPICS[words.topic].message).DESCRIPTOR.fields_by_name)
+        fields = message_class(TOPICS[words.topic].message).DESCRIPTOR.fields_by_name
+        assert {*words.fields, *words.before} <= set(fields)
+
+
+def test_every_topic_of_the_table_is_drawn() -> None:
+    drawn = {part.topic for part in mapping.parts()} | {words.topic for words in mapping.WORDS}
+    drawn |= {topic for panel in mapping.CAR_PANELS for topic in panel.topics}
+    drawn |= {topic for _, ours, theirs in mapping.FLEET_TEXTS for topic in (*ours, *theirs)}
+    assert drawn | {mapping.PLAN, mapping.WORLD} == set(TOPICS)
 
 
 @pytest.mark.parametrize("key", ["fleet/red/sensor/range", "fleet/@recorder/status", "my-fleet/car_1/state/mode"])
