@@ -70,7 +70,7 @@ def _open(path: Path) -> "Session":
     return Session.open(path)
 
 
-def _watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:
+def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:
     """Passes on; on a terminal a bar appears if it takes over a second, and how much there is is known."""
 
     def watch(items: Iterable[T]) -> Iterator[T]:
@@ -194,7 +194,7 @@ def verify(session: Path, *, as_json: bool) -> None:
 
     with _explained():
         found = _open(session)
-        verdict = look(found, _watched("verify", total(found)))
+        verdict = look(found, watched("verify", total(found)))
     if as_json:
         click.echo(json.dumps(verdict.to_dict()))
     else:
@@ -215,7 +215,7 @@ def recover(session: Path, out: Path | None) -> None:
         found = _open(session)
     out = out or found.path.resolve().with_name(f"{found.name}-recovered")
     with _explained(out):
-        count, words = make(found, out, _watched("recover", total(found)))
+        count, words = make(found, out, watched("recover", total(found)))
     click.echo(f"{out}: {count} messages{f'; could not be saved: {words}' if words else ', nothing was damaged'}")
 
 
@@ -237,13 +237,13 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
 
     with _explained():
         found = _open(session)
-        selection = _selection(found, start, end, cars)
+        selection = part_of(found, start, end, cars)
     with _explained(out):
-        count = make(found, out, selection, cars, _watched("cut", None))
+        count = make(found, out, selection, cars, watched("cut", None))
     click.echo(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
 
 
-def _selection(session: "Session", start: str | None, end: str | None, cars: Iterable[str]) -> Any:
+def part_of(session: "Session", start: str | None, end: str | None, cars: Iterable[str]) -> Any:
     """The part that is meant; a car or a time that is not there is said before anything is written."""
     from fleet.recording import times
     from fleet.recording.selection import Selection
@@ -292,7 +292,7 @@ def export(session: Path, csv: Path | None, parquet: Path | None) -> None:
     for name, out in wanted.items():
         with _explained(out), made_whole(out) as new:
             found = _open(session)
-            done = write(_watched(f"export {name}", total(found))(found.rows()), new, FORMATS[name])
+            done = write(watched(f"export {name}", total(found))(found.rows()), new, FORMATS[name])
         click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")
         if done.undecoded:
             click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)
