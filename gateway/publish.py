@@ -20,7 +20,8 @@ from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
 from gateway.control.records import CommandRecord, Level, LogRecord, Write
 from gateway.history import BadRange, Ring
-from gateway.protocol.readings import ArmReading, Echo, Event, ImuReading, Rejected, Sensors
+from gateway.protocol.measured import measured, verdict_of
+from gateway.protocol.readings import Event
 from gateway.protocol.values import Mode
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
@@ -91,68 +92,26 @@ class Publications:
         `loaded`: motors may pull the battery down.
         """
         published: list[str] = []
-        verdict = ""
-        match event:
-            case Sensors():
-                verdict = "sensors"
-                self._sensors(event, stamp_ns, confirmed, published, loaded=loaded)
-            case ArmReading():
-                verdict = "arm"
-                if all(joint is not None for joint in event.joint_deg):
-                    message = _CLASSES["sensor/arm"]()
-                    message.joint_deg.extend(event.joint_deg)
-                    self._reading("sensor/arm", message, stamp_ns, published)
-            case ImuReading():
-                verdict = "imu"
-                message = _CLASSES["sensor/imu"]()
-                message.gyro_x_raw, message.gyro_y_raw, message.gyro_z_raw = event.gyro
-                message.accel_x_raw, message.accel_y_raw, message.accel_z_raw = event.accel
-                self._reading("sensor/imu", message, stamp_ns, published)
-            case Echo():
-                verdict = "echo"
-            case Rejected(cause=cause):
-                verdict = str(cause)
+        for name, fields in measured(event, self.profile, confirmed).items():
+            message = _CLASSES[name]()
+            for field, value in fields.items():
+                if isinstance(value, tuple):
+                    getattr(message, field).extend(value)
+                else:
+                    setattr(message, field, value)
+            if name == "sensor/battery":
+                voltage_v = message.voltage_v
+                message.charge, message.charge_error = battery.charge(voltage_v, loaded=loaded)
+                message.level = self._battery.level or self._battery.policy.level(voltage_v)
+            self._reading(name, message, stamp_ns, published)
         if not self._raw.take(1, event.at):
             return False
         frame = _CLASSES["frame/rx"]()
         frame.data = event.raw
-        frame.verdict = verdict
+        frame.verdict = verdict_of(event)
         frame.published.extend(published)
         self._publishers["frame/rx"].put(frame, stamp_ns)
         return True
-
-    def _sensors(
-        self, event: Sensors, stamp_ns: int, confirmed: Mode | None, published: list[str], *, loaded: bool
-    ) -> None:
-        measured = self.profile.measured(event, confirmed)
-        if "range" in measured and event.range_cm is not None:
-            message = _CLASSES["sensor/range"]()
-            message.no_echo = event.range_cm == 0
-            if event.range_cm:
-                message.range_m = round(event.range_cm / 100, 4)
-            self._reading("sensor/range", message, stamp_ns, published)
-        if "battery" in measured and event.voltage_v is not None:
-            message = _CLASSES["sensor/battery"]()
-            message.voltage_v = event.voltage_v
-            message.charge, message.charge_error = battery.charge(event.voltage_v, loaded=loaded)
-            message.level = self._battery.level or self._battery.policy.level(event.voltage_v)
-            self._reading("sensor/battery", message, stamp_ns, published)
-        if "grayscale" in measured and event.grayscale is not None:
-            message = _CLASSES["sensor/grayscale"]()
-            message.raw = event.grayscale
-            self._reading("sensor/grayscale", message, stamp_ns, published)
-        if "line" in measured and event.line is not None:
-            message = _CLASSES["sensor/line"]()
-            message.left_outer, message.left_inner, message.right_inner, message.right_outer = event.line
-            self._reading("sensor/line", message, stamp_ns, published)
-        if "obstacle" in measured and (obstacle := self.profile.obstacle(event, confirmed)) is not None:
-            message = _CLASSES["sensor/obstacle"]()
-            message.left, message.right = obstacle
-            self._reading("sensor/obstacle", message, stamp_ns, published)
-        if "light" in measured and event.light is not None:
-            message = _CLASSES["sensor/light"]()
-            message.left, message.right = event.light
-            self._reading("sensor/light", message, stamp_ns, published)
 
     def _reading(self, name: str, message: Any, stamp_ns: int, published: list[str]) -> None:
         self._rings[name].add(stamp_ns, self._publishers[name].put(message, stamp_ns))
