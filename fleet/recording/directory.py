@@ -6,7 +6,7 @@
 import json
 import platform
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -43,6 +43,10 @@ class Description:
     missed: Mapping[str, int] = field(default_factory=dict)
     error: str = ""
     format: int = FORMAT
+    marks: Sequence[Mapping[str, Any]] = ()
+    """What people said while it was recorded: `time` (ISO 8601), `text`, `by`."""
+    kept: bool = False
+    """Whether it is spared when room is made for others."""
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Of what it was made, by what (`recover`, `cut`), and what could not be saved; empty: it was recorded."""
 
@@ -52,7 +56,7 @@ class Description:
         path = directory / DESCRIPTION
         try:
             values: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-            if not isinstance(values.get("format", FORMAT), int):
+            if not _sound(values):
                 return None
             return cls(**{name: values[name] for name in cls.__slots__ if name in values})
         except (OSError, ValueError, TypeError, AttributeError):
@@ -64,6 +68,25 @@ class Description:
         new = directory / (DESCRIPTION + ".new")
         new.write_text(text, encoding="utf-8")
         new.replace(directory / DESCRIPTION)
+
+
+_COUNTS: Final = ("drops", "missed")
+_TYPES: Final[Mapping[str, type]] = {
+    **dict.fromkeys(("fleet", "started", "host", "error"), str),
+    **dict.fromkeys(("format", "messages"), int),
+    **dict.fromkeys(("versions", "origin", *_COUNTS), dict),
+    "marks": list,
+}
+
+
+def _sound(values: Mapping[str, Any]) -> bool:
+    """Whether what was read is of the types that it should be: whoever edits the file by hand ends nobody's reading."""
+    return (
+        all(isinstance(values[name], kind) for name, kind in _TYPES.items() if name in values)
+        and all(isinstance(count, int) for name in _COUNTS for count in values.get(name, {}).values())
+        and all(isinstance(mark, dict) for mark in values.get("marks", []))
+        and isinstance(values.get("ended"), str | None)
+    )
 
 
 def iso(now: datetime) -> str:

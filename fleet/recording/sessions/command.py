@@ -153,7 +153,7 @@ def info(session: Path, *, as_json: bool) -> None:
         about = of_session(found)
         about.marks = marks_of(found, about)
         description = found.description
-    origin = getattr(description, "origin", {}) if description is not None else {}
+    origin = description.origin if description is not None else {}
     if as_json:
         more = {"versions": dict(description.versions), "host": description.host} if description is not None else {}
         click.echo(json.dumps({**about.to_dict(), **more, "origin": origin}))

@@ -122,7 +122,7 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
     assert last is not None
     old = session.description
     base = old if old is not None else directory.Description(fleet, times.iso(first), "", {})
-    made = {"by": origin["by"], "from": session.name, **origin}
+    made = {"by": origin["by"], "of": session.name, **origin}
     replace(
         base,
         started=times.iso(first) if origin["by"] == "cut" else base.started,
@@ -143,5 +143,5 @@ def origin_words(origin: object) -> str:
     """What a session was made of, in a line; empty if it was recorded."""
     if not isinstance(origin, dict) or not origin:
         return ""
-    parts = [f"{name} {json.dumps(value)}" for name, value in origin.items() if value and name not in ("by", "from")]
-    return f"{origin.get('by')} of {origin.get('from')}" + (f": {', '.join(parts)}" if parts else "")
+    parts = [f"{name} {json.dumps(value)}" for name, value in origin.items() if value and name not in ("by", "of")]
+    return f"{origin.get('by')} of {origin.get('of')}" + (f": {', '.join(parts)}" if parts else "")

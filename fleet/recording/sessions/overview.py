@@ -109,8 +109,8 @@ def of_session(session: Session) -> Overview:
     if description is not None:
         found.started = description.started or found.started
         found.lost = sum(description.drops.values()) + sum(description.missed.values())
-        found.marks = list(getattr(description, "marks", ()))
-        found.kept = bool(getattr(description, "kept", False))
+        found.marks = list(description.marks)
+        found.kept = description.kept
     found.state, found.words = _state(session, cut)
     return found
 

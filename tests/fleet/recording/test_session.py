@@ -51,7 +51,15 @@ def test_a_session_of_which_nothing_is_whole_is_refused_with_the_cause(tmp_path:
         Session.open(tmp_path).rescue(tmp_path / "rescued.mcap")
 
 
-@pytest.mark.parametrize("text", ["", "[]", "null", "7", '{"format": "2"}', '{"format": null}', "\0", '{"fleet": 1}'])
+WRONG = [
+    f'{{"fleet": "f", "started": "", "host": "", "versions": {{}}, {more}}}'
+    for more in ('"drops": 7', '"missed": {"a": "b"}', '"marks": [1]', '"ended": 5', '"origin": []', '"messages": "x"')
+]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "null", "7", '{"format": "2"}', '{"format": null}', "\0", '{"fleet": 1}', *WRONG]
+)
 def test_a_description_that_cannot_be_read_hides_no_message(tmp_path: Path, text: str) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1))
     (tmp_path / "session.json").write_text(text)
