@@ -9,6 +9,7 @@ import os
 import sys
 from typing import Final
 
+from gateway import streams
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 
 COMMANDS: Final = {
@@ -30,6 +31,7 @@ Ctrl-C stops the car before the process ends."""
 
 def main() -> None:
     """Entry point; exit code 2 for wrong use, 1 for a failure."""
+    streams.complete()
     parser = argparse.ArgumentParser(
         prog="gateway", description="One process per car: its bytes, keyed on the bus.", epilog=_EPILOG
     )

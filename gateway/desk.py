@@ -5,9 +5,10 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from typing import IO, Any, Final
 
+from gateway import streams
 from gateway.capture import BadCapture
 from gateway.link import BadUrl, LinkError, LinkUrl
 from gateway.link.url import TcpUrl
@@ -48,8 +49,7 @@ def explained(name: str, run: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except OSError as error:  # the commands explain what they open; this is the output's
-        # Otherwise the interpreter would try once more, and complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        streams.silence(sys.stdout)
         quiet = isinstance(error, BrokenPipeError)  # whoever closed a pipe has seen enough
         return 1 if quiet else _told(f"{name}: the output cannot be written: {error.strerror}", 1)
     return 0
@@ -86,6 +86,17 @@ def note(words: str) -> None:
     """A line for the person, on stderr."""
     sys.stderr.write(f"note: {words}\n")
     sys.stderr.flush()
+
+
+def say(lines: Iterable[str]) -> None:
+    """What a person must know, on stdout; where that cannot be written on stderr, and then OSError is raised."""
+    text = "".join(f"{line}\n" for line in lines)
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except OSError:
+        sys.stderr.write(text)
+        raise
 
 
 class Paint:

@@ -7,7 +7,6 @@ import argparse
 import asyncio
 import re
 import shlex
-import sys
 from typing import Final
 
 from gateway import desk
@@ -75,9 +74,7 @@ def _run(arguments: argparse.Namespace) -> None:
     data = raw_bytes(arguments.frame) if arguments.raw else checked(arguments.frame, profile, url)
     desk.warn_of(url)
     desk.run_until_interrupted(_send(url, data, arguments.wait))
-    sys.stdout.write(f"sent {desk.printable(data)} to {url}\n")
-    for line in aftermath(parse_sent(data), profile, arguments.link):
-        sys.stdout.write(line + "\n")
+    desk.say([f"sent {desk.printable(data)} to {url}", *aftermath(parse_sent(data), profile, arguments.link)])
 
 
 async def _send(url: LinkUrl, data: bytes, wait_s: float) -> None:

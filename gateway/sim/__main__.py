@@ -3,9 +3,11 @@
 import argparse
 import sys
 
+from gateway import streams
 from gateway.sim.command import add_arguments, run
 
 if __name__ == "__main__":
+    streams.complete()
     parser = argparse.ArgumentParser(prog="gateway sim")
     add_arguments(parser)
     sys.exit(run(parser.parse_args()))

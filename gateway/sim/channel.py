@@ -1,7 +1,6 @@
 """The control channel of `gateway sim`: JSON objects on stdin, one a line, each answered by one line on stdout."""
 
 import asyncio
-import contextlib
 import json
 import os
 import signal
@@ -9,6 +8,7 @@ import sys
 import threading
 from typing import Final
 
+from gateway import streams
 from gateway.sim.changes import change_of
 from gateway.sim.core.played import Played
 from gateway.sim.faults import fault_of, press_of
@@ -20,10 +20,16 @@ LINE_LIMIT: Final = 65536
 
 
 def say(line: dict[str, object]) -> None:
-    """One line of JSON on stdout. Whoever reads may have gone; the cars go on."""
-    with contextlib.suppress(BrokenPipeError):
+    """One line of JSON on stdout. Whoever reads may have gone, or the disk be full: the cars go on, without words."""
+    try:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
+    except OSError as error:
+        streams.silence(sys.stdout)
+        if not isinstance(error, BrokenPipeError):  # whoever closed a pipe knows
+            sys.stderr.write(
+                f"gateway sim: stdout cannot be written ({error.strerror}): the cars go on, and no more is said there\n"
+            )
 
 
 async def obey(simulation: Simulation) -> None:
@@ -78,6 +84,8 @@ async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
         return {"ok": True, "fault": fault.kind.value, "cars": await simulation.inflict(fault)}
     except ValueError as error:  # BadSpec, and whatever is no JSON
         words = str(error) if isinstance(error, BadSpec) else f"no JSON: {error}"
+    except RecursionError:
+        words = "no JSON: it is nested too deep"
     except LinkError as error:
         words = str(error)
     return {"ok": False, "error": words}

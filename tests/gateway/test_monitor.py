@@ -187,6 +187,22 @@ def test_a_full_disk_is_one_line(command: Command, kept: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("arguments", [["monitor", "--from", "KEPT"], ["scan", "--link", "/dev/nope"]])
+def test_a_closed_stdout_is_one_line(arguments: list[str], kept: Path) -> None:
+    words = [word.replace("KEPT", str(kept)) for word in arguments]
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "gateway.cli", *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+    assert (done.returncode, done.stderr) == (
+        1,
+        f"gateway {words[0]}: the output cannot be written: Bad file descriptor\n",
+    )
+
+
 def test_a_tcp_car_is_warned_of_before_it_is_connected(start: Started) -> None:
     car = TcpCar()
     try:

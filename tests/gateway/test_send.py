@@ -1,5 +1,7 @@
 """`gateway send` as a process: what reaches a car, what is refused and why, what it says the car may do then."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -8,7 +10,7 @@ import pytest
 from gateway.protocol.profile import parse_platform
 from gateway.protocol.values import Mode
 from gateway.send import why_not
-from tests.gateway.conftest import Command
+from tests.gateway.conftest import PATIENCE_S, Command
 from tests.support.processes import TcpCar, driving, wait_for
 
 STOP = "$0,0,0,0,0,0,0,0,0#"
@@ -41,6 +43,27 @@ def test_a_mode_is_opened_and_closed_as_it_says(simulate: Callable[..., Any], co
     wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["mode"] == "tracking", "the car tracks")
     assert command("send", "--link", link, "--wait", "4", "$4WD,MODE00#").returncode == 0
     wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["mode"] == "manual", "the car is in mode 0")
+
+
+@pytest.mark.parametrize(("where", "why"), [(">&-", "Bad file descriptor"), (">/dev/full", "No space left on device")])
+def test_how_it_is_stopped_is_said_also_when_stdout_cannot_be_written(
+    where: str, why: str, simulate: Callable[..., Any]
+) -> None:
+    sim, [link] = simulate("red:arduino:pty")
+    frame = [sys.executable, "-m", "gateway.cli", "send", "--link", link, "$1,0,0,0,0,0,0,0,0#"]
+    done = subprocess.run(
+        ["sh", "-c", f'exec "$@" {where}', "sh", *frame],
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 1
+    first, *_, stop, _, last = done.stderr.splitlines()
+    assert first == f"sent $1,0,0,0,0,0,0,0,0# to {link}"
+    assert stop == f"stop it: gateway send --link {link} '$0,0,0,0,0,0,0,0,0#'"
+    assert last == f"gateway send: the output cannot be written: {why}"
+    wait_for(lambda: driving(sim), "it drives")
 
 
 @pytest.mark.parametrize(

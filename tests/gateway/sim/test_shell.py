@@ -336,6 +336,8 @@ def test_it_says_what_it_hosts_takes_faults_and_ends_clean(
     assert sim.popen.stdin is not None
     sim.popen.stdin.write("no json\n")
     assert "no JSON" in sim.line()["error"]
+    sim.popen.stdin.write("[" * 60_000 + "\n")
+    assert sim.line() == {"ok": False, "error": "no JSON: it is nested too deep"}
     assert sim.ask(car="red", fault="link_drop")["ok"]
     assert not path.is_symlink()
     assert sim.ask(car="red", fault="link_drop", for_s=0)["ok"]
@@ -347,6 +349,34 @@ def test_it_says_what_it_hosts_takes_faults_and_ends_clean(
     assert not path.is_symlink()
     assert sim.popen.stderr is not None
     assert sim.popen.stderr.read() == ""
+
+
+@pytest.mark.parametrize("closed", [">&-", "<&-", ">/dev/full", "<&- >&-", ""])
+def test_the_cars_go_on_without_streams(closed: str, tmp_path: Path) -> None:
+    """A file that is opened may get the number of a stream that is closed.
+
+    Without a redirection stdout is a pipe whose reader is gone.
+    """
+    path = tmp_path / "red"
+    sim = [sys.executable, "-m", "gateway.sim", "--no-truth", "--car", f"red:arduino:pty:{path}"]
+    command = ["sh", "-c", f'exec "$@" {closed}', "sh", *sim]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        end = time.monotonic() + PATIENCE
+        while not path.is_symlink():
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        with serial.Serial(str(path), timeout=PATIENCE) as port:
+            port.write(opening(2))
+            assert port.read_until(b"CSB0,PV8").endswith(b"CSB0,PV8"), "it tracks: it heard what was written"
+        process.send_signal(signal.SIGTERM)
+        stderr = process.stderr.read()
+    assert not path.is_symlink()
+    assert process.returncode == 0
+    told = [b"gateway sim: stdout cannot be written"] if ">" in closed else []
+    assert [line.partition(b" (")[0] for line in stderr.splitlines()] == told
 
 
 def test_lamps_are_switched_and_things_moved_while_it_runs(started: list[Process]) -> None:
