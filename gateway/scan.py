@@ -24,11 +24,12 @@ EPILOG: Final = """\
 examples:
   gateway scan                              list and listen; nothing is sent
   gateway scan --json                       one JSON object a line
-  gateway scan --link /dev/ttyUSB0 --probe  ask a car that is silent
+  gateway scan --link /dev/ttyUSB0 --probe  stop what is there, and ask it if it is silent
 
 Opening a serial port can reset an Arduino that is on a USB cable. A port that another program has is left alone.
 Bluetooth devices are only listed, not connected to. A TCP car is never looked for: the connection ends its program.
---probe stops a car and closes whatever mode it is in. Ports that send something else are not probed."""
+--probe stops every car that it finds and closes whatever mode it is in. Ports that send something else are not
+probed."""
 
 SECONDS: Final = 6.0
 """An Arduino that was reset by opening its port has started after two; in mode 0 a car reports once in one, and three
@@ -46,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, default=SECONDS, metavar="S", help=f"how long to listen (default {SECONDS:g})"
     )
-    parser.add_argument("--probe", action="store_true", help="send what silent ones may be sent: an unknown car's stop")
+    parser.add_argument("--probe", action="store_true", help="send cars and silent ones an unknown car's stop")
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
 
 
@@ -118,13 +119,10 @@ class _Scan:
             desk.note(str(error))
 
     async def _probe_silent(self) -> None:
-        asked = [
-            ear
-            for ear in self._ears
-            if not ear.answered and ear.trouble is None and ear.verdict in (Verdict.SILENT, Verdict.CAR)
-        ]
+        # A car in mode 0, too: its readings do not tell whether it drives.
+        asked = [ear for ear in self._ears if ear.trouble is None and ear.verdict in (Verdict.SILENT, Verdict.CAR)]
         if not asked:
-            desk.note("nothing to probe: what is open has shown mode 0, or sends something else")
+            desk.note("nothing to probe: nothing is open, or what is sends something else")
             return
         frames = ", ".join(encode(step.frame).decode() for step in UNKNOWN.steps)
         where = ", ".join(str(ear.url) for ear in asked)

@@ -106,7 +106,7 @@ def test_what_each_link_is(
     assert other.received == b""
 
 
-def test_a_probe_asks_only_what_is_silent_or_in_a_mode(
+def test_a_probe_asks_what_is_silent_and_stops_cars_driving_ones_too(
     simulate: Callable[..., Any], command: Command, stranger: Callable[[], Stranger]
 ) -> None:
     sim, links = simulate("red:arduino:pty", "blue:arduino:pty")
@@ -116,17 +116,22 @@ def test_a_probe_asks_only_what_is_silent_or_in_a_mode(
     loop.echoes = True
     done = command("send", "--link", blue, "--platform", "arduino", "--wait", "1", "$4WD,MODE31#")
     assert done.returncode == 0
+    assert command("send", "--link", red, "--wait", "1", "$1,0,0,0,0,0,0,0,0#").returncode == 0
+    wait_for(lambda: driving(sim, "red"), "it drives, in mode 0")
     wait_for(lambda: sim.say({"car": "blue", "ask": "truth"})["mode"] == "obstacle_avoidance", "it avoids obstacles")
     found, done = _scan(command, *links, silent.link, other.link, loop.link, more=("--seconds", "5", "--probe"))
     assert done.returncode == 0
     assert {link: each["probed"] for link, each in found.items()} == {
-        red: False,
+        red: True,
         blue: True,
         silent.link: True,
         other.link: False,
         loop.link: True,
     }
-    assert f"within 4.8 s to {blue}, {silent.link}, {loop.link}: a car there stops, and goes to mode 0" in done.stderr
+    assert (
+        f"within 4.8 s to {red}, {blue}, {silent.link}, {loop.link}: a car there stops, and goes to mode 0"
+        in done.stderr
+    )
     assert found[blue]["verdict"] == "car"
     assert "it answered the probe in mode 0" in found[blue]["words"]
     assert found[silent.link]["verdict"] == "silent"
@@ -136,6 +141,7 @@ def test_a_probe_asks_only_what_is_silent_or_in_a_mode(
     assert other.received == b""
     assert sim.say({"car": "blue", "ask": "truth"})["mode"] == "manual"
     assert not driving(sim, "blue")
+    assert not driving(sim, "red")
 
 
 def test_for_a_person(simulate: Callable[..., Any], command: Command, stranger: Callable[[], Stranger]) -> None:
