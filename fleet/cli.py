@@ -44,6 +44,7 @@ COMMANDS: Final = {
     "record": ("fleet.recording.command:record", "Record everything of the fleet to MCAP, until Ctrl-C."),
     "sessions": ("fleet.recording.sessions.command:sessions", "List, verify, recover, cut and export recordings."),
     "replay": ("fleet.replay.command:replay", "Open a recorded session in Rerun."),
+    "view": ("fleet.replay.view:view", "See the fleet live in Rerun."),
     "demo": ("fleet.demo:demo", "Three simulated cars do a job, recorded and checked."),
 }
 """Subcommand: where it lives, and its line in `fleet --help`."""

@@ -1,28 +1,37 @@
 """`fleet replay`: a session in Rerun, in its viewer or as a file that carries its layout."""
 
 import os
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from fleet.commands.common import INTERRUPTED, Cars
+
 if TYPE_CHECKING:
     from fleet.recording.session import Session
+    from fleet.replay.to_rerun import Part
+
+BAR_AFTER_S: Final = 1.0
 
 
 @click.command()
 @click.argument("session", type=click.Path(path_type=Path))
+@click.option("--car", "--cars", "cars", type=Cars(), default=(), help="Only these cars, and the services.")
+@click.option("--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date.")
+@click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not shown.")
 @click.option(
     "--save",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="OUT.rrd",
     help="Write a file that carries its layout instead of opening the viewer: `rerun OUT.rrd` shows it.",
 )
-def replay(session: Path, save: Path | None) -> None:  # fmt: skip
+def replay(session: Path, cars: tuple[str, ...], start: str | None, end: str | None, save: Path | None) -> None:
     """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun."""
     from fleet.recording.session import NoSession, Session
     from fleet.replay.viewer import has_display
@@ -31,11 +40,12 @@ def replay(session: Path, save: Path | None) -> None:  # fmt: skip
         found = Session.open(session)
         found.check()
         if save is not None:
-            _refuse_target(save, found.segments)
+            refuse_target(save, found.segments)
         elif not has_display():
             raise click.ClickException(
                 f"there is no display here to open Rerun on: write a file, fleet replay {session} --save out.rrd"
             )
+        part = _part(found, cars, start, end)
         with tempfile.TemporaryDirectory() as scratch:
             if found.damage:
                 # What is whole is copied first: Rerun's own reader shows also what fails its checksum.
@@ -43,14 +53,14 @@ def replay(session: Path, save: Path | None) -> None:  # fmt: skip
                 click.echo(f"{found.damage_words}; showing what is whole", err=True)
                 found = whole
             out = save if save is not None else Path(scratch) / f"{found.name}.rrd"
-            _export(found, out)
+            _export(found, out, part, cars)
             if save is None:
                 sys.exit(_view(out))
     except NoSession as error:
         raise click.ClickException(str(error)) from None
 
 
-def _refuse_target(save: Path, segments: Iterable[Path]) -> None:
+def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
     """A recording or a device is not to be overwritten."""
     if save.suffix != ".rrd":
         raise click.UsageError(
@@ -63,6 +73,18 @@ def _refuse_target(save: Path, segments: Iterable[Path]) -> None:
             raise click.UsageError(f"--save {save}: this is the recording itself: name another file")
 
 
+def _part(session: "Session", cars: tuple[str, ...], start: str | None, end: str | None) -> "Part":
+    quiet_rerun()
+    from fleet.replay.to_rerun import EVERYTHING, Part
+
+    if not cars and start is None and end is None:
+        return EVERYTHING
+    from fleet.recording.sessions.command import part_of
+
+    selection = part_of(session, start, end, cars)
+    return Part(cars, selection.start_ns, selection.end_ns)
+
+
 def _rescue(session: "Session", out: Path) -> "Session":
     try:
         return session.rescue(out)
@@ -73,13 +95,17 @@ def _rescue(session: "Session", out: Path) -> "Session":
         ) from None
 
 
-def _export(session: "Session", out: Path) -> None:
-    # Rerun has a log of its own, which would stand between our lines; it reads this when it is imported.
+def quiet_rerun() -> None:
+    """Rerun has a log of its own, which would stand between our lines; it reads this when it is imported."""
     os.environ.setdefault("RUST_LOG", "off")
+
+
+def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) -> None:
     from fleet.replay.to_rerun import ExportFailed, export
 
     try:
-        held = export(session, out)
+        with _bar(session) as seen:
+            held = export(session, out, part, tab=cars[0] if len(cars) == 1 else "", seen=seen)
     except ExportFailed as error:
         raise click.ClickException(str(error)) from None
     except OSError as error:
@@ -87,15 +113,41 @@ def _export(session: "Session", out: Path) -> None:
     click.echo(f"{out}: {held.total()} messages on {len(held)} keys")
 
 
+@contextmanager
+def _bar(session: "Session") -> Iterator[Callable[[int], None]]:
+    """On a terminal a bar appears if it takes over a second; it is told how many messages have been read."""
+    from fleet.replay.to_rerun import count_of
+
+    count = count_of(session) if sys.stderr.isatty() else 0
+    bar: Any = None
+    began = time.monotonic()
+    done = 0
+
+    def seen(messages: int) -> None:
+        nonlocal bar, done
+        done += messages
+        if bar is not None:
+            bar.update(messages)
+        elif count and time.monotonic() - began > BAR_AFTER_S:
+            bar = click.progressbar(length=count, label="replay", file=sys.stderr).__enter__()
+            bar.update(done)
+
+    try:
+        yield seen
+    finally:
+        if bar is not None:
+            bar.render_finish()
+
+
 def _view(rrd: Path) -> int:
     """Rerun's viewer until its window is closed; it listens on loopback only."""
-    from fleet.replay.viewer import environment, program
+    from fleet.replay.viewer import Viewer
 
-    viewer = subprocess.Popen([str(program()), "--bind", "127.0.0.1", "--port", "auto", str(rrd)], env=environment())
-    try:
-        return viewer.wait()
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        viewer.terminate()
-        viewer.wait()
+    with Viewer("--port", "auto", str(rrd)) as viewer:
+        try:
+            code = viewer.wait() or 0
+        except KeyboardInterrupt:
+            return INTERRUPTED
+        if code:
+            click.echo(f"fleet: Rerun's viewer ended with {code}: {viewer.last_words}", err=True)
+        return 1 if code else 0

@@ -8,6 +8,7 @@ import shutil
 import tempfile
 import warnings
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -19,7 +20,6 @@ from fleet.recording.session import NoSession, Session
 from fleet.replay import blueprint, mapping
 from fleet.replay.drawing import Drawing
 from fleet.replay.lenses import MESSAGE, lenses
-from schemas import keys
 
 APPLICATION: Final = "zenoh-car-fleet"
 TEXT: Final = "TextLog:text"
@@ -33,7 +33,6 @@ class ExportFailed(Exception):
 class Part:
     """What of a session is shown: some of its cars (and the fleet's services), some of its time."""
 
-    fleet: str = keys.DEFAULT_FLEET
     cars: tuple[str, ...] = ()
     """None: all."""
     start_ns: int | None = None
@@ -45,7 +44,7 @@ class Part:
         wanted = None
         if self.cars:
             names = "|".join(re.escape(name) for name in self.cars)
-            wanted = [f"^{re.escape(self.fleet)}/(({names})|@[^/]*)/"]
+            wanted = [f"^[^/]+/(({names})|@[^/]*)/"]
         return rrc.McapReader(
             segment,
             include_topic_regex=wanted,
@@ -63,15 +62,24 @@ class Part:
 EVERYTHING: Final = Part()
 
 
-def export(session: Session, out: Path, part: Part = EVERYTHING, tab: str = "") -> Counter[str]:
+def export(
+    session: Session,
+    out: Path,
+    part: Part = EVERYTHING,
+    *,
+    tab: str = "",
+    seen: Callable[[int], None] = lambda _: None,
+) -> Counter[str]:
     """Write `out`; how many messages of each key it holds. Raises ExportFailed, and NoSession if there is nothing.
 
-    `tab`: the car whose tab is in front.
+    `tab`: the car whose tab is in front. `seen` is told how many messages have been read since it was last told.
     """
     drawing = Drawing()
     readers = [part.reader(segment) for segment in session.segments]
     stream = rrc.LazyChunkStream.merge(*(reader.stream() for reader in readers))
-    stream = rrc.LazyChunkStream.from_iter(drawing.follow(stream)).lenses(lenses(), output_mode="forward_all")
+    stream = rrc.LazyChunkStream.from_iter(drawing.follow(_told(stream, seen))).lenses(
+        lenses(), output_mode="forward_all"
+    )
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".replay-") as scratch:
         whole = Path(scratch) / "whole.rrd"
         # A recording stream, because only its file carries a layout, which comes last: what there is is known then.
@@ -99,6 +107,19 @@ def export(session: Session, out: Path, part: Part = EVERYTHING, tab: str = "") 
             ) from None
         whole.replace(out)
     return drawing.held
+
+
+def count_of(session: Session) -> int:
+    """How many messages a session has, as its files say."""
+    channels = [channel for each in session.segments for channel in EVERYTHING.reader(each).info().channels]
+    return sum(channel.message_count or 0 for channel in channels)
+
+
+def _told(chunks: Iterable[rrc.Chunk], seen: Callable[[int], None]) -> Iterator[rrc.Chunk]:
+    for chunk in chunks:
+        yield chunk
+        if not chunk.is_static:
+            seen(chunk.num_rows)
 
 
 def rows(path: Path) -> Counter[str]:
