@@ -226,7 +226,7 @@ def test_only_what_a_link_needs_is_imported(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         for url, said in (
             (TcpUrl("127.0.0.1", server.getsockname()[1]), "False False False\n"),
-            (peer.url, "True False False\n"),
+            (SerialUrl(str((tmp_path / "tty").resolve())), "True False False\n"),
         ):
             done = subprocess.run(
                 [sys.executable, "-c", ONLY_WHAT_IS_NEEDED, str(url)],

@@ -34,7 +34,7 @@ Usb = Callable[..., None]
     ],
 )
 def test_one_fits(url: UsbUrl, device: str) -> None:
-    assert choose(url, THERE) == device
+    assert choose(url, THERE).device == device
 
 
 @pytest.mark.parametrize(
@@ -139,6 +139,48 @@ async def test_a_listing_that_fails_once_is_asked_for_again(
 
 def _raise(error: Exception) -> list[ListPortInfo]:
     raise error
+
+
+@pytest.mark.parametrize("named", ["serial://?vid=2341&pid=0a0a", "PATH"])
+async def test_another_device_that_comes_in_its_place_is_not_commanded(named: str, tmp_path: Path, plug: Usb) -> None:
+    peer = PtyPeer(tmp_path)
+    url = parse_url(named.replace("PATH", path(peer)))
+    device = str((tmp_path / "tty").resolve())
+    first, second = (Plugged(device, 0x2341, 0x0A0A, number) for number in ("7573", "99\n12"))
+    plug(CH340, first)
+    await (await open_link(url)).close()
+    plug(CH340, second)
+    with pytest.raises(CannotOpen) as caught:
+        await open_link(url)
+    assert str(caught.value) == (
+        f"{url}: another device is there, {device} (2341:0a0a serial number 99?12); it was {device} (2341:0a0a serial "
+        "number 7573): plug that in again, or restart this program if it is the right one"
+    )
+    plug(first)
+    await (await open_link(url)).close()
+    peer.close()
+
+
+async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: Usb) -> None:
+    """Gone, or something that says nothing of itself."""
+    peer = PtyPeer(tmp_path)
+    plug(Plugged(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
+    await (await open_link(peer.url)).close()
+    plug(CH340)
+    with pytest.raises(CannotOpen, match=f"another device is there, {path(peer)}, of which the system says nothing;"):
+        await open_link(peer.url)
+    peer.close()
+    with pytest.raises(CannotOpen, match="there is no such port"):
+        await open_link(peer.url)
+
+
+async def test_ports_that_say_nothing_of_themselves_are_all_the_same(tmp_path: Path, plug: Usb) -> None:
+    peer = PtyPeer(tmp_path)
+    plug(Plugged(str((tmp_path / "tty").resolve())))
+    await (await open_link(peer.url)).close()
+    plug(CH340)
+    await (await open_link(peer.url)).close()
+    peer.close()
 
 
 async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> None:
