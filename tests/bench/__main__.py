@@ -17,6 +17,7 @@ BENCHMARKS = {
     "stops": "stops",
     "record": "recording",
     "replay": "replaying",
+    "sessions": "sessions",
     "fleet": "fleet",
     "plan": "planning",
 }

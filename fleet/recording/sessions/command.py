@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 
 from fleet.commands.common import Cars, json_option
+from fleet.replay.decoding_commands import vector
 
 if TYPE_CHECKING:
     from fleet.recording.session import Session
@@ -36,6 +37,8 @@ class _WithDefault(click.Group):
 def sessions() -> None:
     """List, look into, verify, recover, cut and export recordings; alone: list those of a directory."""
 
+
+sessions.add_command(vector)
 
 session_argument = click.argument("session", type=click.Path(path_type=Path))
 out_option = click.option(
@@ -189,7 +192,7 @@ def verify(session: Path, *, as_json: bool) -> None:
 
     Says exactly what is missing; ends with 1 if anything is.
     """
-    from fleet.recording.sessions.export import total
+    from fleet.recording.sessions.overview import total
     from fleet.recording.sessions.verify import verify as look
 
     with _explained():
@@ -208,8 +211,8 @@ def verify(session: Path, *, as_json: bool) -> None:
 @out_option
 def recover(session: Path, out: Path | None) -> None:
     """Write every whole chunk of a cut or damaged SESSION into a whole session, which says so."""
-    from fleet.recording.sessions.export import total
     from fleet.recording.sessions.making import recover as make
+    from fleet.recording.sessions.overview import total
 
     with _explained():
         found = _open(session)
@@ -282,9 +285,9 @@ def export(session: Path, csv: Path | None, parquet: Path | None) -> None:
     names, in Parquet also in the fields' metadata. What is no protobuf message is in `other`.
     """
     from fleet.recording.sessions.export import export as write
-    from fleet.recording.sessions.export import total
     from fleet.recording.sessions.formats import FORMATS
     from fleet.recording.sessions.making import made_whole
+    from fleet.recording.sessions.overview import total
 
     wanted = {name: out for name, out in (("csv", csv), ("parquet", parquet)) if out is not None}
     if not wanted or csv == parquet:

@@ -10,13 +10,13 @@ from google.protobuf.message import DecodeError, Message
 
 from fleet.recording.decoding import Decoder
 from fleet.recording.salvage import Lane, Row
-from fleet.recording.session import Session, message_of
+from fleet.recording.session import message_of
 from fleet.recording.sessions import tables
 from fleet.recording.sessions.formats import Sink
 
-BATCH_ROWS: Final = 16_384
 BATCH_BYTES: Final = 4 << 20
-"""What waits of one table until it is written."""
+"""What waits of one table until it is written: payloads, and ROW_BYTES for each row."""
+ROW_BYTES: Final = 256
 OTHER: Final = "other"
 
 
@@ -31,6 +31,46 @@ class Exported:
 
 
 @dataclass(slots=True)
+class _Waiting:
+    """Messages that wait for their table, by column: of a row each, the garbage collector would take a third longer."""
+
+    lanes: list[Lane] = field(default_factory=list)
+    log_ns: list[int] = field(default_factory=list)
+    publish_ns: list[int] = field(default_factory=list)
+    sequences: list[int] = field(default_factory=list)
+    payloads: list[bytes] = field(default_factory=list)
+
+    def part(self, numbers: Sequence[int]) -> "_Waiting":
+        """Some of them."""
+        columns = (self.lanes, self.log_ns, self.publish_ns, self.sequences, self.payloads)
+        return _Waiting(*([column[number] for number in numbers] for column in columns))  # type: ignore[arg-type]  # in turn
+
+    def extend(self, others: "_Waiting") -> None:
+        """Add them all."""
+        self.lanes += others.lanes
+        self.log_ns += others.log_ns
+        self.publish_ns += others.publish_ns
+        self.sequences += others.sequences
+        self.payloads += others.payloads
+
+    def common(self) -> list[tables.Values]:
+        """The values of the columns that every table has."""
+        topics = [lane.channel.topic for lane in self.lanes]
+        cars = {key: tables.car_of(key) for key in set(topics)}
+        return [topics, [cars[key] for key in topics], self.log_ns, self.publish_ns, self.sequences]
+
+    def others(self) -> list[tables.Values]:
+        """The values of the columns of what is no protobuf message."""
+        texts = [_text(payload) for payload in self.payloads]
+        return [
+            [message_of(lane) or None for lane in self.lanes],
+            [lane.channel.message_encoding for lane in self.lanes],
+            texts,
+            [None if text is not None else data for data, text in zip(self.payloads, texts, strict=True)],
+        ]
+
+
+@dataclass(slots=True)
 class _Table:
     """One file, and what waits for it."""
 
@@ -38,61 +78,39 @@ class _Table:
     layout: tables.Layout | None
     made: type[Message] | None
     name: str
-    waiting: list[Row] = field(default_factory=list)
+    waiting: _Waiting = field(default_factory=_Waiting)
     size: int = 0
     rows: int = 0
 
-    def write(self) -> list[Row]:
+    def write(self) -> _Waiting:
         """Write what waits; what of it is not the message that it should be is left out and returned."""
-        rows, self.waiting, self.size = self.waiting, [], 0
-        bad: list[Row] = []
+        batch, self.waiting, self.size = self.waiting, _Waiting(), 0
+        bad = _Waiting()
         messages: list[Message] = []
         if self.made is not None:
             try:
-                messages = list(map(self.made.FromString, [row[4] for row in rows]))
+                messages = list(map(self.made.FromString, batch.payloads))
             except DecodeError:
-                rows, bad, messages = _sorted_out(rows, self.made)
-        if rows:
-            own = self.layout.fill(messages) if self.layout is not None else _others(rows)
-            self.sink.add([*_common(rows), *own])
-            self.rows += len(rows)
+                batch, bad, messages = _sorted_out(batch, self.made)
+        if batch.lanes:
+            own = self.layout.fill(messages) if self.layout is not None else batch.others()
+            self.sink.add([*batch.common(), *own])
+            self.rows += len(batch.lanes)
         return bad
 
 
-def _sorted_out(rows: Iterable[Row], made: type[Message]) -> tuple[list[Row], list[Row], list[Message]]:
-    good: list[Row] = []
-    bad: list[Row] = []
+def _sorted_out(batch: _Waiting, made: type[Message]) -> tuple[_Waiting, _Waiting, list[Message]]:
+    good: list[int] = []
+    bad: list[int] = []
     messages: list[Message] = []
-    for row in rows:
+    for number, payload in enumerate(batch.payloads):
         try:
-            messages.append(made.FromString(row[4]))
+            messages.append(made.FromString(payload))
         except DecodeError:
-            bad.append(row)
+            bad.append(number)
         else:
-            good.append(row)
-    return good, bad, messages
-
-
-def _common(rows: Sequence[Row]) -> list[tables.Values]:
-    topics = [row[0].channel.topic for row in rows]
-    cars = {key: tables.car_of(key) for key in set(topics)}
-    return [
-        topics,
-        [cars[key] for key in topics],
-        [row[2] for row in rows],
-        [row[3] for row in rows],
-        [row[1] for row in rows],
-    ]
-
-
-def _others(rows: Sequence[Row]) -> list[tables.Values]:
-    texts = [_text(row[4]) for row in rows]
-    return [
-        [message_of(row[0]) or None for row in rows],
-        [row[0].channel.message_encoding for row in rows],
-        texts,
-        [None if text is not None else row[4] for row, text in zip(rows, texts, strict=True)],
-    ]
+            good.append(number)
+    return batch.part(good), batch.part(bad), messages
 
 
 class _Export:
@@ -109,15 +127,20 @@ class _Export:
     def run(self, rows: Iterable[Row]) -> None:
         """Write every message."""
         by_lane = self._by_lane
-        for row in rows:
+        for lane, sequence, log_ns, publish_ns, payload in rows:
             # By identity, which is quick; the lane is kept with it, so that no other can have the same.
-            known = by_lane.get(id(row[0]))
+            known = by_lane.get(id(lane))
             if known is None:
-                known = by_lane[id(row[0])] = (row[0], self._of(self._decoder.class_of(row[0])))
+                known = by_lane[id(lane)] = (lane, self._of(self._decoder.class_of(lane)))
             table = known[1]
-            table.waiting.append(row)
-            table.size += len(row[4])
-            if len(table.waiting) >= BATCH_ROWS or table.size >= BATCH_BYTES:
+            waiting = table.waiting
+            waiting.lanes.append(lane)
+            waiting.log_ns.append(log_ns)
+            waiting.publish_ns.append(publish_ns)
+            waiting.sequences.append(sequence)
+            waiting.payloads.append(payload)
+            table.size += len(payload) + ROW_BYTES
+            if table.size >= BATCH_BYTES:
                 self._write(table)
         for table in list(self.tables.values()):
             self._write(table)
@@ -126,9 +149,9 @@ class _Export:
 
     def _write(self, table: _Table) -> None:
         bad = table.write()
-        self.undecoded += len(bad)
-        if bad:
-            self._of(None).waiting += bad
+        self.undecoded += len(bad.lanes)
+        if bad.lanes:
+            self._of(None).waiting.extend(bad)
 
     def _of(self, made: type[Message] | None) -> _Table:
         if made not in self.tables:
@@ -174,13 +197,3 @@ def _text(payload: bytes) -> str | None:
         return payload.decode()
     except UnicodeDecodeError:
         return None
-
-
-def total(session: Session) -> int | None:
-    """How many messages the indexes say that there are; None where one is missing."""
-    count = 0
-    for index in session.indexes().values():
-        if index is None or index.statistics is None:
-            return None
-        count += index.statistics.message_count
-    return count

@@ -44,14 +44,11 @@ class CsvSink:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._file)
         self._writer.writerow([column.name for column in columns])
-        self._cells = [_CELLS.get(column.kind) for column in columns]
+        self._texts = [_TEXTS.get(column.kind) for column in columns]
 
     def add(self, values: Sequence[Values]) -> None:
         """Write rows: the values of each column."""
-        columns = [
-            column if cell is None else [None if value is None else cell(value) for value in column]
-            for cell, column in zip(self._cells, values, strict=True)
-        ]
+        columns = [column if text is None else text(column) for text, column in zip(self._texts, values, strict=True)]
         self._writer.writerows(zip(*columns, strict=True))
 
     def close(self) -> None:
@@ -59,33 +56,36 @@ class CsvSink:
         self._file.close()
 
 
-class _Times:
-    """Times as text; the seconds met lately are remembered, as most times lie within the same few."""
+class _Seconds(dict[int, str]):
+    """Seconds since the epoch as text, as they are asked for; those met lately are remembered."""
 
-    def __init__(self) -> None:
-        self._words: dict[int, str] = {}
-
-    def __call__(self, ns: int) -> str:
-        second, rest = divmod(ns, 1_000_000_000)
-        words = self._words.get(second)
-        if words is None:
-            try:
-                words = datetime.fromtimestamp(second, UTC).strftime("%Y-%m-%d %H:%M:%S")
-            except (OverflowError, ValueError, OSError):
-                return str(ns)  # somebody else's clock
-            if len(self._words) >= SECONDS:
-                self._words.clear()
-            self._words[second] = words
-        return f"{words}.{rest:09d}"
+    def __missing__(self, second: int) -> str:
+        if len(self) >= SECONDS:
+            self.clear()
+        words = self[second] = datetime.fromtimestamp(second, UTC).strftime("%Y-%m-%d %H:%M:%S")
+        return words
 
 
-_CELLS: Final[dict[Kind, Callable[[Any], str]]] = {
-    Kind.BOOL: lambda value: "true" if value else "false",
-    Kind.BYTES: bytes.hex,
-    Kind.TIME: _Times(),
-    Kind.LIST: json.dumps,
-    Kind.MAP: json.dumps,
+def _times(column: Values) -> Values:
+    seconds = _Seconds()
+    try:
+        return [None if ns is None else f"{seconds[ns // 1_000_000_000]}.{ns % 1_000_000_000:09d}" for ns in column]
+    except (OverflowError, ValueError, OSError):
+        return column  # somebody else's clock: no date, so numbers
+
+
+def _by(text: Callable[[Any], str]) -> Callable[[Values], Values]:
+    return lambda column: [None if value is None else text(value) for value in column]
+
+
+_TEXTS: Final[dict[Kind, Callable[[Values], Values]]] = {
+    Kind.BOOL: lambda column: [None if value is None else "true" if value else "false" for value in column],
+    Kind.BYTES: _by(bytes.hex),
+    Kind.TIME: _times,
+    Kind.LIST: _by(json.dumps),
+    Kind.MAP: _by(json.dumps),
 }
+"""What makes text of the values of a column; the csv module writes the others as they are to be."""
 
 
 class ParquetSink:

@@ -115,6 +115,16 @@ def of_session(session: Session) -> Overview:
     return found
 
 
+def total(session: Session) -> int | None:
+    """How many messages the indexes say that there are; None where one is missing."""
+    count = 0
+    for index in session.indexes().values():
+        if index is None or index.statistics is None:
+            return None
+        count += index.statistics.message_count
+    return count
+
+
 def marks_of(session: Session, about: Overview) -> list[Mapping[str, Any]]:
     """The marks of a session: as its description has them, else as they were recorded."""
     if about.marks:
