@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.components import LinkAxis
@@ -133,7 +134,7 @@ class _Layout:
     def _lane(self, lane: Lane, car: str) -> rrb.Visualizer:
         name = f"{lane.name} {car}" if lane == mapping.ROLE else lane.name
         tints = self._leds if lane.name in _LEDS else colours.MARKS if lane == mapping.MARKS else colours.STATES
-        style = rr.StateConfiguration(values=list(tints), colors=list(tints.values()))
+        style = rr.StateConfiguration(values=list(tints), colors=np.array(list(tints.values()), dtype=np.uint32))
         source = VisualizerComponentMapping(
             "StateChange:state", ComponentSourceKind.SourceComponent, source_component=name
         )

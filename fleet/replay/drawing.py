@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.chunk as rrc
 
 from fleet.replay import mapping
-from fleet.replay.colours import OFF, colour, rgb
+from fleet.replay.colours import OFF, Rgb, colour, rgb
 from fleet.replay.lenses import component, numbers, triples
 from schemas import keys, messages
 from schemas.topics import COMMANDS
@@ -28,6 +28,10 @@ _LED: Final = "led"
 LED: Final = COMMANDS["led"]
 _THING_M: Final = 0.2
 """Height at which things are drawn; the world has none."""
+_LAMP: Final = (255, 225, 90)
+_THING: Final = (170, 140, 110)
+_WALL: Final = (150, 155, 165)
+_TAPE: Final = (220, 220, 220)
 _Times = dict[str, Any]
 _MANY: Final = 256
 """Colours of LEDs that get a colour of their own in the lanes."""
@@ -83,9 +87,11 @@ class Drawing:
             if way is None:
                 continue
             strip = rr.LineStrips3D.columns(
-                strips=[triples(way[:, 0], way[:, 1])], colors=[colour(car, index)], radii=[0.012]
+                strips=[triples(way[:, 0], way[:, 1])], colors=_tints([colour(car, index)]), radii=[0.012]
             )
-            name = rr.Arrows3D.columns(colors=[colour(car, index)], radii=[0.035], labels=[car], show_labels=[True])
+            name = rr.Arrows3D.columns(
+                colors=_tints([colour(car, index)]), radii=[0.035], labels=[car], show_labels=[True]
+            )
             yield rrc.Chunk.from_columns(f"{mapping.entity(key)}/way", indexes=[], columns=strip)
             yield rrc.Chunk.from_columns(mapping.entity(key), indexes=[], columns=name)
 
@@ -112,7 +118,7 @@ class Drawing:
         self._parts.setdefault(mapping.key_of(path), []).append(np.stack([x, y], axis=1))
         self._note(leds)
         discs = rr.Points3D.columns(
-            positions=triples(x, y), colors=[rgb(each) for each in leds], radii=np.full(len(x), 0.07)
+            positions=triples(x, y), colors=_tints(rgb(each) for each in leds), radii=np.full(len(x), 0.07)
         )
         yield rrc.Chunk.from_columns(f"{path}/{_LED}", indexes=_indexes(times), columns=discs)
 
@@ -128,7 +134,7 @@ class Drawing:
             every = [lamp for row in lamps for lamp in row]
             points = rr.Points3D.columns(
                 positions=[(lamp["x_m"], lamp["y_m"], 0.02) for lamp in every],
-                colors=[(255, 225, 90) if lamp["on"] else OFF for lamp in every],
+                colors=_tints(_LAMP if lamp["on"] else OFF for lamp in every),
                 radii=[0.06] * len(every),
                 labels=[lamp["name"] for lamp in every],
             )
@@ -141,7 +147,7 @@ class Drawing:
                 centers=[(thing["x_m"], thing["y_m"], 0.0) for thing in every],
                 half_sizes=[_half_size(thing) for thing in every],
                 quaternions=[_about_z(thing["heading_rad"]) for thing in every],
-                colors=[(170, 140, 110)] * len(every),
+                colors=_tints([_THING] * len(every)),
                 labels=[thing["name"] for thing in every],
             )
             boxes = boxes.partition([len(row) for row in things])
@@ -152,15 +158,15 @@ class Drawing:
         walls = [[_point(wall["begin"]), _point(wall["end"])] for wall in world["walls"] or ()]
         line = [_point(each) for each in world["line"] or ()]
         strips = {
-            "walls": (walls, (150, 155, 165), 0.03),
-            "line": ([[*line, line[0]]] if line else [], (220, 220, 220), 0.0125),
+            "walls": (walls, _WALL, 0.03),
+            "line": ([[*line, line[0]]] if line else [], _TAPE, 0.0125),
         }
         for name, (shapes, tint, radius) in strips.items():
             if not shapes or self._still.get(name) == shapes:
                 continue
             self._still[name] = shapes
             drawn = rr.LineStrips3D.columns(
-                strips=shapes, colors=[tint] * len(shapes), radii=[radius] * len(shapes)
+                strips=shapes, colors=_tints([tint] * len(shapes)), radii=[radius] * len(shapes)
             ).partition([len(shapes)])
             yield rrc.Chunk.from_columns(f"{path}/{name}", indexes=[], columns=drawn)
         self.corners = [(x, y) for wall in walls for x, y, _ in wall]
@@ -186,6 +192,11 @@ class Drawing:
 def _lane(path: str, name: str, times: _Times, states: Sequence[str | None]) -> Any:
     columns = rr.AnyValues.columns(**{name: pa.array(states, pa.string())})
     return rrc.Chunk.from_columns(path, indexes=_indexes(times), columns=columns)
+
+
+def _tints(colours: Iterable[Rgb]) -> Any:
+    """As 0xRRGGBBAA: Rerun takes four triples for one colour of four parts."""
+    return np.array([int.from_bytes((*each, 255), "big") for each in colours], dtype=np.uint32)
 
 
 def _indexes(times: _Times) -> list[Any]:

@@ -187,7 +187,7 @@ FLEET_LANES: Final = (
 """(name, of every car), on the fleet's tab."""
 FLEET_CURVES: Final = (("Distance (m)", DISTANCE), ("Battery (V)", BATTERY))
 FLEET_TEXTS: Final = (
-    ("Decisions and why", (), ("@coordinator/decision", ASSIGNMENT)),
+    ("Decisions and why", (), ("@coordinator/decision", ASSIGNMENT, "@recorder/mark")),
     ("Commands and log", (COMMANDS, "event/log"), ()),
 )
 """(name, topics of every car, topics of services)."""

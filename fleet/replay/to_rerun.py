@@ -20,9 +20,11 @@ from fleet.recording.session import NoSession, Session
 from fleet.replay import blueprint, mapping
 from fleet.replay.drawing import Drawing
 from fleet.replay.lenses import MESSAGE, lenses
+from schemas.topics import TOPICS
 
 APPLICATION: Final = "zenoh-car-fleet"
 TEXT: Final = "TextLog:text"
+_LOGS: Final = tuple(f"/{topic.name}" for topic in TOPICS.values() if topic.message == "foxglove.Log")
 
 
 class ExportFailed(Exception):
@@ -132,6 +134,6 @@ def rows(path: Path) -> Counter[str]:
         names = chunk.to_record_batch().schema.names
         own = any(name.endswith(MESSAGE) for name in names)
         # foxglove.Log is text in Rerun; any other text was made by a lens of ours.
-        if own or (TEXT in names and key.endswith("/event/log")):
+        if own or (TEXT in names and key.endswith(_LOGS)):
             counted[key] += chunk.num_rows
     return counted

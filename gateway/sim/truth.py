@@ -1,6 +1,6 @@
 """What is so, published: `<fleet>/<car>/sim/truth` at 10 Hz and on every change, as long as there is a hub.
 
-Of a world with lamps, things or cars that meet also `<fleet>/@sim/world`: at 10 Hz while it changes, else at 1 Hz.
+Of a world with anything in it also `<fleet>/@sim/world`: at 10 Hz while it changes, else at 1 Hz.
 
 The simulator runs without a bus just as well; this waits for a hub, never starts one.
 """
@@ -65,9 +65,9 @@ class TruthPublisher:
                 self._bus.close()
 
     def _world_publisher(self) -> Callable[[float], None]:
-        """What publishes the world, if it is one of which more is to be said than where its cars are."""
+        """What publishes the world, if there is anything in it but cars."""
         world, topic = self._simulation.world, TOPICS["@sim/world"]
-        if self._bus is None or not (world.lively or world.lamps):
+        if self._bus is None or not (world.lively or world.lamps or world.walls or world.line):
             return lambda _: None
         key = keys.topic_key(self._fleet, keys.SIMULATOR, "world")
         publisher = self._bus.publisher(key, topic, keys.SIMULATOR)

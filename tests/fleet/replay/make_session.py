@@ -12,6 +12,7 @@ from mcap.writer import Writer
 
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.topics import PROTOBUF
 
 START_NS = 1_790_000_000_000_000_000
 CARS = ("blue", "green", "red")
@@ -19,10 +20,14 @@ MODES = ("manual", "tracking", "obstacle_avoidance")
 COMMANDS = (
     (3.0, "drive", "asked", "forward for 3 s"),
     (3.02, "drive", "sent", ""),
+    (4.0, "led", "sent", ""),
     (6.1, "stop", "complete", "motors off"),
     (6.5, "mode", "sent", "tracking"),
     (13.0, "mode", "rejected", "the link is down"),
 )
+
+
+LED = pb.LedCommand(r=255, g=0, b=16)
 
 
 class Made:
@@ -69,7 +74,7 @@ def drive_about(made: Made, car: str, index: int, seconds: int) -> None:
         at = tenth / 10
         angle = at * 0.35 + index * 2.1
         radius = 0.8 + 0.35 * index
-        truth = pb.Truth(mode=mode(at, seconds), motor_left=120, motor_right=150, led="off")
+        truth = pb.Truth(mode=mode(at, seconds), motor_left=120, motor_right=150, led="#ff0010" if at > 4 else "off")
         truth.x_m, truth.y_m = radius * math.cos(angle), radius * math.sin(angle)
         truth.heading_rad = angle + math.pi / 2
         made.put(f"{base}/sim/truth", truth, at)
@@ -106,15 +111,34 @@ def drive_about(made: Made, car: str, index: int, seconds: int) -> None:
         made.put(f"{base}/state/motion", pb.Motion(motion=motion, source="commanded", speed=0.6), at)
         quiet = "lost" if index == 1 and 8 <= second < 11 else "quiet" if now == "obstacle_avoidance" else "online"
         made.put(f"{base}/state/link", pb.Link(state=quiet, rx_bytes=second * 35, rejects={"truncated": 1}), at)
-        made.put(f"{base}/state/safety", pb.Safety(motors="on" if motion == "forward" else "off", worst_stop_s=1.2), at)
+        safety = pb.Safety(motors="on" if motion == "forward" else "off", worst_stop_s=1.2)
+        if second == 3:
+            safety.lease.holder = "ann"
+        if second in (6, 7):
+            safety.hold.by = "ann"
+            safety.estops.add(id="1", by="ann", why="too close")
+        made.put(f"{base}/state/safety", safety, at)
         made.put(f"{base}/state/health", pb.Health(platform="arduino", loop_lag_s=0.002, cpu=0.01, rss_mb=38), at)
     for number, (at, verb, phase, words) in enumerate(COMMANDS):
         event = pb.CommandEvent(id=f"c{number}", verb=verb, sender="ann", kind="person", phase=phase, words=words)
+        if verb == "led":
+            event.request, event.request_encoding = LED.SerializeToString(), f"{PROTOBUF};fleet.v1.LedCommand"
         made.put(f"{base}/event/command", event, at + 0.1 * index)
         made.put(f"{base}/frame/tx", pb.TxFrame(data=b"$1,0,0,0,0,0,0,0,0#", why="command", written=True), at)
     made.put(f"{base}/event/log", log(car, 0.1, 2, "connected to /dev/pts/3"), 0.1)
     made.put(f"{base}/event/log", log(car, 8.0, 3, "link lost: the port is gone"), 8.0)
     made.put(f"{base}/event/log", log(car, 11.0, 2, "link back; recovery begun"), 11.0)
+
+
+def world(second: int) -> pb.World:
+    """A room with a line, a lamp that is switched, a thing that turns."""
+    corners = [(-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)]
+    points = [pb.SimPoint(x_m=x, y_m=y) for x, y in corners]
+    walls = [pb.SimWall(begin=points[n - 1], end=points[n]) for n in range(4)]
+    line = [pb.SimPoint(x_m=x / 2, y_m=y / 2) for x, y in corners]
+    lamp = pb.SimLamp(name="beacon", x_m=1.5, y_m=1.5, on=second % 4 < 2, brightness=1.0, reach_m=1.0)
+    box = pb.SimThing(name="box", x_m=-1.2, y_m=1.2, heading_rad=second / 10, width_m=0.4, depth_m=0.2)
+    return pb.World(lamps=[lamp], things=[box], walls=walls, line=line)
 
 
 def mode(at_s: float, seconds: int) -> str:
@@ -142,7 +166,8 @@ def make(path: Path, seconds: int = 20, writer: type[Writer] = Writer) -> Counte
         )
         supervised = pb.Supervised(name="red", kind="gateway", state="running", pid=4711)
         made.put("fleet/@supervisor/status", pb.Supervision(state="running", processes=[supervised]), second)
-        made.put("fleet/@sim/world", pb.World(lamps=[pb.SimLamp(name="beacon", on=True)]), second)
+        made.put("fleet/@sim/world", world(second), second)
+    made.put("fleet/@recorder/mark", log("@recorder", 9.0, 2, "here it gets interesting"), 9.0)
     made.close()
     return made.counts
 

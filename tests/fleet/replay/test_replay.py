@@ -80,7 +80,7 @@ def test_every_topic_of_the_table_is_drawn() -> None:
     drawn = {part.topic for part in mapping.parts()} | {words.topic for words in mapping.WORDS}
     drawn |= {topic for panel in mapping.CAR_PANELS for topic in panel.topics}
     drawn |= {topic for _, ours, theirs in mapping.FLEET_TEXTS for topic in (*ours, *theirs)}
-    assert drawn | {mapping.PLAN, mapping.WORLD} == set(TOPICS)
+    assert set(TOPICS) - drawn == {mapping.PLAN, mapping.WORLD}
 
 
 @pytest.mark.parametrize("key", ["fleet/red/sensor/range", "fleet/@recorder/status", "my-fleet/car_1/state/mode"])

@@ -493,7 +493,7 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Proce
         with Bus.open(endpoint, start_hub=True) as bus:
             bus.subscribe("mine/*/sim/truth", seen.append)
             bus.subscribe("mine/@sim/world", worlds.append)
-            while not seen:
+            while not (seen and worlds):
                 assert time.monotonic() < end
                 time.sleep(0.01)
             with serial.Serial(link.removeprefix("serial://")) as port:
@@ -507,7 +507,8 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Proce
         assert truth.y_m == pytest.approx(-1.05)
         sequences = [sample.sequence for sample in seen]
         assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
-        assert not worlds  # nothing in the room but cars
+        world = worlds[0].message()
+        assert (len(world.walls), bool(world.line), len(world.lamps), len(world.things)) == (8, True, 0, 0)
     finally:
         sim.popen.terminate()
         assert sim.popen.wait(PATIENCE) == 0
