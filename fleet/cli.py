@@ -45,6 +45,10 @@ COMMANDS: Final = {
     "sessions": ("fleet.recording.sessions.command:sessions", "List, verify, recover, cut and export recordings."),
     "replay": ("fleet.replay.command:replay", "Open a recorded session in Rerun."),
     "view": ("fleet.replay.view:view", "See the fleet live in Rerun."),
+    "redecode": (
+        "fleet.replay.decoding_commands:redecode",
+        "Recorded raw frames through today's decoder: what is otherwise.",
+    ),
     "demo": ("fleet.demo:demo", "Three simulated cars do a job, recorded and checked."),
 }
 """Subcommand: where it lives, and its line in `fleet --help`."""

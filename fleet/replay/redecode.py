@@ -19,8 +19,10 @@ from gateway.protocol.profile import Profile, parse_platform
 from gateway.protocol.readings import Event
 from gateway.protocol.values import Mode
 
-AROUND_NS: Final = 500_000_000
-"""A state is published so much later than what it follows from, at most: a gateway's loop takes what came in turns."""
+MODE_NS: Final = 500_000_000
+"""A mode is published so much later than it follows, at most: a gateway's loop takes what came in turns."""
+PLATFORM_NS: Final = 1_500_000_000
+"""The same of the platform, which is in what comes once a second."""
 WAIT_NS: Final = 2_500_000_000
 """A frame waits so long for the state after it: states come once a second."""
 _EARLY_NS: Final = 300_000_000
@@ -72,7 +74,6 @@ class Redecoding:
     _modes: deque[Confirmed] = field(default_factory=deque)
     _platforms: deque[Treated] = field(default_factory=deque)
     _began_ns: int | None = None
-    _told_of: str = ""
 
     def take(self, item: Item) -> Iterator[Difference]:
         """One more item; the differences of frames that nothing more can be learnt of. Raises NoPlatform."""
@@ -114,7 +115,7 @@ class Redecoding:
         while self._sent and self._sent[0].at_ns <= frame.at_ns + _EARLY_NS:
             sent = self._sent.popleft()
             self._decoder.sent(sent.data, (sent.at_ns - self._began_ns) / 1e9)
-        modes = [each.mode for each in _around(self._modes, frame.at_ns)] or [None]
+        modes = [each.mode for each in _around(self._modes, frame.at_ns, MODE_NS)] or [None]
         found: list[Outcome] = []
         for events, profile, mode in product(
             _decoded(self._decoder, frame.data, at), self._profiles(frame.at_ns), dict.fromkeys(modes)
@@ -129,7 +130,7 @@ class Redecoding:
     def _profiles(self, at_ns: int) -> list[Profile]:
         if self.platform is not None:
             return [parse_platform(self.platform)]
-        names = dict.fromkeys(each.platform for each in _around(self._platforms, at_ns))
+        names = dict.fromkeys(each.platform for each in _around(self._platforms, at_ns, PLATFORM_NS))
         found = []
         for name in names:
             try:
@@ -145,16 +146,11 @@ class Redecoding:
         return found
 
 
-def _around(states: deque[Any], at_ns: int) -> list[Any]:
-    """The state before a moment and the one after it, and what was told so soon after it that it may be of before."""
+def _around(states: deque[Any], at_ns: int, late_ns: int) -> list[Any]:
+    """The state before a moment (or the first), and those told so soon after it that they may be of then."""
     while len(states) > 1 and states[1].at_ns < at_ns:
         states.popleft()
-    found = []
-    for state in states:
-        found.append(state)
-        if state.at_ns > at_ns + AROUND_NS:
-            break
-    return found
+    return [state for number, state in enumerate(states) if not number or state.at_ns <= at_ns + late_ns]
 
 
 def _decoded(decoder: Decoder, data: bytes, at: float) -> list[tuple[Event, ...]]:
