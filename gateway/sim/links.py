@@ -143,8 +143,9 @@ class PtySimLink:
         except FileExistsError:
             what = "is there already"
             if path.is_symlink():
-                used = ", which is in use, perhaps by another simulator" if path.exists() else ""
-                what = f"leads to {path.readlink()}{used}"
+                what = f"leads to {path.readlink()}"
+                if _TERMINAL.fullmatch(str(path.readlink())):
+                    what += ", which is in use, perhaps by another simulator"
             raise Taken(f"{path} {what}: name another path, or remove it") from None
         except OSError as error:
             raise LinkError(f"no symlink can be made at {path}: {error.strerror}") from None
