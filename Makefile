@@ -13,7 +13,7 @@ export XDG_DATA_HOME := $(CURDIR)/.state/share
 export TMPDIR := $(CURDIR)/.tmp
 export FLEET_STATE_DIR := $(CURDIR)/.state
 
-.PHONY: help demo test soak lint bench proto picture readme clean
+.PHONY: help demo test soak lint bench proto pictures readme clean
 help: ## what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
@@ -50,8 +50,8 @@ bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in 
 proto: .venv/.ready ## generate schemas/gen from schemas/proto
 	$(BIN)/python -m schemas.generate
 
-picture: .venv/.ready ## the README's picture, of the newest session (needs a Vulkan driver, which may be software)
-	$(BIN)/python -m fleet.replay.picture "$$(ls -td sessions/*/ | head -n 1)session.rrd" .github/demo.png
+pictures: .venv/.ready ## the README's pictures, of the newest session (needs a Vulkan driver, which may be software)
+	$(BIN)/python -m fleet.replay.picture "$$(ls -td sessions/*/ | head -n 1)" .github
 
 readme: .venv/.ready ## generate the tables and help texts of the README, and the SDK's reference
 	$(BIN)/python -m tests.readme

@@ -150,7 +150,7 @@ class _Layout:
         (x, y), size = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2), max(high[0] - low[0], high[1] - low[1])
         # Not straight down: Rerun's eye has no sides when it looks along its own up.
         eye = rrb.EyeControls3D(
-            position=(x, y - 0.01, max(_LEAST_HEIGHT_M, 1.3 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
+            position=(x, y - 0.01, max(_LEAST_HEIGHT_M, 1.1 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
         )
         name = "World, from above (simulated cars)"
         return rrb.Spatial3DView(origin="/", contents=contents, name=name, eye_controls=eye)

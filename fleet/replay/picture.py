@@ -1,68 +1,150 @@
-"""A picture of an .rrd in Rerun's viewer, without a screen: `python -m fleet.replay.picture SESSION.rrd OUT.png`.
+"""Pictures of a session in Rerun's viewer, without a screen: `python -m fleet.replay.picture SESSION DIRECTORY`.
 
-Needs a Vulkan driver that draws in software where there is no graphics card (Debian: `mesa-vulkan-drivers`).
+They are `fleet.png` (the fleet's tab), `car.png` (the first car's) and, of simulated cars, `world.png`. Needs a Vulkan
+driver that draws in software where there is no graphics card (Debian: `mesa-vulkan-drivers`).
 """
 
 import contextlib
+import io
 import os
-import socket
-import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import click
 
-from fleet.replay.viewer import environment, program
+from fleet.replay.viewer import Viewer, free_port
 
-SIZE: Final = "1600x900"
+SIZE: Final = "1440x810"
+AT: Final = 0.75
+"""Of the session's time: where the cursor is."""
 UP_WITHIN_S: Final = 30.0
-SETTLE_S: Final = 3.0
-"""The viewer offers no sign that it has drawn everything; a software renderer draws a few frames a second."""
+DRAWN_WITHIN_S: Final = 20.0
+SETTLE_S: Final = 1.0
+"""The viewer offers no sign that it has drawn everything: two pictures so far apart that are the same are one."""
 DRIVERS: Final = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+COLOURS: Final = 255
+WORLD: Final = "World, from above"
 
 
 class NoPicture(Exception):
     """There is no picture; its text says what is missing."""
 
 
-def take(rrd: Path, out: Path) -> None:
-    """Draw `rrd` as its layout says, into a PNG. Raises NoPicture."""
-    with tempfile.TemporaryDirectory() as home:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-        words = Path(home) / "words"
-        with _viewer(port, Path(home), words):
-            client = _connect(port, words)
-            client.open(str(rrd.resolve()))
-            time.sleep(SETTLE_S)
-            client.save_screenshot(str(out.resolve()))
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What the viewer says that it shows."""
+
+    views: tuple[str, ...]
+    """Names of all views, on every tab."""
+    faults: tuple[str, ...]
+    """What it could not show, and why."""
+
+
+def software_driver() -> str | None:
+    """The installed driver that needs no card; without naming it a machine's broken card would be tried first."""
+    found = [str(each) for place in DRIVERS for each in sorted(Path(place).glob("lvp_icd*.json"))]
+    return found[0] if found else None
+
+
+def take(rrd: Path, out: Path, view: str = "") -> Shown:
+    """Draw `rrd` as its layout says into a PNG; of the view alone whose name begins so. Raises NoPicture."""
+    port = free_port()
+    with tempfile.TemporaryDirectory() as home, _viewer(port, Path(home)) as viewer:
+        try:
+            png, shown = _look(_connect(port), rrd, view)
+        except (RuntimeError, OSError, ValueError):  # its ways to say that nobody answers, or no more
+            viewer.wait(SETTLE_S)
+            raise NoPicture(
+                "Rerun's viewer cannot draw here: it needs a graphics driver, or one in software "
+                f"(Debian: apt install mesa-vulkan-drivers). It said: {viewer.last_words}"
+            ) from None
+    _write(png, out)
+    return shown
+
+
+def _look(client: Any, rrd: Path, view: str) -> tuple[bytes, Shown]:
+    client.open(str(rrd.resolve()))
+    state = _loaded(client)
+    recording = state.recordings[0]
+    times = next(each for each in recording.timelines if each.name == recording.current_timeline)
+    client.set_time(timestamp=(times.start + AT * (times.end - times.start)) / 1e9, play_state="paused")
+    wanted = [each.view_id for each in state.views if view and each.name.startswith(view)]
+    if view and not wanted:
+        raise NoPicture(f"{rrd} has no view {view}: there are {', '.join(each.name for each in state.views)}")
+    png = _drawn(client, wanted[0] if wanted else None)
+    views = client.get_state().views
+    faults = tuple(f"{each.name}: {report}" for each in views for report in each.reports)
+    return png, Shown(tuple(each.name for each in views), faults)
+
+
+def pictures(session: Path, folder: Path) -> dict[str, Shown]:
+    """Make those of a session; by file name what is shown. Raises NoPicture, NoSession and ExportFailed."""
+    from fleet.recording.session import Session
+    from fleet.replay.to_rerun import export
+
+    found = Session.open(session)
+    made: dict[str, Shown] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        rrd = Path(scratch) / f"{found.name}.rrd"
+        held = export(found, rrd)
+        made["fleet.png"] = take(rrd, folder / "fleet.png")
+        if any(view.startswith(WORLD) for view in made["fleet.png"].views):
+            made["world.png"] = take(rrd, folder / "world.png", WORLD)
+        cars = sorted({key.split("/")[1] for key in held} - {key.split("/")[1] for key in held if "/@" in key})
+        if cars:
+            export(found, rrd, tab=cars[0])
+            made["car.png"] = take(rrd, folder / "car.png")
+    return made
+
+
+def _loaded(client: Any) -> Any:
+    deadline = time.monotonic() + UP_WITHIN_S
+    while not ((state := client.get_state()).recordings and state.recordings[0].timelines and state.views):
+        if time.monotonic() > deadline:
+            raise NoPicture("Rerun's viewer did not load the session")
+        time.sleep(0.1)
+    return state
+
+
+def _drawn(client: Any, view_id: str | None) -> bytes:
+    """A picture, once two in a row are the same."""
+    deadline = time.monotonic() + DRAWN_WITHIN_S
+    last: bytes = client.take_screenshot(view_id)
+    while time.monotonic() < deadline:
+        time.sleep(SETTLE_S)
+        now: bytes = client.take_screenshot(view_id)
+        if now == last:
+            break
+        last = now
+    return last
+
+
+def _write(png: bytes, out: Path) -> None:
+    """With a palette: a third of the bytes, and nothing that one would see."""
+    from PIL import Image  # rerun-sdk depends on it
+
+    with Image.open(io.BytesIO(png)) as image:
+        image.convert("RGB").quantize(COLOURS).save(out, optimize=True)
 
 
 @contextlib.contextmanager
-def _viewer(port: int, home: Path, words: Path) -> Iterator[None]:
+def _viewer(port: int, home: Path) -> Iterator[Viewer]:
     """Rerun's viewer without a window, with a home of its own: driver caches and settings stay out of the user's."""
     own = {
         name: str(home) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_RUNTIME_DIR")
     }
-    # Among the installed drivers the one that needs no card; without it a machine's broken card would be tried first.
-    software = [str(found) for place in DRIVERS for found in sorted(Path(place).glob("lvp_icd*.json"))]
-    if software and "VK_ICD_FILENAMES" not in os.environ:
-        own["VK_ICD_FILENAMES"] = software[0]
-    command = [str(program()), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", SIZE]
-    with words.open("wb") as log:
-        process = subprocess.Popen(command, env={**environment(), **own}, stdout=log, stderr=log)
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.wait()
+    driver = software_driver()
+    if driver and "VK_ICD_FILENAMES" not in os.environ:
+        own["VK_ICD_FILENAMES"] = driver
+    with Viewer("--headless", "--port", str(port), "--window-size", SIZE, extra=own) as viewer:
+        yield viewer
 
 
-def _connect(port: int, words: Path) -> Any:
+def _connect(port: int) -> Any:
     from rerun.experimental import ViewerClient
 
     deadline = time.monotonic() + UP_WITHIN_S
@@ -71,27 +153,29 @@ def _connect(port: int, words: Path) -> Any:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
         except (RuntimeError, OSError, ValueError):  # how it says that nothing answers yet
-            said = words.read_text(errors="replace").strip().splitlines()
-            if time.monotonic() > deadline or any("adapter" in line or "panicked" in line for line in said):
-                raise NoPicture(
-                    "Rerun's viewer cannot draw here: it needs a graphics driver, or one in software "
-                    f"(Debian: apt install mesa-vulkan-drivers). It said: {said[-1] if said else 'nothing'}"
-                ) from None
+            if time.monotonic() > deadline:
+                raise
             time.sleep(0.1)
         else:
             return client
 
 
 @click.command()
-@click.argument("rrd", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
-def main(rrd: Path, out: Path) -> None:
-    """Draw the .rrd of `fleet replay --save` as its layout says, into a PNG."""
+@click.argument("session", type=click.Path(path_type=Path))
+@click.argument("directory", type=click.Path(exists=True, file_okay=False, path_type=Path))
+def main(session: Path, directory: Path) -> None:
+    """Draw SESSION's fleet tab, a car's tab and the simulated world into PNGs in DIRECTORY."""
+    from fleet.recording.session import NoSession
+    from fleet.replay.to_rerun import ExportFailed
+
     try:
-        take(rrd, out)
-    except NoPicture as error:
+        made = pictures(session, directory)
+    except (NoPicture, NoSession, ExportFailed) as error:
         raise click.ClickException(str(error)) from None
-    click.echo(f"{out}: {out.stat().st_size} bytes")
+    for name, shown in made.items():
+        click.echo(f"{directory / name}: {(directory / name).stat().st_size} bytes")
+        for fault in shown.faults:
+            click.echo(f"not shown: {fault}", err=True)
 
 
 if __name__ == "__main__":

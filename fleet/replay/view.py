@@ -13,6 +13,7 @@ import click
 
 from fleet.commands.common import bus_options
 from fleet.replay.command import quiet_rerun, refuse_target
+from schemas import keys
 
 if TYPE_CHECKING:
     from fleet.replay.viewer import Viewer
@@ -55,8 +56,11 @@ def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, co
         raise click.UsageError("--web and --save do not go together: name one")
     if not re.fullmatch(r"[1-9]\d*(\.\d+)?([KMG]i?B|%)", memory):
         raise click.UsageError(f"--memory {memory} is not allowed: write 500MB, 1GiB or 25%")
+    keys.check_name(fleet, "fleet name")
     if save is not None:
         refuse_target(save)
+        if not save.resolve().parent.is_dir():
+            raise click.UsageError(f"--save {save}: there is no directory {save.parent}")
     quiet_rerun()
     from fleet.replay.viewer import NoViewer, has_display
 

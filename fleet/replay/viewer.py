@@ -8,7 +8,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, Self
 
 LOOPBACK: Final = "127.0.0.1"
@@ -46,7 +48,7 @@ class NoViewer(Exception):
 class Viewer:
     """Rerun's program, bound to loopback, gone when it is closed or when we are gone; use it with `with`."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, *arguments: str, extra: Mapping[str, str] = MappingProxyType({})) -> None:
         self._words = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
         command = [sys.executable, "-m", "fleet.replay.guard", str(program()), "--bind", LOOPBACK, *arguments]
         # In a group of its own: Ctrl-C at the terminal comes to us, and we end it when what is under way is over.
@@ -55,7 +57,7 @@ class Viewer:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._words,
-            env=environment(),
+            env={**environment(), **extra},
             process_group=0 if os.name == "posix" else None,
         )
         assert self._guard.stdout is not None
