@@ -4,12 +4,13 @@ What is wrong in the text itself reader.py says. Here is what the plan means for
 file, or (without one) cars of any platform.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
 from fleet.expression import contradictory
+from fleet.faults import meant
 from fleet.policy.picture import CarPicture, topic_of
 from fleet.policy.plan import ALL, OTHERS, Condition, Of, Plan, Role
 from fleet.policy.staffing import unfit
@@ -40,6 +41,39 @@ class Finding:
         return f"{self.part}: {self.words}"
 
 
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What is wrong with a plan; with an error it is not put in force."""
+
+    errors: tuple[Finding, ...] = ()
+    warnings: tuple[Finding, ...] = ()
+
+    def refusal(self, source: str = "plan") -> str:
+        """Every error, one a line, each with the plan's name; empty: the plan may be put in force."""
+        return "\n".join(f"{source}: {each}" for each in self.errors)
+
+
+def faults(plan: Plan, cars: Mapping[str, CarPicture] | None = None, there: Collection[str] | None = None) -> Faults:
+    """What is wrong with a plan that is to be put in force.
+
+    `cars`: those of the fleet file (hearing.listed_cars), None: there is none. Then a car that the plan names and that
+    is not among those `there` (on the bus; None: not known) is a warning: it may still come.
+    """
+    found = check(plan, cars)
+    warnings = [each for each in found if each.gravity is Gravity.WARNING]
+    if cars is None and there is not None:
+        told = ", ".join(sorted(there)) or "no cars"
+        warnings += [
+            Finding(Gravity.WARNING, f"car {car}", f"it is not on the bus now, which has {told}")
+            for car in sorted(_named(plan) - set(there))
+        ]
+    return Faults(tuple(each for each in found if each.gravity is Gravity.ERROR), tuple(warnings))
+
+
+def _named(plan: Plan) -> set[str]:
+    return set(plan.named) | {condition.car for condition in plan.conditions if condition.car is not None}
+
+
 def check(plan: Plan, fleet: Mapping[str, CarPicture] | None = None) -> tuple[Finding, ...]:
     """What is wrong; `fleet`: what the fleet file says of its cars, None: there is none."""
     return tuple(_Check(plan, fleet).findings())
@@ -48,13 +82,14 @@ def check(plan: Plan, fleet: Mapping[str, CarPicture] | None = None) -> tuple[Fi
 class _Check:
     def __init__(self, plan: Plan, fleet: Mapping[str, CarPicture] | None) -> None:
         self._plan = plan
-        self._named = set(plan.named) | {condition.car for condition in plan.conditions if condition.car is not None}
+        self._named = _named(plan)
         self._known = fleet
         # Without a fleet file: a car of each platform under every name.
         self._cars = fleet if fleet is not None else dict.fromkeys((*sorted(self._named), _ANY_CAR), CarPicture())
 
     def findings(self) -> Iterator[Finding]:
         yield from self._unknown_cars()
+        yield from self._unknown_roles()
         yield from self._roles()
         yield from self._rules()
         yield from self._phases()
@@ -64,6 +99,13 @@ class _Check:
             if self._known is not None and car not in self._known:
                 there = ", ".join(sorted(self._known)) or "none"
                 yield Finding(Gravity.ERROR, f"car {car}", f"the fleet file has no such car; it has {there}")
+
+    def _unknown_roles(self) -> Iterator[Finding]:
+        for car, known in sorted((self._known or {}).items()):
+            for role in sorted((known.roles or set()) - set(self._plan.roles)):
+                there = f"there are {', '.join(self._plan.roles)}{meant(role, self._plan.roles)}"
+                words = f"the fleet file lets it take role {role}, which this plan does not have: {there}"
+                yield Finding(Gravity.WARNING, f"car {car}", words)
 
     # ------------------------------------------------------------------ roles
 

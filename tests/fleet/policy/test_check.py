@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.policy.check import Gravity, check
+from fleet.policy.check import Gravity, check, faults
 from fleet.policy.picture import CarPicture
 from fleet.policy.reader import parse
 from gateway.protocol.profile import parse_platform
@@ -96,3 +96,40 @@ phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_o
 """)
     assert check(plan) == ()
     assert check(plan, FLEET) == ()
+
+
+BROKEN = parse("""
+cars: {purple: tracking}
+roles:
+  patrol: {mode: tracking, cars: [orange]}
+  ghost: {mode: following, needs: battery.voltage_v > 9 and battery.voltage_v < 8}
+""")
+
+
+def test_with_a_fleet_file_a_plan_that_can_never_work_is_refused_with_all_that_is_wrong() -> None:
+    refusal = faults(BROKEN, FLEET).refusal("plan.yaml")
+    assert [line.split(": ")[1] for line in refusal.splitlines()] == [
+        "car orange",
+        "car purple",
+        "role patrol",
+        "role ghost",
+        "role tracking",
+    ]
+    assert all(line.startswith("plan.yaml: ") for line in refusal.splitlines())
+
+
+def test_without_one_a_named_car_that_is_not_there_is_a_warning() -> None:
+    plan = parse("cars: {purple: tracking, red: manual}")
+    assert faults(plan).warnings == ()
+    found = faults(plan, None, {"red", "green"})
+    assert [str(each) for each in found.warnings] == ["car purple: it is not on the bus now, which has green, red"]
+    assert found.refusal() == ""
+    assert "role ghost: no car can fill it" in faults(BROKEN).refusal(), "what no car could do is refused anyway"
+
+
+def test_a_role_of_the_fleet_file_that_the_plan_does_not_have_is_told() -> None:
+    fleet = {"red": listed("arduino", "patroll", "patrol"), "blue": listed("arduino")}
+    (found,) = check(parse("roles: {patrol: {mode: tracking}}"), fleet)
+    assert found.gravity is Gravity.WARNING
+    assert str(found).startswith("car red: the fleet file lets it take role patroll, which this plan does not have")
+    assert "did you mean 'patrol'" in found.words
