@@ -45,6 +45,7 @@ COMMANDS: Final = {
     "sessions": ("fleet.recording.sessions.command:sessions", "List, verify, recover, cut and export recordings."),
     "replay": ("fleet.replay.command:replay", "Open a recorded session in Rerun."),
     "view": ("fleet.replay.view:view", "See the fleet live in Rerun."),
+    "replan": ("fleet.replay.planning_command:replan", "A plan on a recorded session: where it decides otherwise."),
     "redecode": (
         "fleet.replay.decoding_commands:redecode",
         "Recorded raw frames through today's decoder: what is otherwise.",

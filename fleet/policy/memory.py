@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 from fleet.policy.decision import Decision
 from fleet.policy.picture import NOBODY, Picture
@@ -9,6 +10,9 @@ from fleet.policy.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.steady import Settled, Steady
 from gateway.protocol.values import Mode
+
+TAKEN_OVER: Final = "it had it before the coordinator was started again"
+"""Why a car has a role that it had before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +99,7 @@ def restored(plan: Plan, picture: Picture, kept: Kept, now: float, wall_s: float
         role = plan.roles.get(name)
         mode = picture.cars.get(car, NOBODY).mode
         if role is not None and plan.may(car, role) and (mode == role.mode or mode not in modes):
-            held[car] = Held(name, "it had it before the coordinator was started again")
+            held[car] = Held(name, TAKEN_OVER)
     if kept.version != plan.version or (kept.phase and kept.phase not in plan.phases):
         return Memory(held=held)
     rules = {
