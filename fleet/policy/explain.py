@@ -177,10 +177,12 @@ def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
     whys: list[str] = []
     used: list[str] = []
     kinds: list[str] = []
+    able = False
     for car in sorted({*staff.free, *barriers}):
         if car in holders or not plan.may(car, role):
             continue
         barrier = barriers.get(car) or staff.barrier(car, role)
+        able = able or barrier is None
         words = barrier.why if barrier is not None else f"it has role {staffing.roles.get(car, 'none')}"
         kinds.append(words)
         if len(whys) < _NAMED:
@@ -188,14 +190,15 @@ def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
             used += staff.seen(car, barrier)
     more = f"; and {len(kinds) - _NAMED} more" if len(kinds) > _NAMED else ""
     instead = f"; {role.fallback} gets the place" if role.fallback is not None else ""
+    none = "no car is left for it" if able else "no other car can"
     return Decision(
         f"role {name}",
         Kind.VACANT,
         decided,
         f"{decided}: {'; '.join(kinds)}",
-        f"no other car can: {'; '.join(whys)}{more}{instead}" if whys else f"no car there may have it{instead}",
+        f"{none}: {'; '.join(whys)}{more}{instead}" if whys else f"no car there may have it{instead}",
         tuple(dict.fromkeys(used)),
-        "one of them being able to",
+        "one of them being left for it, or able to" if able else "one of them being able to",
         role=name,
     )
 

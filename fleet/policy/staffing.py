@@ -1,7 +1,7 @@
 """Which roles are open, who may take which, and who does. Pure; times in s.
 
-To keep a place filled counts for most, then that nobody who has a role loses it, then that few cars change their mode,
-then the order in the plan.
+To keep a place filled counts for most (of one priority the places that are counted, before those for all that are
+left), then that nobody who has a role loses it, then that few cars change their mode, then the order in the plan.
 """
 
 from collections.abc import Mapping
@@ -192,13 +192,17 @@ def _fallback_order(plan: Plan) -> list[str]:
     return sorted(plan.roles, key=lambda name: depth[name])
 
 
+def _rank(role: Role) -> tuple[int, bool]:
+    return role.priority, role.count is not None
+
+
 def _costs(staff: Staff) -> dict[str, dict[str, int]]:
     """What each car costs in each role that it may have."""
     plan = staff.plan
     cars = sorted({*staff.free, *staff.reserved})
-    ranks = {priority: rank for rank, priority in enumerate(sorted({role.priority for role in plan.roles.values()}))}
-    # One place of a higher priority is worth more than all of the lower ones, and any place more than all else.
-    worth = {rank: (len(cars) + 1) ** (rank + 1) * _KEEP * 10 for rank in ranks.values()}
+    ranks = {rank: order for order, rank in enumerate(sorted({_rank(role) for role in plan.roles.values()}))}
+    # One place of a higher rank is worth more than all of the lower ones, and any place more than all else.
+    worth = {rank: (len(cars) + 1) ** (order + 1) * _KEEP * 10 for rank, order in ranks.items()}
     found: dict[str, dict[str, int]] = {}
     for car in cars:
         row: dict[str, int] = {}
@@ -212,11 +216,12 @@ def _costs(staff: Staff) -> dict[str, dict[str, int]]:
                     continue
             elif staff.barrier(car, role) is not None:
                 continue
-            cost = order - worth[ranks[role.priority]]
-            if car in staff.in_vain and known.verdict == CONTRADICTED:
+            cost = order - worth[_rank(role)]
+            if car in staff.in_vain and known.verdict == CONTRADICTED and role.count is not None:
                 cost += _KEEP
             elif staff.has.get(car) == role.name:
-                cost -= _KEEP
+                # Less for a place that any car has: it holds nobody back from taking over a counted one.
+                cost -= _KEEP if role.count is not None else _KEEP // 2
             if known.mode != role.mode or known.verdict == CONTRADICTED:
                 cost += _SWITCH
             if known.link != "online" and known.link != "quiet":

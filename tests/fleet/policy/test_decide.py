@@ -98,7 +98,9 @@ def test_the_higher_priority_is_filled_first_and_by_whom_it_costs_least() -> Non
     assert run.at(0.0).roles == {"blue": "patrol", "green": "patrol", "red": "scout"}
     run.change("blue", held_by="ann")
     assert run.at(0.1).roles == {"green": "patrol", "red": "patrol"}
-    assert run.of("role scout").why.startswith("no other car can: ")
+    assert run.of("role scout").why.startswith(
+        "no car is left for it: blue is on hold by ann; green: it has role patrol"
+    )
 
 
 def test_needs_that_flicker_change_nothing_and_old_values_count_where_nothing_measures_them() -> None:
@@ -256,6 +258,59 @@ def test_roles_wait_at_the_start_for_cars_that_have_not_said_how_they_are() -> N
     assert run.asked == []
 
 
+REST = "rest: {mode: manual, count: all}"
+PATROL = "patrol: {mode: tracking, count: 1}"
+
+
+def test_a_role_for_all_that_are_left_starves_none_of_its_priority() -> None:
+    run = Run(parse(f"roles: {{{REST}}}"), "blue", "green", "red")
+    run.until(2.0)
+    assert set(run.roles.values()) == {"rest"}
+    for roles in (f"{PATROL}, {REST}", f"{REST}, {PATROL}"):
+        after = parse(f"roles: {{{roles}}}")
+        memory, again = carried(run.memory, run.plan, after), Run(after, *run.cars)
+        again.memory, again.now = memory, run.now
+        again.until(4.0)
+        assert sorted(again.roles.values()) == ["patrol", "rest", "rest"]
+        assert len(again.asked) == 1, "and only one car changes its mode"
+
+
+def test_after_all_were_stopped_the_counted_role_is_filled_first() -> None:
+    run = Run(parse(f"roles: {{{PATROL}, {REST}}}"), "blue", "green", "red")
+    run.at(0.0)
+    for car in run.cars:
+        run.change(car, held_by="ann", mode="manual")
+    run.until(3.0)
+    for car in ("red", "green", "blue"):
+        run.change(car, held_by=None)
+        run.until(run.now + 1.0)
+        assert list(run.roles.values()).count("patrol") == 1
+    run.until(60.0)
+    assert [mode for _, _, mode in run.asked] == ["tracking", "tracking"], "and nothing flaps"
+
+
+def test_in_the_next_phase_cars_leave_a_role_for_all_that_are_left() -> None:
+    plan = parse("""
+roles: {a: {mode: tracking}, b: {mode: following, count: 2}, c: {mode: manual, count: all}}
+phases: {one: {roles: [a, c], timeout_s: 5, next: two}, two: {roles: [b, c]}}
+""")
+    run = Run(plan, "blue", "green", "red")
+    run.until(4.0)
+    assert sorted(run.roles.values()) == ["a", "c", "c"]
+    run.until(6.0)
+    assert sorted(run.roles.values()) == ["b", "b", "c"]
+
+
+def test_a_car_that_does_not_do_its_role_gives_it_to_one_that_has_a_role_for_all() -> None:
+    run = Run(parse(f"roles: {{{PATROL}, {REST}}}"), "blue", "red", obey=False)
+    run.change("blue", mode="tracking")
+    run.until(1.0)
+    assert run.roles == {"blue": "patrol", "red": "rest"}
+    run.change("blue", verdict="contradicted", evidence="silent for 3.1 s")
+    run.until(6.0)
+    assert run.roles == {"blue": "rest", "red": "patrol"}
+
+
 CARS = ("a", "b", "c", "d")
 PLANS = (
     TWO,
@@ -320,13 +375,11 @@ def test_whatever_happens(plan: Any, course: list[Any]) -> None:
         if not {"light", "voltage"} & set(fields):
             run.change(car, **fields)
         run.at(round(run.now + wait_s, 6))
-        alone = {name for name, known in run.cars.items() if known.held_by or known.estopped_by or not known.present}
         assert not {ask.car for ask in result.asks} & {
             name for name, known in run.cars.items() if known.held_by or known.estopped_by
         }
-        for name in alone:
-            known = run.cars[name]
-            if known.held_by or known.estopped_by:
+        for name, known in run.cars.items():
+            if (known.held_by or known.estopped_by) and known.mode:  # else nothing is heard of it, nor of a hold
                 assert name not in result.roles
         for role in plan.roles.values():
             if role.count is not None and not any(other.fallback == role.name for other in plan.roles.values()):
