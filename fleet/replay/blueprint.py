@@ -1,6 +1,7 @@
 """The layout of a session in Rerun's viewer: a tab for the fleet and one per car, only with views that have data."""
 
 from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
 from typing import Any, Final
 
 import numpy as np
@@ -31,7 +32,7 @@ _Shown = dict[Any, list[Any]]
 def layout(drawing: Drawing, tab: str = "") -> rrb.Blueprint:
     """The layout of what a drawing has seen; `tab`: the car whose tab is in front, none: the fleet's."""
     session = drawing.contents()
-    shown = _Layout(session, colours.leds(drawing.leds))
+    shown = _Layout(session, colours.leds(drawing.leds), drawing.lanes)
     tabs = [shown.fleet_tab(drawing.ground()), *(shown.car_tab(car) for car in session.cars)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=1 + list(session.cars).index(tab) if tab else 0),
@@ -46,9 +47,10 @@ def layout(drawing: Drawing, tab: str = "") -> rrb.Blueprint:
 class _Layout:
     """The tabs of one session."""
 
-    def __init__(self, session: Contents, leds: Mapping[str, int]) -> None:
+    def __init__(self, session: Contents, leds: Mapping[str, int], drawn: AbstractSet[tuple[str, str]]) -> None:
         self._session = session
         self._leds = leds
+        self._drawn = drawn
 
     def fleet_tab(self, ground: tuple[tuple[float, float], tuple[float, float]] | None) -> _View:
         """The fleet at a glance, and beside it its services."""
@@ -99,6 +101,11 @@ class _Layout:
             return topic in self._session.services
         return topic in self._session.cars.get(car, ())
 
+    def _has_lane(self, car: str, lane: Lane) -> bool:
+        if lane.drawn:
+            return (self._entity(car, lane.topic), _name(lane, car)) in self._drawn
+        return self._has(car, lane.topic)
+
     def _fleet_text(self, name: str, ours: Iterable[str], theirs: Iterable[str]) -> rrb.View | None:
         shown = [self._entity(car, topic) for topic in ours for car in self._session.cars if self._has(car, topic)]
         shown += [self._entity("", topic) for topic in theirs if self._has("", topic)]
@@ -108,7 +115,7 @@ class _Layout:
         shown: _Shown = {}
         for car in self._session.cars:
             for lane in lanes:
-                if self._has(car, lane.topic):
+                if self._has_lane(car, lane):
                     shown.setdefault(self._entity(car, lane.topic), []).append(self._lane(lane, car))
         return _lanes(name, shown) if shown else None
 
@@ -125,18 +132,17 @@ class _Layout:
                 rgb = _THRESHOLDS.get(curve.how, own) if curve.how is not None else own
                 shown.setdefault(self._entity(car, curve.topic), []).append(_curve(curve, curve.name, rgb))
         for lane in panel.lanes:
-            if self._has(car, lane.topic):
+            if self._has_lane(car, lane):
                 shown.setdefault(self._entity(car, lane.topic), []).append(self._lane(lane, car))
         if not shown:
             return None
         return _lanes(panel.name, shown) if panel.lanes else _curves(panel.name, shown)
 
     def _lane(self, lane: Lane, car: str) -> rrb.Visualizer:
-        name = f"{lane.name} {car}" if lane == mapping.ROLE else lane.name
         tints = self._leds if lane.name in _LEDS else colours.MARKS if lane == mapping.MARKS else colours.STATES
         style = rr.StateConfiguration(values=list(tints), colors=np.array(list(tints.values()), dtype=np.uint32))
         source = VisualizerComponentMapping(
-            "StateChange:state", ComponentSourceKind.SourceComponent, source_component=name
+            "StateChange:state", ComponentSourceKind.SourceComponent, source_component=_name(lane, car)
         )
         return style.visualizer(mappings=[source])
 
@@ -154,6 +160,11 @@ class _Layout:
         )
         name = "World, from above (simulated cars)"
         return rrb.Spatial3DView(origin="/", contents=contents, name=name, eye_controls=eye)
+
+
+def _name(lane: Lane, car: str) -> str:
+    """The component of a lane: of roles there is one for each car, on one entity."""
+    return f"{lane.name} {car}" if lane == mapping.ROLE else lane.name
 
 
 def _two_pages(name: str, first: rrb.Container, others: list[rrb.View], what: str) -> rrb.Container:

@@ -54,6 +54,8 @@ class Drawing:
         self.held: Counter[str] = Counter()
         """Messages by key."""
         self.leds: set[str] = set()
+        self.lanes: set[tuple[str, str]] = set()
+        """(entity, name) of the lanes that were drawn."""
         self.corners: list[tuple[float, float]] = []
         """Of the simulated world's walls."""
 
@@ -174,24 +176,24 @@ class Drawing:
     def _commands(self, path: str, events: Any, times: _Times) -> Iterator[Any]:
         rows = events.to_pylist()
         marks = [f"{row['verb']} {row['phase']}" for row in rows]
-        yield _lane(path, mapping.MARKS.name, *_with_ends(times, marks))
+        yield self._lane(path, mapping.MARKS.name, *_with_ends(times, marks))
         asked = [(place, _led_asked(row)) for place, row in enumerate(rows) if row["verb"] == _LED]
         asked = [(place, led) for place, led in asked if led]
         if asked:
             places, leds = [place for place, _ in asked], [led for _, led in asked]
             self._note(leds)
-            yield _lane(path, mapping.LED_ASKED.name, {name: at[places] for name, at in times.items()}, leds)
+            yield self._lane(path, mapping.LED_ASKED.name, {name: at[places] for name, at in times.items()}, leds)
 
     def _roles(self, path: str, assignments: Any, times: _Times) -> Iterator[Any]:
         rows = assignments.to_pylist()
         roles = [{car: role["name"] for role in row["roles"] or () for car in role["cars"] or ()} for row in rows]
         for car in sorted(set().union(*roles)):
-            yield _lane(path, f"{mapping.ROLE.name} {car}", times, [each.get(car) for each in roles])
+            yield self._lane(path, f"{mapping.ROLE.name} {car}", times, [each.get(car) for each in roles])
 
-
-def _lane(path: str, name: str, times: _Times, states: Sequence[str | None]) -> Any:
-    columns = rr.AnyValues.columns(**{name: pa.array(states, pa.string())})
-    return rrc.Chunk.from_columns(path, indexes=_indexes(times), columns=columns)
+    def _lane(self, path: str, name: str, times: _Times, states: Sequence[str | None]) -> Any:
+        self.lanes.add((path, name))
+        columns = rr.AnyValues.columns(**{name: pa.array(states, pa.string())})
+        return rrc.Chunk.from_columns(path, indexes=_indexes(times), columns=columns)
 
 
 def _tints(colours: Iterable[Rgb]) -> Any:

@@ -43,7 +43,7 @@ class Live:
         self._bus = bus
         self._fleet = keys.check_name(fleet, "fleet name")
         self._drawing = Drawing(WAY)
-        self._shown: frozenset[str] = frozenset()
+        self._shown: frozenset[object] = frozenset()
         self._lock = threading.Lock()
         self._waiting: list[Sample] = []
         self._closing = threading.Event()
@@ -112,7 +112,7 @@ class Live:
 
     def _lay_out(self) -> None:
         """A layout for what there is; only when there is something new, since it takes the place of the user's."""
-        there = frozenset(self._drawing.held)
+        there = frozenset(self._drawing.held) | self._drawing.lanes
         if there == self._shown:
             return
         self._shown = there
