@@ -162,9 +162,10 @@ class Car:
             done, _ = await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
             failed = [task for task in done if task is not stopped and task.exception() is not None]
             if failed:
-                if not self._ending:
-                    self.stop()
-                await asyncio.wait([stopped, tasks[1]], return_when=asyncio.FIRST_COMPLETED)
+                if self._control.was_open:
+                    if not self._ending:
+                        self.stop()
+                    await asyncio.wait([stopped, tasks[1]], return_when=asyncio.FIRST_COMPLETED)
                 failed[0].result()
         finally:
             running = {stopped, *tasks}

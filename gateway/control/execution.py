@@ -4,6 +4,7 @@ Each layer of control knows those below it only: commands (controller.py) on evi
 """
 
 from dataclasses import replace
+from typing import Final
 
 from gateway.control import recipes, stop
 from gateway.control.battery import Battery, Policy
@@ -31,6 +32,9 @@ from gateway.protocol.encode import Frame, General, ModeClose, ModeOpen, encode
 from gateway.protocol.profile import Profile, StopStyle
 from gateway.protocol.values import Mode, Motion
 
+LISTEN_S: Final = 2.2
+"""How long a gateway that ends listens to the car that it stopped: a report a second, and one more without an echo."""
+
 
 class Execution:
     """What waits for the car, and how it gets there: one frame in flight, a stop ahead of everything."""
@@ -57,7 +61,8 @@ class Execution:
         self.known = False
         """The last recovery is complete and no write has failed since: what is sent will be read as it is meant."""
         self._link_open = False
-        self._was_open = False
+        self.was_open = False
+        """The link was open at least once: the car may have been set going."""
         self._link_reason = "not connected yet"
         self._gave_up = False
         self._unheard = False
@@ -130,7 +135,7 @@ class Execution:
 
     def link_up(self, now: float) -> None:
         """The link is open: bring the car to a known state."""
-        self._link_open = self._was_open = True
+        self._link_open = self.was_open = True
         self._gave_up = self._unheard = False
         self.known = False
         if self.platform.auto:  # another car may have been plugged in
@@ -227,7 +232,8 @@ class Execution:
             return float("inf")
         times = self._waiting.deadlines()
         if self._running is not None:
-            times.append(self._running.wake_at(self.pacing))
+            listening = self._closing and self._running.frames_sent and self._listens(self._running)
+            times.append(self._running.last_at + LISTEN_S if listening else self._running.wake_at(self.pacing))
         elif self.known:
             if self._waiting.acts:
                 times.append(max(self.pacing.act_at(self._waiting.acts[0].frames[0]), self._left_until))
@@ -286,19 +292,25 @@ class Execution:
         self._waiting.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)
         if self._link_open:
             self._begin(self._full(now), Why.SHUTDOWN, now)
-        elif self._was_open:
+        else:
             self._not_stopped(now)
 
     @property
     def finished(self) -> bool:
-        """After `shutdown`: the last frame is written, and a Raspberry Pi, which dies when we go, has obeyed it."""
-        if self._closing and self._running is not None and self.profile.stop_style is not StopStyle.RASPBERRY_PI:
-            return self._running.frames_sent
+        """After `shutdown`: the stop is complete, or its last frame is written and it need not be listened for."""
+        if self._closing and self._running is not None:
+            pi = self.profile.stop_style is StopStyle.RASPBERRY_PI  # it dies when we go: it must have obeyed
+            return self._running.frames_sent and not pi and not self._listens(self._running)
         return self._closing and self._running is None
+
+    def _listens(self, running: Running) -> bool:
+        """Whether the end waits until the car was heard: of a recovery, and of a stop that leaves a mode."""
+        return running.recipe.confirmed or self._left_at >= running.began_at
 
     def _not_stopped(self, now: float) -> None:
         self.unstopped = True
-        words = f"ending without a stop, {self.car} cannot be reached ({self._link_reason}): look whether it drives"
+        why = "sent no reading after it" if self._link_open else f"cannot be reached ({self._link_reason})"
+        words = f"ending without a stop, {self.car} {why}: look whether it drives"
         self._ledger.log(Level.ERROR, "not_stopped", words, now)
 
     def _halt(self, words: str, now: float, by: str = "") -> None:
@@ -385,8 +397,9 @@ class Execution:
 
     def _overdue(self, running: Running, now: float) -> None:
         """No mode-0 reading since the last frame: a stop is over in time; a recovery tries again, three times."""
+        listens_until = running.last_at + LISTEN_S if self._closing and self._listens(running) else float("-inf")
         if not running.recipe.confirmed:
-            if now < running.obeyed_at:
+            if now < max(running.obeyed_at, listens_until if self.mode.verdict is Verdict.ASSUMED else 0.0):
                 return
             if self.mode.verdict is Verdict.CONTRADICTED and self._recovery(now).confirmed:
                 self.known = False
@@ -395,6 +408,16 @@ class Execution:
             if not self._unheard:
                 self._finish(running, now)
                 return
+        elif self._closing:
+            if now < listens_until:
+                return
+            self._running = None
+            self._not_stopped(now)
+            for pending in running.commands:
+                self._ledger.record(
+                    pending, Phase.FAILED, now, reason=Reason.LINK_DOWN, words="no reading confirmed it"
+                )
+            return
         elif now < running.last_at + recipes.CONFIRM_S:
             return
         elif running.retries < recipes.RETRIES:

@@ -483,7 +483,8 @@ def test_a_link_that_is_not_there_yet_is_waited_for(fleet: Fleet, tmp_path: Path
 def test_a_signal_while_nothing_is_connected_ends_at_once(fleet: Fleet, tmp_path: Path) -> None:
     gateway = fleet.gateway(str(tmp_path / "tty"), "--retry")
     wait_for(lambda: fleet.state("link"), "it runs")
-    assert gateway.end(signal.SIGINT) == 0, gateway.stderr
+    assert gateway.end(signal.SIGINT) == 1, gateway.stderr
+    assert "ending without a stop, red cannot be reached" in gateway.stderr, "the one before may have left it driving"
 
 
 def test_it_imports_nothing_that_it_does_not_need(fleet: Fleet, tcp_car: TcpCar) -> None:
