@@ -35,7 +35,7 @@ from gateway.control.records import (
 from gateway.control.safety import LEASE_S, Estop
 from gateway.control.senders import PAUSE_S
 from gateway.control.waiting import Held
-from gateway.protocol.encode import ColorLed, Frame, General
+from gateway.protocol.encode import ColorLed, Frame, General, ModeOpen
 from gateway.protocol.values import Mode, Motion
 
 
@@ -194,8 +194,9 @@ class Controller(Evidence):
         match command.what:
             case Drive(duration_s=lasts_s):
                 pass
-            case SetMode():
-                lasts_s = 0.0
+            case SetMode(mode):  # until it is in force: sooner nobody can tell whether it is wanted
+                opening_s = 0.0 if mode is Mode.MANUAL else self.profile.block_s(ModeOpen(mode))
+                lasts_s = max(self._free_at(now) - now, 0.0) + opening_s
             case _:  # what is asked on the way does not shorten it
                 lasts_s = self.expires_in_s(now) if self.owner == sender.name else 0.0
         self.safety.grant(sender, now + lasts_s)

@@ -276,3 +276,12 @@ def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Desk) -> None:
         desk.hear(TRACKING)
     assert (desk.control.motors, desk.control.motion) == ("unknown", None)
     assert desk.ask(Act(ColorLed(1, 2, 3)), PERSON).reason is Reason.WRONG_MODE, "it would be lost"
+
+
+def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Desk) -> None:
+    """Or the coordinator closes it again while it opens: that takes 3.5 s, longer than a lease outlives its drive."""
+    desk.ask(SetMode(Mode.TRACKING), PERSON)
+    desk.run(4.0, reports=False)
+    assert desk.ask(SetMode(Mode.MANUAL), COORDINATOR).reason is Reason.LEASED
+    desk.run(2.0, reports=False)
+    assert desk.ask(SetMode(Mode.MANUAL), COORDINATOR).status is QUEUED
