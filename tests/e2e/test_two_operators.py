@@ -152,12 +152,12 @@ def test_a_person_and_a_script(fleet: Fleet, sim: Process) -> None:
     ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "8s")
     assert script.wait() == 1
     assert script.stderr.startswith("lost: red was taken by ann@"), script.stderr
+    wait_for(lambda: driving(sim), "ann's frame is obeyed")
     assert drives(fleet, "ann@"), "the script that went stopped what ann drives"
-    assert driving(sim)
     assert fleet.ask("drive", motion="back", sender="bot", kind="script")["reason"] == "leased"
     assert drives(fleet, "ann@")
     assert ended(ann)[0] == 0
-    assert not driving(sim)
+    wait_for(lambda: not driving(sim), "it stands")
 
     assert all(reason in ("", "superseded", "leased") for _, reason, _ in record.of("bot"))
     assert "forward by ann@" in next(words for phase, _, words in record.of("bot") if phase == "superseded")
