@@ -16,6 +16,7 @@ from fleet.replay.drawing import Drawing
 from fleet.replay.lenses import component
 from fleet.replay.mapping import Contents, Curve, Lane, Panel
 from schemas import keys
+from schemas.topics import TOPICS
 
 TIMELINE: Final = "message_publish_time"
 """When a message was published, by its publisher's clock; the recorder's own is `message_log_time`."""
@@ -174,12 +175,6 @@ def _two_pages(name: str, first: rrb.Container, others: list[rrb.View], what: st
 
 
 def _curve(curve: Curve, name: str, rgb: Rgb | None) -> rrb.Visualizer:
-    width = 2.0 if curve.how not in _THRESHOLDS else 1.0
-    style = (
-        rr.SeriesLines(names=name, widths=width)
-        if rgb is None
-        else rr.SeriesLines(names=name, widths=width, colors=rgb)
-    )
     made = curve.how is not None
     source = VisualizerComponentMapping(
         "Scalars:scalars",
@@ -187,7 +182,13 @@ def _curve(curve: Curve, name: str, rgb: Rgb | None) -> rrb.Visualizer:
         source_component=curve.name if made else component(curve.topic),
         selector="." if made else f".{curve.field}",
     )
-    return style.visualizer(mappings=[source])
+    if TOPICS[curve.topic].family == "sensor" and not made:
+        # Readings stop for as long as a mode does not send them: a line across that would look like a measurement.
+        points = rr.SeriesPoints(names=name, marker_sizes=3.0, markers="circle", colors=rgb)
+        return points.visualizer(mappings=[source])
+    width = 1.0 if curve.how in _THRESHOLDS else 2.0
+    line = rr.SeriesLines(names=name, widths=width, colors=rgb)
+    return line.visualizer(mappings=[source])
 
 
 def _curves(name: str, shown: _Shown) -> rrb.TimeSeriesView:
