@@ -5,7 +5,7 @@ finds out; nothing is opened here but the file.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
@@ -68,7 +68,7 @@ class CarSpec:
 class FleetFile:
     """A fleet file, every car resolved, every path absolute.
 
-    endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. unbound: cars without a link (`fleet bind`).
+    endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. unlinked: cars without a link, where those are let through.
     """
 
     name: str
@@ -80,7 +80,12 @@ class FleetFile:
     world: Path | None
     text: str
     path: Path
-    unbound: tuple[str, ...] = ()
+    unlinked: Mapping[str, CarSpec] = field(default_factory=dict)
+
+    @property
+    def unbound(self) -> tuple[str, ...]:
+        """The cars without a link (`fleet bind`)."""
+        return tuple(self.unlinked)
 
 
 def read_fleet(path: Path | str, *, unbound: bool = False) -> FleetFile:
@@ -100,16 +105,15 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False) -> FleetFile:
     assert file is not None  # else the document had ended
     merged = {name: _merged(tree, car) for name, car in tree["cars"].items()}
     places = {name: _beside(path, tree.get(name)) for name in PATHS}
+    cars = {name: _spec(name, car, index) for index, (name, car) in enumerate(merged.items())}
     return FleetFile(
         name=file.name,
         endpoint=file.endpoint or None,
-        cars=MappingProxyType(
-            {name: _spec(name, car, index) for index, (name, car) in enumerate(merged.items()) if "link" in car}
-        ),
+        cars=MappingProxyType({name: car for name, car in cars.items() if car.link}),
         record=file.record,
         text=text,
         path=path.absolute(),
-        unbound=tuple(name for name, car in merged.items() if "link" not in car),
+        unlinked=MappingProxyType({name: car for name, car in cars.items() if not car.link}),
         **places,
     )
 
@@ -128,7 +132,7 @@ def _spec(name: str, car: Mapping[str, Any], index: int) -> CarSpec:
     limits = LimitsEntry.model_validate(car.get("limits", {}))
     return CarSpec(
         name=name,
-        link=car["link"],
+        link=car.get("link", ""),
         platform=platform,
         colour=car.get("colour", PALETTE[index % len(PALETTE)]).lower(),
         capabilities=frozenset(car["capabilities"]) if "capabilities" in car else profile_capabilities(platform),
@@ -169,12 +173,12 @@ def _contradictions(tree: Mapping[str, Any], path: Path, *, unbound: bool) -> It
             yield ("cars", name, "link"), words
         yield from _car_contradictions(tree, name, car)
     yield from _one_port(cars)
-    for field in ("plan", "world"):
-        given = tree.get(field)
+    for entry in ("plan", "world"):
+        given = tree.get(entry)
         if isinstance(given, str) and given and given.isprintable():
             there = _beside(path, given)
             if there is not None and not there.is_file():
-                yield (field,), f"{shown(given)}: there is no such file beside this one"
+                yield (entry,), f"{shown(given)}: there is no such file beside this one"
 
 
 def _car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:

@@ -85,5 +85,5 @@ def _clashes(error: BadFile) -> bool:
 def _same_but(before: FleetFile, now: FleetFile, car: str, link: str) -> bool:
     others, others_now = ({name: spec for name, spec in each.cars.items() if name != car} for each in (before, now))
     same = others == others_now and set(before.unbound) - {car} == set(now.unbound)
-    rest = [replace(each, cars={}, text="", unbound=()) for each in (before, now)]
+    rest = [replace(each, cars={}, text="", unlinked={}) for each in (before, now)]
     return same and rest[0] == rest[1] and now.cars[car].link == link

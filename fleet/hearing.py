@@ -26,6 +26,11 @@ class Hearing:
     def __post_init__(self) -> None:
         self.cars.update(self.listed)
 
+    @property
+    def present(self) -> frozenset[str]:
+        """The cars whose gateways are on the bus."""
+        return frozenset(car for car, known in self.cars.items() if known.present)
+
     def picture(self, busy: Iterable[str]) -> Picture:
         """What is known now; `busy`: the cars that something was asked of, with no outcome yet."""
         cars = {**self.cars, **{car: replace(self.cars[car], busy=True) for car in busy if car in self.cars}}
@@ -108,5 +113,5 @@ def listed_cars(file: FleetFile) -> Mapping[str, CarPicture]:
             roles=None if car.roles is None else frozenset(car.roles),
             listed=True,
         )
-        for name, car in file.cars.items()
+        for name, car in {**file.cars, **file.unlinked}.items()
     }

@@ -47,7 +47,7 @@ def coordinate(
     """Keep a plan true, until Ctrl-C; cars on hold are left alone. One line per decision."""
     parent = os.getppid() if with_parent else None
     plan = parse(read_text(path), str(path))
-    listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file))
+    listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file, unbound=True))
     stop = threading.Event()
 
     def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
