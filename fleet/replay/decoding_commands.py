@@ -169,7 +169,12 @@ def _fields(each: "Difference", start_ns: int) -> dict[str, Any]:
     }
 
 
-@click.command()
+@click.command(
+    epilog="""\b
+example:
+  fleet sessions vector sessions/20260314T151617Z-fleet --car red --from 10s --to 20s --out tracking.jsonl
+""",
+)
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--car", required=True, callback=lambda _ctx, _param, value: keys.check_name(value), help="Whose frames.")
 @click.option("--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date.")

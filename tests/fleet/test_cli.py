@@ -7,6 +7,7 @@ import sys
 from datetime import datetime
 from typing import Any
 
+import click
 import pytest
 
 from fleet import cli
@@ -97,7 +98,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     assert said.out == ""
 
 
-OF_FILES = ("init", "check", "bind", "schema", "plan")
+OF_FILES = ("init", "check", "bind", "schema", "plan", "sessions", "replan", "redecode")
 """Subcommands that look at no bus, or at that of the file."""
 
 
@@ -114,6 +115,15 @@ def test_every_help_has_an_example(
     if name not in OF_FILES:
         assert "--connect" in said
         assert "--fleet" in said
+
+
+@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if name not in ("demo", "record")])
+def test_every_help_of_a_commands_commands_has_an_example(name: str) -> None:
+    context = click.Context(cli.cli)
+    command = cli.cli.get_command(context, name)
+    assert command is not None
+    for sub, each in getattr(command, "commands", {}).items():
+        assert f"  fleet {name} {sub}" in (each.epilog or ""), sub
 
 
 def test_help_imports_nothing_heavy() -> None:

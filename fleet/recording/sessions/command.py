@@ -33,7 +33,16 @@ class _WithDefault(click.Group):
         return super().parse_args(ctx, args)
 
 
-@click.group(cls=_WithDefault, subcommand_metavar="[COMMAND | DIR]")
+@click.group(
+    cls=_WithDefault,
+    subcommand_metavar="[COMMAND | DIR]",
+    epilog="""\b
+examples:
+  fleet sessions
+  fleet sessions verify sessions/20260314T151617Z-fleet
+  fleet sessions export sessions/20260314T151617Z-fleet --csv tables
+""",
+)
 def sessions() -> None:
     """List, look into, verify, recover, cut and export recordings; alone: list those of a directory."""
 
@@ -101,7 +110,14 @@ def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T
     return watch
 
 
-@sessions.command("list")
+@sessions.command(
+    "list",
+    epilog="""\b
+examples:
+  fleet sessions list
+  fleet sessions list /media/disk/sessions --json
+""",
+)
 @click.argument("directory", default=DEFAULT_DIR, type=click.Path(path_type=Path))
 @json_option
 def list_sessions(directory: Path, *, as_json: bool) -> None:
@@ -143,7 +159,12 @@ def _size(count: int) -> str:
     return f"{size:.1f} GB"
 
 
-@sessions.command()
+@sessions.command(
+    epilog="""\b
+example:
+  fleet sessions info sessions/20260314T151617Z-fleet
+""",
+)
 @session_argument
 @json_option
 def info(session: Path, *, as_json: bool) -> None:
@@ -184,7 +205,12 @@ def _say_contents(about: "Overview") -> None:
         click.echo(f"  {key.ljust(width)}  {count:8}{rate}")
 
 
-@sessions.command()
+@sessions.command(
+    epilog="""\b
+example:
+  fleet sessions verify sessions/20260314T151617Z-fleet
+""",
+)
 @session_argument
 @json_option
 def verify(session: Path, *, as_json: bool) -> None:
@@ -206,7 +232,12 @@ def verify(session: Path, *, as_json: bool) -> None:
     raise SystemExit(0 if verdict.whole else 1)
 
 
-@sessions.command()
+@sessions.command(
+    epilog="""\b
+example:
+  fleet sessions recover sessions/20260314T151617Z-fleet --out rescued
+""",
+)
 @session_argument
 @out_option
 def recover(session: Path, out: Path | None) -> None:
@@ -222,7 +253,13 @@ def recover(session: Path, out: Path | None) -> None:
     click.echo(f"{out}: {count} messages{f'; could not be saved: {words}' if words else ', nothing was damaged'}")
 
 
-@sessions.command()
+@sessions.command(
+    epilog="""\b
+examples:
+  fleet sessions cut sessions/20260314T151617Z-fleet --from 30s --to -10s --out part
+  fleet sessions cut sessions/20260314T151617Z-fleet --cars red,blue --out part
+""",
+)
 @session_argument
 @click.option("--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date.")
 @click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not part of it.")
@@ -272,7 +309,13 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
     return selection
 
 
-@sessions.command()
+@sessions.command(
+    epilog="""\b
+examples:
+  fleet sessions export sessions/20260314T151617Z-fleet --csv tables
+  fleet sessions export sessions/20260314T151617Z-fleet --parquet tables
+""",
+)
 @session_argument
 @click.option("--csv", "csv", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write CSV here.")
 @click.option(
