@@ -16,12 +16,13 @@ from fleet.client import Fleet
 from fleet.hearing import Hearing
 from fleet.kept import Keeper
 from fleet.outcome import Outcome
+from fleet.policy.check import faults
 from fleet.policy.decide import Ask, Step, step
 from fleet.policy.decision import LEFT_ALONE, Decision
 from fleet.policy.memory import Memory, carried, restored, to_keep
 from fleet.policy.picture import CarPicture, Refused, topic_of
 from fleet.policy.plan import Plan
-from fleet.policy.reader import BadPlan, parse
+from fleet.policy.reader import parse
 from fleet.verbs import led_request, mode_request
 from schemas import keys, messages, topics
 from schemas.bus import BusError, Publisher, Sample, ensure_hub, reply, reply_value
@@ -59,8 +60,9 @@ class AnotherCoordinator(Exception):
 class Coordinator:
     """Keeps a plan true. `client` is of kind coordinator, its sender begins with SENDER.
 
-    `decided` hears of every decision that changed, `failed` of a command that was not carried out. `listed`: what the
-    fleet file says of its cars.
+    `decided` hears of every decision that changed, `failed` of a command that was not carried out and of what is
+    doubtful in a plan that was taken over the bus. `listed`: what the fleet file says of its cars; empty: there is
+    none. Whoever gives `plan` has asked policy.check.faults() of it.
     """
 
     client: Fleet
@@ -158,32 +160,35 @@ class Coordinator:
                 self._subscribe(f"{self.client.name}/*/{topic}")
         self._publish("plan", pb.Plan(text=plan.text, version=plan.version))
 
-    def _replace(self, query: zenoh.Query) -> None:
+    def _replace(self, query: zenoh.Query, hearing: Hearing) -> None:
         """Take another plan, wholly; or refuse it with all that is wrong with it."""
-        payload = query.payload.to_bytes() if query.payload is not None else b""
-        encoding = str(query.encoding) if query.encoding is not None else ""
         result = pb.Result(status="sent")
         try:
-            if encoding.startswith((topics.PROTOBUF, messages.JSON)):
-                given: Any = messages.parse(topics.TOPICS[f"{keys.COORDINATOR}/plan"].message, payload, encoding)
-                text = given.text
-            else:
-                text = payload.decode()
-            plan = parse(text)
-        except (BadPlan, messages.BadPayload, UnicodeDecodeError) as error:
+            plan = parse(_text(query))
+        except (ValueError, messages.BadPayload) as error:  # BadPlan and UnicodeDecodeError are ValueErrors
             result = pb.Result(status="rejected", reason="bad_value", words=str(error))
         else:
-            result.words = f"plan {plan.version} is in force"
-            self._memory = carried(self._memory, self.plan, plan)
-            for name, subject in [*self._published]:
-                if name == "decision":
-                    del self._published[name, subject]
-            self._follow(plan)
-            self._ask_all()
+            found = faults(plan, self.listed or None, hearing.present)
+            if found.errors:
+                result = pb.Result(status="rejected", reason="bad_value", words=found.refusal())
+            else:
+                warnings = [f"warning: {each}" for each in found.warnings]
+                result.words = "\n".join((f"plan {plan.version} is in force", *warnings))
+                self._take(plan)
+                for each in found.warnings:
+                    self.failed(f"the new plan: {each}")
         if query.parameters.get("format") == "json":
             reply(query, str(query.key_expr), messages.to_json(result).encode(), messages.JSON)
         else:
             reply(query, str(query.key_expr), result.SerializeToString(), messages.encoding_of(topics.RESULT))
+
+    def _take(self, plan: Plan) -> None:
+        self._memory = carried(self._memory, self.plan, plan)
+        for name, subject in [*self._published]:
+            if name == "decision":
+                del self._published[name, subject]
+        self._follow(plan)
+        self._ask_all()
 
     # ------------------------------------------------------------------ what is heard
 
@@ -218,7 +223,7 @@ class Coordinator:
             wait_s = 0.0
             now = time.monotonic()
             if isinstance(item, zenoh.Query):
-                self._answer(item)
+                self._answer(item, hearing)
             elif isinstance(item, tuple):
                 car = item[0].rpartition("/")[2]
                 hearing.token(car, alive=item[1])
@@ -229,10 +234,10 @@ class Coordinator:
             else:
                 hearing.take(item, now, None)
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def _answer(self, query: zenoh.Query, hearing: Hearing) -> None:
         with query:
             if str(query.key_expr).endswith(f"/@cmd/{PLAN_VERB}"):
-                self._replace(query)
+                self._replace(query, hearing)
                 return
             for publisher, message in self._published.values():
                 if query.key_expr.intersects(publisher.key):
@@ -272,6 +277,16 @@ class Coordinator:
             self._publishers[name] = self.client.bus.publisher(key, topic, keys.COORDINATOR)
         self._published[name, getattr(message, "subject", "")] = (self._publishers[name], message)
         self._publishers[name].put(message, time.time_ns())
+
+
+def _text(query: zenoh.Query) -> str:
+    """The text of the plan that a query gives, in protobuf, in JSON, or as it is."""
+    payload = query.payload.to_bytes() if query.payload is not None else b""
+    encoding = str(query.encoding) if query.encoding is not None else ""
+    if not encoding.startswith((topics.PROTOBUF, messages.JSON)):
+        return payload.decode()
+    given: Any = messages.parse(topics.TOPICS[f"{keys.COORDINATOR}/plan"].message, payload, encoding)
+    return str(given.text)
 
 
 def _message(decision: Decision) -> pb.Decision:

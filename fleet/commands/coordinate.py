@@ -10,11 +10,12 @@ from types import FrameType
 import click
 
 from fleet.client import Fleet, default_sender
-from fleet.commands.common import bus_options, json_option
+from fleet.commands.common import WrongFile, bus_options, json_option
 from fleet.config import read_fleet
 from fleet.coordinator import SENDER, AnotherCoordinator, Coordinator
 from fleet.hearing import listed_cars
 from fleet.marked import read_text
+from fleet.policy.check import faults
 from fleet.policy.decision import Decision
 from fleet.policy.reader import parse
 
@@ -48,6 +49,11 @@ def coordinate(
     parent = os.getppid() if with_parent else None
     plan = parse(read_text(path), str(path))
     listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file, unbound=True))
+    found = faults(plan, listed or None)
+    if found.errors:
+        raise WrongFile(found.refusal(str(path)))
+    for each in found.warnings:
+        click.echo(f"fleet: {path}: {each}", err=True)
     stop = threading.Event()
 
     def ask_to_stop(_number: int, _frame: FrameType | None) -> None:

@@ -37,9 +37,9 @@ class Lines:
                 return line
 
 
-def coordinator(cars: Cars, path: Path, plan: str = PLAN) -> Process:
+def coordinator(cars: Cars, path: Path, plan: str = PLAN, *more: str) -> Process:
     path.write_text(plan, encoding="utf-8")
-    process = cars.start("-m", "fleet.cli", "coordinate", "--plan", str(path), "--json")
+    process = cars.start("-m", "fleet.cli", "coordinate", "--plan", str(path), "--json", *more)
     STARTED.append(process)
     return process
 
@@ -196,6 +196,55 @@ def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_a
     lines.until("red", "light_seeking", "role dance")
     wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
     assert process.end(signal.SIGTERM) == 0
+
+
+LISTED = """
+cars:
+  red: {platform: arduino, roles: [scout]}
+  green: {platform: raspberry_pi}
+  blue: {platform: raspberry_pi}
+"""
+NEVER = "cars: {purple: tracking}\nroles: {ghost: {mode: tracking, cars: [green]}}"
+
+
+def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_over_the_bus(
+    cars: Cars, tmp_path: Path
+) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(LISTED, encoding="utf-8")
+    listed = ("--fleet-file", str(file))
+    told = (
+        "car purple: the fleet file has no such car; it has blue, green, red",
+        "role ghost: no car can fill it",
+        "role tracking: no car can fill it",
+    )
+    refused = coordinator(cars, tmp_path / "never.yaml", NEVER, *listed)
+    assert refused.wait() == 2
+    assert all(f"{tmp_path / 'never.yaml'}: {each}" in refused.stderr for each in told), refused.stderr
+    assert "Traceback" not in refused.stderr
+    alone = coordinator(cars, tmp_path / "alone.yaml", "roles: {ghost: {mode: manual, platforms: [stm32]}}", *listed)
+    assert alone.wait() == 2, "nor is one that only the cars of the fleet file cannot do"
+
+    process = coordinator(cars, tmp_path / "plan.yaml", "roles: {scout: {mode: tracking}}", *listed)
+    lines = Lines(process)
+    lines.until("red", "tracking", "role scout")
+    key = "fleet/@coordinator/@cmd/plan"
+    for plan, expected in ((NEVER, told), ("roles: {x: {mode: arm}}", ("roles.x.mode",))):
+        (sample,) = cars.bus.query(key, payload=plan.encode(), timeout_s=5.0)
+        assert isinstance(sample, bus.Sample)
+        answer: Any = sample.message()
+        assert (answer.status, answer.reason) == ("rejected", "bad_value")
+        assert all(each in answer.words for each in expected), answer.words
+    (in_force,) = cars.get("fleet/@coordinator/plan")
+    assert in_force.text == "roles: {scout: {mode: tracking}}"
+    # A role of the fleet file that the plan does not have may be a typo of either: it is told, and no more.
+    (sample,) = cars.bus.query(key, payload=b"roles: {scouts: {mode: manual}}", timeout_s=5.0)
+    assert isinstance(sample, bus.Sample)
+    answer = sample.message()
+    assert answer.status == "sent"
+    assert "warning: car red: the fleet file lets it take role scout, which this plan does not have" in answer.words
+    assert process.end(signal.SIGTERM) == 0
+    assert "the new plan: car red: the fleet file lets it take role scout" in process.stderr
 
 
 def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Cars, tmp_path: Path) -> None:
