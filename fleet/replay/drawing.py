@@ -116,12 +116,12 @@ class Drawing:
         return parts[0]
 
     def _truth(self, path: str, truths: Any, times: _Times) -> Iterator[Any]:
-        x, y, leds = numbers(truths, "x_m"), numbers(truths, "y_m"), truths.field(_LED).to_pylist()
+        x, y, leds = numbers(truths, "x_m"), numbers(truths, "y_m"), truths.field(_LED).dictionary_encode()
         self._parts.setdefault(mapping.key_of(path), []).append(np.stack([x, y], axis=1))
-        self._note(leds)
-        discs = rr.Points3D.columns(
-            positions=triples(x, y), colors=_tints(rgb(each) for each in leds), radii=np.full(len(x), 0.07)
-        )
+        seen = leds.dictionary.to_pylist()
+        self._note(seen)
+        tints = _tints(rgb(each) for each in seen)[leds.indices.to_numpy(zero_copy_only=False)]
+        discs = rr.Points3D.columns(positions=triples(x, y), colors=tints, radii=np.full(len(x), 0.07))
         yield rrc.Chunk.from_columns(f"{path}/{_LED}", indexes=_indexes(times), columns=discs)
 
     def _note(self, leds: Iterable[str]) -> None:
