@@ -13,10 +13,10 @@ import os
 import random
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
@@ -25,10 +25,11 @@ from gateway.control.backoff import Attempts
 from gateway.control.battery import Policy
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
-from gateway.control.records import Answer, Command, EmergencyStop, Level, LogRecord, Phase, Resume
+from gateway.control.records import Answer, Command, EmergencyStop, Level, LogRecord, Phase
 from gateway.control.safety import Estop
 from gateway.doors import Doors
 from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.neighbours import Neighbours
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Event, Rejected
@@ -44,8 +45,6 @@ LONGEST_SLEEP_S: Final = 3600.0
 HUB_GONE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 0.5
 """Two gateways that started at the same moment see each other when both have declared (design.md, "Keys")."""
-TOGETHER_S: Final = 0.2
-"""Gateways that come within this time are asked together for the e-stops that they know of."""
 HEALTH_EVERY_S: Final = 1.0
 TURN_BYTES: Final = 1024
 """Bytes that are looked at before others get their turn, a stop above all; a car sends 960 a second."""
@@ -112,9 +111,7 @@ class Car:
             speed_max=settings.speed_max,
         )
         self._saved = self._control.safety.kept
-        self._passing_on: set[asyncio.Task[None]] = set()
-        self._came = asyncio.Event()
-        """There may be fleet-wide e-stops that this gateway does not know: it asks the others."""
+        self._neighbours = Neighbours(opened, settings.fleet, settings.car)
         self._health = LinkHealth(since=now)
         self._decoder = Decoder()
         self._flood_until = now
@@ -146,7 +143,7 @@ class Car:
             command=self._query,
             streamed=self._streamed,
             sender=self._sender,
-            car=self._neighbour,
+            car=self._neighbours.changed,
         )
         work = (
             self._connect(),
@@ -154,7 +151,7 @@ class Car:
             self._tick(),
             self._keep_hub(),
             self._look_again(),
-            self._unite(),
+            self._neighbours.keep_united(self._unite),
         )
         tasks = [asyncio.ensure_future(each) for each in work]
         stopped = asyncio.ensure_future(self._stopped.wait())
@@ -364,12 +361,12 @@ class Car:
         request = requests.Request(
             verb, payload, encoding, time.time_ns(), longest_drive_s=longest_s, by_wildcard=by_wildcard
         )
-        fleet_wide = {estop.id for estop in self._control.safety.estops if estop.fleet_wide}
+        before = self._control.safety.kept
         command, answer = self._command(request)
         if not request.by_wildcard:
-            self._pass_on(command, fleet_wide)
+            self._neighbours.pass_on(command, before, self._control.safety.kept)
         elif isinstance(command.what, EmergencyStop) and command.what.fleet_wide:
-            self._came.set()  # what one gateway made of it, or did not hear, the others show
+            self._neighbours.ask_soon()  # what one gateway made of it, or did not hear, the others show
         key = keys.command_key(self._settings.fleet, self._settings.car, verb)
         self._asked.append(_Asked(query, key, command.id, answer, as_json))
         self._wake.set()
@@ -465,55 +462,9 @@ class Car:
         self._control.sender_alive(name, alive=alive, now=self._loop.time())
         self._wake.set()
 
-    # ------------------------------------------------------------------ the other gateways of the fleet
-
-    def _pass_on(self, command: Command, fleet_wide: set[str]) -> None:
-        """What was asked of this car alone and is meant for the fleet: ask all, under the same id."""
-        payload: pb.EstopCommand | pb.ResumeCommand
-        match command.what:
-            case EmergencyStop(why, True):
-                payload = pb.EstopCommand(why=why, scope="fleet")
-            case Resume(ids) if over := sorted(fleet_wide & set(ids) & set(self._control.safety.ended)):
-                payload = pb.ResumeCommand(ids=over)
-            case _:
-                return
-        payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
-        key = keys.command_key(self._settings.fleet, "*", command.verb)
-        encoding = messages.encoding_of(topics.COMMANDS[command.verb])
-        asking = asyncio.to_thread(self._ask_all, key, payload.SerializeToString(), encoding)
-        task = asyncio.ensure_future(asking)
-        self._passing_on.add(task)
-        task.add_done_callback(self._passing_on.discard)
-
-    def _ask_all(self, key: str, payload: bytes, encoding: str) -> None:
-        """On a thread; what each car answers is in its own records."""
-        for _ in self._bus.query(key, payload=payload, encoding=encoding):
-            pass
-
-    def _neighbour(self, change: tuple[str, bool]) -> None:
-        """Another car's gateway came or went."""
-        name, alive = change
-        if alive and name != self._settings.car:
-            self._came.set()
-
-    async def _unite(self) -> None:
-        """Fleet-wide e-stops, in force and ended, are taken over from whoever comes onto the bus."""
-        key = keys.topic_key(self._settings.fleet, "*", "state/safety")
-        while True:
-            await self._came.wait()
-            await asyncio.sleep(TOGETHER_S)
-            self._came.clear()
-            for answer in await asyncio.to_thread(lambda: list(self._bus.query(key))):
-                if not isinstance(answer, bus.Sample):
-                    continue
-                try:
-                    shown: Any = answer.message()
-                except (messages.BadPayload, KeyError) as error:
-                    log.warning("%s: no state of a gateway of this fleet: %s", answer.key, error)
-                    continue
-                estops = [_estop(each) for each in shown.estops]
-                self._control.unite(estops, shown.ended, shown.car, self._loop.time())
-            self._wake.set()
+    def _unite(self, estops: Sequence[Estop], ended: Sequence[str], told_by: str) -> None:
+        self._control.unite(estops, ended, told_by, self._loop.time())
+        self._wake.set()
 
     # ------------------------------------------------------------------ time, and the hub
 
@@ -579,11 +530,6 @@ class Car:
                 await asyncio.to_thread(bus.ensure_hub, self._bus.endpoint)
             except bus.BusError as error:
                 self._log(Level.ERROR, "no_hub", str(error))
-
-
-def _estop(shown: pb.Estop) -> Estop:
-    at_ns = shown.stamp.seconds * 1_000_000_000 + shown.stamp.nanos
-    return Estop(shown.id, shown.by, shown.why, at_ns, shown.scope == "fleet")
 
 
 async def serve(settings: Settings, opened: bus.Bus, doors: Doors) -> bool:
