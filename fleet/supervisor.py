@@ -5,7 +5,6 @@ heard and asked over the bus supervise/desk.py's. Here is the loop that joins th
 """
 
 import asyncio
-import hashlib
 import json
 import os
 import socket
@@ -14,14 +13,13 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from fleet.supervise import wanted
 from fleet.supervise.cars import Row
 from fleet.supervise.crew import TURN_S, Crew, Process
 from fleet.supervise.desk import Desk, Refused
-from fleet.supervise.process import new_run
+from fleet.supervise.process import copied, new_run
 from fleet.supervise.reload import change
 from fleet.supervise.restart import State, grace_s
 from fleet.supervise.wanted import COORDINATOR, HUB, RECORDER, SELF, SIMULATOR, Kind, Wanted, WantedCar
@@ -171,8 +169,7 @@ class Supervisor:
             self.crew.add(SIMULATOR, Kind.SIMULATOR, command)
         for car in self._wish.cars.values():
             self._add_car(car)
-        if self._wish.plan is not None:
-            command, _ = self._coordinator(self._wish.plan)
+        if command := self._coordinator(self._wish):
             self.crew.add(COORDINATOR, Kind.COORDINATOR, command)
 
     def _add_car(self, car: WantedCar) -> None:
@@ -182,30 +179,44 @@ class Supervisor:
         if link is not None:
             self.crew.add(car.name, Kind.GATEWAY, wanted.gateway_command(self._wish, car, link, self.endpoint))
 
-    def _coordinator(self, plan: Path) -> tuple[tuple[str, ...], str]:
-        """Its command, and its plan. It gets a copy: a file that is changed counts when it is reloaded and checked."""
-        text = plan.read_text(encoding="utf-8")
-        copy = self.crew.directory / f"plan-{hashlib.sha256(text.encode()).hexdigest()[:12]}.yaml"
-        copy.write_text(text, encoding="utf-8")
-        return wanted.coordinator_command(self._wish, copy, self.endpoint), text
+    def _coordinator(self, wish: Wanted) -> tuple[str, ...]:
+        """Its command; empty without a plan. Raises OSError.
 
-    async def _set_plan(self, plan: Path | None) -> str:
-        """See that the coordinator has this plan; what is new about it."""
+        It gets copies of plan and fleet file: what is changed there counts when it is reloaded and checked.
+        """
+        if wish.plan is None:
+            return ()
+        plan = copied(self.crew.directory, "plan", wish.plan_text)
+        listed = copied(self.crew.directory, "fleet", wanted.listing(wish))
+        return wanted.coordinator_command(wish, plan, listed, self.endpoint)
+
+    async def _set_plan(self, desk: Desk, old: Wanted, command: tuple[str, ...]) -> str:
+        """See that the coordinator does what is wanted now; what is new about its plan."""
         coordinator = self.crew.get(COORDINATOR)
-        if plan is None:
+        if not command or coordinator is None:
+            if command:
+                self.crew.add(COORDINATOR, Kind.COORDINATOR, command)
+                return "there is a plan now"
             self.crew.remove(COORDINATOR, END_S)
             return "there is no plan any more: cars keep their modes" if coordinator is not None else ""
-        command, text = self._coordinator(plan)
-        if coordinator is not None and coordinator.command == command:
-            self.crew.add(COORDINATOR, Kind.COORDINATOR, command)  # one that was given up has another chance
-            return ""
-        if coordinator is not None and self._desk is not None and coordinator.ward.state is State.RUNNING:
-            taken = await asyncio.to_thread(self._desk.take_plan, text)
-            if taken:
-                coordinator.command = command
-                return "the plan is changed"
-        self.crew.add(COORDINATOR, Kind.COORDINATOR, command)
-        return "the plan is changed"
+        text = self._wish.plan_text
+        words = "" if text == old.plan_text else "the plan is changed"
+        in_force = None
+        if coordinator.ward.state is State.RUNNING:
+            in_force = await asyncio.to_thread(desk.plan_in_force)
+        if in_force is not None and in_force.text not in (text, old.plan_text):
+            words = f"plan {in_force.version}, which was given over the bus, is replaced by {self._wish.plan}"
+        has_it = in_force is not None and in_force.text == text
+        if (
+            in_force is not None
+            and old.listed == self._wish.listed
+            and (has_it or await asyncio.to_thread(desk.take_plan, text))
+        ):
+            coordinator.command = command
+        else:
+            # One that was given up has another chance.
+            self.crew.add(COORDINATOR, Kind.COORDINATOR, command, anew=not has_it and in_force is not None)
+        return words
 
     # ------------------------------------------------------------------ one turn
 
@@ -376,7 +387,12 @@ class Supervisor:
             new = await asyncio.to_thread(self._read)
         except ValueError as error:
             raise Refused(f"nothing was changed: {error}") from None
-        found = change(self._wish, new)
+        old, found = self._wish, change(self._wish, new)
+        try:
+            command = self._coordinator(found.wish)  # what may fail comes first
+        except OSError as error:
+            why = f"the coordinator's copies cannot be written in {self.crew.directory}: {error.strerror}"
+            raise Refused(f"nothing was changed: {why}") from None
         words = list(found.words)
         self._wish = found.wish
         for name in found.gone:
@@ -386,11 +402,12 @@ class Supervisor:
                 self.rows.pop(name, None)
         for name in found.begun:
             self._add_car(self._wish.cars[name])
-        if planned := await self._set_plan(self._wish.plan):
+        assert self._desk is not None  # it was asked there
+        if planned := await self._set_plan(self._desk, old, command):
             words.append(planned)
         for line in words:
             self._say("process", SELF, f"reload by {sender}: {line}")
-        return "\n".join(words or ["nothing has changed"])
+        return "\n".join([*(words or ["nothing has changed"]), *found.wish.doubts])
 
     def _say(self, what: str, name: str, words: str) -> None:
         self._tell(Happening(what, name, words))

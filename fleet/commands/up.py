@@ -7,6 +7,7 @@ import signal
 import stat
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -14,10 +15,12 @@ from typing import Final
 import click
 
 from fleet.commands.common import explained
-from fleet.config import read_fleet
+from fleet.config import parse_fleet, read_fleet
+from fleet.hearing import listed_cars
+from fleet.policy.check import faults
 from fleet.policy.reader import parse as parse_plan
 from fleet.supervise.desk import AnotherSupervisor
-from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, wanted
+from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, listing, wanted
 from fleet.supervisor import Happening, Supervisor
 from schemas import keys
 
@@ -79,6 +82,8 @@ def up(
         if fleet is not None:
             keys.check_name(fleet, "fleet name")
         wish = read(file, asked)
+        for doubt in wish.doubts:
+            click.echo(f"fleet: {doubt}", err=True)
         if not wish.cars:
             raise click.UsageError(f"{file} has no car with a link: fleet bind finds links, --sim {3} simulates cars")
         try:
@@ -97,14 +102,24 @@ def read(file: Path | None, asked: Asked) -> Wanted:
         if path is None:
             continue
         try:
-            text = path.read_text(encoding="utf-8")
+            text = path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError:
             raise ValueError(f"{what} {path} is not a text in UTF-8") from None
         except OSError as error:
             raise ValueError(f"{what} {path} cannot be read: {error.strerror}") from None
         if path is wish.plan:
-            parse_plan(text, str(path))
+            wish = _with_plan(wish, text)
     return wish
+
+
+def _with_plan(wish: Wanted, text: str) -> Wanted:
+    """With this plan, if it can work; raises ValueError with all that cannot."""
+    plan = parse_plan(text, str(wish.plan))
+    cars = listed_cars(parse_fleet(listing(wish), Path("fleet.yaml"), unbound=True))  # as the coordinator will
+    found = faults(plan, cars)
+    if found.errors:
+        raise ValueError(f"the plan can never work:\n{found.refusal(str(wish.plan))}")
+    return replace(wish, plan_text=text, doubts=tuple(f"{wish.plan}: {each}" for each in found.warnings))
 
 
 async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool) -> bool:

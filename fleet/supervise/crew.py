@@ -70,13 +70,13 @@ class Crew:
         """The processes of these kinds."""
         return [process for process in self if process.kind in kinds]
 
-    def add(self, name: str, kind: Kind, command: tuple[str, ...]) -> None:
-        """One more, to be started; of that name with another command: to be started anew."""
+    def add(self, name: str, kind: Kind, command: tuple[str, ...], *, anew: bool = False) -> None:
+        """One more, to be started; of that name with another command, or `anew`: to be started anew."""
         process = self._processes.get(name)
         if process is None:
             log = Log(self.directory / f"{name}.log")
             self._processes[name] = Process(name, kind, command, Ward(PATIENCE[kind], time.monotonic()), log)
-        elif process.command != command or process.leaving or process.ward.state is State.GIVEN_UP:
+        elif anew or process.command != command or process.leaving or process.ward.state is State.GIVEN_UP:
             process.command, process.leaving = command, False
             self.end(process, grace_s(None), again=True)
 

@@ -1,6 +1,7 @@
 """The supervisor's place on the bus: what it hears of cars and services, what it is asked, that there is only one."""
 
 import asyncio
+import logging
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Iterable, Mapping
@@ -32,6 +33,7 @@ class Refused(Exception):
     """What was asked cannot be done; the text says why, and that nothing was changed."""
 
 
+_log: Final = logging.getLogger(__name__)
 Service = Callable[[str], Awaitable[str]]
 """Does what its sender asked for; what it says of it. Raises Refused."""
 
@@ -97,8 +99,12 @@ class Desk:
 
     def coordinator_answers(self) -> bool:
         """Whether the coordinator answers; on a thread, it waits for PING_S."""
+        return self.plan_in_force() is not None
+
+    def plan_in_force(self) -> Any:
+        """The coordinator's fleet.v1.Plan; None if it does not answer. On a thread, it waits for PING_S."""
         answers = self.bus.query(f"{self.fleet}/{keys.COORDINATOR}/plan", timeout_s=PING_S, qos=Qos.STATE)
-        return any(isinstance(answer, Sample) for answer in list(answers))
+        return next((answer.message() for answer in answers if isinstance(answer, Sample)), None)
 
     def take_plan(self, text: str) -> bool:
         """Give the coordinator another plan; whether it took it. On a thread."""
@@ -131,6 +137,9 @@ class Desk:
             result.words = await services[verb](command.sender or "anonymous")
         except (Refused, messages.BadPayload) as error:
             result.status, result.reason, result.words = "rejected", "bad_value", str(error)
+        except Exception as error:  # noqa: BLE001 - whoever asks gets an answer, also of what nobody thought of
+            result.status, result.words = "rejected", f"it went wrong: {type(error).__name__}: {error}"
+            _log.exception("%s went wrong", verb)
         as_json = query.parameters.get("format") == "json" or not encoding.startswith(topics.PROTOBUF)
         with query:
             payload = messages.to_json(result).encode() if as_json else result.SerializeToString()

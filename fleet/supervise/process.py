@@ -5,6 +5,7 @@ A group of its own: Ctrl-C at the terminal comes to it from its supervisor, and 
 
 import asyncio
 import contextlib
+import hashlib
 import os
 import signal
 import sys
@@ -77,6 +78,20 @@ def new_run(fleet: str, now: float) -> Path:
                 for file in old.iterdir():
                     file.unlink()
                 old.rmdir()
+    return path
+
+
+def copied(directory: Path, name: str, text: str) -> Path:
+    """A file of this text, named by it: it is whole, or not there. Raises OSError."""
+    data = text.encode()
+    path = directory / f"{name}-{hashlib.sha256(data).hexdigest()[:12]}.yaml"
+    if not path.is_file():
+        begun = path.with_suffix(".part")
+        try:
+            begun.write_bytes(data)
+            begun.replace(path)
+        finally:
+            begun.unlink(missing_ok=True)
     return path
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from fleet.supervise.wanted import SIMULATED, Wanted, WantedCar
+from fleet.supervise.wanted import SIMULATED, Listed, Wanted, WantedCar
 
 _FIXED: Final[Mapping[str, str]] = {
     "fleet": "the fleet's name",
@@ -29,7 +29,7 @@ class Change:
 
 
 def change(old: Wanted, new: Wanted) -> Change:
-    """What becomes of `old` when `new` is wanted, without the plan's text."""
+    """What becomes of `old` when `new` is wanted."""
     words = [
         f"{what} cannot be changed while running (fleet down, fleet up)"
         for name, what in _FIXED.items()
@@ -51,4 +51,23 @@ def change(old: Wanted, new: Wanted) -> Change:
             words.append(f"{name} is {'begun anew' if before else 'added'}")
     gone = tuple(name for name in old.cars if name not in cars)
     words += [f"{name} is taken out" for name in gone]
-    return Change(replace(old, cars=cars, plan=new.plan), gone, tuple(begun), tuple(words))
+    # A car that stays as it was, against the file, keeps what is said of it there, too.
+    kept = {name for name, car in cars.items() if car != new.cars.get(name)}
+    listed = {name: told for name, told in new.listed.items() if name in cars and name not in kept}
+    listed |= {name: told for name, told in old.listed.items() if name in kept}
+    words += [
+        f"{name}: {said}"
+        for name in cars
+        if name not in begun and (said := _told_anew(old.listed.get(name), listed.get(name)))
+    ]
+    wish = replace(old, cars=cars, plan=new.plan, plan_text=new.plan_text, listed=listed, doubts=new.doubts)
+    return Change(wish, gone, tuple(begun), tuple(words))
+
+
+def _told_anew(before: Listed | None, now: Listed | None) -> str:
+    """What the coordinator has to learn of a car that was there before."""
+    if before is None or now is None:
+        return ""
+    fields = ("platform", "capabilities", "roles")
+    changed = [name for name in fields if getattr(before, name) != getattr(now, name)]
+    return f"its {' and '.join(changed)} changed, for the coordinator" if changed else ""

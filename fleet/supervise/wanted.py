@@ -3,6 +3,7 @@
 What fleet needs of links and simulators it starts as processes; it imports none of them.
 """
 
+import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from fleet.config import CarSpec, FleetFile
+from fleet.config import CarSpec, FleetFile, profile_capabilities
 from fleet.supervise.restart import Patience
 from schemas.keys import DEFAULT_FLEET
 
@@ -61,6 +62,17 @@ class WantedCar:
 
 
 @dataclass(frozen=True, slots=True)
+class Listed:
+    """What the coordinator is told of one car: what it may do with it."""
+
+    platform: str
+    capabilities: tuple[str, ...] | None = None
+    """None: its platform's."""
+    roles: tuple[str, ...] | None = None
+    """None: any."""
+
+
+@dataclass(frozen=True, slots=True)
 class Wanted:
     """All that is to run."""
 
@@ -68,11 +80,15 @@ class Wanted:
     endpoint: str | None = None
     cars: Mapping[str, WantedCar] = field(default_factory=dict)
     plan: Path | None = None
+    plan_text: str = ""
+    """As it was read and checked: a file that is changed counts when it is reloaded."""
     record: bool = True
     recordings: Path = RECORDINGS
     world: Path | None = None
-    file: Path | None = None
-    """The fleet file, which the coordinator reads too: what cars may do."""
+    listed: Mapping[str, Listed] = field(default_factory=dict)
+    """Every car, as the fleet file says; those that are only simulated, as their platform is."""
+    doubts: tuple[str, ...] = ()
+    """What is hardly meant so, a line each."""
 
     @property
     def simulated(self) -> list[WantedCar]:
@@ -95,8 +111,11 @@ class Asked:
 
 def wanted(file: FleetFile | None, asked: Asked) -> Wanted:
     """Unite file and command line, which wins. Of `asked.simulated` cars the file's come first, whatever their link."""
-    cars = {} if file is None else {name: _car(spec) for name, spec in file.cars.items()}
-    for index, name in enumerate(_names(list(cars), asked.simulated)):
+    specs = {} if file is None else {**file.cars, **file.unlinked}
+    cars = {name: _car(spec) for name, spec in specs.items()}
+    names = _names(list(cars), asked.simulated)
+    cars = {name: car for name, car in cars.items() if car.link or name in names}
+    for index, name in enumerate(names):
         car = cars.get(name) or WantedCar(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
         # A simulated car must be of some platform, one of a real car may be found out.
         platform = "arduino" if car.platform in ("auto", "unknown") else car.platform
@@ -109,7 +128,7 @@ def wanted(file: FleetFile | None, asked: Asked) -> Wanted:
         record=(file.record if file else True) if asked.record is None else asked.record,
         recordings=asked.out or (file.recordings if file else None) or RECORDINGS,
         world=asked.world or (file.world if file else None),
-        file=file.path if file else None,
+        listed={name: _listed(specs.get(name), car.platform) for name, car in cars.items()},
     )
 
 
@@ -143,6 +162,29 @@ def _car(spec: CarSpec) -> WantedCar:
             ),
         ),
     )
+
+
+def _listed(spec: CarSpec | None, platform: str) -> Listed:
+    if spec is None:
+        return Listed(platform)
+    fewer = spec.capabilities != profile_capabilities(spec.platform)
+    return Listed(spec.platform, tuple(sorted(spec.capabilities)) if fewer else None, spec.roles)
+
+
+def listing(wish: Wanted) -> str:
+    """A fleet file for the coordinator, of what was accepted.
+
+    The user's own may be wrong, or gone, when the coordinator is started again.
+    """
+    cars = {
+        name: {
+            "platform": car.platform,
+            **({} if car.capabilities is None else {"capabilities": car.capabilities}),
+            **({} if car.roles is None else {"roles": car.roles}),
+        }
+        for name, car in wish.listed.items()
+    }
+    return json.dumps({"cars": cars}, indent=1)
 
 
 def module(name: str, *arguments: str) -> tuple[str, ...]:
@@ -180,8 +222,7 @@ def recorder_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
     return module("fleet.cli", "record", "--out", str(wish.recordings), "--json", *where)
 
 
-def coordinator_command(wish: Wanted, plan: Path, endpoint: str) -> tuple[str, ...]:
-    """The coordinator."""
+def coordinator_command(wish: Wanted, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
+    """The coordinator, with copies of the plan and of what is said of the cars."""
     where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
-    file = () if wish.file is None else ("--fleet-file", str(wish.file))
-    return module("fleet.cli", "coordinate", "--plan", str(plan), "--json", *file, *where)
+    return module("fleet.cli", "coordinate", "--plan", str(plan), "--fleet-file", str(listed), "--json", *where)

@@ -257,8 +257,7 @@ def test_another_plan_is_taken_by_the_coordinator_that_runs_and_a_bad_one_by_nob
     plan = tmp_path / "plan.yaml"
     plan.write_text("cars: {red: tracking}\n")
     with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--plan", str(plan), "--no-record") as started:
-        started.ready("red")
-        wait_for(lambda: started.get("red/state/mode").asked == "tracking", "red is told to track")
+        wait_for(lambda: _asked(started, "red") == "tracking", "red is told to track")
         pid = started.running("@coordinator")
         plan.write_text("cars: {red: trakking}\n")
         refused = started.fleet("reload")
@@ -266,11 +265,90 @@ def test_another_plan_is_taken_by_the_coordinator_that_runs_and_a_bad_one_by_nob
         assert "trakking" in refused.stderr
         plan.write_text("cars: {red: light_seeking}\n")
         assert started.fleet("reload").stdout == "the plan is changed\n"
-        wait_for(lambda: started.get("red/state/mode").asked == "light_seeking", "red seeks light")
+        wait_for(lambda: _asked(started, "red") == "light_seeking", "red seeks light")
         os.kill(pid, signal.SIGKILL)
         assert started.running("@coordinator", but=pid)
         answer = started.get("@coordinator/plan")
         assert answer is None or "light_seeking" in answer.text, "the one after it has the new plan, too"
+
+
+def test_the_coordinator_goes_by_what_was_accepted_not_by_what_the_files_have_become(tmp_path: Path) -> None:
+    file = _job(tmp_path)
+    with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
+        pid = started.running("@coordinator")
+        file.write_text("cars: [\n")
+        (tmp_path / "plan.yaml").unlink()
+        assert started.fleet("reload").stderr.startswith("nothing was changed: ")
+        started.kill(pid)
+        assert started.running("@coordinator", but=pid)
+
+
+def test_simulated_cars_that_have_no_link_yet_do_a_plan(tmp_path: Path) -> None:
+    with Up(tmp_path, free_endpoint(), str(_job(tmp_path, link="")), "--sim", "2", "--no-record") as started:
+        for car, mode in (("ann", "tracking"), ("bob", "light_seeking")):
+            wait_for(lambda car=car, mode=mode: _asked(started, car) == mode, f"{car} is told its role")
+
+
+def test_reload_tells_the_coordinator_what_the_cars_may_do_now(tmp_path: Path) -> None:
+    file = _job(tmp_path)
+    with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
+        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
+        _job(tmp_path, ann="seek", bob="follow")
+        told = started.fleet("reload").stdout
+        assert told == "ann: its roles changed, for the coordinator\nbob: its roles changed, for the coordinator\n"
+        wait_for(lambda: _asked(started, "bob") == "tracking", "bob follows")
+        assert started.fleet("reload").stdout == "nothing has changed\n"
+
+
+def test_reload_restores_a_plan_that_was_replaced_over_the_bus(tmp_path: Path) -> None:
+    with Up(tmp_path, free_endpoint(), str(_job(tmp_path)), "--no-record") as started:
+        pid = started.running("@coordinator")
+        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
+        (answer,) = started.bus.query("fleet/@coordinator/@cmd/plan", payload=OTHER_JOB.encode(), timeout_s=5.0)
+        assert isinstance(answer, bus.Sample)
+        wait_for(lambda: _asked(started, "ann") == "obstacle_avoidance", "ann does as the plan over the bus says")
+        told = started.fleet("reload").stdout
+        assert "which was given over the bus, is replaced by " in told
+        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows again")
+        assert started.running("@coordinator") == pid
+        assert started.fleet("reload").stdout == "nothing has changed\n"
+
+
+def test_reload_on_a_full_disk_changes_nothing(tmp_path: Path) -> None:
+    """A run's directory that takes no more file is as a full disk, also for root: it is away."""
+    file = _job(tmp_path)
+    with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
+        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
+        (run,) = (tmp_path / "state" / "runs" / "fleet").iterdir()
+        run.rename(run.with_name("away"))
+        text = file.read_text()
+        file.write_text(text + "  eve: {link: tcp://127.0.0.1:9}\n")
+        (tmp_path / "plan.yaml").write_text(OTHER_JOB)
+        refused = started.fleet("reload")
+        assert refused.returncode == 2
+        assert refused.stderr.startswith("nothing was changed: the coordinator's copies cannot be written in ")
+        assert started.state("eve") is None
+        run.with_name("away").rename(run)
+        done = started.fleet("reload")
+        assert "eve is added" in done.stdout
+        assert "the plan is changed" in done.stdout
+        wait_for(lambda: _asked(started, "ann") == "obstacle_avoidance", "ann does as the new plan says")
+
+
+def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(tmp_path: Path) -> None:
+    file, bad = _job(tmp_path), "roles: {follow: {mode: tracking, cars: [eve]}, seek: {mode: light_seeking}}\n"
+    with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
+        started.running("@coordinator")
+        (tmp_path / "plan.yaml").write_text(bad)
+        refused = started.fleet("reload")
+        assert refused.returncode == 2
+        assert refused.stderr.startswith("nothing was changed: the plan can never work:\n")
+        assert "plan.yaml: role follow: no car can fill it" in refused.stderr
+    second = subprocess.run(
+        [sys.executable, "-m", "fleet.cli", "up", str(file)], capture_output=True, text=True, check=False
+    )
+    assert second.returncode == 2
+    assert "plan.yaml: role follow: no car can fill it" in second.stderr
 
 
 @pytest.mark.parametrize(
@@ -301,6 +379,23 @@ def _file(directory: Path, **links: str) -> Path:
 
 def _text(**links: str) -> str:
     return "cars:\n" + "".join(f"  {car}: {{link: '{link}', platform: arduino}}\n" for car, link in links.items())
+
+
+def _job(directory: Path, link: str = "link: sim, ", ann: str = "follow", bob: str = "seek") -> Path:
+    """Two simulated cars with a plan; the role that each may take."""
+    (directory / "plan.yaml").write_text("roles: {follow: {mode: tracking}, seek: {mode: light_seeking}}\n")
+    path = directory / "fleet.yaml"
+    cars = "".join(f"  {car}: {{{link}roles: [{role}]}}\n" for car, role in (("ann", ann), ("bob", bob)))
+    path.write_text(f"plan: plan.yaml\ndefaults: {{platform: arduino}}\ncars:\n{cars}")
+    return path
+
+
+OTHER_JOB = "roles: {follow: {mode: obstacle_avoidance}, seek: {mode: light_seeking}}\n"
+
+
+def _asked(started: Up, car: str) -> str:
+    mode = started.get(f"{car}/state/mode")
+    return "" if mode is None else str(mode.asked)
 
 
 def _exists(pid: int) -> bool:

@@ -83,7 +83,7 @@ def test_every_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
         gateway_command(wish, wish.cars["bob"], "tcp://127.0.0.1:1", endpoint),
         simulator_command(wish, tmp_path, endpoint),
         recorder_command(wish, endpoint),
-        coordinator_command(wish, tmp_path / "plan.yaml", endpoint),
+        coordinator_command(wish, tmp_path / "plan.yaml", tmp_path / "fleet.yaml", endpoint),
     ]
     for command in commands:
         assert command[0] == sys.executable
