@@ -444,8 +444,12 @@ class Bus:
 
     def put_command(self, key: str, payload: bytes, encoding: str, sequence: int = 0) -> None:
         """Publish one command of a stream (drive); `sequence` counts within it."""
+        self.put_again(key, payload, encoding, sequence, Qos.COMMAND)
+
+    def put_again(self, key: str, payload: bytes, encoding: str, sequence: int, qos: Qos) -> None:
+        """Publish a payload as it is, under the number that it was given."""
         source = zenoh.SourceInfo(self._session.id, sequence & 0xFFFFFFFF)
-        self._session.put(key, payload, encoding=encoding, source_info=source, **_QOS[Qos.COMMAND])
+        self._session.put(key, payload, encoding=encoding, source_info=source, **_QOS[qos])
 
 
 def reply(query: zenoh.Query, key: str, payload: bytes, encoding: str, *, express: bool = True) -> None:

@@ -13,6 +13,8 @@ RECORDER: Final = "@recorder"
 SUPERVISOR: Final = "@supervisor"
 SIMULATOR: Final = "@sim"
 OPERATOR: Final = "@operator"
+REPLAY: Final = "@replay"
+"""`<fleet>/@replay/<session>`: the token that says that a fleet is a recording."""
 
 
 class BadKey(ValueError):

@@ -34,6 +34,10 @@ def list_cars(client: Fleet, *, as_json: bool) -> None:
     if not said:
         raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
     rows = [_row(car, values) for car, values in sorted(said.items())]
+    for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
+        session = token.rpartition("/")[2]
+        click.echo(f"fleet: {client.name} is a replay of {session}: ages are those of the recording", err=True)
+        rows = [{**row, "replay": session} for row in rows]
     if as_json:
         for row in rows:
             click.echo(json.dumps(row))

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from fleet.commands.common import INTERRUPTED, Cars
+from fleet.replay.to_bus_command import refuse_without, to_bus_options
+from fleet.replay.to_bus_command import to_bus as play_to_bus
 
 if TYPE_CHECKING:
     from fleet.recording.session import Session
@@ -20,7 +22,13 @@ if TYPE_CHECKING:
 BAR_AFTER_S: Final = 1.0
 
 
-@click.command()
+@click.command(
+    epilog="""\b
+examples:
+  fleet replay sessions/20260314T151617Z-fleet
+  fleet replay sessions/20260314T151617Z-fleet --car red --from=-60s --save red.rrd
+  fleet replay sessions/20260314T151617Z-fleet --to-bus --as rehearsal --rate 4 --loop"""
+)
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--car", "--cars", "cars", type=Cars(), default=(), help="Only these cars, and the services.")
 @click.option("--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date.")
@@ -31,8 +39,24 @@ BAR_AFTER_S: Final = 1.0
     metavar="OUT.rrd",
     help="Write a file that carries its layout instead of opening the viewer: `rerun OUT.rrd` shows it.",
 )
-def replay(session: Path, cars: tuple[str, ...], start: str | None, end: str | None, save: Path | None) -> None:
-    """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun."""
+@to_bus_options
+def replay(
+    session: Path,
+    cars: tuple[str, ...],
+    start: str | None,
+    end: str | None,
+    save: Path | None,
+    *,
+    to_bus: bool,
+    **bus_options: Any,
+) -> None:
+    """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun, or play it on the bus again."""
+    if to_bus:
+        if save is not None:
+            raise click.UsageError("--save and --to-bus: give one of them")
+        play_to_bus(session, cars, start, end, **bus_options)
+        return
+    refuse_without(bus_options)
     from fleet.recording.session import NoSession, Session
     from fleet.replay.viewer import has_display
 

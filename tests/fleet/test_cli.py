@@ -98,11 +98,11 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     assert said.out == ""
 
 
-OF_FILES = ("init", "check", "bind", "schema", "plan", "sessions", "replan", "redecode")
+OF_FILES = ("init", "check", "bind", "schema", "plan", "sessions", "replay", "replan", "redecode")
 """Subcommands that look at no bus, or at that of the file."""
 
 
-@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if name not in ("demo", "replay", "record")])
+@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if name not in ("demo", "record")])
 def test_every_help_has_an_example(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
