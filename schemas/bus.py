@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 
 import zenoh
+from zenoh import ext
 
 from schemas.keys import BadKey
 from schemas.topics import Qos, Topic
@@ -253,6 +254,11 @@ class Failure:
     words: str
 
 
+def sequence_of(info: zenoh.SourceInfo) -> int:
+    """A publisher's number for a key, from 1, modulo 2^32: Zenoh counts from 0."""
+    return (int(info.source_sn) + 1) & 0xFFFFFFFF
+
+
 def sample_of(sample: zenoh.Sample) -> Sample:
     """Copy what is wanted out of a Zenoh sample."""
     stamp = sample.timestamp
@@ -262,17 +268,27 @@ def sample_of(sample: zenoh.Sample) -> Sample:
         payload=sample.payload.to_bytes(),
         encoding=str(sample.encoding),
         time_ns=stamp.get_time_as_ntp64().as_nanos() if stamp is not None else time.time_ns(),
-        sequence=int(info.source_sn) if info is not None else 0,
+        sequence=sequence_of(info) if info is not None else 0,
         deleted=sample.kind == zenoh.SampleKind.DELETE,
     )
 
 
 class Publisher:
-    """Publishes one topic of one car; numbers the messages and fills their common fields."""
+    """Publishes one topic of one car; numbers the messages and fills their common fields.
+
+    It holds the last of them (`Topic.held`), also those published while there was no hub: see `Bus.recall`.
+    """
 
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, source: str, boot_id: str) -> None:
-        self._publisher = session.declare_publisher(key, encoding=zenoh.Encoding(topic.encoding), **_QOS[topic.qos])
-        self._id = self._publisher.id
+        self._publisher = ext.declare_advanced_publisher(
+            session,
+            key,
+            encoding=zenoh.Encoding(topic.encoding),
+            cache=ext.CacheConfig(topic.held),
+            # Numbers only. Heartbeats and a token for each would double what a hub of a hundred cars has to do.
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+            **_QOS[topic.qos],
+        )
         self._source = source
         self._boot_id = boot_id
         self._headed = topic.message.startswith("fleet.v1.")
@@ -289,8 +305,7 @@ class Publisher:
             message.seq = self.sequence
             message.boot_id = self._boot_id
         payload: bytes = message.SerializeToString()
-        source = zenoh.SourceInfo(self._id, self.sequence & 0xFFFFFFFF)
-        self._publisher.put(payload, source_info=source)
+        self._publisher.put(payload)
         return payload
 
 
@@ -442,13 +457,34 @@ class Bus:
             elif reply.err is not None:
                 yield Failure(reply.err.payload.to_string())
 
-    def put_command(self, key: str, payload: bytes, encoding: str, sequence: int = 0) -> None:
-        """Publish one command of a stream (drive); `sequence` counts within it."""
+    def recall(self, expression: str, last_s: float, *, timeout_s: float = 5.0) -> Iterator[zenoh.Sample]:
+        """Publications of the last seconds that their publishers still hold, those that were received, too.
+
+        They are those of `Publisher` that are alive now, with the time and the number under which each was published;
+        those of one publisher come in order. Blocks until all have answered.
+        """
+        replies = self._session.get(
+            f"{expression}/@adv/pub/**?_time=[now(-{last_s:.3f}s)..]",  # where zenoh.ext's publishers answer
+            zenoh.handlers.FifoChannel(_ANSWERS),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=timeout_s,
+        )
+        return (reply.ok for reply in replies if reply.ok is not None)
+
+    @property
+    def hubs(self) -> tuple[str, ...]:
+        """The ids of the routers that there is a link to now; a hub that was started again has another."""
+        return tuple(sorted(str(hub) for hub in self._session.info.routers_zid()))
+
+    def put_command(self, key: str, payload: bytes, encoding: str, sequence: int = 1) -> None:
+        """Publish one command of a stream (drive); `sequence` counts within it, from 1."""
         self.put_again(key, payload, encoding, sequence, Qos.COMMAND)
 
     def put_again(self, key: str, payload: bytes, encoding: str, sequence: int, qos: Qos) -> None:
-        """Publish a payload as it is, under the number that it was given."""
-        source = zenoh.SourceInfo(self._session.id, sequence & 0xFFFFFFFF)
+        """Publish a payload as it is, under the number that it was given; 0: under none."""
+        source = zenoh.SourceInfo(self._session.id, (sequence - 1) & 0xFFFFFFFF) if sequence else None
         self._session.put(key, payload, encoding=encoding, source_info=source, **_QOS[qos])
 
 

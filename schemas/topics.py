@@ -1,5 +1,6 @@
 """The one table of topics: name, message, units, rate, staleness, QoS, recorded or not, Rerun entity. Pure."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -8,6 +9,9 @@ from typing import Final
 
 PROTOBUF: Final = "application/protobuf"
 HISTORY: Final = 1500  # design.md, "Keys": one minute of the fastest readings
+HELD_S: Final = 10.0
+"""How long a publication can be had again by who missed it: a hub or a recorder is back after two or three seconds."""
+_HELD_AT_LEAST: Final = 100  # events and states come in bursts
 
 
 class Qos(StrEnum):
@@ -54,6 +58,11 @@ class Topic:
     def kept(self) -> int:
         """How many values a gateway keeps for queries: of a reading its history, of a state the latest."""
         return {"sensor": HISTORY, "state": 1}.get(self.family, 0)
+
+    @property
+    def held(self) -> int:
+        """How many publications its publisher holds for who missed them, a recorder above all."""
+        return max(_HELD_AT_LEAST, math.ceil(HELD_S * self.rate_hz))
 
 
 # A mode-0 report comes about once a second and may be blocked for another (protocol.md, "From the car: readings"), so a
@@ -223,6 +232,7 @@ SERVICE_TOPICS: Final = (
         {"bytes": "B", "free_bytes": "B"},
         entity="recorder",
     ),
+    Topic("@recorder/mark", "foxglove.Log", "what somebody marked in the recording", Qos.STATE, entity="recorder/mark"),
     Topic(
         "@supervisor/status",
         "fleet.v1.Supervision",

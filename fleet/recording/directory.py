@@ -1,8 +1,10 @@
 """A session's directory: its name, what lies in it, and `session.json`, which describes it. No MCAP and no bus here.
 
-`sessions/20260314T151617Z-fleet/` holds `session.json` and the segments `0001.mcap`, `0002.mcap`, ...
+`sessions/20260314T151617Z-fleet/` holds `session.json`, the segments `0001.mcap`, `0002.mcap`, ..., copies of the fleet
+file and the plan if there are any, and `index.json`: by segment what is in it, for who is in a hurry. A cache only.
 """
 
+import contextlib
 import json
 import platform
 import socket
@@ -14,6 +16,9 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 DESCRIPTION: Final = "session.json"
+INDEX: Final = "index.json"
+FLEET_FILE: Final = "fleet.yaml"
+PLAN: Final = "plan.yaml"
 SEGMENTS: Final = "[0-9][0-9][0-9][0-9].mcap"
 FORMAT: Final = 1
 """Raised when a reader of the old layout could misread a session."""
@@ -42,6 +47,11 @@ class Description:
     drops: Mapping[str, int] = field(default_factory=dict)
     missed: Mapping[str, int] = field(default_factory=dict)
     error: str = ""
+    """What went wrong, also if the recording went on after it."""
+    recovered: Mapping[str, int] = field(default_factory=dict)
+    """By key: missed at first, and had again from who published it. Those lie in the file later than their numbers."""
+    continues: str = ""
+    """The session that this one goes on with: its recorder was killed, and what it had not written yet is here."""
     format: int = FORMAT
     marks: Sequence[Mapping[str, Any]] = ()
     """What people said while it was recorded: `time` (ISO 8601), `text`, `by`."""
@@ -64,15 +74,24 @@ class Description:
 
     def write(self, directory: Path) -> None:
         """Replace the description in a directory, whole or not at all; raises OSError."""
-        text = json.dumps({name: getattr(self, name) for name in self.__slots__}, indent=2) + "\n"
-        new = directory / (DESCRIPTION + ".new")
-        new.write_text(text, encoding="utf-8")
-        new.replace(directory / DESCRIPTION)
+        replace(directory / DESCRIPTION, {name: getattr(self, name) for name in self.__slots__}, indent=2)
 
 
-_COUNTS: Final = ("drops", "missed")
+def replace(path: Path, values: object, indent: int | None = None) -> None:
+    """Write JSON to a file, whole or not at all; raises OSError."""
+    new = path.with_name(path.name + ".new")
+    try:
+        new.write_text(json.dumps(values, indent=indent) + "\n", encoding="utf-8")
+        new.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):  # on a full disk an empty file is all that is left of it
+            new.unlink()
+        raise
+
+
+_COUNTS: Final = ("drops", "missed", "recovered")
 _TYPES: Final[Mapping[str, type]] = {
-    **dict.fromkeys(("fleet", "started", "host", "error"), str),
+    **dict.fromkeys(("fleet", "started", "host", "error", "continues"), str),
     **dict.fromkeys(("format", "messages"), int),
     **dict.fromkeys(("versions", "origin", *_COUNTS), dict),
     "marks": list,

@@ -1,24 +1,25 @@
-"""The recorder: everything of one fleet that comes over the bus, into one session. One more subscriber, no policy.
+"""The recorder: everything of one fleet that comes over the bus, into sessions. One more subscriber, no policy.
 
-Two threads. One takes what comes off Zenoh's channels and never touches a disk: a disk that hangs must show as drops
-here, not as a session that stalls its senders. The other writes: file, flush and status each second, answers.
+Three threads. One takes what comes off Zenoh's channels and never touches a disk: a disk that hangs must show as drops
+here, not as a session that stalls its senders. One asks publishers again for what was missed (recall.py). The third
+writes (tape.py), flushes and tells the status each second, and answers.
 """
 
 import contextlib
-import shutil
+import json
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 import zenoh
 
-from fleet.recording import directory
-from fleet.recording.segment import Segment
-from schemas import keys
+from fleet.recording import room
+from fleet.recording.recall import Recall
+from fleet.recording.tape import Options, Tape
+from schemas import keys, messages
 from schemas.bus import Bus, Sample, reply_value
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
@@ -39,8 +40,12 @@ ROUND: Final = 4_096
 LINGER_S: Final = 0.1
 """What was published before we were told to end is still under way."""
 QUESTIONS: Final = 64
+LONGEST_MARK: Final = 1000
 
 STATUS: Final = TOPICS["@recorder/status"]
+MARK: Final = TOPICS["@recorder/mark"]
+VERBS: Final = ("start", "stop", "status", "mark")
+"""Under `<fleet>/@recorder/@cmd/`; mark takes JSON: `text`, and `by` whom."""
 
 
 class AnotherRecorder(Exception):
@@ -49,6 +54,10 @@ class AnotherRecorder(Exception):
 
 class RecordingFailed(Exception):
     """The session could not be written to its end; its text says why, and what is there."""
+
+
+class _Refused(Exception):
+    """What was asked over the bus cannot be; its text is the answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,35 +75,43 @@ _Item = tuple[str, bytes, zenoh.Encoding, "zenoh.Timestamp | None", "zenoh.Sourc
 
 
 class Recorder:
-    """Records from `start` to `close`. If the disk fails, `ended` is set and `close` raises RecordingFailed."""
+    """Records from `start` to `close`. If the disk fails, `ended` is set and `close` raises RecordingFailed.
+
+    `tell` hears what a person should know: a full disk, an old session that was removed, a session that begins.
+    """
 
     def __init__(
         self,
         bus: Bus,
         fleet: str,
         root: Path,
+        options: Options | None = None,
         *,
         limit_messages: int = LIMIT_MESSAGES,
         limit_bytes: int = LIMIT_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
+        tell: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._bus = bus
         self._fleet = keys.check_name(fleet, "fleet name")
         self._root = root
+        self._options = options or Options()
         self._limit_messages = limit_messages
         self._limit_bytes = limit_bytes
         self._now = wall_ns
+        self._tell = tell
+        self._told: set[str] = set()
         self._lock = threading.Lock()
         self._waiting: list[_Item] = []
         self._held_messages = 0
         self._held_bytes = 0
-        self._drops: dict[str, int] = {}
         self._questions: list[zenoh.Query] = []
         self._closing = threading.Event()
         self._taken = threading.Event()
         self._reader_error: Exception | None = None
         self._subscribers: list[zenoh.Subscriber[Any]] = []
         self._error = ""
+        self._recording = True
         self.ended = threading.Event()
         """The writer has ended: closed, or failed."""
 
@@ -104,31 +121,35 @@ class Recorder:
         Raises AnotherRecorder, and OSError if the session cannot be made.
         """
         self._refuse_a_second()
-        self.session, self._description = directory.create(self._root, self._fleet, self._wall())
-        about = {"fleet": self._fleet, "started": self._description.started, "host": self._description.host}
-        self._segment = Segment(
-            directory.segment(self.session, 1), {**about, **self._description.versions, "format": str(directory.FORMAT)}
-        )
-        key = keys.topic_key(self._fleet, keys.RECORDER, STATUS.name.partition("/")[2])
-        self._publisher = self._bus.publisher(key, STATUS, keys.RECORDER)
-        self._last = self._status("recording")
         for expression in keys.recorded(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, CHANNEL))
+        self._tape = Tape(self._root, self._fleet, self._options, self._now())
+        self._drops = self._tape.drops
+        session = self._tape.path
+        key = keys.topic_key(self._fleet, keys.RECORDER, STATUS.name.partition("/")[2])
+        self._publisher = self._bus.publisher(key, STATUS, keys.RECORDER)
+        marks = keys.topic_key(self._fleet, keys.RECORDER, MARK.name.partition("/")[2])
+        self._marks = self._bus.publisher(marks, MARK, keys.RECORDER)
+        self._last = self._status()
+        self._recall = Recall(self._bus, keys.recorded(self._fleet), follows=bool(self._tape.description.continues))
         self._reader = threading.Thread(target=self._read, name="bus-reader")
         self._writer = threading.Thread(target=self._write, name="mcap-writer")
         self._reader.start()
         self._writer.start()
+        self._recall.start()
         self._bus.queryable(key, self._ask)
+        self._bus.queryable(keys.command_key(self._fleet, keys.RECORDER, "*"), self._ask)
         token = keys.car_token(self._fleet, keys.RECORDER)
         self._bus.token(token)
         # Declaring does not wait for the hub. Its answer comes after it has passed our subscriptions on to all.
         self._bus.tokens(token)
-        return self.session
+        return session
 
     def close(self) -> Outcome:
         """Write what has come until now, and close the session whole; raises RecordingFailed."""
         if not self.ended.is_set():
             time.sleep(LINGER_S)
+        self._recall.close()
         self._closing.set()
         self._reader.join()
         for subscriber in self._subscribers:
@@ -137,7 +158,8 @@ class Recorder:
         self._writer.join()
         if self._error:
             raise RecordingFailed(self._error)
-        return Outcome(self.session, self._segment.messages, self._size, dict(self._drops), dict(self._segment.missed))
+        tape = self._tape
+        return Outcome(tape.path, tape.messages, tape.bytes, dict(tape.drops), tape.missed)
 
     def _refuse_a_second(self) -> None:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
@@ -148,9 +170,6 @@ class Recorder:
                 message: Any = answer.message()
                 where = f"to {message.session}"
         raise AnotherRecorder(f"fleet {self._fleet!r} is being recorded already, {where}: one recorder is enough")
-
-    def _wall(self) -> datetime:
-        return datetime.fromtimestamp(self._now() / 1e9, UTC)
 
     def _ask(self, query: zenoh.Query) -> None:
         with self._lock:
@@ -211,78 +230,163 @@ class Recorder:
                 self._drain()
                 if time.monotonic() >= due:
                     due = max(due + PERIOD_S, time.monotonic())
-                    self._segment.flush()
-                    self._publish("recording")
+                    self._each_second()
                 self._answer()
             self._drain()
             if self._reader_error is not None:
                 self._fail(f"{type(self._reader_error).__name__}: {self._reader_error}")
                 return
-            self._segment.finish(dict(self._drops))
-            self._describe(closed=True)
+            if self._recording:
+                self._tape.close(self._now())
             self._publish("closed")
         except OSError as error:
-            self._fail(f"{error.filename or self._segment.path}: {error.strerror or error}")
+            self._fail(f"{error.filename or self._tape.path}: {error.strerror or error}")
         except Exception as error:  # noqa: BLE001 - a recorder that stops must never do so silently, whatever the cause
             self._fail(f"{type(error).__name__}: {error}")
         finally:
-            self._answer()
             self.ended.set()
+            self._answer()
 
     def _drain(self) -> None:
         with self._lock:
             batch, self._waiting = self._waiting, []
-        add = self._segment.add
-        size = 0
-        for item in batch:
-            add(*item)
-            size += len(item[1])
+        recalled = self._recall.taken()
+        if self._recording:
+            add = self._tape.add
+            for item in batch:
+                add(*item)
+            for sample in recalled:
+                self._tape.add_recalled(sample, self._now())
+            if self._tape.gaps:
+                # What found no room here would find none again.
+                self._recall.ask(self._tape.gaps.difference(self._drops))
+                self._tape.gaps.clear()
         # Only now: what is being written is still held.
         with self._lock:
             self._held_messages -= len(batch)
-            self._held_bytes -= size
+            self._held_bytes -= sum(len(item[1]) for item in batch)
+
+    def _each_second(self) -> None:
+        tape = self._tape
+        if self._recording:
+            tape.tick(self._now())
+            if tape.over:
+                self._begin()
+                tape.close(self._now())
+        self._say_once(tape)
+        self._publish()
+
+    def _begin(self) -> None:
+        """The next session; raises OSError if none can be made."""
+        self._tape = Tape(self._root, self._fleet, self._options, self._now())
+        self._drops = self._tape.drops
+        self._tell(f"recording fleet {self._fleet} to {self._tape.path}")
+
+    def _say_once(self, tape: Tape) -> None:
+        """Tell what is new of what should be known."""
+        for session in tape.removed:
+            self._tell(f"{session} was removed: the oldest that nobody marked, to keep the quota")
+        tape.removed.clear()
+        words = {"full": tape.full, "warning": "" if tape.full else tape.warning.partition(",")[0]}
+        now = {f"{kind}: {text}" for kind, text in words.items() if text}
+        for text in sorted(now - self._told):
+            self._tell(text)
+        if any(text.startswith("full") for text in self._told) and not tape.full and self._recording:
+            self._tell(f"there is room again: recording goes on to {tape.path}")
+        self._told = now
 
     def _fail(self, words: str) -> None:
-        self._error = f"recording to {self.session} failed: {words}. What was written until then is whole"
+        self._error = f"recording to {self._tape.path} failed: {words}. What was written until then is whole"
         self._limit_messages = 0
-        self._segment.abandon()
+        self._tape.abandon(self._error, self._now())
         # From the last status: asking the disk again may fail again.
-        self._last.state, self._last.error, self._last.messages = "failed", self._error, self._segment.messages
+        self._last.state, self._last.error, self._last.messages = "failed", self._error, self._tape.messages
         self._publisher.put(self._last, self._now())
-        with contextlib.suppress(OSError):  # the disk that failed; said already
-            self._describe(closed=False)
 
-    def _describe(self, *, closed: bool) -> None:
-        description = self._description
-        description.ended, description.closed = directory.iso(self._wall()), closed
-        description.messages, description.error = self._segment.messages, self._error
-        description.drops = dict(self._drops)
-        description.missed = dict(self._segment.missed)
-        description.write(self.session)
-
-    @property
-    def _size(self) -> int:
-        return self._segment.path.stat().st_size
-
-    def _status(self, state: str) -> fleet_v1_pb2.Recording:
+    def _status(self, state: str = "") -> fleet_v1_pb2.Recording:
+        tape = self._tape
         return fleet_v1_pb2.Recording(
-            session=str(self.session),
-            state=state,
-            bytes=self._size,
-            messages=self._segment.messages,
-            drops=dict(self._drops),
-            free_bytes=shutil.disk_usage(self.session).free,
-            error=self._error,
-            missed=self._segment.missed,
+            session=str(tape.path),
+            state=state or ("stopped" if not self._recording else "full" if tape.full else "recording"),
+            bytes=tape.bytes,
+            messages=tape.messages,
+            drops=dict(tape.drops),
+            free_bytes=room.free_bytes(tape.path),
+            error=self._error or tape.full,
+            missed=tape.missed,
+            recovered=tape.recovered,
+            segments=tape.segments,
+            warning=tape.warning,
         )
 
-    def _publish(self, state: str) -> None:
+    def _publish(self, state: str = "") -> None:
         self._last = self._status(state)
         self._publisher.put(self._last, self._now())
+
+    # ------------------------------------------------------------------ what is asked
 
     def _answer(self) -> None:
         with self._lock:
             questions, self._questions = self._questions, []
         for query in questions:
             with query:
-                reply_value(query, self._publisher.key, self._last.SerializeToString(), STATUS)
+                key = str(query.key_expr)
+                verb = key.rpartition("/")[2] if "/@cmd/" in key else "status"
+                try:
+                    self._do(verb, query)
+                except _Refused as refused:
+                    query.reply_err(str(refused), encoding="text/plain")
+                else:
+                    reply_value(query, key, self._last.SerializeToString(), STATUS)
+
+    def _do(self, verb: str, query: zenoh.Query) -> None:
+        if self.ended.is_set() and verb != "status":
+            raise _Refused("the recorder is ending")
+        match verb:
+            case "start":
+                self._start_again()
+            case "stop":
+                self._stop()
+            case "mark":
+                self._mark(query)
+            case "status":
+                pass
+            case _:
+                raise _Refused(f"{verb!r} is not known: allowed are {', '.join(VERBS)}")
+
+    def _start_again(self) -> None:
+        if self._recording:
+            raise _Refused(f"fleet {self._fleet!r} is being recorded already, to {self._tape.path}")
+        try:
+            self._begin()
+        except OSError as error:
+            raise _Refused(f"no session can be made in {self._root}: {error.strerror}") from None
+        self._recording = True
+        self._publish()
+
+    def _stop(self) -> None:
+        if not self._recording:
+            raise _Refused(f"nothing is being recorded; the last session is {self._tape.path}")
+        self._drain()
+        self._tape.close(self._now())
+        self._recording = False
+        self._tell(f"{self._tape.path} is closed, as was asked")
+        self._publish()
+
+    def _mark(self, query: zenoh.Query) -> None:
+        if not self._recording:
+            raise _Refused("nothing is being recorded: `fleet record start` begins a session")
+        try:
+            asked = json.loads(query.payload.to_bytes()) if query.payload is not None else {}
+            text, by = asked["text"], asked.get("by", "anonymous")
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise _Refused('a mark is JSON, as {"text": "the cat came", "by": "me"}') from None
+        if not (isinstance(text, str) and isinstance(by, str) and 0 < len(text) <= LONGEST_MARK >= len(by)):
+            raise _Refused(f"text must have 1 to {LONGEST_MARK} characters, and by at most so many")
+        now = self._now()
+        message: Any = messages.message_class("foxglove.Log")()
+        message.timestamp.seconds, message.timestamp.nanos = divmod(now, 1_000_000_000)
+        message.level, message.name, message.message = 2, by, text
+        self._marks.put(message, now)
+        with contextlib.suppress(OSError):  # no room for it now: it is told on the bus, and written at the end
+            self._tape.mark(text, by, now)

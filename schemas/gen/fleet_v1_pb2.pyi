@@ -587,7 +587,7 @@ class Decision(_message.Message):
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., subject: _Optional[str] = ..., decided: _Optional[str] = ..., why: _Optional[str] = ..., readings: _Optional[_Iterable[str]] = ..., would_change: _Optional[str] = ..., kind: _Optional[str] = ..., role: _Optional[str] = ...) -> None: ...
 
 class Recording(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "session", "state", "bytes", "messages", "drops", "free_bytes", "error", "missed")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "session", "state", "bytes", "messages", "drops", "free_bytes", "error", "missed", "recovered", "segments", "warning")
     class DropsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -596,6 +596,13 @@ class Recording(_message.Message):
         value: int
         def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
     class MissedEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+    class RecoveredEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
         VALUE_FIELD_NUMBER: _ClassVar[int]
@@ -614,6 +621,9 @@ class Recording(_message.Message):
     FREE_BYTES_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
     MISSED_FIELD_NUMBER: _ClassVar[int]
+    RECOVERED_FIELD_NUMBER: _ClassVar[int]
+    SEGMENTS_FIELD_NUMBER: _ClassVar[int]
+    WARNING_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -626,7 +636,10 @@ class Recording(_message.Message):
     free_bytes: int
     error: str
     missed: _containers.ScalarMap[str, int]
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., bytes: _Optional[int] = ..., messages: _Optional[int] = ..., drops: _Optional[_Mapping[str, int]] = ..., free_bytes: _Optional[int] = ..., error: _Optional[str] = ..., missed: _Optional[_Mapping[str, int]] = ...) -> None: ...
+    recovered: _containers.ScalarMap[str, int]
+    segments: int
+    warning: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., bytes: _Optional[int] = ..., messages: _Optional[int] = ..., drops: _Optional[_Mapping[str, int]] = ..., free_bytes: _Optional[int] = ..., error: _Optional[str] = ..., missed: _Optional[_Mapping[str, int]] = ..., recovered: _Optional[_Mapping[str, int]] = ..., segments: _Optional[int] = ..., warning: _Optional[str] = ...) -> None: ...
 
 class Supervised(_message.Message):
     __slots__ = ("name", "kind", "state", "pid", "restarts", "since_s", "words")

@@ -4,7 +4,6 @@ import tracemalloc
 from dataclasses import dataclass
 from pathlib import Path
 
-import zenoh
 from mcap.reader import make_reader
 
 from fleet.recording.salvage import LIMIT
@@ -38,6 +37,7 @@ class Original:
 def written(path: Path) -> Original:
     """Write one: five chunks of three keys, of which the last comes with the second chunk only."""
     segment = Segment(path, {"fleet": "fleet"})
+    channels: dict[str, int] = {}
     number = 0
     for chunk in range(CHUNKS):
         for _ in range(PER_CHUNK):
@@ -48,7 +48,10 @@ def written(path: Path) -> Original:
                 ("fleet/blue/note", None, "application/json"),
             )[number % (2 if chunk == 0 else 3)]
             data = payload.SerializeToString() if payload is not None else b'{"number": %d}' % number
-            segment.add(key, data, zenoh.Encoding(encoding), None, None, 1_790_000_000_000_000_000 + number)
+            if key not in channels:
+                channels[key] = segment.channel(key, encoding)
+            at_ns = 1_790_000_000_000_000_000 + number
+            segment.add(channels[key], at_ns, data, at_ns, 0)
         segment.flush()
     segment.finish({})
     with path.open("rb") as file:

@@ -116,21 +116,21 @@ def own_config(endpoint: str) -> zenoh.Config:
 def test_gaps_in_a_publishers_numbers_are_counted_and_a_restart_is_none(
     endpoint: str, bus: Bus, tmp_path: Path
 ) -> None:
-    with Bus.open(endpoint) as own:
+    key = "fleet/red/sensor/range"
+    with Bus.open(endpoint) as own, zenoh.open(own_config(endpoint)) as stranger:
         recorder = Recorder(own, "fleet", tmp_path)
         session = recorder.start()
-        first = publisher(bus, "red", "sensor/range")
-        for number in (1, 2, 5, 6, 0xFFFFFFFF):  # 3 and 4 are missing, then a wrap without a gap
-            if number == 0xFFFFFFFF:
-                first = publisher(bus, "red", "sensor/range")  # another publisher: its first number is no gap
-            first.sequence = number - 1
-            first.put(pb.Range(range_m=1.0), time.time_ns())
-        first.put(pb.Range(range_m=1.0), time.time_ns())  # 2^32: travels as 0
+        # Publishers that hold nothing: what they lost is lost. One skips two, another begins anywhere and wraps.
+        for numbers in ((0, 1, 4, 5), (0xFFFFFFFE, 0xFFFFFFFF, 0)):
+            with stranger.declare_publisher(key) as out:
+                wait_for(lambda out=out: out.matching_status.matching, "a subscriber")
+                for number in numbers:
+                    out.put(b"", source_info=zenoh.SourceInfo(out.id, number))
         outcome = recorder.close()
-    assert outcome.missed == {"fleet/red/sensor/range": 2}
+    assert outcome.missed == {key: 2}
     assert not outcome.drops
-    assert json.loads(metadata(session / "0001.mcap")["recording"]["missed"]) == {"fleet/red/sensor/range": 2}
-    assert json.loads((session / "session.json").read_text())["missed"] == {"fleet/red/sensor/range": 2}
+    assert json.loads(metadata(session / "0001.mcap")["recording"]["missed"]) == {key: 2}
+    assert json.loads((session / "session.json").read_text())["missed"] == {key: 2}
 
 
 @pytest.mark.parametrize("limits", [{"limit_messages": 20}, {"limit_bytes": 1000}])
@@ -159,9 +159,10 @@ def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
         outcome = recorder.close()
     held = Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))[out.key]
     dropped, missed = outcome.drops[out.key], outcome.missed.get(out.key, 0)
-    # What the queue refused shows as a gap in the numbers of what was written, except after the last one.
-    assert held + dropped == sent
-    assert missed <= dropped
+    # What the queue refused shows as a gap in the numbers of what was written, except after the last one; and some of
+    # it may have been had again.
+    assert held < sent <= held + dropped
+    assert missed <= sent - held
     assert json.loads(metadata(session / "0001.mcap")["recording"]["drops"]) == dict(outcome.drops)
 
 

@@ -205,7 +205,7 @@ def test_rrd_holds_what_the_recording_holds(original: Rows, session: Path, tmp_p
         if component.endswith(":message"):
             descriptor = messages.message_class(component.removesuffix(":message")).DESCRIPTOR
             found.setdefault(key, []).append((log, published, of_arrow(descriptor, value)))
-        elif component == "TextLog:text" and key.endswith("/event/log"):
+        elif component == "TextLog:text" and key.endswith(("/event/log", "/@recorder/mark")):
             texts.setdefault(key, []).append((log, published, value))
     assert {key: sorted(rows, key=lambda row: row[:2]) for key, rows in found.items()} == {
         key: rows for key, rows in original.items() if key != "fleet/red/event/log"
