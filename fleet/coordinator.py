@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import zenoh
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from fleet.client import Fleet
 from fleet.hearing import Hearing
@@ -74,6 +75,7 @@ class Coordinator:
     """Samples that found the queue full."""
     _memory: Memory = field(default_factory=Memory)
     _running: "dict[str, tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=dict)
+    _colouring: "list[tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=list)
     _told: dict[str, str] = field(default_factory=dict)
     _published: dict[tuple[str, str], tuple[Publisher, Any]] = field(default_factory=dict)
     """The last of each topic, and of each subject in it: what a query is answered with."""
@@ -128,10 +130,17 @@ class Coordinator:
             if future.done():
                 del self._running[car]
                 self._outcome(hearing, car, ask, future.result()[0], now)
+        for ask, future in [each for each in self._colouring if each[1].done()]:
+            self._colouring.remove((ask, future))
+            outcome = future.result()[0]
+            if not outcome.ok:
+                self.failed(f"{ask.car}: the colour of a rule: {outcome.reason or outcome.phase}: {outcome.words}")
         result = step(self.plan, hearing.picture(self._running), self._memory, now)
         before, self._memory = self._memory, result.memory
+        since_s = time.time() - now
+        for decision in (*result.changed, *result.reworded):
+            self._publish("decision", _message(decision, since_s + decision.since))
         for decision in result.changed:
-            self._publish("decision", _message(decision))
             self.decided(decision)
         if result.changed or before.phase.name != result.memory.phase.name:
             self._publish("assignment", _assignment(self.plan, result))
@@ -140,6 +149,8 @@ class Coordinator:
             future = pool.submit(self.client.ask, request, [ask.car])
             if ask.mode is not None:
                 self._running[ask.car] = (ask, future)
+            else:
+                self._colouring.append((ask, future))
 
     def _outcome(self, hearing: Hearing, car: str, ask: Ask, outcome: Outcome, now: float) -> None:
         assert ask.mode is not None
@@ -289,8 +300,9 @@ def _text(query: zenoh.Query) -> str:
     return str(given.text)
 
 
-def _message(decision: Decision) -> pb.Decision:
+def _message(decision: Decision, since_s: float) -> pb.Decision:
     return pb.Decision(
+        since=Timestamp(seconds=int(since_s), nanos=int(since_s % 1 * 1e9)),
         subject=decision.subject,
         decided=decision.decided,
         why=decision.why,

@@ -1,7 +1,8 @@
 """`fleet why` and `fleet plan check`: what the coordinator decided, and what a plan means before anything moves."""
 
 import json
-from datetime import timedelta
+import time
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import click
@@ -40,7 +41,10 @@ def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
 
 def _told(reading: Reading) -> str:
     decision = reading.value
-    lines = [f"{decision.subject}: {decision.decided}, since {timedelta(seconds=int(reading.age_s()))} at least"]
+    since_s = decision.since.seconds + decision.since.nanos / 1e9
+    at = datetime.fromtimestamp(since_s).astimezone().strftime("%H:%M:%S")
+    lasting = timedelta(seconds=max(0, int(time.time() - since_s)))
+    lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})"]
     lines.append(f"  because of {decision.why}")
     lines += [f"  with       {each}" for each in decision.readings]
     lines.append(f"  changes by {decision.would_change}")

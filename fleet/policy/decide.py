@@ -42,9 +42,11 @@ class Step:
 
     memory: Memory
     decisions: tuple[Decision, ...] = ()
-    """One for each car of the plan, each role that is or was not filled, and a phase that has just begun."""
+    """One for each car of the plan, each role, and the phase."""
     changed: tuple[Decision, ...] = ()
     """Those that are not what they were."""
+    reworded: tuple[Decision, ...] = ()
+    """Those that are, but whose reasons, or what would change them, are told otherwise now."""
     asks: tuple[Ask, ...] = ()
     roles: Mapping[str, str] = field(default_factory=dict)
 
@@ -65,11 +67,14 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     }
     free = tuple(car for car in subjects if car not in barriers)
     cars = Cars(subjects, frozenset(free), frozenset({*free, *lately}), has)
-    phase = memory.phase if memory.phase.name else replace(memory.phase, name=plan.first, since=now)
+    phase = memory.phase
+    if not phase.name:  # it begins before the rules are looked at: some count only in it
+        phase = follow_phase(plan, picture, cars, phase, {}, now)
     rules = follow_rules(plan, picture, cars, phase.name, memory.rules, now)
-    phase, turn = follow_phase(plan, picture, cars, phase, rules, now)
+    phase = follow_phase(plan, picture, cars, phase, rules, now)
     needs = follow_needs(plan, picture, subjects, memory.needs, now)
     rules_before = memory.rules
+    told = memory.said if phase.name == memory.phase.name else {}  # what would change a decision depends on the phase
     memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
     assert memory.began is not None
     if now - memory.began < HEARD_WITHIN_S and any(_unheard(picture.cars.get(car, NOBODY)) for car in subjects):
@@ -90,25 +95,27 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     )
     staffing = fill(staff)
     held = _held(staff, staffing, memory.held, barriers)
-    overrides = _overrides(plan, rules, subjects, staffing.roles, staff.pinned)
-    decisions = [explain.of_phase(turn, phase.since)] if turn is not None else []
+    overrides = _overrides(plan, picture, rules, subjects, staffing.roles, staff.pinned)
+    decisions = [explain.of_phase(plan, phase)] if phase.name else []
     for car in subjects:
         if car in barriers:
             decisions.append(explain.alone(car, barriers[car], reserved.get(car)))
         elif car in overrides:
             decisions.append(explain.ruled(car, overrides[car], staffing.roles.get(car)))
         elif car in held:
-            decisions.append(explain.in_role(car, held[car], staff, staffing, memory.said))
+            decisions.append(explain.in_role(car, held[car], staff, staffing, phase.name, told))
         else:
-            decisions.append(explain.idle(car, staff, staffing, memory.said))
+            decisions.append(explain.idle(car, staff, staffing))
     decisions = [_doubted(decision, picture) for decision in decisions]
-    decisions += _vacancies(staff, staffing, memory.said, barriers)
+    decisions += _places(staff, staffing, barriers, phase.name)
+    decisions = [each.after(memory.said.get(each.subject), now) for each in decisions]
     tried, asks = _asks(decisions, picture, memory.tried, now)
     asks += _leds(plan, rules, rules_before, staff, staffing)
     return Step(
         replace(memory, held=held, tried=tried, said={**memory.said, **{each.subject: each for each in decisions}}),
         tuple(decisions),
         tuple(each for each in decisions if explain.new(each, memory.said)),
+        tuple(each for each in decisions if explain.reworded(each, memory.said)),
         tuple(asks),
         staffing.roles,
     )
@@ -168,18 +175,22 @@ def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...
 
 def _overrides(
     plan: Plan,
+    picture: Picture,
     rules: Mapping[int, RuleState],
     subjects: tuple[str, ...],
     roles: Mapping[str, str],
     pinned: Mapping[str, tuple[str, str]],
 ) -> dict[str, Override]:
-    """The modes that rules in force give cars, whatever their roles say: of several rules the first counts."""
+    """The modes that rules in force give cars, whatever their roles say: of several rules the first counts.
+
+    A rule for several cars passes over those that do not know its mode: they would refuse it for ever.
+    """
     found: dict[str, Override] = {}
     said: set[str] = set()
     for _, rule, state, effect in _effects(plan, rules):
         if effect.mode is not None:
             for car in targets(effect, state, subjects, roles):
-                if car not in said:
+                if car not in said and not picture.cars.get(car, NOBODY).lacks(effect.mode):
                     said.add(car)
                     found[car] = Override(rule, state, effect)
         elif effect.role is not None:
@@ -204,24 +215,35 @@ def _held(
         if held is not None and held.role == name:
             found[car] = held
             continue
-        gone = lost[name].pop(0) if lost[name] else None
-        barrier = None
-        if gone is not None:
-            barrier = barriers.get(gone) or staff.barrier(gone, staff.plan.roles[name])
-        words = barrier.why if barrier is not None else f"{gone} is wanted elsewhere"
+        # A role for all that are left has a place for each: nobody has it in place of another.
+        gone = lost[name].pop(0) if lost[name] and staff.plan.roles[name].count is not None else None
+        words = "" if gone is None else _lost(gone, name, staff, staffing, barriers)
         found[car] = explain.came_by(car, name, staff, gone, words)
     return found
 
 
-def _vacancies(
-    staff: Staff, staffing: Staffing, said: Mapping[str, Decision], barriers: Mapping[str, Barrier]
-) -> list[Decision]:
+def _lost(car: str, name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> str:
+    """Why this car no longer has this role."""
+    role = staff.plan.roles[name]
+    barrier = barriers.get(car) or staff.barrier(car, role)
+    if barrier is not None:
+        return barrier.why
+    if car in staff.in_vain and staff.picture.cars.get(car, NOBODY).verdict == CONTRADICTED:
+        return f"{car} was asked for mode {role.mode} again and again, and is not in it"
+    other = staffing.roles.get(car)
+    return f"{car} has role {other} now" if other is not None else f"{car} fits it less"
+
+
+def _places(staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier], phase: str) -> list[Decision]:
     found = []
-    for name in staffing.places:
+    for name in staff.plan.roles:
+        if not staffing.places.get(name):
+            found.append(explain.out(name, staff, phase))
+            continue
         least = 1 if staff.plan.roles[name].count is None else staffing.places[name]
         if len(staffing.holders(name)) < min(least, staffing.places[name]):
             found.append(explain.vacancy(name, staff, staffing, barriers))
-        elif f"role {name}" in said:
+        else:
             found.append(explain.filled(name, staffing))
     return found
 

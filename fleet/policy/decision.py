@@ -1,6 +1,6 @@
 """A decision as a value: of whom, what, why, and what would change it. Its words are explain.py's. Pure."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
@@ -19,6 +19,8 @@ class Kind(StrEnum):
     VACANT = "vacant"
     FILLED = "filled"
     PHASE = "phase"
+    OUT = "out"
+    """A role that nobody is to have now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,3 +41,13 @@ class Decision:
     role: str | None = None
     mode: Mode | None = None
     """The mode the car should be in; None: it is left alone."""
+    since: float = 0.0
+    """When it was decided, s on the step's clock: the same as long as the cause is."""
+
+    def after(self, before: "Decision | None", now: float) -> "Decision":
+        """This, or `before` if it said the same: its readings are those that were used then."""
+        if before is None or before.cause != self.cause:
+            return replace(self, since=now)
+        if (before.decided, before.why, before.would_change) == (self.decided, self.why, self.would_change):
+            return before
+        return replace(self, since=before.since)

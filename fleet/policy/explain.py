@@ -4,14 +4,14 @@ Each kind of decision stands in tests/vectors/decisions.tsv with the words expec
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from fleet.policy.decision import LEFT_ALONE, Decision, Kind
 from fleet.policy.memory import Held
 from fleet.policy.picture import NOBODY
-from fleet.policy.plan import Effect, Plan, Rule
-from fleet.policy.rules import RuleState, Turn
+from fleet.policy.plan import ALL, OTHERS, THAT, Effect, Of, Plan, Role, Rule
+from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.staffing import Barrier, Staff, Staffing
 from fleet.policy.steady import HYSTERESIS_S
 
@@ -28,10 +28,27 @@ class Override:
     effect: Effect
 
 
-def of_phase(turn: Turn, since: float) -> Decision:
-    """A phase has begun."""
+def of_phase(plan: Plan, state: PhaseState) -> Decision:
+    """The phase, and what ends it."""
+    phase, ends = plan.phases[state.name], list[str]()
+    if phase.until is not None:
+        ends.append(f"{phase.until.text}: then {phase.next}")
+    if phase.timeout_s is not None:
+        ends.append(f"{phase.timeout_s:g} s of it being over: then {phase.on_timeout}")
+    ends += [
+        f"{rule.name}: {rule.when.text}: then {effect.phase}"
+        for rule in plan.rules
+        for effect in rule.effects
+        if effect.phase not in (None, state.name) and (rule.during is None or state.name in rule.during)
+    ]
     return Decision(
-        "phase", Kind.PHASE, turn.after, f"{turn.after} since {since}", turn.why, turn.used, f"the end of {turn.after}"
+        "phase",
+        Kind.PHASE,
+        state.name,
+        f"{state.name} since {state.since}",
+        state.why,
+        state.used,
+        "; or ".join(ends) or "another plan: nothing ends it",
     )
 
 
@@ -49,6 +66,9 @@ def ruled(car: str, override: Override, role: str | None) -> Decision:
         if rule.until is not None
         else f"that no longer being so for {HYSTERESIS_S:g} s, or not known for 5 s"
     )
+    if rule.during is not None:
+        end += f"; or the end of phase {' or '.join(sorted(rule.during))}"
+    end += "; or a person's stop or drive"
     why = f"{rule.name}: {rule.when.text}"
     if override.state.that is not None and override.state.that != rule.when.car:
         why += f" (it is so of {override.state.that})"
@@ -60,23 +80,23 @@ def ruled(car: str, override: Override, role: str | None) -> Decision:
 
 def new(decision: Decision, said: Mapping[str, Decision]) -> bool:
     """Whether something else decides than before."""
-    return _same(said, decision.subject, decision.cause) is None
+    before = said.get(decision.subject)
+    return before is None or before.cause != decision.cause
 
 
-def _same(said: Mapping[str, Decision], subject: str, cause: str) -> Decision | None:
-    """What was decided already: nobody is told again, so it needs no new words."""
-    before = said.get(subject)
-    return before if before is not None and before.cause == cause else None
+def reworded(decision: Decision, said: Mapping[str, Decision]) -> bool:
+    """Whether the same decides as before, and there is something else to say of it."""
+    return not new(decision, said) and decision is not said[decision.subject]
 
 
-def in_role(car: str, held: Held, staff: Staff, staffing: Staffing, said: Mapping[str, Decision]) -> Decision:
-    """A role gives the car its mode."""
+def in_role(
+    car: str, held: Held, staff: Staff, staffing: Staffing, phase: str, told: Mapping[str, Decision]
+) -> Decision:
+    """A role gives the car its mode; `told`: what was decided in this phase, which needs no new words."""
     plan, name = staff.plan, held.role
     role = plan.roles[name]
     pinned = staff.pinned.get(car)
     cause = f"role {name}, {pinned[1]}" if pinned is not None else f"role {name}"
-    if (same := _same(said, car, cause)) is not None:
-        return same
     why = f"role {name} ({len(staffing.holders(name))} of {staffing.places[name]})"
     if pinned is not None:
         why += f", as {pinned[1]} wants"
@@ -84,8 +104,13 @@ def in_role(car: str, held: Held, staff: Staff, staffing: Staffing, said: Mappin
         why += f", which stands in for {staffing.stands_in[name]}"
     if held.why:
         why += f": {held.why}"
+    before = told.get(car)
+    if before is not None and (before.cause, before.why) == (cause, why):
+        return before
     changes = [f"{role.needs_text} no longer being so"] if role.needs is not None else []
-    changes += [f"the end of {pinned[1]}"] if pinned is not None else _rules_for(car, plan)
+    changes += [f"the end of {pinned[1]}"] if pinned is not None else _rules_for(car, role, plan, phase)
+    if any(each.roles is not None and name not in each.roles for each in plan.phases.values()):
+        changes.append(f"the end of phase {phase}")
     changes.append("a person's stop or drive")
     return Decision(
         car,
@@ -101,16 +126,34 @@ def in_role(car: str, held: Held, staff: Staff, staffing: Staffing, said: Mappin
     )
 
 
-def _rules_for(car: str, plan: Plan) -> list[str]:
+def _rules_for(car: str, role: Role, plan: Plan, phase: str) -> list[str]:
+    """The rules that could give the car something else than this role."""
     told = [
         f"{rule.name}: {rule.when.text}"
         for rule in plan.rules
-        if any(effect.who and (effect.who == car or not plan.is_car(effect.who)) for effect in rule.effects)
+        if (rule.during is None or phase in rule.during)
+        and any(_could(effect, rule, car, role, plan) for effect in rule.effects)
     ]
     return told[:_NAMED]
 
 
-def idle(car: str, staff: Staff, staffing: Staffing, said: Mapping[str, Decision]) -> Decision:
+def _could(effect: Effect, rule: Rule, car: str, role: Role, plan: Plan) -> bool:
+    if effect.role is not None:
+        if effect.role == role.name or not plan.may(car, plan.roles[effect.role]):
+            return False
+    elif effect.mode in (None, role.mode):
+        return False
+    of = rule.when.car if rule.when.of is Of.CAR else None
+    match effect.who:
+        case who if who == THAT:
+            return of in (None, car) and rule.when.role in (None, role.name)
+        case who if who == OTHERS:
+            return of != car
+        case who:
+            return who in (ALL, car, role.name)
+
+
+def idle(car: str, staff: Staff, staffing: Staffing) -> Decision:
     """A car that no role is left for."""
     plan = staff.plan
     whys: list[str] = []
@@ -136,8 +179,6 @@ def idle(car: str, staff: Staff, staffing: Staffing, said: Mapping[str, Decision
             whys.append(f"{name}: {words}")
             changes.append(change)
     cause = "idle: " + "; ".join(kinds)
-    if (same := _same(said, car, cause)) is not None:
-        return same
     mode = plan.idle
     return Decision(
         car,
@@ -154,17 +195,11 @@ def idle(car: str, staff: Staff, staffing: Staffing, said: Mapping[str, Decision
 
 def repaired(decision: Decision, evidence: str) -> Decision:
     """The same, of a car that does not do what it was asked for."""
-    return Decision(
-        decision.subject,
-        decision.kind,
-        decision.decided,
-        f"{decision.cause}, contradicted",
-        f"{decision.why}; but the car is not in {decision.mode} ({evidence}): it is asked for again",
-        decision.readings,
-        "a reading with the shape of that mode",
-        decision.car,
-        decision.role,
-        decision.mode,
+    return replace(
+        decision,
+        cause=f"{decision.cause}, contradicted",
+        why=f"{decision.why}; but the car is not in {decision.mode} ({evidence}): it is asked for again",
+        would_change="a reading with the shape of that mode",
     )
 
 
@@ -204,7 +239,7 @@ def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
 
 
 def filled(name: str, staffing: Staffing) -> Decision:
-    """A role that lacked a car has what it wants."""
+    """A role that has the cars it wants."""
     holders = staffing.holders(name)
     return Decision(
         f"role {name}",
@@ -215,6 +250,15 @@ def filled(name: str, staffing: Staffing) -> Decision:
         would_change="one of them dropping out",
         role=name,
     )
+
+
+def out(name: str, staff: Staff, phase: str) -> Decision:
+    """A role that no car is to have now."""
+    if name not in staff.in_force:
+        why, change = f"it does not count in phase {phase}", f"the end of phase {phase}"
+    else:
+        why, change = "no rule gives it to a car now, nor does it stand in for another", "such a rule coming true"
+    return Decision(f"role {name}", Kind.OUT, "not wanted", f"out: {why}", why, would_change=change, role=name)
 
 
 def came_by(car: str, name: str, staff: Staff, before: str | None, lost: str) -> Held:

@@ -15,6 +15,9 @@ TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Why a car has a role that it had before."""
 
 
+IN_PHASE: Final = "it was so before the coordinator was started again"
+
+
 @dataclass(frozen=True, slots=True)
 class Tried:
     """How often a car was asked for one mode, and when it may be asked again."""
@@ -108,7 +111,8 @@ def restored(plan: Plan, picture: Picture, kept: Kept, now: float, wall_s: float
         if index < len(plan.rules)
     }
     age_s = max(0.0, wall_s - kept.phase_since_s)
-    return Memory(held=held, rules=rules, phase=PhaseState(kept.phase, now - age_s) if kept.phase else PhaseState())
+    phase = PhaseState(kept.phase, now - age_s, why=IN_PHASE) if kept.phase else PhaseState()
+    return Memory(held=held, rules=rules, phase=phase)
 
 
 def to_keep(plan: Plan, memory: Memory, now: float, wall_s: float) -> Kept:

@@ -103,6 +103,11 @@ class CarPicture:
         """What its platform can do; None if that is not known."""
         return _profile(self.platform)
 
+    def lacks(self, mode: str) -> bool:
+        """Whether it is known not to do this mode, by its platform or by the fleet file."""
+        profile = self.profile
+        return (profile is not None and mode not in profile.modes) or (self.listed and mode not in self.capabilities)
+
 
 @cache
 def _profile(platform: str) -> Profile | None:

@@ -36,6 +36,9 @@ class PhaseState:
     name: str = ""
     since: float = 0.0
     until: Mapping[str, Steady] = field(default_factory=dict)
+    why: str = ""
+    """What began it."""
+    used: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,23 +146,13 @@ def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: 
             yield from (car for car in subjects if roles.get(car) == who)
 
 
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """A phase that has ended, and why."""
-
-    before: str
-    after: str
-    why: str
-    used: tuple[str, ...] = ()
-
-
 def follow_phase(
     plan: Plan, picture: Picture, cars: Cars, before: PhaseState, rules: Mapping[int, RuleState], now: float
-) -> tuple[PhaseState, Turn | None]:
+) -> PhaseState:
     """The phase now; none is shorter than HYSTERESIS_S, so that two do not alternate."""
     phase = plan.phases.get(before.name)
     if phase is None:
-        return PhaseState(plan.first, now), None
+        return PhaseState(plan.first, now, why="the plan begins with it" if plan.first else "")
     lasted_s = now - before.since
     for index, state in rules.items():
         rule = plan.rules[index]
@@ -169,23 +162,18 @@ def follow_phase(
                 if lasted_s < HYSTERESIS_S:
                     continue
                 assert effect.phase is not None
-                return PhaseState(effect.phase, now), Turn(
-                    phase.name, effect.phase, f"{rule.name}: {rule.when.text}", state.used
-                )
+                return PhaseState(effect.phase, now, why=f"{rule.name}: {rule.when.text}", used=state.used)
     return _by_itself(phase, picture, cars, before, lasted_s, now)
 
 
 def _by_itself(
     phase: Phase, picture: Picture, cars: Cars, before: PhaseState, lasted_s: float, now: float
-) -> tuple[PhaseState, Turn | None]:
+) -> PhaseState:
     until = _NONE if phase.until is None else _follow(phase.until, picture, cars, before.until, now)
     true = [car for car, steady in until.items() if steady.on]
     if phase.until is not None and phase.next is not None and true and lasted_s >= HYSTERESIS_S:
         used = _used(phase.until, picture, cars, true[0] or None, now)
-        return PhaseState(phase.next, now), Turn(
-            phase.name, phase.next, f"{phase.name} ends with {phase.until.text}", used
-        )
+        return PhaseState(phase.next, now, why=f"{phase.name} ends with {phase.until.text}", used=used)
     if phase.timeout_s is not None and phase.on_timeout is not None and lasted_s >= phase.timeout_s:
-        why = f"{phase.name} lasts at most {phase.timeout_s:g} s"
-        return PhaseState(phase.on_timeout, now), Turn(phase.name, phase.on_timeout, why)
-    return PhaseState(phase.name, before.since, until), None
+        return PhaseState(phase.on_timeout, now, why=f"{phase.name} lasts at most {phase.timeout_s:g} s")
+    return replace(before, until=until)

@@ -1,5 +1,6 @@
 """`fleet coordinate` as a process, with real gateways: a plan is kept, and never against a hold."""
 
+import re
 import signal
 import threading
 from collections.abc import Iterator
@@ -150,12 +151,13 @@ def test_plan_assignment_and_decisions_can_be_asked_for(cars: Cars, tmp_path: Pa
     Lines(process).until("red", "manual", "role manual")
 
     def known() -> dict[str, Any]:
-        return {message.DESCRIPTOR.name: message for message in cars.get("fleet/@coordinator/*")}
+        return {getattr(each, "subject", each.DESCRIPTOR.name): each for each in cars.get("fleet/@coordinator/*")}
 
-    wait_for(lambda: len(known()) == 3, "all three answer")
+    wait_for(lambda: len(known()) == 4, "all four answer")
     found = known()
     assert found["Plan"].text == "cars: {red: manual}"
-    assert found["Decision"].subject == "red"
+    assert found["red"].decided == "manual"
+    assert found["role manual"].decided == "1 of 1"
     assert [role.name for role in found["Assignment"].roles] == ["manual"]
 
 
@@ -176,6 +178,10 @@ def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_a
     told = why.line()
     assert (told["decided"], told["kind"], told["role"]) == ("tracking", "role", "scout")
     assert why.wait() == 0
+    assert told["since"] <= told["stamp"]
+    said = cars.start("-m", "fleet.cli", "why", "red")
+    assert said.wait() == 0
+    assert re.match(r"red: tracking, for 0:0\d:\d\d \(since \d\d:\d\d:\d\d\)", said.lines()[0]), said.stderr
     nobody = cars.start("-m", "fleet.cli", "why", "purple")
     assert nobody.wait() == 1
     assert "nothing was decided of purple; there are decisions of blue, green, red" in nobody.stderr

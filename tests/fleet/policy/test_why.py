@@ -108,7 +108,59 @@ def _phase(case: str) -> Run:
         run.readings["red"] = {"sensor/light": Seen({"left": True}, 9.5)}
     elif case == "phase by rule":
         run.readings["red"] = {"state/motion": Seen({"fan": True}, 9.5)}
-    run.at(30.0 if case == "phase by time-out" else 10.0)
+    if case != "phase at the start":
+        run.at(30.0 if case == "phase by time-out" else 10.0)
+    return run
+
+
+LATE = parse("""
+roles: {late: {mode: tracking}}
+phases: {look: {timeout_s: 9, next: rest}, rest: {roles: []}}
+""")
+PAIR = parse("roles: {pair: {mode: tracking, count: 2}}")
+PASSED_OVER = parse("""
+roles: {lead: {mode: tracking, cars: [red]}}
+rules: [{when: {car: red, is: light.left}, then: {who: others, mode: color_led}}]
+""")
+
+
+def _out(case: str) -> Run:
+    run = Run(LATE if case == "phase without a role" else STAND_IN, "blue", "red")
+    for car in ("blue", "red"):
+        run.change(car, held_by="ann")
+    run.at(0.0)
+    assert any(each.kind == Kind.VACANT for each in run.last.changed)
+    run.change("red", held_by=None)
+    run.at(10.0)
+    return run
+
+
+def _pair(case: str) -> Run:
+    run = Run(PAIR, "red")
+    run.at(0.0)
+    if case == "two of two":
+        run.cars["blue"] = HERE
+        run.at(10.0)
+        assert run.of("red") in run.last.reworded
+        assert run.of("red").since == 0.0, "it is told since when, not when it was said"
+    return run
+
+
+def _in_vain() -> Run:
+    run = Run(parse("roles: {one: {mode: tracking}}"), "green", "red", obey=False)
+    run.change("green", mode="tracking", verdict="contradicted", evidence="silent for 3.1 s")
+    run.change("red", held_by="ann")
+    run.until(5.0)
+    run.change("red", held_by=None)
+    run.at(10.0)
+    return run
+
+
+def _passed_over() -> Run:
+    run = Run(PASSED_OVER, "red", "pi")
+    run.change("pi", platform="raspberry_pi")
+    run.readings["red"] = {"sensor/light": Seen({"left": True}, 0.0)}
+    run.at(0.0)
     return run
 
 
@@ -118,8 +170,16 @@ TABLE = rows("decisions")
 @pytest.mark.parametrize("row", TABLE, ids=lambda row: f"{row['case']}, {row['subject']}")
 def test_a_decision_is_explained(row: dict[str, str]) -> None:
     case, subject = row["case"], row["subject"]
-    if case.startswith("phase"):
+    if case.startswith("phase ") and case != "phase without a role":
         run = _phase(case)
+    elif case in ("phase without a role", "on call no more"):
+        run = _out(case)
+    elif case.endswith("of two"):
+        run = _pair(case)
+    elif case == "does not do it":
+        run = _in_vain()
+    elif case == "rule passes over":
+        run = _passed_over()
     elif case == "stands in" or subject == "role first":
         run = _stand_in()
     else:
@@ -128,7 +188,7 @@ def test_a_decision_is_explained(row: dict[str, str]) -> None:
     assert (found.kind, found.decided, found.why) == (row["kind"], row["decided"], row["why"])
     assert "; ".join(found.readings) == row["with"]
     assert found.would_change == row["changes_by"]
-    assert found in run.last.changed
+    assert found in (*run.last.changed, *run.last.reworded)
 
 
 def test_the_table_has_every_kind() -> None:
