@@ -42,6 +42,7 @@ COMMANDS: Final = {
     "bind": ("fleet.commands.bind:bind", "Find out which car is at which link: each blinks, you say which it was."),
     "schema": ("fleet.commands.config:print_schema", "Print the JSON Schema of fleet files, for editors."),
     "record": ("fleet.recording.command:record", "Record everything of the fleet to MCAP, until Ctrl-C."),
+    "mark": ("fleet.recording.asking:mark", "Write a mark into what is being recorded."),
     "sessions": ("fleet.recording.sessions.command:sessions", "List, verify, recover, cut and export recordings."),
     "replay": ("fleet.replay.command:replay", "Open a recorded session in Rerun."),
     "view": ("fleet.replay.view:view", "See the fleet live in Rerun."),

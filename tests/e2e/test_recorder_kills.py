@@ -1,0 +1,31 @@
+"""A hub and a recorder that are killed under load: what is lost, what is there twice, what is said of it.
+
+`make soak` does the same twenty and fifty times, with more cars.
+"""
+
+import random
+from pathlib import Path
+
+import pytest
+
+from tests.support.lossless import hub_killed, recorder_killed
+from tests.support.ports import free_endpoint
+from tests.support.processes import Fleet
+
+
+@pytest.mark.timeout(240)
+def test_of_a_hub_that_is_killed_nothing_is_lost_and_nothing_comes_twice(tmp_path: Path) -> None:
+    fleet = Fleet(free_endpoint(), tmp_path)
+    try:
+        hub_killed(fleet, tmp_path / "sessions", cars=10, times=3, chance=random.Random(6))
+    finally:
+        fleet.close()
+
+
+@pytest.mark.timeout(240)
+def test_of_a_recorder_that_is_killed_the_last_second_is_missing_and_the_next_one_has_it(tmp_path: Path) -> None:
+    fleet = Fleet(free_endpoint(), tmp_path)
+    try:
+        recorder_killed(fleet, tmp_path / "sessions", cars=10, times=5, chance=random.Random(7))
+    finally:
+        fleet.close()

@@ -1,0 +1,103 @@
+"""What a recording must hold whoever is killed meanwhile, at random moments and under load."""
+
+import random
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from fleet.recording.session import Session
+from fleet.recording.sessions.making import recover
+from fleet.recording.sessions.verify import verify
+from tests.support.processes import Fleet, wait_for
+from tests.support.recording import Load, Recording, faults, kill_hub, numbers
+
+SECOND_S = 1.0
+SLACK_S = 0.75
+"""What a flush that is due may be late on a machine that is busy with other tests."""
+GATHER_S = 0.25
+"""How long messages are under way until they have a log time, on such a machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """Figures of one run."""
+
+    published: int
+    recovered: int
+    """Missed at first and had again."""
+    missing_s: tuple[float, ...] = ()
+    """Of each session that was cut off: how long before the kill it ends."""
+
+
+def hub_killed(fleet: Fleet, out: Path, *, cars: int, times: int, chance: random.Random) -> Told:
+    """Kill the hub so often: nothing is lost, nothing is there twice, and nothing is said to be."""
+    recording = Recording(fleet, out)
+    with Load(fleet.endpoint, cars) as load:
+        wait_for(lambda: load.count() > 4 * cars, "a load")
+        for _ in range(times):
+            kill_hub(fleet, chance)
+        running = {key: len(sent) for key, sent in load.sent.items()}
+        wait_for(lambda: all(len(load.sent[key]) > count for key, count in running.items()), "all are publishing")
+        fleet_back(fleet, cars)
+        load.rest()
+        last = recording.end()
+    assert faults(load, [recording.session]) == ({}, {})
+    assert (last["drops"], last["missed"]) == ({}, {})
+    verdict = verify(Session.open(recording.session))
+    assert verdict.whole, list(verdict.words())
+    description = Session.open(recording.session).description
+    assert description is not None
+    assert description.recovered, "there was nothing to have again: the test tries nothing"
+    return Told(load.count(), sum(description.recovered.values()))
+
+
+def fleet_back(fleet: Fleet, cars: int) -> None:
+    """Wait until every publisher is back at the hub: who answers holds what the recorder still asks for."""
+    wait_for(lambda: len({str(s.key_expr) for s in fleet.bus.recall("fleet/*/sensor/line", 1.0)}) == cars, "all back")
+    time.sleep(2 * SECOND_S)  # the recorder asks for the last time some seconds after a hub is back
+
+
+def recorder_killed(fleet: Fleet, out: Path, *, cars: int, times: int, chance: random.Random) -> Told:
+    """Kill the recorder so often, each time starting the next.
+
+    Each session ends a second before its kill at most, and says so; the next one has what it lacks.
+    """
+    recording = Recording(fleet, out)
+    sessions, killed_ns = [recording.session], []
+    with Load(fleet.endpoint, cars) as load:
+        wait_for(lambda: load.count() > 4 * cars, "a load")
+        for _ in range(times):
+            time.sleep(SECOND_S + 2 * chance.random())
+            killed_ns.append(recording.process.kill())
+            recording.process.wait()
+            recording = Recording(fleet, out)
+            sessions.append(recording.session)
+        fleet_back(fleet, cars)
+        load.rest()
+        last = recording.end()
+    assert (last["drops"], last["missed"]) == ({}, {})
+    missing_s = []
+    for number, (path, at_ns) in enumerate(zip(sessions, killed_ns, strict=False)):
+        session = Session.open(path)
+        verdict = verify(session)
+        words = list(verdict.words())
+        assert not verdict.whole
+        assert "it was killed" in verdict.ended, words
+        assert (verdict.missing, verdict.twice, verdict.missed, verdict.dropped) == ([], [], {}, {}), words
+        ends_s = (at_ns - verdict.last_ns) / 1e9
+        missing_s.append(ends_s)
+        assert ends_s < SECOND_S + SLACK_S
+        # Everything until then is here, as verify says: from what this session or the ones before it have.
+        have = numbers(sessions[: number + 1])
+        for key, sent in load.sent.items():
+            must = {each for each, sent_ns in enumerate(sent, 1) if sent_ns < verdict.last_ns - GATHER_S * 1e9}
+            assert must <= set(have.get(key, ())), (key, path)
+        recovered = path.with_name(path.name + "-recovered")
+        rescued, _ = recover(session, recovered)
+        assert rescued == verdict.messages
+        assert not verify(Session.open(recovered)).damage
+        following = Session.open(sessions[number + 1]).description
+        assert following is not None
+        assert following.continues == path.name
+    assert faults(load, sessions) == ({}, {})
+    return Told(load.count(), 0, tuple(missing_s))
