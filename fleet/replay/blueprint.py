@@ -7,22 +7,21 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from rerun.blueprint.components import LinkAxis
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from fleet.replay import colours, mapping
 from fleet.replay.colours import Rgb, colour
 from fleet.replay.drawing import Drawing
+from fleet.replay.ends import PUBLISHED
 from fleet.replay.lenses import component
 from fleet.replay.mapping import Contents, Curve, Lane, Panel
 from schemas import keys
 from schemas.topics import TOPICS
 
-TIMELINE: Final = "message_publish_time"
-"""When a message was published, by its publisher's clock; the recorder's own is `message_log_time`."""
-
 _THRESHOLDS: Final[Mapping[mapping.How, Rgb]] = {mapping.How.LOW: (224, 160, 48), mapping.How.CRITICAL: (217, 83, 79)}
 _LEAST_HEIGHT_M: Final = 1.5
+_WIDE: Final = 1.5
+"""The world's view is so many times as wide as it is high, at least."""
 _LEDS: Final = frozenset({mapping.LED_ASKED.name, mapping.LED_TRUE.name})
 
 _View = rrb.View | rrb.Container
@@ -30,16 +29,19 @@ _Shown = dict[Any, list[Any]]
 """Visualizers by entity; Any, because Rerun's mapping is invariant in a union of its own."""
 
 
-def layout(drawing: Drawing, tab: str = "") -> rrb.Blueprint:
-    """The layout of what a drawing has seen; `tab`: the car whose tab is in front, none: the fleet's."""
+def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.Blueprint:
+    """The layout of what a drawing has seen; `tab`: the car whose tab is in front, none: the fleet's.
+
+    `last_s`: of curves and lanes the last seconds before the cursor are in view; None: the whole time.
+    """
     session = drawing.contents()
-    shown = _Layout(session, colours.leds(drawing.leds), drawing.lanes)
+    shown = _Layout(session, colours.leds(drawing.leds), drawing.lanes, _axis(drawing.span_ns, last_s))
     tabs = [shown.fleet_tab(drawing.ground()), *(shown.car_tab(car) for car in session.cars)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=1 + list(session.cars).index(tab) if tab else 0),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        rrb.TimePanel(state="collapsed", timeline=PUBLISHED),
         auto_views=False,
         auto_layout=False,
     )
@@ -48,10 +50,13 @@ def layout(drawing: Drawing, tab: str = "") -> rrb.Blueprint:
 class _Layout:
     """The tabs of one session."""
 
-    def __init__(self, session: Contents, leds: Mapping[str, int], drawn: AbstractSet[tuple[str, str]]) -> None:
+    def __init__(
+        self, session: Contents, leds: Mapping[str, int], drawn: AbstractSet[tuple[str, str]], axis: rrb.TimeAxis
+    ) -> None:
         self._session = session
         self._leds = leds
         self._drawn = drawn
+        self._axis = axis
 
     def fleet_tab(self, ground: tuple[tuple[float, float], tuple[float, float]] | None) -> _View:
         """The fleet at a glance, and beside it its services."""
@@ -74,9 +79,9 @@ class _Layout:
                 if curve.topic in topics
             }
             if shown:
-                right.append(_curves(name, shown))
+                right.append(self._curves(name, shown))
         # The lanes of every car need room; the curves share a view.
-        shares = [2 if isinstance(view, rrb.Tabs) else 1 for view in right]
+        shares = [3 if isinstance(view, rrb.Tabs) else 1 for view in right]
         columns = [
             rrb.Vertical(*column, row_shares=parts)
             for column, parts in ((left, [1] * len(left)), (right, shares))
@@ -87,9 +92,19 @@ class _Layout:
 
     def car_tab(self, car: str) -> _View:
         """One car: what matters most, and beside it the rest."""
-        main = [view for panel in mapping.MAIN_PANELS if (view := self._panel(car, panel))]
+        lanes, others = self._column(car, lanes=True), self._column(car, lanes=False)
         more = [view for panel in mapping.MORE_PANELS if (view := self._panel(car, panel))]
-        return _two_pages(car, rrb.Grid(*main, grid_columns=2, name="Car"), more, "More")
+        columns = [column for column in (lanes, others) if column is not None]
+        return _two_pages(car, rrb.Horizontal(*columns, name="Car"), more, "More")
+
+    def _column(self, car: str, *, lanes: bool) -> rrb.Vertical | None:
+        """Half of a car's first page: what is lanes, each panel as high as it has some, or what is none."""
+        panels = [panel for panel in mapping.MAIN_PANELS if bool(panel.lanes) == lanes]
+        shown = [(view, 1 + self._lane_count(car, panel)) for panel in panels if (view := self._panel(car, panel))]
+        return rrb.Vertical(*(view for view, _ in shown), row_shares=[share for _, share in shown]) if shown else None
+
+    def _lane_count(self, car: str, panel: Panel) -> int:
+        return sum(self._has_lane(car, lane) for lane in panel.lanes)
 
     def _entity(self, car: str, topic: str) -> str:
         """The entity of a topic: a service's has its own name in front, and no car."""
@@ -118,7 +133,7 @@ class _Layout:
             for lane in lanes:
                 if self._has_lane(car, lane):
                     shown.setdefault(self._entity(car, lane.topic), []).append(self._lane(lane, car))
-        return _lanes(name, shown) if shown else None
+        return self._lanes(name, shown) if shown else None
 
     def _panel(self, car: str, panel: Panel) -> rrb.View | None:
         """One view of a car; of a service with an empty name."""
@@ -137,7 +152,7 @@ class _Layout:
                 shown.setdefault(self._entity(car, lane.topic), []).append(self._lane(lane, car))
         if not shown:
             return None
-        return _lanes(panel.name, shown) if panel.lanes else _curves(panel.name, shown)
+        return self._lanes(panel.name, shown) if panel.lanes else self._curves(panel.name, shown)
 
     def _lane(self, lane: Lane, car: str) -> rrb.Visualizer:
         tints = self._leds if lane.name in _LEDS else colours.MARKS if lane == mapping.MARKS else colours.STATES
@@ -147,6 +162,19 @@ class _Layout:
         )
         return style.visualizer(mappings=[source])
 
+    def _curves(self, name: str, shown: _Shown) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            origin="/",
+            contents=list(shown),
+            name=name,
+            overrides=shown,
+            plot_legend=rrb.PlotLegend(visible=True),
+            axis_x=self._axis,
+        )
+
+    def _lanes(self, name: str, shown: _Shown) -> rrb.StateTimelineView:
+        return rrb.StateTimelineView(origin="/", contents=list(shown), name=name, overrides=shown, time_view=self._axis)
+
     def _world(self, low: tuple[float, float], high: tuple[float, float]) -> rrb.Spatial3DView:
         session = self._session
         contents = [
@@ -154,13 +182,24 @@ class _Layout:
         ]
         if mapping.WORLD in session.services:
             contents.append(f"{self._entity('', mapping.WORLD)}/**")
-        (x, y), size = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2), max(high[0] - low[0], high[1] - low[1])
+        x, y = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
+        size = max(high[1] - low[1], (high[0] - low[0]) / _WIDE)
         # Not straight down: Rerun's eye has no sides when it looks along its own up.
         eye = rrb.EyeControls3D(
-            position=(x, y - 0.01, max(_LEAST_HEIGHT_M, 1.1 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
+            position=(x, y - 0.01, max(_LEAST_HEIGHT_M, 1.2 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
         )
         name = "World, from above (simulated cars)"
         return rrb.Spatial3DView(origin="/", contents=contents, name=name, eye_controls=eye)
+
+
+def _axis(span_ns: tuple[int, int] | None, last_s: float | None) -> rrb.TimeAxis:
+    """The time in view; not linked with other views, since linked ones ignore it and show a minute."""
+    at = rr.TimeRangeBoundary
+    if last_s is not None:
+        return rrb.TimeAxis(view_range=rr.TimeRange(at.cursor_relative(seconds=-last_s), at.cursor_relative()))
+    if span_ns is None or span_ns[0] == span_ns[1]:
+        return rrb.TimeAxis()
+    return rrb.TimeAxis(view_range=rr.TimeRange(at.absolute(nanos=span_ns[0]), at.absolute(nanos=span_ns[1])))
 
 
 def _name(lane: Lane, car: str) -> str:
@@ -184,26 +223,11 @@ def _curve(curve: Curve, name: str, rgb: Rgb | None) -> rrb.Visualizer:
     )
     if TOPICS[curve.topic].family == "sensor" and not made:
         # Readings stop for as long as a mode does not send them: a line across that would look like a measurement.
-        points = rr.SeriesPoints(names=name, marker_sizes=3.0, markers="circle", colors=rgb)
+        points = rr.SeriesPoints(names=name, marker_sizes=4.0, markers="circle", colors=rgb)
         return points.visualizer(mappings=[source])
     width = 1.0 if curve.how in _THRESHOLDS else 2.0
     line = rr.SeriesLines(names=name, widths=width, colors=rgb)
     return line.visualizer(mappings=[source])
-
-
-def _curves(name: str, shown: _Shown) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        origin="/",
-        contents=list(shown),
-        name=name,
-        overrides=shown,
-        plot_legend=rrb.PlotLegend(visible=True),
-        axis_x=rrb.TimeAxis(link=LinkAxis.LinkToGlobal),
-    )
-
-
-def _lanes(name: str, shown: _Shown) -> rrb.StateTimelineView:
-    return rrb.StateTimelineView(origin="/", contents=list(shown), name=name, overrides=shown)
 
 
 def _text(name: str, entities: list[str]) -> rrb.TextLogView:
@@ -212,5 +236,5 @@ def _text(name: str, entities: list[str]) -> rrb.TextLogView:
         origin="/",
         contents=entities,
         name=name,
-        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=columns),
+        columns=rrb.TextLogColumns(timeline_columns=[PUBLISHED], text_log_columns=columns),
     )

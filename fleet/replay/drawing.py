@@ -11,18 +11,22 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
+import pyarrow.compute as pc  # type: ignore[import-untyped]  # likewise
 import rerun as rr
 import rerun.chunk as rrc
 
 from fleet.replay import mapping
 from fleet.replay.colours import OFF, Rgb, colour, rgb
+from fleet.replay.ends import LOGGED, PUBLISHED, Ends
 from fleet.replay.lenses import component, numbers, triples
 from schemas import keys, messages
 from schemas.topics import COMMANDS
 
-TIMELINES: Final = ("message_log_time", "message_publish_time")
+TIMELINES: Final = (LOGGED, PUBLISHED)
 MARK_S: Final = 0.4
 """How long the mark of a command is, if nothing comes after it."""
+_ASKED: Final = "asked"
+_QUEUED: Final = "queued"
 _CARRIED_OUT: Final = frozenset({"sent", "complete"})
 _LED: Final = "led"
 LED: Final = COMMANDS["led"]
@@ -45,6 +49,9 @@ class Drawing:
         self._ways: dict[str, Any] = {}
         self._parts: dict[str, list[Any]] = {}
         self._still: dict[str, Any] = {}
+        self._ends = Ends()
+        self._asked: dict[str, str] = {}
+        """Colours of LEDs that were asked for, by the command's id, until it is known what became of it."""
         self._drawn: dict[str, Callable[[str, Any, _Times], Iterator[Any]]] = {
             mapping.TRUTH: self._truth,
             mapping.WORLD: self._world,
@@ -58,6 +65,8 @@ class Drawing:
         """(entity, name) of the lanes that were drawn."""
         self.corners: list[tuple[float, float]] = []
         """Of the simulated world's walls."""
+        self.span_ns: tuple[int, int] | None = None
+        """When the first and the last message were published, ns since the epoch; None: nothing came."""
 
     def follow(self, chunks: Iterable[Any]) -> Iterator[Any]:
         """Pass the chunks on, each followed by what is drawn of it."""
@@ -67,18 +76,32 @@ class Drawing:
                 continue
             key = mapping.key_of(chunk.entity_path)
             self.held[key] += chunk.num_rows
+            batch = chunk.to_record_batch()
             topic = mapping.topic_of(key)
+            if PUBLISHED in batch.schema.names:
+                self._widen(batch.column(PUBLISHED))
+                self._ends.heard(chunk.entity_path, topic, batch)
             draw = self._drawn.get(topic)
             if draw is None:
                 continue
-            batch = chunk.to_record_batch()
             if component(topic) in batch.schema.names:
                 times = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in TIMELINES}
                 yield from draw(chunk.entity_path, batch.column(component(topic)).flatten(), times)
 
+    def _widen(self, published: Any) -> None:
+        ends = pc.min_max(published.cast(pa.int64())).as_py()
+        if ends["min"] is not None:
+            first, last = self.span_ns or (ends["min"], ends["max"])
+            self.span_ns = min(first, ends["min"]), max(last, ends["max"])
+
     def contents(self) -> mapping.Contents:
         """What there was."""
         return mapping.contents(frozenset(self.held))
+
+    def ends(self) -> Iterator[Any]:
+        """Ends of lanes of which nothing was heard any more, as far as is known by now; each once."""
+        if self.span_ns is not None:
+            yield from self._ends.chunks(self.span_ns[1])
 
     def still(self) -> Iterator[Any]:
         """Each simulated car's way as one line, its colour and its name: static, so seen at any time."""
@@ -177,12 +200,22 @@ class Drawing:
         rows = events.to_pylist()
         marks = [f"{row['verb']} {row['phase']}" for row in rows]
         yield self._lane(path, mapping.MARKS.name, *_with_ends(times, marks))
-        asked = [(place, _led_asked(row)) for place, row in enumerate(rows) if row["verb"] == _LED]
-        asked = [(place, led) for place, led in asked if led]
-        if asked:
-            places, leds = [place for place, _ in asked], [led for _, led in asked]
+        done = [(place, led) for place, row in enumerate(rows) if row["verb"] == _LED and (led := self._led(row))]
+        if done:
+            places, leds = [place for place, _ in done], [led for _, led in done]
             self._note(leds)
             yield self._lane(path, mapping.LED_ASKED.name, {name: at[places] for name, at in times.items()}, leds)
+
+    def _led(self, event: dict[str, Any]) -> str:
+        """The colour if this says that a command for an LED was sent; what it was it said when it was asked."""
+        if event["phase"] == _ASKED:
+            if len(self._asked) < _MANY:
+                self._asked[event["id"]] = _led_asked(event)
+            return ""
+        if event["phase"] == _QUEUED:
+            return ""
+        asked = self._asked.pop(event["id"], "")
+        return asked if event["phase"] in _CARRIED_OUT else ""
 
     def _roles(self, path: str, assignments: Any, times: _Times) -> Iterator[Any]:
         rows = assignments.to_pylist()
@@ -217,9 +250,7 @@ def _with_ends(times: _Times, marks: list[str]) -> tuple[_Times, list[str | None
 
 
 def _led_asked(event: dict[str, Any]) -> str:
-    """The colour that was carried out, as `sim/truth` has it; empty if none was."""
-    if event["phase"] not in _CARRIED_OUT:
-        return ""
+    """The colour that was asked for, as `sim/truth` has it; empty if that is not known."""
     try:
         asked: Any = messages.parse(LED, event["request"], event["request_encoding"])
     except messages.BadPayload:

@@ -9,6 +9,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,6 +32,8 @@ LIMIT: Final = 50_000
 """Messages that wait for the viewer."""
 WAY: Final = 3_000
 """Points of each simulated car's way that are shown: five minutes."""
+SHOWN_S: Final = 120.0
+"""Of curves and lanes so much is in view; what was before is a scroll away."""
 FLUSH_S: Final = 2.0
 _KEPT: Final = (f"{keys.COORDINATOR}/plan", f"{keys.COORDINATOR}/assignment")
 """Published only when they change: asked for at the start."""
@@ -83,7 +86,9 @@ class Live:
             self._recording.send_chunks(
                 rrc.LazyChunkStream.from_iter(chunks).lenses(lenses(), output_mode="forward_all")
             )
-            self._recording.send_chunks(rrc.LazyChunkStream.from_iter(self._drawing.still()))
+            self._recording.send_chunks(
+                rrc.LazyChunkStream.from_iter(chain(self._drawing.ends(), self._drawing.still()))
+            )
         self._lay_out()
         self._stuck = not self._flushed()
         return len(batch)
@@ -116,7 +121,9 @@ class Live:
         if there == self._shown:
             return
         self._shown = there
-        self._recording.send_blueprint(blueprint.layout(self._drawing), make_active=True, make_default=True)
+        self._recording.send_blueprint(
+            blueprint.layout(self._drawing, last_s=SHOWN_S), make_active=True, make_default=True
+        )
 
     def _flushed(self) -> bool:
         try:

@@ -18,7 +18,7 @@ import click
 
 from fleet.replay.viewer import Viewer, free_port
 
-SIZE: Final = "1440x810"
+SIZE: Final = "1920x1080"
 AT: Final = 0.75
 """Of the session's time: where the cursor is."""
 UP_WITHIN_S: Final = 30.0

@@ -10,6 +10,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -95,7 +96,7 @@ def export(
         contents = drawing.contents()
         if not contents.cars and not contents.services:
             raise NoSession(f"{session.path} holds no message of a fleet{part.words}")
-        recording.send_chunks(rrc.LazyChunkStream.from_iter(drawing.still()))
+        recording.send_chunks(rrc.LazyChunkStream.from_iter(chain(drawing.ends(), drawing.still())))
         recording.send_blueprint(blueprint.layout(drawing, tab), make_active=False, make_default=True)
         recording.disconnect()
         try:

@@ -20,6 +20,7 @@ MODES = ("manual", "tracking", "obstacle_avoidance")
 COMMANDS = (
     (3.0, "drive", "asked", "forward for 3 s"),
     (3.02, "drive", "sent", ""),
+    (3.9, "led", "asked", ""),
     (4.0, "led", "sent", ""),
     (6.1, "stop", "complete", "motors off"),
     (6.5, "mode", "sent", "tracking"),
@@ -119,9 +120,9 @@ def drive_about(made: Made, car: str, index: int, seconds: int) -> None:
             safety.estops.add(id="1", by="ann", why="too close")
         made.put(f"{base}/state/safety", safety, at)
         made.put(f"{base}/state/health", pb.Health(platform="arduino", loop_lag_s=0.002, cpu=0.01, rss_mb=38), at)
-    for number, (at, verb, phase, words) in enumerate(COMMANDS):
-        event = pb.CommandEvent(id=f"c{number}", verb=verb, sender="ann", kind="person", phase=phase, words=words)
-        if verb == "led":
+    for at, verb, phase, words in COMMANDS:
+        event = pb.CommandEvent(id=f"{car} {verb}", verb=verb, sender="ann", kind="person", phase=phase, words=words)
+        if verb == "led" and phase == "asked":
             event.request, event.request_encoding = LED.SerializeToString(), f"{PROTOBUF};fleet.v1.LedCommand"
         made.put(f"{base}/event/command", event, at + 0.1 * index)
         made.put(f"{base}/frame/tx", pb.TxFrame(data=b"$1,0,0,0,0,0,0,0,0#", why="command", written=True), at)

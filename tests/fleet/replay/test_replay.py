@@ -15,7 +15,7 @@ from fleet.replay import mapping, to_rerun
 from fleet.replay.command import replay
 from schemas.topics import TOPICS
 
-from .make_session import CARS, make
+from .make_session import CARS, START_NS, make
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +59,25 @@ def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]
     messages = [m for m in Session.open(made[0]).messages() if m.key == "fleet/red/state/mode"]
     assert len(lanes["mode asked"]) == len(lanes["mode inferred"]) == len(messages)
     assert set(lanes["mode inferred"]) == {"manual", "tracking", "unknown"}
+
+
+def test_lanes_say_what_was_so_and_for_how_long(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    to_rerun.export(Session.open(made[0]), out)
+    lanes: dict[tuple[str, str], list[tuple[float, object]]] = {}
+    for chunk in rrc.RrdReader(out).store().stream():
+        batch = chunk.to_record_batch()
+        for name in ("LED asked", "light left", "mode inferred"):
+            if name in batch.schema.names:
+                times = batch.column("message_publish_time").cast("int64").to_pylist()
+                lane = lanes.setdefault((mapping.key_of(chunk.entity_path), name), [])
+                for at, row in zip(times, batch.column(name).to_pylist(), strict=True):
+                    lane.append(((at - START_NS) / 1e9, row[0]))
+    assert lanes["fleet/red/event/command", "LED asked"] == [(4.2, "#ff0010")]
+    *light, (end, nothing) = sorted(lanes["fleet/red/sensor/light", "light left"])
+    assert [state for _, state in light] == [second % 2 == 0 for second in range(7)], "as long as mode manual"
+    assert (end, nothing) == (9.06, None), "stale 3 s after the last"
+    assert None not in [state for _, state in lanes["fleet/red/state/mode", "mode inferred"]]
 
 
 def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
