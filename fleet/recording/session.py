@@ -3,10 +3,12 @@
 A session is a directory (directory.py) or a bare .mcap, also somebody else's. What is whole of a file is salvage.py's.
 """
 
+import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from fnmatch import fnmatch
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from fleet.recording import directory
 from fleet.recording.copying import Copy
@@ -73,19 +75,26 @@ class Session:
             raise NoSession("; ".join(f"{segment} {words}" for segment, words in damage.items()))
         if whole:
             numbered = {directory.segment(path, number + 1) for number in range(int(there[-1].stem))}
-            if missing := sorted(numbered - set(there)):
+            if missing := sorted((numbered | _closed(path)) - set(there)):
                 damage[path] = f"lacks {len(missing)} of its files, the first is {missing[0].name}"
+            given = _json(path / directory.DESCRIPTION).get("format")
+            if isinstance(given, int) and given > directory.FORMAT:
+                raise NoSession(
+                    f"{path} has format {given}, this version reads up to {directory.FORMAT}: update zenoh-car-fleet; "
+                    f"its files can be looked into one by one, as {there[0]}"
+                )
         description = directory.Description.read(path) if whole else None
-        if description is not None and description.format > directory.FORMAT:
-            raise NoSession(
-                f"{path} has format {description.format}, this version reads up to {directory.FORMAT}: update it"
-            )
         return cls(path, tuple(segment for segment in there if segment not in damage), description, damage)
 
     @property
     def name(self) -> str:
         """What to call it: the directory's name, or the file's without its ending."""
         return self.path.resolve().name if self.path.is_dir() else self.path.stem
+
+    def lacking(self, messages: int) -> str:
+        """What its description says that there should be besides; empty if these are all, or nothing tells."""
+        said = self.description.messages if self.description is not None and self.description.closed else 0
+        return f"says that there were {said} messages: {said - messages} are not here" if messages < said else ""
 
     @property
     def damage_words(self) -> str:
@@ -160,6 +169,22 @@ class Session:
         yield from salvage.messages(selection)
         if salvage.damage:
             self.damage[segment] = salvage.words
+
+
+def _closed(path: Path) -> set[Path]:
+    """The segments that the recorder noted when it closed them: of one that was last, nothing else tells."""
+    noted = _json(path / directory.INDEX).get("segments")
+    names = [one.get("file") for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
+    return {path / name for name in names if isinstance(name, str) and fnmatch(name, directory.SEGMENTS)}
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """What a file says; nothing if that is no object."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return values if isinstance(values, dict) else {}
 
 
 def message_of(lane: Lane) -> str:

@@ -108,6 +108,8 @@ def to_bus(
                 )
         except NoSession as error:
             raise click.ClickException(str(error)) from None
+        if not any(keys.parse(key) for key in about.keys):
+            raise click.ClickException(f"{path} holds nothing that is a fleet's: no FLEET/CAR/... key")
         wanted = _wanted(cars, cars_only=cars_only)
         there = cars or tuple(about.cars)
         words = f"fleet {name} is a replay of {session.name}: nothing in it takes commands"
@@ -128,7 +130,7 @@ def to_bus(
                 recorded = session.messages(wanted, first_ns, part.end_ns)
                 player.play(_counted_from(recorded, first_ns, schedule), schedule, origin_s, stop.is_set, told)
                 if not player.published:
-                    raise click.ClickException(f"{path} holds nothing there that is a fleet's: no FLEET/CAR/... key")
+                    raise click.ClickException(f"{path} holds nothing there that is published again")
                 if not loop or stop.is_set():
                     break
                 schedule.again(PAUSE_NS)

@@ -139,6 +139,9 @@ def list_sessions(directory: Path, *, as_json: bool) -> None:
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         click.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    for one in found:
+        if one.words:
+            click.echo(f"{one.name}: {one.words}", err=True)
 
 
 def _row(one: "Overview") -> tuple[str, ...]:
@@ -250,7 +253,7 @@ def recover(session: Path, out: Path | None) -> None:
     out = out or found.path.resolve().with_name(f"{found.name}-recovered")
     with _explained(out):
         count, words = make(found, out, watched("recover", total(found)))
-    click.echo(f"{out}: {count} messages{f'; could not be saved: {words}' if words else ', nothing was damaged'}")
+    click.echo(f"{out}: {count} messages{f'; could not be saved: {words}' if words else ', no message was damaged'}")
 
 
 @sessions.command(

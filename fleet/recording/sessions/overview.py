@@ -74,7 +74,8 @@ def overview(path: Path) -> Overview:
     try:
         session = Session.open(path)
     except NoSession as error:
-        return Overview(path.name, str(path), State.UNREADABLE, str(error), bytes=_size([path]))
+        files = [*path.glob(directory.SEGMENTS)] if path.is_dir() else [path]
+        return Overview(path.name, str(path), State.UNREADABLE, str(error), bytes=_size(files))
     return of_session(session)
 
 
@@ -112,6 +113,8 @@ def of_session(session: Session) -> Overview:
         found.marks = list(description.marks)
         found.kept = description.kept
     found.state, found.words = _state(session, cut)
+    if found.state is State.WHOLE and (words := session.lacking(found.messages)):
+        found.state, found.words = State.DAMAGED, f"{directory.DESCRIPTION} {words}"
     return found
 
 

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from google.protobuf.message import Message
 
-from fleet.recording import times
+from fleet.recording import directory, times
 from fleet.recording.decoding import SAME, Decoder, compared
 from fleet.recording.salvage import Lane, Row
 from fleet.recording.session import Session, message_of
@@ -224,6 +224,10 @@ def verify(session: Session, watched: Callable[[Iterable[Row]], Iterable[Row]] =
     # What reading says is lost comes before what only a checksum tells.
     verdict.damage = {path.name: words for path, words in sorted((session.damage | read).items())}
     description = session.description
+    if session.path.is_dir() and description is None:
+        verdict.damage[directory.DESCRIPTION] = "is missing, or cannot be understood: who recorded what, and the marks"
+    if words := session.lacking(verdict.messages):
+        verdict.damage[directory.DESCRIPTION] = words
     if description is not None:
         verdict.closed = description.closed
         verdict.dropped, verdict.missed = dict(description.drops), dict(description.missed)

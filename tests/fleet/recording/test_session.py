@@ -95,5 +95,10 @@ def test_an_empty_directory_and_a_newer_format_are_refused(tmp_path: Path) -> No
     (tmp_path / "session.json").write_text(
         '{"fleet": "fleet", "started": "", "host": "", "versions": {}, "format": 99}'
     )
+    with pytest.raises(NoSession, match=r"format 99.*update zenoh-car-fleet.* as .*0001\.mcap"):
+        Session.open(tmp_path)
+    # Nor is it read when what else it says cannot be understood by now.
+    (tmp_path / "session.json").write_text('{"format": 99, "messages": {"red": 3}}')
     with pytest.raises(NoSession, match="format 99"):
         Session.open(tmp_path)
+    assert len([*Session.open(tmp_path / "0001.mcap").messages()]) == 1

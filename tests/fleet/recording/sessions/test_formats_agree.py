@@ -201,18 +201,20 @@ def test_rrd_holds_what_the_recording_holds(original: Rows, session: Path, tmp_p
     export(Session.open(session), out)
     found: Rows = {}
     texts: dict[str, list[tuple[int, int, str]]] = {}
+    logs = [key for key, name in every_type.keys_and_types().items() if name == "foxglove.Log"]
     for key, component, log, published, value in arrow_rows(out):
         if component.endswith(":message"):
             descriptor = messages.message_class(component.removesuffix(":message")).DESCRIPTOR
             found.setdefault(key, []).append((log, published, of_arrow(descriptor, value)))
-        elif component == "TextLog:text" and key.endswith(("/event/log", "/@recorder/mark")):
+        elif component == "TextLog:text" and key in logs:
             texts.setdefault(key, []).append((log, published, value))
     assert {key: sorted(rows, key=lambda row: row[:2]) for key, rows in found.items()} == {
-        key: rows for key, rows in original.items() if key != "fleet/red/event/log"
+        key: rows for key, rows in original.items() if key not in logs
     }
     # Rerun makes foxglove.Log the text of a log of its own.
-    logs = [(log, published, row["message"]) for log, published, row in original["fleet/red/event/log"]]
-    assert sorted(texts["fleet/red/event/log"]) == logs
+    assert {key: sorted(rows) for key, rows in texts.items()} == {
+        key: [(log, published, row["message"]) for log, published, row in original[key]] for key in logs
+    }
 
 
 def arrow_rows(path: Path) -> Iterator[tuple[str, str, int, int, Any]]:

@@ -79,7 +79,10 @@ def test_the_list_says_how_each_is(session: Path) -> None:
     assert found[session.name]["messages"] == 4 * len(every_type.keys_and_types())
     assert found["cut"]["lost"] == 3
     assert "format 99" in found["newer"]["words"]
-    lines = fleet(root).stdout.splitlines()
+    assert found["newer"]["bytes"] == (session / "0001.mcap").stat().st_size
+    listed = fleet(root)
+    assert {line.partition(": ")[0] for line in listed.stderr.splitlines()} == {"cut", "damaged", "newer"}
+    lines = listed.stdout.splitlines()
     assert lines[0].split() == ["session", "state", "length", "size", "messages", "lost", "marks", "cars"]
     assert len(lines) == 6
     assert fleet(cwd=root.parent).returncode == 1  # there is no ./sessions
@@ -124,6 +127,36 @@ def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
         wrong = fleet("cut", session, *arguments, "--out", tmp_path / "other")
         assert (wrong.returncode, words in wrong.stderr) == (2, True), wrong.stderr
     assert not (tmp_path / "other").exists()
+
+
+def test_files_that_went_are_told_also_the_last(session: Path) -> None:
+    shutil.copy(session / "0001.mcap", session / "0002.mcap")
+    each = 4 * len(every_type.keys_and_types())
+    describe(session, closed=True, messages=2 * each)
+    assert f"NOT whole, {2 * each} messages" in fleet("verify", session).stdout  # the second says all again
+    (session / "0002.mcap").unlink()
+    told = f"session.json says that there were {2 * each} messages: {each} are not here"
+    assert told in fleet("verify", session).stdout
+    assert told in fleet(session.parent).stderr
+    noted = [{"file": name} for name in ("0001.mcap", "0002.mcap", "../x.mcap", 3)]
+    (session / "index.json").write_text(json.dumps({"segments": noted}))
+    assert "lacks 1 of its files, the first is 0002.mcap" in fleet("verify", session).stdout
+    assert "could not be saved" in fleet("recover", session).stdout
+    for text in ("[]", '{"segments": 3}', "{", '{"segments": [3]}'):
+        (session / "index.json").write_text(text)  # a cache: nothing depends on it
+        assert told in fleet("verify", session).stdout
+
+
+@pytest.mark.parametrize("text", [None, "", '{"fleet": 3}'])
+def test_a_description_that_went_is_told(session: Path, text: str | None) -> None:
+    (session / "session.json").unlink()
+    if text is not None:
+        (session / "session.json").write_text(text)
+    broken = fleet("verify", session)
+    assert broken.returncode == 1
+    assert "damage: session.json is missing, or cannot be understood" in broken.stdout
+    assert fleet("recover", session).returncode == 0
+    assert directory.Description.read(session.with_name(f"{session.name}-recovered")) is not None
 
 
 def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -> None:
