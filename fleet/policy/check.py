@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from fleet.expression import contradictory
 from fleet.faults import meant
+from fleet.policy.conflicts import alternations, fights, outside
 from fleet.policy.picture import CarPicture, topic_of
-from fleet.policy.plan import ALL, OTHERS, Condition, Of, Plan, Role
+from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Phase, Plan, Role, Rule
 from fleet.policy.staffing import unfit
 from gateway.protocol.profile import Platform, Profile, parse_platform
 from gateway.protocol.values import Mode
@@ -112,8 +112,8 @@ class _Check:
     def _roles(self) -> Iterator[Finding]:
         for role in self._plan.roles.values():
             part = f"role {role.name}"
-            if role.needs is not None and contradictory(role.needs):
-                yield Finding(Gravity.ERROR, part, f"no car can fill it: {role.needs} is never so")
+            if role.needs is not None and (why := outside(role.needs)):
+                yield Finding(Gravity.ERROR, part, f"no car can fill it: {why}")
                 continue
             able = [car for car in self._cars if self._able(car, role)]
             if not able:
@@ -135,8 +135,8 @@ class _Check:
         given = any(effect.role == role.name for rule in self._plan.rules for effect in rule.effects)
         return given or any(other.fallback == role.name for other in self._plan.roles.values())
 
-    def _in_some_phase(self, role: Role) -> bool:
-        phases = self._plan.phases.values()
+    def _in_some_phase(self, role: Role, during: frozenset[str] | None = None) -> bool:
+        phases = [phase for phase in self._plan.phases.values() if during is None or phase.name in during]
         return not phases or any(phase.roles is None or role.name in phase.roles for phase in phases)
 
     def _able(self, car: str, role: Role) -> bool:
@@ -164,27 +164,56 @@ class _Check:
 
     def _rules(self) -> Iterator[Finding]:
         for rule in self._plan.rules:
+            yield from self._out_of_phase(rule)
             for condition, word in ((rule.when, "fire"), (rule.until, "end by `until`")):
                 if condition is not None and (why := self._never_so(condition)):
                     yield Finding(Gravity.ERROR, rule.name, f"it can never {word}: {why}")
             for effect in rule.effects:
-                for car in self._targets(effect.who):
-                    yield from self._useless(rule.name, car, effect.mode)
+                yield from self._useless(rule, effect)
         yield from self._fights()
         yield from self._circular()
 
-    def _targets(self, who: str) -> list[str]:
-        return [who] if who and self._plan.is_car(who) and who in self._cars else []
+    def _out_of_phase(self, rule: Rule) -> Iterator[Finding]:
+        """A rule about a role, or that gives one, which counts in none of the rule's phases."""
+        for role in (rule.when.role, *(effect.role for effect in rule.effects)):
+            if role is not None and not self._in_some_phase(self._plan.roles[role], rule.during):
+                where = f"phase {' or '.join(sorted(rule.during))}" if rule.during is not None else "any phase"
+                words = f"role {role} does not count in {where}"
+                yield Finding(
+                    Gravity.ERROR, rule.name, f"it can never {'fire' if role == rule.when.role else 'help'}: {words}"
+                )
 
-    def _useless(self, part: str, car: str, mode: Mode | None) -> Iterator[Finding]:
+    def _useless(self, rule: Rule, effect: Effect) -> Iterator[Finding]:
+        """What no car that it is for can do."""
+        who = effect.who if effect.who != THAT or rule.when.car is None else rule.when.car
+        if who == OTHERS and self._known is not None and len(self._known) < 2:
+            yield Finding(Gravity.ERROR, rule.name, f"there are no others: the fleet file has {len(self._known)} car")
+        certain = bool(who) and self._plan.is_car(who)
+        cars = [who] if certain else list(self._cars)
+        cars = [car for car in cars if car in self._cars]
+        if effect.role is not None:
+            role = self._plan.roles[effect.role]
+            whys = {car: self._why_not(car, role) for car in cars}
+            if certain and cars and all(whys.values()):
+                yield Finding(Gravity.ERROR, rule.name, f"{who} can never have role {role.name}: {whys[who]}")
+        mode = effect.mode
+        if mode is None or not cars or not all(self._cannot(car, mode) for car in cars):
+            return
+        words = f"{who} is {self._cannot(who, mode)}" if certain else f"no car can be in mode {mode}"
+        yield Finding(Gravity.ERROR, rule.name, words)
+
+    def _cannot(self, car: str, mode: Mode) -> str:
+        """Why it is never in this mode; empty if it can be."""
         profiles = self._profiles(car)
-        if mode is not None and not any(mode in profile.modes for profile in profiles):
-            yield Finding(Gravity.ERROR, part, f"{car} is a {profiles[0].name} car, which does not know mode {mode}")
+        if not any(mode in profile.modes for profile in profiles):
+            return f"a {profiles[0].name} car, which does not know mode {mode}"
+        known = self._cars[car]
+        return f"not let do mode {mode} by the fleet file" if known.lacks(mode) else ""
 
     def _never_so(self, condition: Condition) -> str:
         """Why a condition can never be so; empty if it may be."""
-        if contradictory(condition.expression):
-            return f"{condition.expression} is never so"
+        if why := outside(condition.expression):
+            return why
         if condition.car is not None:
             if condition.car not in self._cars:
                 return f"there is no car {condition.car}"
@@ -237,20 +266,8 @@ class _Check:
         return ""
 
     def _fights(self) -> Iterator[Finding]:
-        """Two rules that are true under the same condition, and want different things of the same car."""
-        said: dict[tuple[str, str], tuple[str, str]] = {}
-        for rule in self._plan.rules:
-            for effect in rule.effects:
-                wish = str(effect.mode or effect.role or "")
-                if not wish or not effect.who:
-                    continue
-                whens = (effect.who, f"{rule.when.of} {rule.when.car} {rule.when.role} {rule.when.expression}")
-                other = said.setdefault(whens, (rule.name, wish))
-                if other[1] != wish:
-                    words = (
-                        f"it fights {other[0]}, which is true at the same time and wants {effect.who} to be {other[1]}"
-                    )
-                    yield Finding(Gravity.ERROR, rule.name, f"{words}, not {wish}: the first counts")
+        for rule, words, always in fights(self._plan):
+            yield Finding(Gravity.ERROR if always else Gravity.WARNING, rule.name, words)
 
     def _circular(self) -> Iterator[Finding]:
         """A rule that ends itself: in the mode that it gives, what makes it true is not measured."""
@@ -291,8 +308,18 @@ class _Check:
             part = f"phase {name}"
             if name not in reached:
                 yield Finding(Gravity.ERROR, part, f"nothing leads to it: the plan begins with {plan.first}")
-            if phase.until is not None and phase.timeout_s is None and (why := self._never_so(phase.until)):
-                yield Finding(Gravity.ERROR, part, f"it never ends: {why}; give it timeout_s")
+            if phase.until is not None and (why := self._never_so(phase.until) or self._no_role(phase)):
+                words = f"it never ends: {why}; give it timeout_s"
+                if phase.timeout_s is not None:
+                    words = f"only its time-out ends it: {why}"
+                yield Finding(Gravity.ERROR if phase.timeout_s is None else Gravity.WARNING, part, words)
+        for name, words in alternations(plan):
+            yield Finding(Gravity.ERROR, f"phase {name}", words)
+
+    def _no_role(self, phase: Phase) -> str:
+        role = None if phase.until is None else phase.until.role
+        missing = role is not None and phase.roles is not None and role not in phase.roles
+        return f"role {role} does not count in it" if missing else ""
 
     def _after(self, name: str) -> set[str]:
         phase = self._plan.phases.get(name)

@@ -64,6 +64,84 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
             "phase x",
             "it never ends: imu.gyro_x_raw is never measured on red",
         ),
+        ("roles: {x: {mode: tracking, needs: battery.voltage_v > 20}}", "role x", "battery.voltage_v is 0 .. 12"),
+        (
+            SCOUT + "rules: [{when: {any: mode.asked == 'dancing'}, then: {who: red, mode: manual}}]",
+            "rule 1",
+            "it can never fire: mode.asked == 'dancing' is never so: mode.asked is one of manual, remote_control,",
+        ),
+        (
+            SCOUT + "rules: [{when: {any: mode.asked == 'manual'}, then: {who: that, mode: following}}]",
+            "rule 1",
+            "it undoes itself again and again: in mode following, mode.asked == 'manual' is not so",
+        ),
+        (
+            SCOUT
+            + "rules:\n  - {when: {any: range.range_m < 0.5}, then: {who: all, mode: manual}}\n"
+            + "  - {when: {car: red, is: range.range_m < 0.3}, then: {who: that, mode: following}}",
+            "rule 2",
+            "it fights rule 1, which is true whenever it is and wants the same car to be manual",
+        ),
+        (
+            SCOUT
+            + "rules:\n  - {when: {any: line.left_outer}, then: {who: red, led: [9, 0, 0]}}\n"
+            + "  - {when: {any: line.left_outer}, then: {who: red, led: [0, 9, 0]}}",
+            "rule 2",
+            "it fights rule 1, which is true whenever it is and wants red to be of colour [9, 0, 0]",
+        ),
+        (
+            SCOUT
+            + "rules: [{when: {any: line.left_outer}, then: [{who: red, mode: manual}, {who: red, mode: following}]}]",
+            "rule 1",
+            "it fights itself",
+        ),
+        (
+            SCOUT + "rules: [{when: {any: line.left_outer}, then: {who: red, mode: following, led: [9, 0, 0]}}]",
+            "rule 1",
+            "its colour is never seen",
+        ),
+        (
+            SCOUT + "rules: [{when: {any: line.left_outer}, then: {who: pi, role: scout}}]",
+            "rule 1",
+            "pi can never have role scout: raspberry_pi cars do not know mode tracking",
+        ),
+        (
+            (
+                "roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {a: {roles: [x], timeout_s: 9, next: b}, b: {}}\n"
+                "rules: [{when: {any: battery.level == 'low', role: y}, then: {who: red, mode: manual}, during: [a]}]"
+            ),
+            "rule 1",
+            "it can never fire: role y does not count in phase a",
+        ),
+        (
+            (
+                "roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {a: {roles: [x], timeout_s: 9, next: b}, b: {}}\n"
+                "rules: [{when: {any: line.left_outer}, then: {who: red, role: y}, during: [a]}]"
+            ),
+            "rule 1",
+            "it can never help: role y does not count in phase a",
+        ),
+        (
+            (
+                "roles: {x: {mode: tracking}, y: {mode: manual}}\n"
+                "phases: {a: {roles: [x], until: {any: battery.level == 'low', role: y}, next: b}, b: {}}"
+            ),
+            "phase a",
+            "it never ends: role y does not count in it",
+        ),
+        (
+            SCOUT
+            + "phases: {a: {until: {any: line.left_outer}, next: b}, b: {until: {any: line.left_outer}, next: a}}",
+            "phase a",
+            "a -> b -> a: these follow each other every 1.5 s as long as any car: line.left_outer is so",
+        ),
+        (
+            SCOUT
+            + "phases: {a: {}, b: {until: {any: range.range_m < 1}, next: a}}\n"
+            + "rules: [{when: {any: range.range_m < 0.5}, then: {phase: b}, during: [a]}]",
+            "phase a",
+            "a -> b -> a: these follow each other every 1.5 s as long as any car: range.range_m < 0.5 is so",
+        ),
     ],
 )
 def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> None:
@@ -80,6 +158,12 @@ def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> Non
             "it ends itself: in mode tracking, range.range_m is not measured; give it until",
         ),
         ("roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {p: {roles: [x]}}", "no phase has it"),
+        (
+            SCOUT
+            + "rules:\n  - {when: {any: line.left_outer}, then: {who: red, mode: manual}}\n"
+            + "  - {when: {any: line.right_outer}, then: {who: red, mode: following}}",
+            "it may be true together with rule 1, and wants something else of the same car: the first counts",
+        ),
     ],
 )
 def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
@@ -96,6 +180,34 @@ phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_o
 """)
     assert check(plan) == ()
     assert check(plan, FLEET) == ()
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        # The narrower one first: so it is meant.
+        (
+            "rules: [{when: {any: range.range_m < 0.1}, then: {who: red, mode: manual}},"
+            " {when: {any: range.range_m < 0.9}, then: {who: red, mode: following}}]"
+        ),
+        (
+            "rules: [{when: {car: red, is: line.left_outer and not line.right_outer}, then: {who: red, mode: manual}},"
+            " {when: {car: red, is: line.right_outer}, then: {who: red, mode: following}}]"
+        ),
+        (
+            "rules: [{when: {any: line.left_outer}, then: {who: red, mode: manual}},"
+            " {when: {any: line.right_outer}, then: {who: green, mode: following}}]"
+        ),
+        (
+            "rules: [{when: {any: line.left_outer}, then: {phase: b}}]\nphases: {a: {timeout_s: 9, next: b},"
+            " b: {until: {any: line.left_outer}, next: a}}"
+        ),
+        "phases: {a: {until: {any: line.left_outer}, next: b}, b: {until: {any: not line.left_outer}, next: a}}",
+    ],
+)
+def test_what_does_not_get_into_its_own_way_is_let_alone(more: str) -> None:
+    plan = parse("roles: {scout: {mode: tracking, count: all}, near: {mode: manual}}\n" + more)
+    assert [str(each) for each in check(plan, FLEET) if each.gravity is Gravity.ERROR or "together" in str(each)] == []
 
 
 BROKEN = parse("""
