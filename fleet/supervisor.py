@@ -19,6 +19,7 @@ from fleet.supervise import wanted
 from fleet.supervise.cars import Row
 from fleet.supervise.crew import TURN_S, Crew, Process
 from fleet.supervise.desk import Desk, Refused
+from fleet.supervise.farewell import Farewell
 from fleet.supervise.process import copied, new_run
 from fleet.supervise.reload import change
 from fleet.supervise.restart import State, grace_s
@@ -66,13 +67,13 @@ class Supervisor:
         self._read = read
         self._tell = tell
         self._state = "starting"
-        self._became: dict[str, str] = {}
-        """By car, at the end."""
+        self._farewell = Farewell(self.crew, self.rows, lambda car, words: self._say("end", car, words))
         self._desk: Desk | None = None
         self._began = self._turned_at = self._awake_since = self._unlinked_since = time.monotonic()
         self._linked_since: float | None = None
         self._gateways_from = 0.0
         self._end_asked = asyncio.Event()
+        self._reloading = asyncio.Lock()
         self._sim_asked: deque[bool] = deque()
         """Whose questions to the simulator wait for an answer: True for a user's."""
         self._sim_links: dict[str, str] = {}
@@ -100,9 +101,14 @@ class Supervisor:
         """Supervise until `end`. Raises AnotherSupervisor, BusError, and OSError if there is no place for the logs."""
         self.crew.directory = await asyncio.to_thread(new_run, self._wish.fleet, time.time())
         try:
-            desk = self._desk = Desk(await self._bus(), self._wish.fleet)
+            bus = await self._bus()
+            if bus is None:
+                self._say("end", SELF, "no car had been started")
+                return True
+            desk = self._desk = Desk(bus, self._wish.fleet)
             await desk.open(self._heard, {"down": self._down, "reload": self._reload}, self.status)
-            self._populate()
+            if not self._end_asked.is_set():
+                self._populate()
             self._state = "running"
             each_second = asyncio.ensure_future(self._each_second(desk))
             try:
@@ -119,15 +125,15 @@ class Supervisor:
             await asyncio.sleep(TURN_S)  # whoever waits for the end hears of it
         finally:
             await self._leave()
-        return all(process.code == 0 for process in self.crew.of(Kind.GATEWAY))
+        return not self._farewell.not_stopped
 
     # ------------------------------------------------------------------ the bus
 
-    async def _bus(self) -> Bus:
-        """A session; the hub is started if there is none. Raises BusError."""
+    async def _bus(self) -> Bus | None:
+        """A session; the hub is started if there is none. None if it is to end before. Raises BusError."""
         self.crew.add(HUB, Kind.HUB, wanted.hub_command(self.endpoint))
         deadline = time.monotonic() + HUB_UP_S
-        while True:
+        while not self._end_asked.is_set():
             await self._turn()
             if await asyncio.to_thread(accepts, self.endpoint):
                 return await asyncio.to_thread(Bus.open, self.endpoint)
@@ -136,6 +142,7 @@ class Supervisor:
                 words = hub.ward.words if hub is not None else ""
                 raise BusError(f"no hub came up at {self.endpoint}: {words or 'it does not listen'}")
             await asyncio.sleep(TURN_S)
+        return None
 
     async def _see_to_hub(self, now: float, *, linked: bool) -> None:
         """A hub that somebody else started serves as well as ours."""
@@ -177,6 +184,7 @@ class Supervisor:
         self.rows.setdefault(car.name, Row(car.name))
         link = self._sim_links.get(car.name) if car.link == wanted.SIMULATED else car.link
         if link is not None:
+            self._farewell.recall(car.name)
             self.crew.add(car.name, Kind.GATEWAY, wanted.gateway_command(self._wish, car, link, self.endpoint))
 
     def _coordinator(self, wish: Wanted) -> tuple[str, ...]:
@@ -231,6 +239,7 @@ class Supervisor:
         elif not linked and self._linked_since is not None:
             self._linked_since, self._unlinked_since = None, now
         await self._see_to_hub(now, linked=linked)
+        self._farewell.turn(now)
         await self.crew.turn(now, self._listening_since, self._may_start)
         shown = [(process.name, process.ward.state, process.ward.restarts) for process in self.crew]
         if self._desk is not None and shown != self._shown:
@@ -243,7 +252,7 @@ class Supervisor:
         return None if self._linked_since is None else max(self._linked_since, self._awake_since)
 
     def _may_start(self, process: Process) -> bool:
-        if process.kind is Kind.HUB:
+        if process.kind is Kind.HUB or self._farewell.may_start(process.name):
             return True
         waits = process.kind is Kind.GATEWAY and time.monotonic() < self._gateways_from
         return not waits and not self._end_asked.is_set()
@@ -258,20 +267,13 @@ class Supervisor:
         row = self.rows.get(process.name)
         if row is not None:
             row.gone()
+        self._farewell.ended(process)
+        if self._farewell.may_start(process.name):
+            return
         if process.leaving:
             self.rows.pop(process.name, None)
-        if self._end_asked.is_set() and process.code is not None:
-            self._set_became(process, process.code, told=told)
-
-    def _set_became(self, process: Process, code: int, *, told: bool) -> None:
-        if code == 0 and told:
-            words = "stopped"
-        elif code < 0:
-            words = "its gateway was killed: the car may be moving"
-        else:
-            words = f"not stopped: {process.why or f'exit code {code}'}"
-        self._became[process.name] = words
-        self._say("end", process.name, words)
+        elif told and process.code != 0 and process.ward.state is State.WAITING:
+            self._say("process", process.name, f"ended without stopping its car: {process.why or process.ward.words}")
 
     def _heard(self, car: str, topic: str, value: Any) -> None:
         now = time.monotonic()
@@ -279,8 +281,9 @@ class Supervisor:
         if car == RECORDER and self.crew.heard(RECORDER):
             self._gateways_from = now
         elif row is not None and topic == "state/health":
-            # The last words of a process that has ended are no sign of life of the next.
-            self.crew.heard(car, value.pid)
+            # The last words of a process that has ended are no sign of life of the next, nor what it shows.
+            if self.crew.heard(car, value.pid):
+                row.gone()
         elif row is not None:
             if words := row.take(topic, value, now):
                 self._say("car", car, words)
@@ -337,21 +340,19 @@ class Supervisor:
         asked = asyncio.ensure_future(asyncio.to_thread(desk.stop_all))
         await asyncio.wait([asked], timeout=STOP_ASKED_S)
         for process in gateways:
-            row = self.rows.get(process.name)
-            if not process.ward.alive:
-                process.code = process.code or 1
-                self._became[process.name] = f"not stopped: no gateway was running ({process.ward.words or 'not yet'})"
-                self._say("end", process.name, self._became[process.name])
-            self.crew.end(process, grace_s(row.worst_stop_s if row else None))
+            self._farewell.begin(process)
         await self._until_ended([*gateways, *self.crew.of(Kind.COORDINATOR)])
         for kind, grace in ((Kind.RECORDER, RECORDER_END_S), (Kind.SIMULATOR, END_S)):
             for process in self.crew.of(kind):
                 self.crew.end(process, grace)
                 await self._until_ended([process])
         await asyncio.wait([asked], timeout=END_S)
+        left = ", ".join(self._farewell.not_stopped)
+        words = "every car that was started is stopped" if self._farewell.became else "no car had been started"
+        self._say("end", SELF, f"not stopped: {left}: look whether they drive" if left else words)
 
     async def _until_ended(self, processes: list[Process]) -> None:
-        while any(process.ward.alive for process in processes):
+        while self._farewell.going or any(process.ward.alive for process in processes):
             await self._turn()
             await asyncio.sleep(TURN_S / 2)
 
@@ -367,7 +368,7 @@ class Supervisor:
             uptime_s=now - self._began,
             fleet_file=self._source,
             directory=str(self.crew.directory),
-            became=self._became,
+            became=self._farewell.became,
         )
         for process in self.crew:
             ward = process.ward
@@ -383,10 +384,16 @@ class Supervisor:
 
     async def _reload(self, sender: str) -> str:
         """Read what is wanted anew and do what can be done; what was done, and what cannot. Raises Refused."""
+        async with self._reloading:
+            return await self._reload_alone(sender)
+
+    async def _reload_alone(self, sender: str) -> str:
         try:
             new = await asyncio.to_thread(self._read)
         except ValueError as error:
             raise Refused(f"nothing was changed: {error}") from None
+        if self._end_asked.is_set():
+            raise Refused("nothing was changed: the fleet is ending")
         old, found = self._wish, change(self._wish, new)
         try:
             command = self._coordinator(found.wish)  # what may fail comes first
@@ -396,8 +403,11 @@ class Supervisor:
         words = list(found.words)
         self._wish = found.wish
         for name in found.gone:
-            row = self.rows.get(name)
-            self.crew.remove(name, grace_s(row.worst_stop_s if row else None))
+            process = self.crew.get(name)
+            if process is not None:
+                process.leaving = True
+                self._farewell.begin(process)
+                self.crew.forget(process)
             if self.crew.get(name) is None:
                 self.rows.pop(name, None)
         for name in found.begun:

@@ -12,6 +12,7 @@ import click
 from fleet.client import default_sender
 from fleet.commands.common import INTERRUPTED, bus_options, json_option, sigterm_interrupts
 from fleet.supervise.desk import STATUS, ask_service, ask_status
+from fleet.supervise.farewell import NOT_STOPPED
 from fleet.supervise.process import runs
 from schemas import keys, messages
 from schemas.bus import Bus, BusError
@@ -68,7 +69,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         last = _until_ended(bus, fleet, heard)
     became = dict(last.became) if last is not None else {}
     ended = last is not None and last.state == "ended"
-    bad = sorted(car for car, words in became.items() if words.startswith(("not stopped", "its gateway was killed")))
+    bad = sorted(car for car, words in became.items() if words.startswith(NOT_STOPPED))
     if as_json:
         click.echo(json.dumps({"ended": ended, "cars": became}))
     else:

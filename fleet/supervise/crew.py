@@ -86,7 +86,7 @@ class Crew:
         if process is not None:
             process.leaving = True
             self.end(process, grace)
-            self._forget(process)
+            self.forget(process)
 
     def end(self, process: Process, grace: float, *, again: bool = False) -> None:
         """Tell it to end within so many s, and to begin anew if `again`."""
@@ -153,9 +153,11 @@ class Crew:
             self._tell(process.name, process.log.failed)
             process.log.failed = ""
         self._told_ended(process, told)
-        self._forget(process)
+        self.forget(process)
 
-    def _forget(self, process: Process) -> None:
-        if process.leaving and not process.ward.alive and self._processes.get(process.name) is process:
+    def forget(self, process: Process) -> None:
+        """Forget one that is not wanted any more, if it has ended for good."""
+        over = process.leaving and process.ward.state in (State.ENDED, State.GIVEN_UP)
+        if over and self._processes.get(process.name) is process:
             del self._processes[process.name]
             self._tell(process.name, "ended: no longer wanted")

@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import hashlib
 import os
+import re
 import signal
 import sys
 import time
@@ -21,6 +22,7 @@ RUNS: Final = 10
 """Directories of runs that are kept."""
 IN_USE_S: Final = 3600.0
 """A run that was touched within this time may go on: it is not removed."""
+_LOGGED: Final = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (?P<level>[A-Z]+) (?P<words>.*)")
 STATE_VARIABLE: Final = "FLEET_STATE_DIR"
 
 
@@ -102,7 +104,7 @@ class Child:
         self._process = process
         self.log = log
         self.last = ""
-        """Its last line on stderr: why it ended, if it knew."""
+        """Its last line on stderr that is no mere note: why it ended, if it knew."""
         self.task: asyncio.Task[None]
 
     @classmethod
@@ -162,7 +164,11 @@ class Child:
         ended(code)
 
     def _complained(self, line: str) -> None:
-        self.last = line
+        logged = _LOGGED.fullmatch(line)
+        if logged is None:
+            self.last = line
+        elif logged["level"] in ("ERROR", "CRITICAL"):
+            self.last = logged["words"]
 
     async def _pump(self, stream: asyncio.StreamReader, take: Callable[[str], None]) -> None:
         rest = b""

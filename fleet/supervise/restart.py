@@ -48,6 +48,8 @@ class Patience:
 
     start_s: float
     silence_s: float
+    to_the_end: bool = False
+    """It is heard until it ends, also after it was told to."""
 
 
 def delay_s(falls: int, chance: float) -> float:
@@ -95,17 +97,17 @@ class Ward:
             case State.WAITING if now >= self.due:
                 return Act.START
             case State.ENDING if now >= self._kill_at and not self._killed:
-                self._killed = True
-                self.words = "did not end in time and was killed"
-                return Act.KILL
+                return self._kill("did not end in time and was killed")
+            case State.ENDING if self.patience.to_the_end and listening_since is not None and not self._killed:
+                silent = now - max(listening_since, self.since, self.heard_at)
+                if silent > self.patience.silence_s:
+                    return self._kill(f"hung: not heard for {silent:.1f} s")
             case State.STARTING | State.RUNNING if listening_since is not None and not self._killed:
                 starting = self.state is State.STARTING
                 allowed = self.patience.start_s if starting else self.patience.silence_s
                 silent = now - max(listening_since, self.since if starting else self.heard_at)
                 if silent > allowed:
-                    self._killed = True
-                    self.words = f"hung: not heard for {silent:.1f} s"
-                    return Act.KILL
+                    return self._kill(f"hung: not heard for {silent:.1f} s")
         return Act.NOTHING
 
     def started(self, now: float) -> None:
@@ -173,6 +175,11 @@ class Ward:
         """Nobody else does it any more."""
         self._set(State.WAITING, now)
         self.due = now
+
+    def _kill(self, words: str) -> Act:
+        self._killed = True
+        self.words = words
+        return Act.KILL
 
     def _set(self, state: State, now: float) -> None:
         if state is not self.state or state is State.STARTING:

@@ -45,7 +45,7 @@ class Kind(StrEnum):
 PATIENCE: Final[Mapping[Kind, Patience]] = {
     Kind.HUB: Patience(start_s=10.0, silence_s=4.0),  # linked again after half a second, a lease is 2 s
     Kind.SIMULATOR: Patience(start_s=20.0, silence_s=5.0),  # asked each second
-    Kind.GATEWAY: Patience(start_s=20.0, silence_s=4.0),  # state/health comes each second
+    Kind.GATEWAY: Patience(start_s=20.0, silence_s=4.0, to_the_end=True),  # state/health comes each second
     Kind.COORDINATOR: Patience(start_s=20.0, silence_s=6.0),  # asked each second
     Kind.RECORDER: Patience(start_s=20.0, silence_s=10.0),  # each second, from a thread that waits for the disk
 }

@@ -214,6 +214,63 @@ def test_killed_its_cars_are_stopped(fleet: Fleet, tmp_path: Path) -> None:
         wait_for(lambda: not [pid for pid in theirs if _exists(pid)], "all end")
 
 
+def test_the_end_stops_cars_whose_gateways_hang_or_were_killed_and_says_which_it_could_not(
+    fleet: Fleet, tmp_path: Path
+) -> None:
+    sims = {car: fleet.simulate(f"{car}:arduino:tcp") for car in ("red", "green", "blue")}
+    file = _file(tmp_path, **{car: link for car, (_, (link,)) in sims.items()})
+    with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
+        for car in sims:
+            started.ready(car)
+        for car, (sim, _) in sims.items():
+            assert started.ask("drive", car, motion="forward", duration_s=10)["status"] == "sent"
+            wait_for(lambda car=car, sim=sim: driving(sim, car), f"{car} drives")
+        hung, killed, lost = (started.running(car) for car in sims)
+        os.kill(hung, signal.SIGSTOP)
+        os.kill(killed, signal.SIGKILL)
+        for pid in (lost, sims["blue"][0].pid):
+            os.kill(pid, signal.SIGKILL)
+        began = time.monotonic()
+        started.process.popen.send_signal(signal.SIGINT)
+        for car in ("green", "red"):
+            wait_for(lambda car=car: not driving(sims[car][0], car), f"{car} is stopped")
+            assert time.monotonic() - began < 9.5, "it was stopped, its drive did not end by itself"
+        assert started.process.wait() == 1
+        said = {
+            each["name"]: each["words"] for each in map(json.loads, started.process.lines()) if each["what"] == "end"
+        }
+        assert (said["red"], said["green"]) == ("stopped", "stopped")
+        assert said["blue"].startswith("not stopped: ending without a stop, blue cannot be reached (")
+        assert said["@supervisor"] == "not stopped: blue: look whether they drive"
+
+
+@pytest.mark.parametrize("until", ["@hub", "red", "green"])
+def test_told_to_end_while_it_starts_it_ends_at_once_and_in_order(tmp_path: Path, until: str) -> None:
+    with Up(tmp_path, free_endpoint(), "--sim", "2", "--no-record") as started:
+        started.until("process", until, "started")
+        assert started.process.end(signal.SIGINT) == 0
+        *_, last = map(json.loads, started.process.lines())
+        assert last["words"] in ("no car had been started", "every car that was started is stopped")
+        assert not started.left(ours=True)
+
+
+def test_a_car_that_is_taken_out_is_stopped_though_its_gateway_hangs(fleet: Fleet, tmp_path: Path) -> None:
+    sim, links = fleet.simulate("red:arduino:tcp", "green:arduino:tcp")
+    file = _file(tmp_path, red=links[0], green=links[1])
+    with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
+        started.ready("green")
+        assert started.ask("drive", "green", motion="forward", duration_s=10)["status"] == "sent"
+        wait_for(lambda: driving(sim, "green"), "green drives")
+        began = time.monotonic()
+        os.kill(started.running("green"), signal.SIGSTOP)
+        file.write_text(_text(red=links[0]))
+        assert started.fleet("reload").stdout == "green is taken out\n"
+        wait_for(lambda: not driving(sim, "green"), "green is stopped")
+        assert time.monotonic() - began < 9.5
+        started.until("end", "green", "stopped")
+        wait_for(lambda: started.state("green") is None, "its gateway has ended")
+
+
 def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: Fleet, tmp_path: Path) -> None:
     _, links = fleet.simulate("red:arduino:tcp", "green:arduino:tcp", "blue:arduino:tcp")
     red, green, blue = links

@@ -174,3 +174,17 @@ def test_for_any_order_there_is_at_most_one_and_what_may_run_is_due(steps: list[
         assert ward.alive == process.alive
         if ward.state is State.WAITING:
             assert ward.due <= now + LONGEST_S * (1 + JITTER)
+
+
+def test_who_is_heard_to_the_end_is_killed_when_it_hangs_while_it_ends_and_nobody_else() -> None:
+    for to_the_end in (True, False):
+        ward = Ward(Patience(start_s=20.0, silence_s=4.0, to_the_end=to_the_end), 100.0)
+        ward.started(100.0)
+        ward.heard(101.0)
+        ward.end(110.0, 15.0)
+        assert ward.turn(114.0, None) is Act.NOTHING, "nobody could be heard"
+        assert ward.turn(114.0, 112.0) is Act.NOTHING
+        ward.heard(112.5)
+        assert ward.turn(116.4, 112.0) is Act.NOTHING
+        assert ward.turn(116.6, 112.0) is (Act.KILL if to_the_end else Act.NOTHING)
+        assert ward.turn(125.0, 112.0) is (Act.NOTHING if to_the_end else Act.KILL)
