@@ -44,7 +44,7 @@ COMMANDS: Final = {
     "record": ("fleet.recording.command:record", "Record everything of the fleet to MCAP, until Ctrl-C."),
     "mark": ("fleet.recording.asking:mark", "Write a mark into what is being recorded."),
     "sessions": ("fleet.recording.sessions.command:sessions", "List, verify, recover, cut and export recordings."),
-    "replay": ("fleet.replay.command:replay", "Open a recorded session in Rerun."),
+    "replay": ("fleet.replay.command:replay", "Open a recorded session in Rerun, or play it on the bus again."),
     "view": ("fleet.replay.view:view", "See the fleet live in Rerun."),
     "replan": ("fleet.replay.planning_command:replan", "A plan on a recorded session: where it decides otherwise."),
     "redecode": (
