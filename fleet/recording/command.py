@@ -47,7 +47,7 @@ class Size(click.ParamType[int]):
         return size
 
 
-_FILE: Final = click.Path(path_type=Path, exists=True, dir_okay=False, readable=True)
+_FILE: Final = click.Path(path_type=Path, dir_okay=False)
 
 
 @click.group(

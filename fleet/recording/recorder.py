@@ -125,6 +125,8 @@ class Recorder:
             self._subscribers.append(self._bus.subscribe_channel(expression, CHANNEL))
         self._tape = Tape(self._root, self._fleet, self._options, self._now())
         self._drops = self._tape.drops
+        for words in self._tape.uncopied:
+            self._tell(words)
         session = self._tape.path
         key = keys.topic_key(self._fleet, keys.RECORDER, STATUS.name.partition("/")[2])
         self._publisher = self._bus.publisher(key, STATUS, keys.RECORDER)
@@ -281,6 +283,8 @@ class Recorder:
         self._tape = Tape(self._root, self._fleet, self._options, self._now())
         self._drops = self._tape.drops
         self._tell(f"recording fleet {self._fleet} to {self._tape.path}")
+        for words in self._tape.uncopied:
+            self._tell(words)
 
     def _say_once(self, tape: Tape) -> None:
         """Tell what is new of what should be known."""

@@ -1,5 +1,6 @@
 """Room on the disk: how much there is, what a session takes, which old sessions give way to new ones."""
 
+import contextlib
 import shutil
 import time
 from collections.abc import Iterator
@@ -18,14 +19,18 @@ def free_bytes(path: Path) -> int:
 
 
 def size(session: Path) -> int:
-    """What a session takes, bytes."""
-    return sum(each.stat().st_size for each in session.rglob("*") if each.is_file())
+    """What a session takes, bytes; of one that somebody removes meanwhile, what was left."""
+    found = 0
+    for each in session.rglob("*"):
+        with contextlib.suppress(OSError):
+            found += each.stat().st_size if each.is_file() else 0
+    return found
 
 
 def make_room(root: Path, limit_bytes: int, keep: Path) -> tuple[list[Path], int]:
     """Remove the oldest sessions below `root` until all take no more than the limit: (removed, what is still over).
 
-    `keep`, marked sessions and what is no session of ours are left alone. Raises OSError.
+    `keep`, marked sessions and what is no session of ours are left alone, and what cannot be removed.
     """
     sizes = {session: size(session) for session in _sessions(root)}
     over = sum(sizes.values()) - limit_bytes
@@ -34,7 +39,10 @@ def make_room(root: Path, limit_bytes: int, keep: Path) -> tuple[list[Path], int
         if over <= 0:
             break
         if session != keep and _may_go(session):
-            shutil.rmtree(session)
+            try:
+                shutil.rmtree(session)
+            except OSError:
+                continue  # somebody else's, perhaps: what is over is told
             removed.append(session)
             over -= sizes[session]
     return removed, max(0, over)
@@ -48,5 +56,8 @@ def _may_go(session: Path) -> bool:
     description = Description.read(session)
     if description is None or description.kept:
         return False
-    newest = max((each.stat().st_mtime for each in session.iterdir()), default=0.0)
+    try:
+        newest = max((each.stat().st_mtime for each in session.iterdir()), default=0.0)
+    except OSError:
+        return False
     return description.closed or time.time() - newest > _IN_USE_S

@@ -31,7 +31,8 @@ HELD_BYTES: Final = 64 * MB
 WARN_FREE: Final = 4
 """With less than so many times `keep_free_bytes` it is told that the disk is nearly full."""
 LEAST_ROOM: Final = 500_000
-"""With less than that nothing is begun again."""
+MOST_MORE: Final = 50 * MB
+"""With less than that beyond what is to stay free nothing is begun again: it would soon be full again."""
 TAIL_S: Final = 3 * HELD_S
 """Of a session that was cut off: what of it publishers may still hold."""
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT} if sys.platform != "win32" else {errno.ENOSPC})
@@ -93,6 +94,7 @@ class Tape:
         self.path, self.description = directory.create(root, fleet, _wall(now_ns))
         self._about = {"fleet": fleet, "started": self.description.started, "host": self.description.host}
         self._about |= {**self.description.versions, "format": str(directory.FORMAT)}
+        self.uncopied: list[str] = []
         self._copy()
         self._numbers: dict[str, Numbers] = {}
         self._odd: set[str] = set()
@@ -295,8 +297,11 @@ class Tape:
         rows = self._unflushed
         if not rows:
             return
-        self._first_ns = self._first_ns or rows[0][1]
-        self._last_ns = rows[-1][1]
+        first_ns, last_ns = rows[0][1], rows[-1][1]
+        if last_ns - first_ns < 0 or first_ns < self._last_ns:  # the clock went back
+            first_ns, last_ns = min(row[1] for row in rows), max(row[1] for row in rows)
+        self._first_ns = min(self._first_ns or first_ns, first_ns)
+        self._last_ns = max(self._last_ns, last_ns)
         for lane, _, _, _, sequence in rows:
             if not lane.count:
                 lane.first = sequence
@@ -365,7 +370,8 @@ class Tape:
             removed, over = room.make_room(self._root, limit, self.path)
             self.removed += removed
             if over:
-                self.warning = f"{self._root} has {over / MB:.1f} MB more than its quota, all of it marked or in use"
+                more = f"{self._root} has {over / MB:.1f} MB more than its quota"
+                self.warning = f"{more}, all of it marked, in use or not to be removed"
         free = room.free_bytes(self.path)
         if free < keep * WARN_FREE:
             self.warning = f"{self._root}: the disk is nearly full, {free / MB:.0f} MB are left"
@@ -378,7 +384,8 @@ class Tape:
             self._pause(f"{free / MB:.1f} MB are left on the disk, {keep / MB:g} MB are to stay free")
 
     def _resume(self, now_ns: int) -> None:
-        if room.free_bytes(self.path) < max(2 * self._options.keep_free_bytes, LEAST_ROOM):
+        keep = self._options.keep_free_bytes
+        if room.free_bytes(self.path) < keep + max(min(keep, MOST_MORE), LEAST_ROOM):
             return
         rows, self._unflushed = self._unflushed, []
         try:
@@ -395,7 +402,13 @@ class Tape:
 
     def _copy(self) -> None:
         for name, source in self._options.copied.items():
-            shutil.copyfile(source, self.path / name)
+            try:
+                shutil.copyfile(source, self.path / name)
+            except OSError as error:  # no reason to record nothing
+                self.uncopied.append(f"{source} could not be copied into {self.path}: {error.strerror}")
+        if self.uncopied:
+            self.description.error = "; ".join(self.uncopied)
+            self.description.write(self.path)
 
     def _describe(self, now_ns: int | None, *, closed: bool) -> None:
         description = self.description
@@ -409,16 +422,39 @@ class Tape:
     def _follow(self, before: Session, now_ns: int) -> None:
         """Go on where a recorder was killed: what it has is not written again, what it has not is."""
         start_ns = now_ns - int(TAIL_S * 1e9)
+        # Killed again before it had what the one before it lacked, it lacks that still.
+        chain = [before, *_continued(before, start_ns)]
         self._known = frozenset(
-            (each.key, each.sequence, each.published_ns) for each in before.messages(start_ns=start_ns)
+            (each.key, each.sequence, each.published_ns)
+            for session in chain
+            for each in session.messages(start_ns=start_ns)
         )
-        self._since_ns = max(start_ns, _begun_ns(before))
+        self._since_ns = max(start_ns, _begun_ns(chain[-1]))
         self.description.continues = before.path.name
         self.description.write(self.path)
 
 
 def _wall(now_ns: int) -> datetime:
     return datetime.fromtimestamp(now_ns / 1e9, UTC)
+
+
+def _continued(session: Session, start_ns: int) -> list[Session]:
+    """The sessions that one goes on with, the latest first, back to the one in which `start_ns` lies."""
+    found = [session]
+    while _begun_ns(found[-1]) > start_ns:
+        description = found[-1].description
+        assert description is not None
+        name = description.continues
+        if not name or Path(name).name != name:
+            break
+        try:
+            earlier = Session.open(session.path.parent / name)
+        except NoSession:
+            break
+        if earlier.description is None or earlier.path in [each.path for each in found]:
+            break
+        found.append(earlier)
+    return found[1:]
 
 
 def _begun_ns(session: Session) -> int:

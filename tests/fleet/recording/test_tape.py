@@ -1,0 +1,150 @@
+"""Files by size and by time, sessions by size, old sessions that give way, clocks that go back; no bus."""
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet.recording import directory
+from fleet.recording.directory import Description
+from fleet.recording.session import Session
+from fleet.recording.sessions.verify import verify
+from fleet.recording.tape import MB, Options, Sync, Tape
+
+BEGUN_NS = 1_790_000_000_000_000_000
+SECOND_NS = 1_000_000_000
+JSON = zenoh.Encoding("application/json")
+
+
+def feed(tape: Tape, at_ns: int, count: int = 10, size: int = 1000) -> None:
+    for number in range(count):
+        tape.add("fleet/red/note", os.urandom(size).hex().encode(), JSON, None, None, at_ns + number)
+
+
+def payloads(paths: Iterable[Path]) -> int:
+    return sum(message.key == "fleet/red/note" for path in paths for message in Session.open(path).messages())
+
+
+@pytest.mark.parametrize("sync", list(Sync))
+def test_a_file_ends_at_its_size_and_none_is_begun_for_nothing(tmp_path: Path, sync: Sync) -> None:
+    tape = Tape(tmp_path, "fleet", Options(segment_bytes=100_000, sync=sync), BEGUN_NS)
+    for second in range(20):
+        feed(tape, BEGUN_NS + second * SECOND_NS, count=20)
+        tape.tick(BEGUN_NS + second * SECOND_NS)
+    tape.close(BEGUN_NS + 20 * SECOND_NS)
+    session = Session.open(tape.path)
+    assert 3 < len(session.segments) == tape.segments < 10
+    assert all(segment.stat().st_size < 200_000 for segment in session.segments)
+    verdict = verify(session)
+    assert verdict.whole, list(verdict.words())
+    assert verdict.messages == tape.messages == 400
+    assert tape.bytes == sum(segment.stat().st_size for segment in session.segments)
+
+
+def test_a_file_ends_at_its_time(tmp_path: Path) -> None:
+    tape = Tape(tmp_path, "fleet", Options(segment_s=5.0), BEGUN_NS)
+    for second in range(12):
+        feed(tape, BEGUN_NS + second * SECOND_NS)
+        tape.tick(BEGUN_NS + second * SECOND_NS)
+    tape.close(BEGUN_NS + 12 * SECOND_NS)
+    assert tape.segments == 3
+    assert verify(Session.open(tape.path)).whole
+
+
+def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
+    tape = Tape(tmp_path, "fleet", Options(segment_s=5.0), BEGUN_NS)
+    for second in range(12):
+        feed(tape, BEGUN_NS + second * SECOND_NS)
+        tape.tick(BEGUN_NS + second * SECOND_NS)
+    tape.close(BEGUN_NS + 12 * SECOND_NS)
+    found = json.loads((tape.path / directory.INDEX).read_text())["segments"]
+    assert [one["file"] for one in found] == [path.name for path in Session.open(tape.path).segments]
+    assert [one["bytes"] for one in found] == [path.stat().st_size for path in Session.open(tape.path).segments]
+    for one in found:
+        rows = [(m.recorded_ns, m.key) for m in Session.open(tape.path / one["file"]).messages()]
+        assert (one["first_ns"], one["last_ns"]) == (rows[0][0], rows[-1][0])
+        assert one["messages"] == one["keys"]["fleet/red/note"]["count"] == len(rows)
+
+
+def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> None:
+    tape = Tape(tmp_path, "fleet", Options(), BEGUN_NS)
+    for second in (0, 1, 2, -3600, -3599):
+        feed(tape, BEGUN_NS + second * SECOND_NS)
+        tape.tick(BEGUN_NS + second * SECOND_NS)
+    tape.close(BEGUN_NS - 3598 * SECOND_NS)
+    verdict = verify(Session.open(tape.path))
+    assert verdict.whole
+    assert verdict.messages == 50
+    assert [round(one["step_s"]) for one in verdict.backwards] == [3602]
+    (one,) = json.loads((tape.path / directory.INDEX).read_text())["segments"]
+    assert (one["first_ns"], one["last_ns"]) == (BEGUN_NS - 3600 * SECOND_NS, BEGUN_NS + 2 * SECOND_NS + 9)
+
+
+def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
+    tape = Tape(tmp_path, "fleet", Options(session_bytes=100_000), BEGUN_NS)
+    feed(tape, BEGUN_NS)
+    tape.tick(BEGUN_NS)
+    assert not tape.over
+    feed(tape, BEGUN_NS, count=200)
+    tape.tick(BEGUN_NS)
+    assert tape.over
+    tape.close(BEGUN_NS)
+
+
+def session(root: Path, number: int, *, closed: bool = True) -> Path:
+    """One of half a megabyte, an hour after the one before."""
+    now = BEGUN_NS + number * 3600 * SECOND_NS
+    tape = Tape(root, "fleet", Options(), now)
+    feed(tape, now, count=400)
+    tape.tick(now)
+    if closed:
+        tape.close(now)
+    return tape.path
+
+
+def test_the_oldest_that_nobody_marked_give_way_and_nothing_else_does(tmp_path: Path) -> None:
+    paths = [session(tmp_path, number) for number in range(6)]
+    marked = Description.read(paths[1])
+    assert marked is not None
+    marked.kept = True
+    marked.write(paths[1])
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_bytes(b"x" * MB)
+    one = sum(path.stat().st_size for path in paths[0].iterdir())
+    tape = Tape(tmp_path, "fleet", Options(root_bytes=4 * one), BEGUN_NS + 7 * 3600 * SECOND_NS)
+    tape.tick(BEGUN_NS + 7 * 3600 * SECOND_NS)
+    assert tape.removed == [paths[0], paths[2], paths[3]]
+    assert not tape.warning
+    assert (tmp_path / "notes" / "mine.txt").exists()
+    assert [path.exists() for path in paths] == [False, True, False, False, True, True]
+    tape.close(BEGUN_NS + 7 * 3600 * SECOND_NS)
+
+
+def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp_path: Path) -> None:
+    tape = Tape(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS)
+    tape.mark("keep this", "me", BEGUN_NS)
+    feed(tape, BEGUN_NS, count=400)
+    tape.tick(BEGUN_NS)
+    tape.close(BEGUN_NS)
+    after = Tape(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS + SECOND_NS)
+    after.tick(BEGUN_NS + SECOND_NS)
+    assert "more than its quota, all of it marked, in use or not to be removed" in after.warning
+    assert after.removed == []
+    after.close(BEGUN_NS + SECOND_NS)
+    assert payloads([tape.path]) == 400
+
+
+def test_files_are_copied_into_each_session(tmp_path: Path) -> None:
+    plan = tmp_path / "my.yaml"
+    plan.write_text("roles: {}\n")
+    tape = Tape(tmp_path / "out", "fleet", Options(copied={directory.PLAN: plan}), BEGUN_NS)
+    tape.close(BEGUN_NS)
+    assert (tape.path / "plan.yaml").read_text() == "roles: {}\n"
+    plan.unlink()
+    after = Tape(tmp_path / "out", "fleet", Options(copied={directory.PLAN: plan}), BEGUN_NS + SECOND_NS)
+    assert after.uncopied == [f"{plan} could not be copied into {after.path}: No such file or directory"]
+    after.close(BEGUN_NS + SECOND_NS)
+    assert verify(Session.open(after.path)).whole
