@@ -10,7 +10,7 @@ from typing import Final
 from fleet.policy import explain
 from fleet.policy.decision import Decision, Kind
 from fleet.policy.explain import Override
-from fleet.policy.memory import Held, Memory, Tried
+from fleet.policy.memory import Coloured, Held, Memory, Tried
 from fleet.policy.picture import CONTRADICTED, LOST, NOBODY, CarPicture, Picture
 from fleet.policy.plan import Effect, Plan, Rule
 from fleet.policy.rules import Cars, RuleState, follow_phase, follow_rules, targets
@@ -73,7 +73,6 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     rules = follow_rules(plan, picture, cars, phase.name, memory.rules, now)
     phase = follow_phase(plan, picture, cars, phase, rules, now)
     needs = follow_needs(plan, picture, subjects, memory.needs, now)
-    rules_before = memory.rules
     told = memory.said if phase.name == memory.phase.name else {}  # what would change a decision depends on the phase
     memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
     assert memory.began is not None
@@ -110,13 +109,19 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     decisions += _places(staff, staffing, barriers, phase.name)
     decisions = [each.after(memory.said.get(each.subject), now) for each in decisions]
     tried, asks = _asks(decisions, picture, memory.tried, now)
-    asks += _leds(plan, rules, rules_before, staff, staffing)
+    coloured, colours = _leds(plan, picture, rules, staff, staffing, memory)
     return Step(
-        replace(memory, held=held, tried=tried, said={**memory.said, **{each.subject: each for each in decisions}}),
+        replace(
+            memory,
+            held=held,
+            tried=tried,
+            coloured=coloured,
+            said={**memory.said, **{each.subject: each for each in decisions}},
+        ),
         tuple(decisions),
         tuple(each for each in decisions if explain.new(each, memory.said)),
         tuple(each for each in decisions if explain.reworded(each, memory.said)),
-        tuple(asks),
+        (*asks, *colours),
         staffing.roles,
     )
 
@@ -288,17 +293,28 @@ def _asks(
 
 
 def _leds(
-    plan: Plan, rules: Mapping[int, RuleState], before: Mapping[int, RuleState], staff: Staff, staffing: Staffing
-) -> list[Ask]:
-    """A colour is set once, when its rule comes into force."""
-    asks = []
+    plan: Plan, picture: Picture, rules: Mapping[int, RuleState], staff: Staff, staffing: Staffing, memory: Memory
+) -> tuple[frozenset[Coloured], list[Ask]]:
+    """A colour is set once while its rule is in force, as soon as the car is in mode manual: in no other it obeys."""
     subjects = tuple(sorted({*staff.free, *staff.reserved}))
-    for index, _, state, effect in _effects(plan, rules):
-        was = before.get(index)
-        if effect.led is not None and (was is None or not was.on or was.that != state.that):
-            asks += [
-                Ask(car, led=effect.led)
-                for car in targets(effect, state, subjects, staffing.roles)
-                if car in staff.free
-            ]
-    return asks
+    found, asks = set[Coloured](), []
+    for index, state in rules.items():
+        for position, effect in enumerate(plan.rules[index].effects):
+            if not state.on or effect.led is None:
+                continue
+            before = Coloured(index, position, state.that, None)
+            if before in memory.coloured:
+                found.add(before)
+                continue
+            for car in targets(effect, state, subjects, staffing.roles):
+                one, known = replace(before, car=car), picture.cars.get(car, NOBODY)
+                if one in memory.coloured:
+                    found.add(one)
+                elif _obeys_a_colour(known) and car in staff.free:
+                    found.add(one)
+                    asks.append(Ask(car, led=effect.led))
+    return frozenset(found), asks
+
+
+def _obeys_a_colour(known: CarPicture) -> bool:
+    return known.mode == Mode.MANUAL and known.verdict != CONTRADICTED and not known.busy

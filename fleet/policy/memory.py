@@ -51,6 +51,18 @@ class Kept:
 
 
 @dataclass(frozen=True, slots=True)
+class Coloured:
+    """A car that was asked for the colour of a rule since that came into force."""
+
+    rule: int
+    effect: int
+    """Both by position."""
+    that: str | None
+    car: str | None
+    """None: every car, by the coordinator before this one."""
+
+
+@dataclass(frozen=True, slots=True)
 class Memory:
     """Everything that the next decision needs besides the picture. Times are seconds on one monotonic clock."""
 
@@ -64,6 +76,7 @@ class Memory:
     gone_since: Mapping[str, float] = field(default_factory=dict)
     needs: Mapping[tuple[str, str], Settled] = field(default_factory=dict)
     tried: Mapping[str, Tried] = field(default_factory=dict)
+    coloured: frozenset["Coloured"] = frozenset()
     said: Mapping[str, Decision] = field(default_factory=dict)
     """The last decision of each subject."""
 
@@ -84,6 +97,11 @@ def carried(memory: Memory, before: Plan, after: Plan) -> Memory:
         memory,
         phase=memory.phase if memory.phase.name in after.phases else PhaseState(),
         rules=rules,
+        coloured=frozenset(
+            replace(each, rule=places[before.rules[each.rule]])
+            for each in memory.coloured
+            if before.rules[each.rule] in places
+        ),
         held={car: held for car, held in memory.held.items() if held.role in after.roles},
         needs={key: settled for key, settled in memory.needs.items() if key[1] in same},
         said={},
@@ -112,7 +130,12 @@ def restored(plan: Plan, picture: Picture, kept: Kept, now: float, wall_s: float
     }
     age_s = max(0.0, wall_s - kept.phase_since_s)
     phase = PhaseState(kept.phase, now - age_s, why=IN_PHASE) if kept.phase else PhaseState()
-    return Memory(held=held, rules=rules, phase=phase)
+    coloured = frozenset(
+        Coloured(index, position, state.that, None)
+        for index, state in rules.items()
+        for position in range(len(plan.rules[index].effects))
+    )
+    return Memory(held=held, rules=rules, phase=phase, coloured=coloured)
 
 
 def to_keep(plan: Plan, memory: Memory, now: float, wall_s: float) -> Kept:

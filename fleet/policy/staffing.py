@@ -18,6 +18,8 @@ REFUSED_S: Final = 10.0
 """So long a car that refused a mode is not asked for it again."""
 _REFUSALS: Final = frozenset({"battery_low", "unsupported", "link_down", "write_failed"})
 """Reasons that lie with the car; a hold or a lease its states tell."""
+_SLOT: Final = "/"
+"""At the end of a role's name: a place in it in place of another role's."""
 _KEEP: Final = 1_000_000_000
 _SWITCH: Final = 1_000_000
 _DOUBT: Final = 10_000
@@ -157,7 +159,9 @@ def fill(staff: Staff) -> Staffing:
     costs = _costs(staff)
     places, stands_in = dict(wanted), dict[str, str]()
     while True:
-        roles = assign(costs, {name: places[name] for name in plan.roles if name in places})
+        open_ = {name: min(places[name], wanted.get(name, 0)) for name in plan.roles if name in places}
+        open_ |= {f"{name}{_SLOT}": places[name] - count for name, count in open_.items() if places[name] > count}
+        roles = {car: place.removesuffix(_SLOT) for car, place in assign(costs, open_).items()}
         more = dict(wanted)
         for name in _fallback_order(plan):
             role = plan.roles[name]
@@ -192,15 +196,28 @@ def _fallback_order(plan: Plan) -> list[str]:
     return sorted(plan.roles, key=lambda name: depth[name])
 
 
-def _rank(role: Role) -> tuple[int, bool]:
-    return role.priority, role.count is not None
+def _rank(role: Role) -> tuple[int, bool, int]:
+    return role.priority, role.count is not None, 0
+
+
+def _stand_in_ranks(plan: Plan) -> dict[str, tuple[int, bool, int]]:
+    """A place in place of another is worth less than that one, and more than what is worth less than that one."""
+    found: dict[str, tuple[int, bool, int]] = {}
+    for name in _fallback_order(plan):
+        after = plan.roles[name].fallback
+        if after is not None:
+            priority, _, depth = max(_rank(plan.roles[name]), found.get(name, _rank(plan.roles[name])))
+            found[after] = max(found.get(after, (-1000, True, 0)), (priority, True, depth - 1))
+    return found
 
 
 def _costs(staff: Staff) -> dict[str, dict[str, int]]:
     """What each car costs in each role that it may have."""
     plan = staff.plan
     cars = sorted({*staff.free, *staff.reserved})
-    ranks = {rank: order for order, rank in enumerate(sorted({_rank(role) for role in plan.roles.values()}))}
+    slots = _stand_in_ranks(plan)
+    every = sorted({*(_rank(role) for role in plan.roles.values()), *slots.values()})
+    ranks = {rank: order for order, rank in enumerate(every)}
     # One place of a higher rank is worth more than all of the lower ones, and any place more than all else.
     worth = {rank: (len(cars) + 1) ** (order + 1) * _KEEP * 10 for rank, order in ranks.items()}
     found: dict[str, dict[str, int]] = {}
@@ -229,5 +246,7 @@ def _costs(staff: Staff) -> dict[str, dict[str, int]]:
             if role.cars is not None and car in role.cars:
                 cost += role.cars.index(car) * 10
             row[role.name] = cost
+            if role.name in slots:
+                row[f"{role.name}{_SLOT}"] = cost + worth[_rank(role)] - worth[slots[role.name]]
         found[car] = row
     return found

@@ -107,7 +107,8 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
         ),
         (
             (
-                "roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {a: {roles: [x], timeout_s: 9, next: b}, b: {}}\n"
+                "roles: {x: {mode: tracking}, y: {mode: manual}}\n"
+                "phases: {a: {roles: [x], timeout_s: 9, next: b}, b: {}}\n"
                 "rules: [{when: {any: battery.level == 'low', role: y}, then: {who: red, mode: manual}, during: [a]}]"
             ),
             "rule 1",
@@ -115,7 +116,8 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
         ),
         (
             (
-                "roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {a: {roles: [x], timeout_s: 9, next: b}, b: {}}\n"
+                "roles: {x: {mode: tracking}, y: {mode: manual}}\n"
+                "phases: {a: {roles: [x], timeout_s: 9, next: b}, b: {}}\n"
                 "rules: [{when: {any: line.left_outer}, then: {who: red, role: y}, during: [a]}]"
             ),
             "rule 1",

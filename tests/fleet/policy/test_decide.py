@@ -220,6 +220,56 @@ roles:
     assert run.at(0.2).roles == {"red": "strong"}
 
 
+def test_a_colour_is_asked_for_once_when_the_car_is_in_the_mode_in_which_it_obeys() -> None:
+    plan = parse("""
+cars: {red: tracking, green: manual}
+rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led: [9, 0, 0]}}]
+""")
+    run, coloured = Run(plan, "green", "red", obey=False), list[float]()
+
+    def until(end: float) -> None:
+        while run.now < end:
+            run.sees("green", light={"left": True})
+            result = run.at(round(run.now + 0.1, 6))
+            coloured.extend(run.now for ask in result.asks if ask.led is not None)
+
+    run.change("red", mode="tracking")
+    until(1.0)
+    run.change("red", busy=True, mode="manual")
+    until(2.0)
+    assert coloured == [], "it would be refused"
+    run.change("red", busy=False)
+    until(9.0)
+    assert coloured == [2.1]
+    kept = to_keep(plan, run.memory, run.now, 100.0)
+    run.memory = restored(plan, Picture(run.cars), kept, run.now, 100.0)
+    until(12.0)
+    assert coloured == [2.1], "nor by a coordinator that takes over"
+
+
+@pytest.mark.parametrize("priority", [-1, 0, 1])
+def test_a_stand_in_takes_no_car_from_the_role_that_it_stands_in_for_nor_from_one_that_counts_for_more(
+    priority: int,
+) -> None:
+    plan = parse(f"""
+roles:
+  scout: {{mode: tracking, priority: {priority + 1}}}
+  pair: {{mode: following, count: 3, priority: {priority}, fallback: rest}}
+  rest: {{mode: manual, on_call: true}}
+""")
+    run = Run(plan, "blue", "green", "pi")
+    run.change("pi", platform="raspberry_pi")
+    run.change("green", held_by="ann")
+    assert run.at(0.0).roles == {"blue": "scout", "pi": "rest"}
+    run.change("green", held_by=None)
+    run.until(3.0)
+    assert run.roles == {"blue": "scout", "green": "pair", "pi": "rest"}
+    run.cars["red"] = HERE
+    run.until(6.0)
+    assert run.roles == {"blue": "scout", "green": "pair", "pi": "rest", "red": "pair"}
+    assert [ask[1:] for ask in run.asked] == [("blue", "tracking"), ("green", "following"), ("red", "following")]
+
+
 def test_a_restarted_coordinator_switches_no_mode() -> None:
     run = Run(TWO, "blue", "green", "red")
     run.change("red", mode="obstacle_avoidance")
