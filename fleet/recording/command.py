@@ -70,7 +70,9 @@ What was marked is spared by the quota.""",
 @click.option(
     "--segment-size", type=Size(10**6), default="512MB", show_default=True, help="A file has at most so much."
 )
-@click.option("--segment-time", type=Span(_WEEK_S), default="1h", show_default=True, help="... and is at most so long.")
+@click.option(
+    "--segment-time", type=Span(_WEEK_S), default="10m", show_default=True, help="... and is at most so long."
+)
 @click.option(
     "--sync",
     type=click.Choice(("never", "segment", "second")),

@@ -354,7 +354,8 @@ class Recorder:
             case "mark":
                 self._mark(query)
             case "status":
-                pass
+                if not self.ended.is_set():
+                    self._last = self._status()
             case _:
                 raise _Refused(f"{verb!r} is not known: allowed are {', '.join(VERBS)}")
 

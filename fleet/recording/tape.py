@@ -30,6 +30,8 @@ HELD_BYTES: Final = 64 * MB
 """What waits while the disk is full; what comes then is dropped, and counted."""
 WARN_FREE: Final = 4
 """With less than so many times `keep_free_bytes` it is told that the disk is nearly full."""
+MOST_SEGMENTS: Final = 9990
+"""Their names have four digits."""
 LEAST_ROOM: Final = 500_000
 MOST_MORE: Final = 50 * MB
 """With less than that beyond what is to stay free nothing is begun again: it would soon be full again."""
@@ -51,7 +53,8 @@ class Options:
     """How sessions are written; 0 is no limit."""
 
     segment_bytes: int = 512 * MB
-    segment_s: float = 3600.0
+    segment_s: float = 600.0
+    """The index of an open file is in memory: of a hundred cars, 0.1 MB a second."""
     sync: Sync = Sync.SEGMENT
     session_bytes: int = 0
     """A session that has so much is closed, and the next one begins."""
@@ -226,7 +229,7 @@ class Tape:
     @property
     def over(self) -> bool:
         """Whether the session has all that it may have."""
-        return 0 < self._options.session_bytes <= self.bytes
+        return 0 < self._options.session_bytes <= self.bytes or self.segments >= MOST_SEGMENTS
 
     # ------------------------------------------------------------------ each second, and the end
 

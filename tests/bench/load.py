@@ -27,7 +27,7 @@ SETTLED = HOUR // 10
 AT_ONCE = 100
 
 
-def _cpu_s(process: Process) -> float:
+def cpu_s(process: Process) -> float:
     """Time on a processor, user and system: by the scheduler's own count (Linux), elsewhere by `ps` in hundredths.
 
     Ticks of 10 ms, as /proc/PID/stat has them, miss most of what runs for a fraction of one.
@@ -64,9 +64,9 @@ def _cpu(process: Process, port: Tty) -> float:
     """Share of a core, in percent."""
     with _frames(port, TRACKING):
         sleep(0.5)
-        before, began = _cpu_s(process), monotonic()
+        before, began = cpu_s(process), monotonic()
         sleep(WINDOW_S)
-        return (_cpu_s(process) - before) / (monotonic() - began) * 100
+        return (cpu_s(process) - before) / (monotonic() - began) * 100
 
 
 def _track(here: Stage, port: Tty) -> None:

@@ -1,4 +1,4 @@
-"""CPU per recorded message; the floor is a subscriber's callback that calls `add_message`.
+"""CPU per recorded message, and of a hundred cars; the floor is a subscriber's callback that calls `add_message`.
 
 Both are processes of their own, given the same messages at the same pace: what forty cars send that track a line.
 Everything that a process does is in its CPU time, so ours pays for its flushes, its status and its counting, too.
@@ -13,14 +13,19 @@ from typing import Any
 from schemas import bus, keys
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
+from tests.bench.load import cpu_s
 from tests.bench.measured import Measured, in_turns
 from tests.bench.stage import READING, Stage, perf_counter, stage
 from tests.support.processes import Process
+from tests.support.recording import Load, Recording, faults
 
 CARS = 40
 TOPIC_NAMES = ("sensor/line", "frame/rx")
 ROUNDS = 50
 ROUND_S = 1 / 25
+CROWD = 100
+CROWD_S = 60.0
+CROWD_FLOOR_S = 20.0
 SETTLE_S = 0.3
 """For what is still under way when the last message was sent."""
 
@@ -63,6 +68,37 @@ def _told_to_end(process: Process) -> Any:
     return found
 
 
+def _crowd(here: Stage) -> list[Measured]:
+    """A hundred cars that track, their readings and raw frames, for a minute: nothing is dropped or missed."""
+    directory = here.fleet.directory / "crowd"
+    recording = Recording(here.fleet, directory)
+    with Load(here.fleet.endpoint, CROWD) as load:
+        ours, rate = _share(recording.process, load, CROWD_S)
+        load.rest()
+        found = recording.end()
+    assert faults(load, [recording.session]) == ({}, {})
+    assert (found["drops"], found["missed"]) == ({}, {}), found
+    bare = here.bare("record", "fleet/**", str(here.fleet.directory / "crowd.mcap"))
+    assert bare.line()["ready"]
+    with Load(here.fleet.endpoint, CROWD) as load:
+        floor, _ = _share(bare, load, CROWD_FLOOR_S)
+    _told_to_end(bare)
+    asked = CROWD * len(TOPIC_NAMES) / ROUND_S
+    return [
+        Measured("recorder CPU, 100 cars at 25/s and frames, a minute", (ours,), (floor,), "%", None),
+        Measured("... which published, and all was recorded", (rate,), (asked,), "/s", None),
+    ]
+
+
+def _share(process: Process, load: Load, seconds: float) -> tuple[float, float]:
+    """Share of a core, in percent, and messages a second."""
+    sleep(SETTLE_S)
+    count, before, began = load.count(), cpu_s(process), perf_counter()
+    sleep(seconds)
+    took = perf_counter() - began
+    return (cpu_s(process) - before) / took * 100, (load.count() - count) / took
+
+
 def run() -> list[Measured]:
     with stage() as here:
         ours, floor = in_turns(
@@ -73,4 +109,5 @@ def run() -> list[Measured]:
             ),
             lambda: _cost(here, "floor", lambda d: here.bare("record", "floor/**", str(d / "floor.mcap"))),
         )
-    return [Measured("record a message (CPU)", tuple(ours), tuple(floor), "us", 1.3)]
+        crowd = _crowd(here)
+    return [Measured("record a message (CPU)", tuple(ours), tuple(floor), "us", 1.3), *crowd]

@@ -1,0 +1,85 @@
+"""What tests/e2e/test_recorder_kills.py does, many times and with more cars; the recorder's memory."""
+
+import random
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from schemas.gen import fleet_v1_pb2 as pb
+from schemas.topics import TOPICS
+from tests.support.lossless import hub_killed, recorder_killed
+from tests.support.ports import free_endpoint
+from tests.support.processes import Fleet, wait_for
+from tests.support.recording import Recording
+
+CARS = 20
+MESSAGES = 10_000_000
+PUBLISHERS = 40
+AT_ONCE = 50
+LEAD = 20_000
+"""How many may be under way."""
+SETTLED = 1_000_000
+GROWN = 1.1
+"""Of the first million: what waits, and the index of the file that is being written."""
+
+
+@pytest.mark.soak
+def test_the_hub_killed_twenty_times(tmp_path: Path) -> None:
+    fleet = Fleet(free_endpoint(), tmp_path)
+    try:
+        told = hub_killed(fleet, tmp_path / "sessions", cars=CARS, times=20, chance=random.Random())
+    finally:
+        fleet.close()
+    print(f"\n{told.published} published over 20 kills of the hub, {told.recovered} had again; none lost, none twice")
+
+
+@pytest.mark.soak
+def test_the_recorder_killed_fifty_times(tmp_path: Path) -> None:
+    fleet = Fleet(free_endpoint(), tmp_path)
+    try:
+        told = recorder_killed(fleet, tmp_path / "sessions", cars=CARS, times=50, chance=random.Random())
+    finally:
+        fleet.close()
+    times = sorted(told.missing_s)
+    print(
+        f"\n{told.published} published over 50 kills of the recorder, none lost, none twice; a session lacks "
+        f"what came in the last {times[len(times) // 2]:.2f} s (median), {times[-1]:.2f} s at most"
+    )
+
+
+@pytest.mark.soak
+def test_memory_is_flat_over_ten_million_messages(tmp_path: Path) -> None:
+    fleet = Fleet(free_endpoint(), tmp_path)
+    began = time.monotonic()
+    try:
+        recording = Recording(fleet, tmp_path / "sessions")
+        out = [
+            fleet.bus.publisher(f"fleet/car{number}/sensor/line", TOPICS["sensor/line"], f"car{number}")
+            for number in range(PUBLISHERS)
+        ]
+        line, sent, memory = pb.Line(left_inner=True), 0, []
+
+        def follows(count: int) -> bool:
+            (status,) = fleet.get("fleet/@recorder/status")
+            return int(status.messages) >= count
+
+        while sent < MESSAGES:
+            for _ in range(AT_ONCE):
+                for each in out:
+                    each.put(line, time.time_ns())
+            sent += AT_ONCE * PUBLISHERS
+            # As many as the recorder takes: what it cannot take it drops, and says so.
+            wait_for(partial(follows, sent - LEAD), "the recorder follows")
+            if sent % SETTLED == 0:
+                memory.append(recording.process.rss_mb())
+        wait_for(partial(follows, sent), "all is recorded")
+        found = recording.end()
+    finally:
+        fleet.close()
+    shown = ", ".join(f"{each:.0f}" for each in memory)
+    print(f"\n{found['messages']} messages in {time.monotonic() - began:.0f} s; RSS after each million: {shown} MB")
+    assert (found["drops"], found["missed"]) == ({}, {})
+    assert found["messages"] >= MESSAGES
+    assert max(memory[1:]) < memory[0] * GROWN
