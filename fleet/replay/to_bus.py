@@ -81,6 +81,12 @@ class Player:
         tried = all(each.startswith((keys.COORDINATOR, keys.RECORDER)) for each in taken)
         return ", or only what cars said with --cars-only" if tried else ""
 
+    def remember(self, recorded: Iterable[Recorded]) -> None:
+        """What was said before the beginning is there to be asked for, as it was then."""
+        for one in recorded:
+            if (key := self._key_of(one)) is not None:
+                self._keep(key, one, _encoding(one))
+
     def play(
         self,
         recorded: Iterable[Recorded],
@@ -127,17 +133,26 @@ class Player:
             with contextlib.suppress(BusError):  # of another machine: it comes back by itself, or Ctrl-C
                 ensure_hub(self.bus.endpoint)
 
-    def _publish(self, one: Recorded) -> None:
+    def _key_of(self, one: Recorded) -> str | None:
         key = keys.parse(one.key)
         if key is None or key.topic.startswith("@cmd/") or not key.topic:
+            return None
+        return f"{self.name}/{key.car}/{key.topic}"
+
+    def _publish(self, one: Recorded) -> None:
+        written = self._key_of(one)
+        if written is None:
             return
-        written = f"{self.name}/{key.car}/{key.topic}"
+        encoding = _encoding(one)
         topic = topics.of_key(written)
-        encoding = f"{topics.PROTOBUF};{one.message}" if one.message else _encoding(one)
         self.bus.put_again(written, one.payload, encoding, one.sequence, Qos.READING if topic is None else topic.qos)
         self.published += 1
+        self._keep(written, one, encoding)
+
+    def _keep(self, key: str, one: Recorded, encoding: str) -> None:
+        topic = topics.of_key(key)
         if topic is not None and topic.message == one.message and topic.family not in ("frame", "event", "sim"):
-            self._latest[written, _subject(topic, one.payload)] = one.payload, encoding
+            self._latest[key, _subject(topic, one.payload)] = one.payload, encoding
 
     # ------------------------------------------------------------------ queries
 
@@ -174,6 +189,8 @@ class Player:
 
 
 def _encoding(one: Recorded) -> str:
+    if one.message:
+        return f"{topics.PROTOBUF};{one.message}"
     return messages.JSON if one.encoding == "json" else one.encoding
 
 

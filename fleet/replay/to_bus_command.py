@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from fleet.recording.sessions.overview import Overview
 
 TOLD_EVERY_S: Final = 0.5
+REMEMBERED_NS: Final = 300_000_000_000
+"""What was said so long before the beginning can be asked for: a battery that is not measured in a mode, a plan."""
 _DEFAULTS: Final = {"name": None, "rate": 1.0, "loop": False, "offset": None, "skip_gaps": None, "connect": None}
 _ONLY: Final = {
     "name": "--as",
@@ -124,6 +126,7 @@ def to_bus(
                 f"{session.name} as fleet {name} at {bus.endpoint}, {rate:g} times as fast: "
                 f"{', '.join(there) or 'no car'}; Ctrl-C ends"
             )
+            player.remember(session.messages(wanted, first_ns - REMEMBERED_NS, first_ns))
             told = _Progress((end_ns - begin_ns) / 1e9)
             origin_s = time.monotonic()
             while not stop.is_set():

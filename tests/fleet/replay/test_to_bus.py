@@ -15,6 +15,7 @@ from mcap.writer import Writer
 
 from fleet.recording.session import Recorded, Session
 from fleet.replay.schedule import Schedule
+from fleet.replay.to_bus import Player
 from schemas import bus
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.replay.make_session import START_NS, Made, make
@@ -141,6 +142,14 @@ def test_a_part_of_it_over_and_over(fleet: Fleet, session: Path) -> None:
     assert first > second  # the first round begins later
 
 
+def test_what_was_said_before_the_beginning_can_be_asked_for(fleet: Fleet, session: Path) -> None:
+    player = play(fleet, session, "--offset", "4500ms", "--rate", "0.1")
+    # A battery is measured in mode manual only: until second 2.
+    battery = wait_for(lambda: fleet.get("fleet-replay/red/sensor/battery"), "the battery")
+    assert [one.stamp.ToNanoseconds() for one in battery] == [START_NS + S + 60_000_000]
+    assert player.end(signal.SIGINT) == 0
+
+
 def test_a_name_that_is_a_living_fleets_is_refused(fleet: Fleet, session: Path) -> None:
     fleet.bus.token("again/red")
     player = play(fleet, session, "--as", "again")
@@ -174,6 +183,10 @@ def test_commands_of_a_recording_are_not_given_again(fleet: Fleet, tmp_path: Pat
         fleet.bus.subscribe(expression, lambda sample: got.append(sample.key))
     assert play(fleet, tmp_path / "driven.mcap").wait() == 0
     assert got == ["fleet-replay/red/sensor/range"]
+    # Neither is it taken out of the recording, nor would it be published if it were.
+    player = Player(fleet.bus, "direct", "")
+    player.play(Session.open(tmp_path / "driven.mcap").messages(), Schedule(), 0.0, lambda: False, lambda _: None)
+    assert player.published == 1
 
 
 def test_a_hub_that_is_killed_is_replaced(fleet: Fleet, session: Path) -> None:
