@@ -10,10 +10,11 @@ from enum import StrEnum
 from typing import Final
 
 from fleet.faults import meant
-from fleet.policy.conflicts import alternations, fights, outside
+from fleet.policy.conflicts import alternations, fights, implies, outside
 from fleet.policy.picture import CarPicture, topic_of
 from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Phase, Plan, Role, Rule
 from fleet.policy.staffing import unfit
+from fleet.policy.steady import HYSTERESIS_S
 from gateway.protocol.profile import Platform, Profile, parse_platform
 from gateway.protocol.values import Mode
 
@@ -119,7 +120,9 @@ class _Check:
             if not able:
                 whys = "; ".join(f"{car}: {self._why_not(car, role)}" for car in list(self._cars)[:4])
                 yield Finding(Gravity.ERROR, part, f"no car can fill it{f': {whys}' if whys else ''}")
-            elif self._known is not None and role.count is not None and len(able) < role.count:
+            elif (
+                role.count is not None and len(able) < role.count and (self._known is not None or role.cars is not None)
+            ):
                 words = f"it wants {role.count} cars, and only {', '.join(sorted(able))} can have it"
                 yield Finding(Gravity.WARNING, part, words)
             if role.on_call and not self._called(role):
@@ -168,6 +171,9 @@ class _Check:
             for condition, word in ((rule.when, "fire"), (rule.until, "end by `until`")):
                 if condition is not None and (why := self._never_so(condition)):
                     yield Finding(Gravity.ERROR, rule.name, f"it can never {word}: {why}")
+            if rule.until is not None and implies(rule.when, rule.until):
+                words = f"it can never fire: {rule.until.text} ends it, and is so whenever it begins"
+                yield Finding(Gravity.ERROR, rule.name, words)
             for effect in rule.effects:
                 yield from self._useless(rule, effect)
         yield from self._fights()
@@ -308,6 +314,9 @@ class _Check:
             part = f"phase {name}"
             if name not in reached:
                 yield Finding(Gravity.ERROR, part, f"nothing leads to it: the plan begins with {plan.first}")
+            if phase.timeout_s is not None and phase.timeout_s < HYSTERESIS_S:
+                words = f"it lasts {HYSTERESIS_S:g} s at least, whatever timeout_s says"
+                yield Finding(Gravity.WARNING, part, words)
             if phase.until is not None and (why := self._never_so(phase.until) or self._no_role(phase)):
                 words = f"it never ends: {why}; give it timeout_s"
                 if phase.timeout_s is not None:

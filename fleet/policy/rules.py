@@ -174,6 +174,6 @@ def _by_itself(
     if phase.until is not None and phase.next is not None and true and lasted_s >= HYSTERESIS_S:
         used = _used(phase.until, picture, cars, true[0] or None, now)
         return PhaseState(phase.next, now, why=f"{phase.name} ends with {phase.until.text}", used=used)
-    if phase.timeout_s is not None and phase.on_timeout is not None and lasted_s >= phase.timeout_s:
+    if phase.timeout_s is not None and phase.on_timeout is not None and lasted_s >= max(phase.timeout_s, HYSTERESIS_S):
         return PhaseState(phase.on_timeout, now, why=f"{phase.name} lasts at most {phase.timeout_s:g} s")
     return replace(before, until=until)

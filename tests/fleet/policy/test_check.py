@@ -133,6 +133,13 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
         ),
         (
             SCOUT
+            + "rules: [{when: {any: line.left_outer}, until: {any: line.left_outer or line.right_outer},"
+            + " then: {who: all, mode: following}}]",
+            "rule 1",
+            "it can never fire: any car: line.left_outer or line.right_outer ends it",
+        ),
+        (
+            SCOUT
             + "phases: {a: {until: {any: line.left_outer}, next: b}, b: {until: {any: line.left_outer}, next: a}}",
             "phase a",
             "a -> b -> a: these follow each other every 1.5 s as long as any car: line.left_outer is so",
@@ -155,6 +162,7 @@ def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> Non
     ("text", "told"),
     [
         ("roles: {x: {mode: tracking, count: 3}}", "it wants 3 cars, and only red can have it"),
+        (SCOUT + "phases: {a: {timeout_s: 0.01, next: b}, b: {timeout_s: 9, next: a}}", "it lasts 1.5 s at least"),
         (
             SCOUT + "rules: [{when: {car: red, is: range.range_m < 0.3}, then: {who: red, mode: tracking}}]",
             "it ends itself: in mode tracking, range.range_m is not measured; give it until",

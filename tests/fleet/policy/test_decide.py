@@ -205,6 +205,17 @@ phases:
     assert run.memory.phase.name == "give_up"
 
 
+def test_phases_with_the_shortest_time_outs_do_not_flap() -> None:
+    plan = parse("""
+roles: {look: {mode: manual}, go: {mode: tracking}}
+phases: {a: {roles: [look], timeout_s: 0.01, next: b}, b: {roles: [go], timeout_s: 0.01, next: a}}
+""")
+    run = Run(plan, "red")
+    run.at(0.0)
+    run.until(15.0)
+    assert all(after - before >= 1.5 for (before, *_), (after, *_) in pairwise(run.asked))
+
+
 def test_a_role_that_lacks_a_car_is_stood_in_for() -> None:
     plan = parse("""
 roles:
