@@ -84,6 +84,8 @@ class Wanted:
     """As it was read and checked: a file that is changed counts when it is reloaded."""
     record: bool = True
     recordings: Path = RECORDINGS
+    file: Path | None = None
+    """The fleet file, of which a recording keeps a copy."""
     world: Path | None = None
     listed: Mapping[str, Listed] = field(default_factory=dict)
     """Every car, as the fleet file says; those that are only simulated, as their platform is."""
@@ -127,6 +129,7 @@ def wanted(file: FleetFile | None, asked: Asked) -> Wanted:
         plan=asked.plan or (file.plan if file else None),
         record=(file.record if file else True) if asked.record is None else asked.record,
         recordings=asked.out or (file.recordings if file else None) or RECORDINGS,
+        file=file.path if file else None,
         world=asked.world or (file.world if file else None),
         listed={name: _listed(specs.get(name), car.platform) for name, car in cars.items()},
     )
@@ -219,7 +222,9 @@ def _terminal(directory: Path, car: str) -> str:
 def recorder_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
     """The recorder."""
     where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
-    return module("fleet.cli", "record", "--out", str(wish.recordings), "--json", *where)
+    files = {"--fleet-file": wish.file, "--plan": wish.plan}
+    kept = [word for option, path in files.items() if path is not None for word in (option, str(path))]
+    return module("fleet.cli", "record", "--out", str(wish.recordings), "--json", *kept, *where)
 
 
 def coordinator_command(wish: Wanted, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
