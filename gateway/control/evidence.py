@@ -5,6 +5,7 @@ from typing import Final
 from gateway.control.battery import Action, BatteryLevel
 from gateway.control.execution import Execution
 from gateway.control.mode import MANUAL_SILENCE_S, Verdict
+from gateway.control.obedience import Shown
 from gateway.control.records import (
     Level,
     Phase,
@@ -12,7 +13,6 @@ from gateway.control.records import (
     SetMode,
     Why,
 )
-from gateway.control.stop import Running
 from gateway.protocol.profile import StopStyle
 from gateway.protocol.readings import Event, Sensors
 from gateway.protocol.values import Mode
@@ -21,8 +21,6 @@ STALL_S: Final = 0.5
 """A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
 UNDER_WAY_S: Final = 0.06
 """A reading that came sooner after a frame was under way when the frame was sent."""
-CLOSING_S: Final = (0.2, 0.95)
-"""protocol.md: `x0` blocks for about 1.0 s. A reading between shows that it did not; a sooner one was under way."""
 FAN_SETTLED_S: Final = 2.0
 """Readings this long after a toggle were sent with the fan as it is now."""
 
@@ -54,32 +52,45 @@ class Evidence(Execution):
             self._weigh_battery(event.voltage_v, now)
         if now > self.believed.fan_at + FAN_SETTLED_S and self.profile.stop_style is not StopStyle.RASPBERRY_PI:
             self.believed.fan = False  # protocol.md: a car whose fan runs sends no readings
+        self._weigh_obedience(event, now)
         running = self._running
         if running is None:
             if self._gave_up and self._link_open:
                 self._gave_up = False
                 self._ledger.log(Level.INFO, "answers_again", "a reading came: recovery begins again", now)
                 self._begin(self._recovery(now), Why.RECOVERY, now)
-        elif not running.disobeyed and self._shows_disobedience(event):
-            self._disobeyed(running, event.at - self._closed_at, now)
-        elif running.frames_sent and not running.disobeyed and event.at > running.last_at + UNDER_WAY_S:
+        elif (
+            running.frames_sent
+            and not running.disobeyed
+            and event.at > running.last_at + UNDER_WAY_S
+            and now >= self._obedience.doubt_until
+        ):
             self._finish(running, now)
 
-    def _shows_disobedience(self, event: Sensors) -> bool:
-        """Whether a mode-0 reading came in the second for which a car that obeys `MODE00` is blocked.
+    def _weigh_obedience(self, event: Sensors, now: float) -> None:
+        """A car that was heard to obey is stopped until it does again; of one that never was, it is only said.
 
-        One without an echo does not show it: it took a second, and had begun before.
+        That may be deaf from the start, but also one that does not beep, or no car at all: protocol.md's recovery asks
+        for no more than a reading, and no number of stops would tell.
         """
-        return bool(event.range_cm) and CLOSING_S[0] < event.at - self._closed_at < CLOSING_S[1]
-
-    def _disobeyed(self, running: Running, after_s: float, now: float) -> None:
+        shown = self._obedience.heard(event.at, echo=bool(event.range_cm))
+        if shown is Shown.OBEYED and self._deaf:
+            self._deaf = False
+            self._ledger.log(Level.INFO, "hears", f"{self.car} was silent for MODE00's second: it hears", now)
+        if shown is not Shown.LOST:
+            return
         self.disobeyed += 1
-        words = (
-            f"{self.car} reported {after_s:.2f} s after it was sent MODE00, which blocks a car that obeys it for 1 s: "
-            "it did not get it, and perhaps nothing else (a link that loses what is written); stopping it again"
-        )
-        self._ledger.log(Level.WARNING, "not_obeyed", words, now)
-        if running.recipe.confirmed:
+        seen = f"{self.car} reported as before through the second for which MODE00 blocks a car that obeys it: "
+        if not self._obedience.ever:
+            if not self._deaf:
+                words = "it has not shown yet that it hears (is its receiving line connected?): rely on no stop"
+                self._ledger.log(Level.WARNING, "not_obeyed", seen + words, now)
+            self._deaf = True
+            return
+        words = "it did not get it, and perhaps nothing else (a link that loses what is written); stopping it again"
+        self._ledger.log(Level.WARNING, "not_obeyed", seen + words, now)
+        running = self._running
+        if running is not None and running.recipe.confirmed:
             running.disobeyed = True  # no reading confirms it any more: it tries again
         else:
             self.known = False

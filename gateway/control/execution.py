@@ -11,6 +11,7 @@ from gateway.control.battery import Battery, Policy
 from gateway.control.believed import Believed
 from gateway.control.ledger import Ledger, Pending
 from gateway.control.mode import ModeTruth, Verdict
+from gateway.control.obedience import Obedience
 from gateway.control.outbox import FLIGHT_S, Pacing
 from gateway.control.platform import PlatformTruth
 from gateway.control.recipes import Recipe
@@ -80,8 +81,9 @@ class Execution:
         """A mode whose effect has not been seen yet, and when its frame went out."""
         self._senders = Senders()
         self._waiting = Waiting(self._ledger, self._senders, self.safety)
-        self._closed_at = float("-inf")
-        """When `MODE00` was written last, if a car in mode 0 must have been awake to get it, and was blocked by it."""
+        self._obedience = Obedience()
+        self._deaf = False
+        """It reports as if it had not got `MODE00`, and has not shown on this link that it hears at all."""
         self.disobeyed = 0
         """How often what was heard has shown that a frame was lost."""
         self._left_at = self._left_until = float("-inf")
@@ -92,7 +94,7 @@ class Execution:
     @property
     def motors(self) -> str:
         """`off` only after a stop that is complete; `unknown` while the car's state is."""
-        if not self.known or self._unsure or self.mode.verdict is Verdict.CONTRADICTED:
+        if not self.known or self._unsure or self._deaf or self.mode.verdict is Verdict.CONTRADICTED:
             return "unknown"
         return "on" if self.believed.motors_on else "off"
 
@@ -136,7 +138,8 @@ class Execution:
     def link_up(self, now: float) -> None:
         """The link is open: bring the car to a known state."""
         self._link_open = self.was_open = True
-        self._gave_up = self._unheard = False
+        self._gave_up = self._unheard = self._deaf = False
+        self._obedience = Obedience()
         self.known = False
         if self.platform.auto:  # another car may have been plugged in
             self.platform = PlatformTruth(self.platform.told, auto=True)
@@ -205,7 +208,7 @@ class Execution:
             deaf_until = max(now, self.pacing.block_until) + self._for_stop(now).turn_s
             self._left_at, self._left_until = now, deaf_until + self.profile.block_s(write.frame) + FLIGHT_S
         if isinstance(write.frame, ModeClose):
-            self._closed_at = now if self._awake(now) else float("-inf")
+            self._obedience.closed(now, awake=self._awake(now))
         self.pacing.wrote(write.frame, now)
         self._note_frame(write.frame, now)
         match source:
@@ -233,7 +236,8 @@ class Execution:
         times = self._waiting.deadlines()
         if self._running is not None:
             listening = self._closing and self._running.frames_sent and self._listens(self._running)
-            times.append(self._running.last_at + LISTEN_S if listening else self._running.wake_at(self.pacing))
+            wake_at = self._running.last_at + LISTEN_S if listening else self._running.wake_at(self.pacing)
+            times.append(max(wake_at, self._obedience.doubt_until) if self._running.frames_sent else wake_at)
         elif self.known:
             if self._waiting.acts:
                 times.append(max(self.pacing.act_at(self._waiting.acts[0].frames[0]), self._left_until))
@@ -386,20 +390,23 @@ class Execution:
     def _finish(self, running: Running, now: float) -> None:
         """The stop is complete: the motors are off."""
         self._running = None
-        if not self.known:
+        if not self.known and not self._deaf:
             self._ledger.log(Level.INFO, "recovered", f"{self.car} is in a known state: stopped, mode manual", now)
         self.known = True
         self._gave_up = self._unsure = False
         self.believed.motors_on = False
         for pending in running.commands:
             if not isinstance(pending.command.what, SetMode):
-                self._ledger.record(pending, Phase.COMPLETE, now)
+                words = f"as far as it was sent: {self.car} has not shown that it hears" if self._deaf else ""
+                self._ledger.record(pending, Phase.COMPLETE, now, words=words)
 
     def _overdue(self, running: Running, now: float) -> None:
         """No mode-0 reading since the last frame: a stop is over in time; a recovery tries again, three times."""
         listens_until = running.last_at + LISTEN_S if self._closing and self._listens(running) else float("-inf")
         if not running.recipe.confirmed:
-            if now < max(running.obeyed_at, listens_until if self.mode.verdict is Verdict.ASSUMED else 0.0):
+            if self.mode.verdict is not Verdict.ASSUMED:
+                listens_until = float("-inf")
+            if now < max(running.obeyed_at, listens_until, self._obedience.doubt_until):
                 return
             if self.mode.verdict is Verdict.CONTRADICTED and self._recovery(now).confirmed:
                 self.known = False
