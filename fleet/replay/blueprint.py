@@ -21,7 +21,7 @@ from schemas.topics import TOPICS
 _THRESHOLDS: Final[Mapping[mapping.How, Rgb]] = {mapping.How.LOW: (224, 160, 48), mapping.How.CRITICAL: (217, 83, 79)}
 _LEAST_HEIGHT_M: Final = 1.5
 _WIDE: Final = 1.5
-"""The world's view is so many times as wide as it is high, at least."""
+"""With lines of text below it the world's view is so many times as wide as it is high, at least."""
 _LEDS: Final = frozenset({mapping.LED_ASKED.name, mapping.LED_TRUE.name})
 
 _View = rrb.View | rrb.Container
@@ -61,11 +61,12 @@ class _Layout:
     def fleet_tab(self, ground: tuple[tuple[float, float], tuple[float, float]] | None) -> _View:
         """The fleet at a glance, and beside it its services."""
         session = self._session
-        left: list[_View] = [self._world(*ground)] if ground is not None else []
         texts = [view for name, ours, theirs in mapping.FLEET_TEXTS if (view := self._fleet_text(name, ours, theirs))]
         if mapping.PLAN in session.services:
             plan = mapping.entity(f"{session.fleet}/{mapping.PLAN}")
             texts.append(rrb.TextDocumentView(origin=plan, contents=[plan], name="Plan"))
+        wide = _WIDE if texts else 1.0
+        left: list[_View] = [self._world(*ground, wide)] if ground is not None else []
         if texts:
             left.append(rrb.Tabs(*texts, active_tab=0))
         right: list[_View] = []
@@ -175,7 +176,7 @@ class _Layout:
     def _lanes(self, name: str, shown: _Shown) -> rrb.StateTimelineView:
         return rrb.StateTimelineView(origin="/", contents=list(shown), name=name, overrides=shown, time_view=self._axis)
 
-    def _world(self, low: tuple[float, float], high: tuple[float, float]) -> rrb.Spatial3DView:
+    def _world(self, low: tuple[float, float], high: tuple[float, float], wide: float) -> rrb.Spatial3DView:
         session = self._session
         contents = [
             f"{self._entity(car, mapping.TRUTH)}/**" for car, topics in session.cars.items() if mapping.TRUTH in topics
@@ -183,7 +184,7 @@ class _Layout:
         if mapping.WORLD in session.services:
             contents.append(f"{self._entity('', mapping.WORLD)}/**")
         x, y = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
-        size = max(high[1] - low[1], (high[0] - low[0]) / _WIDE)
+        size = max(high[1] - low[1], (high[0] - low[0]) / wide)
         # Not straight down: Rerun's eye has no sides when it looks along its own up.
         eye = rrb.EyeControls3D(
             position=(x, y - 0.01, max(_LEAST_HEIGHT_M, 1.2 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)

@@ -33,7 +33,7 @@ LIMIT: Final = 50_000
 WAY: Final = 3_000
 """Points of each simulated car's way that are shown: five minutes."""
 SHOWN_S: Final = 120.0
-"""Of curves and lanes so much is in view; what was before is a scroll away."""
+"""Of curves and lanes so much is in view, unless it is to be the whole time."""
 FLUSH_S: Final = 2.0
 _KEPT: Final = (f"{keys.COORDINATOR}/plan", f"{keys.COORDINATOR}/assignment")
 """Published only when they change: asked for at the start."""
@@ -42,10 +42,13 @@ _KEPT: Final = (f"{keys.COORDINATOR}/plan", f"{keys.COORDINATOR}/assignment")
 class Live:
     """Follows one fleet from `start` to `close`; `step` brings what came to the viewer or file."""
 
-    def __init__(self, bus: Bus, fleet: str, sink: Callable[[rr.RecordingStream], None]) -> None:
+    def __init__(
+        self, bus: Bus, fleet: str, sink: Callable[[rr.RecordingStream], None], last_s: float | None = SHOWN_S
+    ) -> None:
         self._bus = bus
         self._fleet = keys.check_name(fleet, "fleet name")
         self._drawing = Drawing(WAY)
+        self._last_s = last_s
         self._shown: frozenset[object] = frozenset()
         self._lock = threading.Lock()
         self._waiting: list[Sample] = []
@@ -111,6 +114,8 @@ class Live:
         for subscriber in self._subscribers:
             subscriber.undeclare()
         if send:
+            if self._last_s is None:
+                self._shown = frozenset()  # the whole time is known only now
             self.step()
         self._recording.disconnect()
         self._scratch.cleanup()
@@ -122,7 +127,7 @@ class Live:
             return
         self._shown = there
         self._recording.send_blueprint(
-            blueprint.layout(self._drawing, last_s=SHOWN_S), make_active=True, make_default=True
+            blueprint.layout(self._drawing, last_s=self._last_s), make_active=True, make_default=True
         )
 
     def _flushed(self) -> bool:

@@ -79,13 +79,13 @@ def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, co
 def _follow(
     connect: str | None, fleet: str, save: Path | None, memory: str, seconds: float | None, *, web: bool
 ) -> None:
-    from fleet.replay.live import BATCH_S, Live
+    from fleet.replay.live import BATCH_S, SHOWN_S, Live
     from schemas.bus import Bus
 
     stop = threading.Event()
     until = time.monotonic() + seconds if seconds is not None else None
     with _signals(stop), Bus.open(connect) as bus, _sink(save, memory, web=web) as (viewer, sink):
-        live = Live(bus, fleet, sink)
+        live = Live(bus, fleet, sink, last_s=None if save is not None else SHOWN_S)
         try:
             live.start()
             pause = SETTLE_S
