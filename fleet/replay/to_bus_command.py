@@ -127,17 +127,19 @@ def to_bus(
                 f"{', '.join(there) or 'no car'}; Ctrl-C ends"
             )
             player.remember(session.messages(wanted, first_ns - REMEMBERED_NS, first_ns))
+            # The earliest time is not the first message's if the clock went back.
+            from_ns = part.start_ns if offset is None else first_ns
             told = _Progress((end_ns - begin_ns) / 1e9)
             origin_s = time.monotonic()
             while not stop.is_set():
-                recorded = session.messages(wanted, first_ns, part.end_ns)
-                player.play(_counted_from(recorded, first_ns, schedule), schedule, origin_s, stop.is_set, told)
-                if not player.published:
+                recorded = session.messages(wanted, from_ns, part.end_ns)
+                player.play(_counted_from(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, told)
+                if not player.published and not stop.is_set():
                     raise click.ClickException(f"{path} holds nothing there that is published again")
                 if not loop or stop.is_set():
                     break
                 schedule.again(PAUSE_NS)
-                first_ns = begin_ns
+                from_ns = part.start_ns
             told.end()
     took_s = time.monotonic() - origin_s
     click.echo(f"{player.published} messages in {took_s:.1f} s")
@@ -152,9 +154,10 @@ def to_bus(
         click.echo(f"what is whole was published: {session.damage_words}", err=True)
 
 
-def _counted_from(recorded: Iterable["Recorded"], first_ns: int, schedule: Any) -> Iterator["Recorded"]:
+def _counted_from(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:
     """The time from where it is to begin until the first message is part of it, too."""
-    schedule.due_s(first_ns)
+    if from_ns is not None:
+        schedule.due_s(from_ns)
     yield from recorded
 
 

@@ -150,6 +150,23 @@ def test_what_was_said_before_the_beginning_can_be_asked_for(fleet: Fleet, sessi
     assert player.end(signal.SIGINT) == 0
 
 
+def test_a_clock_that_went_back_is_not_waited_for(fleet: Fleet, tmp_path: Path) -> None:
+    recording = Made(tmp_path / "back.mcap", Writer)
+    for at_s in (3600.0, 3600.1, 0.0, 0.1):
+        recording.put("fleet/red/sensor/range", pb.Range(range_m=0.4), at_s)
+    recording.close()
+    player = play(fleet, tmp_path / "back.mcap")
+    assert player.wait() == 0
+    assert player.lines()[-1].startswith("4 messages in ")
+
+
+def test_who_ends_it_before_the_first_message_is_told_no_fault(fleet: Fleet, session: Path) -> None:
+    player = play(fleet, session, "--from", "2s", "--rate", "0.01")
+    wait_for(lambda: fleet.bus.tokens("fleet-replay/red"), "it has begun")
+    assert player.end(signal.SIGINT) == 0
+    assert not player.stderr
+
+
 def test_a_name_that_is_a_living_fleets_is_refused(fleet: Fleet, session: Path) -> None:
     fleet.bus.token("again/red")
     player = play(fleet, session, "--as", "again")
