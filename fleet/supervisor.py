@@ -20,7 +20,7 @@ from fleet.supervise.cars import Row
 from fleet.supervise.crew import TURN_S, Crew, Process
 from fleet.supervise.desk import Desk, Refused
 from fleet.supervise.farewell import Farewell
-from fleet.supervise.process import copied, new_run
+from fleet.supervise.process import copied, new_run, remove_links
 from fleet.supervise.reload import change
 from fleet.supervise.restart import State, grace_s
 from fleet.supervise.wanted import COORDINATOR, HUB, RECORDER, SELF, SIMULATOR, Kind, Wanted, WantedCar
@@ -262,6 +262,7 @@ class Supervisor:
     def _ended(self, process: Process, told: bool) -> None:  # noqa: FBT001 - the crew calls it so
         if process.kind is Kind.SIMULATOR:
             self._sim_asked.clear()
+            remove_links(self.crew.directory)
         if process.kind is not Kind.GATEWAY:
             return
         row = self.rows.get(process.name)

@@ -34,8 +34,9 @@ def _none(fleet: str, endpoint: str) -> click.ClickException:
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """What `fleet up` runs: each process, since when, how often it was started again, and why."""
+    keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        found = ask_status(bus, keys.check_name(fleet, "fleet name"))
+        found = ask_status(bus, fleet)
         if not found:
             raise _none(fleet, bus.endpoint)
     for each in found:
@@ -120,7 +121,7 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool) -> None:
     """What a car's gateway has said, or hub, simulator, coordinator, recorder; of the run that is up, else the last."""
     directory = _directory(connect, keys.check_name(fleet, "fleet name"))
     found = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]
-    path = next((each for each in found if _either(each)), None)
+    path = next((each for each in found if each.parent == directory and _either(each)), None)
     if path is None:
         there = sorted({each.name.partition(".")[0].lstrip("@") for each in directory.glob("*.log*")})
         raise click.UsageError(f"there is no log of {name!r} in {directory}: there are {', '.join(there) or 'none'}")

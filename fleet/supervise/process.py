@@ -97,6 +97,13 @@ def copied(directory: Path, name: str, text: str) -> Path:
     return path
 
 
+def remove_links(directory: Path) -> None:
+    """Remove the symlinks to terminals of a simulator that has ended: another's car may be at such a terminal next."""
+    for path in directory.glob("*.tty"):
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
 class Child:
     """A process that was started; `said` hears each line of its stdout, `ended` once how it ended."""
 

@@ -254,6 +254,16 @@ def test_told_to_end_while_it_starts_it_ends_at_once_and_in_order(tmp_path: Path
         assert not started.left(ours=True)
 
 
+def test_no_path_of_a_killed_simulator_is_left_to_lead_to_somebody_elses_car(tmp_path: Path) -> None:
+    with Up(tmp_path, free_endpoint(), "--sim", "1", "--no-record") as started:
+        started.ready("red")
+        (run,) = (tmp_path / "state" / "runs" / "fleet").iterdir()
+        assert [each.name for each in run.glob("*.tty")] == ["red.tty"]
+        started.kill(started.running("@simulator"))
+        started.process.end(signal.SIGINT)
+        assert not [each for each in run.glob("*.tty") if each.is_symlink()]
+
+
 def test_a_car_that_is_taken_out_is_stopped_though_its_gateway_hangs(fleet: Fleet, tmp_path: Path) -> None:
     sim, links = fleet.simulate("red:arduino:tcp", "green:arduino:tcp")
     file = _file(tmp_path, red=links[0], green=links[1])
