@@ -145,7 +145,9 @@ def _barrier(car: str, known: CarPicture) -> tuple[Barrier, bool] | None:
     if not known.mode:  # so it is not known either whether there is a hold
         return Barrier(f"{car} has not said yet how it is", "its first states"), False
     if known.estopped_by is not None:
-        return Barrier(f"{car} is e-stopped by {known.estopped_by}", "a resume of that e-stop by a person or script"), True
+        return Barrier(
+            f"{car} is e-stopped by {known.estopped_by}", "a person or script ending it (fleet resume --estops)"
+        ), True
     if known.held_by is not None:
         return Barrier(f"{car} is on hold by {known.held_by}", "a drive, mode or resume by a person or script"), True
     if known.driven_by is not None:
