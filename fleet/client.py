@@ -14,13 +14,15 @@ import uuid
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, Final, Self
 
 from fleet import history
+from fleet.asking import ANSWER_S, CLOSED, Asking, Gone, Item, Over
 from fleet.condition import Condition
 from fleet.lease import Lease
-from fleet.outcome import Outcome, Progress
+from fleet.outcome import Outcome
 from fleet.readings import Reading, Watch, reading_of
 from fleet.verbs import Request, Verbs, estop_request, resume_request, stop_request
 from fleet.waiting import Waiting
@@ -28,13 +30,10 @@ from schemas import keys, messages, topics
 from schemas.bus import Bus, Failure, Sample, canon
 from schemas.topics import Qos
 
-ANSWER_S: Final = 2.0
-"""How long a gateway may take to answer; it answers at once, whatever its car does."""
 _FOREVER_S: Final = 3600.0
 """One look of a wait without a time-out."""
 _SHORTEST_S: Final = 0.1
 """However short a wait is, the current value is asked for."""
-_QUEUE: Final = 4096  # answers and events of one command: a few for each of some hundred cars
 
 log = logging.getLogger("fleet")
 
@@ -73,7 +72,7 @@ class Fleet:
         self.kind = kind
         token = keys.operator_token(self.name, self.sender)
         self.bus = Bus.open(endpoint, start_hub=start_hub)
-        self._inboxes: dict[str, queue.Queue[_Item]] = {}
+        self._inboxes: dict[str, queue.Queue[Item]] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
         self.dropped = 0
@@ -81,6 +80,7 @@ class Fleet:
         try:
             self.bus.token(token)
             self.bus.subscribe(keys.topic_key(self.name, "*", "event/command"), self._event)
+            self.bus.watch_tokens(keys.car_token(self.name, "*"), self._gateway)
         except BaseException:
             self.close()
             raise
@@ -96,7 +96,7 @@ class Fleet:
         for watch in list(self._watches):
             watch.close()
         for inbox in list(self._inboxes.values()):
-            inbox.put((time.monotonic(), _CLOSED))
+            inbox.put((time.monotonic(), CLOSED))
         self._pool.shutdown(cancel_futures=True)
         self.bus.close()
 
@@ -208,7 +208,7 @@ class Fleet:
         """
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._filled(request)
-        asking = _Asking(request, self.cars(), named)
+        asking = Asking(request, self.cars(), named, lambda: self.bus.hubs)
         self._inboxes[command_id] = asking.inbox
         try:
             payload = message.SerializeToString()
@@ -231,7 +231,7 @@ class Fleet:
         message.asked.seconds, message.asked.nanos = divmod(time.time_ns(), 1_000_000_000)
         return message, message.id
 
-    def _query(self, target: str, asking: "_Asking", payload: bytes) -> None:
+    def _query(self, target: str, asking: Asking, payload: bytes) -> None:
         """Ask one car, or all; on a thread of the pool."""
         verb = asking.request.verb
         words = f"{target} gave no answer: its gateway went away or failed"
@@ -250,7 +250,15 @@ class Fleet:
                 else:
                     words = answer.words
         finally:
-            asking.inbox.put((time.monotonic(), _Over(target, words)))
+            asking.inbox.put((time.monotonic(), Over(target, words)))
+
+    def _gateway(self, token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
+        """A car's gateway came or went; on a Zenoh thread."""
+        if not alive:
+            gone = Gone(token.rpartition("/")[2])
+            for inbox in list(self._inboxes.values()):
+                with suppress(queue.Full):
+                    inbox.put_nowait((time.monotonic(), gone))
 
     def _event(self, sample: Sample) -> None:
         """A record of some command of somebody; on a Zenoh thread."""
@@ -305,89 +313,3 @@ class LeasedCar(Car):
         """Ask for one command; raises NotCarriedOut, or LeaseLost once another has the car."""
         self._lease.check()
         return self._lease.checked(super().do(request))
-
-
-class _Over:
-    """The query to a car, or to all, is over."""
-
-    def __init__(self, target: str, words: str) -> None:
-        self.target = target
-        self.words = words
-
-
-_CLOSED: Final = _Over("", "")
-
-_Item = tuple[float, Any]
-"""When it came (monotonic s), and a Sample (an answer), a CommandEvent, or _Over."""
-
-
-class _Asking:
-    """One command on its way to some cars; `wait` runs on the thread that asked and takes what others put in."""
-
-    def __init__(self, request: Request, present: list[str], named: list[str] | None) -> None:
-        self.request = request
-        self.inbox: queue.Queue[_Item] = queue.Queue(_QUEUE)
-        self._asked_at = time.monotonic()
-        self._open = 0
-        self._progress: dict[str, Progress] = {}
-        for car in present if named is None else named:
-            self._of(car)
-            if car not in present:
-                self._progress[car].missing(present, self._asked_at)
-        self.targets = ["*"] if named is None else [car for car in named if car in present]
-        self._open = len(self.targets)
-
-    def outcomes(self) -> list[Outcome]:
-        """What became of it, sorted by car."""
-        ended = [progress.outcome for _, progress in sorted(self._progress.items())]
-        return [outcome for outcome in ended if outcome is not None]
-
-    def wait(self) -> None:
-        """Until every car's outcome is known, or its deadline is over."""
-        while True:
-            waiting = [progress for progress in self._progress.values() if progress.outcome is None]
-            # By wildcard a car may answer that showed no token yet: it counts as well, so the query must be over.
-            if not waiting and not self._open:
-                return
-            now = time.monotonic()
-            for progress in waiting:
-                if now >= progress.deadline:
-                    progress.give_up(now)
-            until = min((each.deadline for each in waiting), default=now + ANSWER_S)
-            try:
-                at, item = self.inbox.get(timeout=max(0.0, until - now))
-            except queue.Empty:
-                continue
-            self._take(item, at)
-
-    def _take(self, item: Any, at: float) -> None:
-        if item is _CLOSED:
-            self._open = 0
-            for progress in self._progress.values():
-                progress.give_up(at)
-        elif isinstance(item, _Over):
-            self._open -= 1
-            for progress in self._progress.values():
-                if item.target in ("*", progress.car):
-                    words = item.words.replace("*", progress.car, 1)
-                    progress.silent(words, at)
-        elif isinstance(item, Sample):
-            key = keys.parse(item.key)
-            if key is not None:
-                self._answer(self._of(key.car), item, at)
-        else:
-            self._of(item.car).event(item.phase, item.reason, item.words, item.worst_case_s, at)
-
-    def _answer(self, progress: Progress, item: Sample, at: float) -> None:
-        """One car's answer; what nobody can read costs no other car its outcome."""
-        try:
-            answer: Any = messages.parse(topics.RESULT, item.payload, item.encoding)
-        except messages.BadPayload as error:
-            progress.silent(f"what answered for {progress.car} is no gateway of this fleet: {error}", at)
-            return
-        progress.answered(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
-
-    def _of(self, car: str) -> Progress:
-        if car not in self._progress:
-            self._progress[car] = Progress(car, self.request.until, self._asked_at, self.request.lasts_s)
-        return self._progress[car]

@@ -15,6 +15,8 @@ MARGIN_S: Final = 5.0
 """What is waited beyond the time in which the gateway said, or must say, what became of a command.
 
 A stop's worst case ends when the motors are off; its last frame follows 1.1 s later (protocol.md, "full")."""
+GONE_S: Final = 0.5
+"""How long a gateway that has gone from the bus may take to be there again, because it was the hub that went."""
 PATIENCE_S: Final = 10.0  # gateway.control: the longest that a command waits there for a busy car
 
 
@@ -83,6 +85,7 @@ class Progress:
         self._heard_at = asked_at
         self._worst_case_s = 0.0
         self._queued = False
+        self._gone_at: float | None = None
 
     @property
     def _joined(self) -> bool:
@@ -92,6 +95,8 @@ class Progress:
     @property
     def deadline(self) -> float:
         """When to give up, on the clock of `asked_at`."""
+        if self._gone_at is not None:
+            return self._gone_at + GONE_S
         if self._joined:
             return self._asked_at + self._lasts_s
         wait_s = {Until.SENT: PATIENCE_S, Until.STOPPED: self._worst_case_s, Until.OVER: self._lasts_s}[self._until]
@@ -128,8 +133,24 @@ class Progress:
         if not self.heard:
             self._end(NO_ANSWER, "", words, at, ok=False)
 
+    def gone(self, at: float) -> None:
+        """Its gateway's token went: killed, or the hub was."""
+        if self._gone_at is None:
+            self._gone_at = at
+
+    def stays(self) -> None:
+        """It was not the gateway that went."""
+        self._gone_at = None
+
     def give_up(self, at: float) -> None:
         """The deadline is over."""
+        if self._gone_at is not None:
+            words = (
+                f"its gateway went away, so whether {self.car} moves is not known and nothing stops it: "
+                "look; a gateway that is started for it stops it first (fleet up, gateway run)"
+            )
+            self._end(self._phase, "", words, at, ok=False)
+            return
         if self._joined:
             self._end(SENT, "", "it prolonged a drive", at, ok=True)
             return

@@ -33,6 +33,8 @@ from gateway.protocol.encode import Frame, General, ModeClose, ModeOpen, encode
 from gateway.protocol.profile import Profile, StopStyle
 from gateway.protocol.values import Mode, Motion
 
+LATE_S: Final = 0.1
+"""A motion that was written later after it was asked, from which its time counts, is said to be shorter."""
 LISTEN_S: Final = 2.2
 """How long a gateway that ends listens to the car that it stopped: a report a second, and one more without an echo."""
 
@@ -215,6 +217,7 @@ class Execution:
             case Running():
                 self._stepped(source, now)
             case Held():
+                source.began_at = now
                 self._ledger.sent(source.pending, now)
             case Pending() if source is self._waiting.opening:
                 self._waiting.opening = None
@@ -449,7 +452,10 @@ class Execution:
             if now < held.expires_at:
                 self._release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.name} is gone", now)
             elif held.pending.sent:
-                self._release(Phase.COMPLETE, None, "its time is over", now)
+                words = "its time is over"
+                if held.began_at is not None and held.began_at > held.pending.asked_at + LATE_S:
+                    words += f", of which {self.car} was driven for {now - held.began_at:.2f} s: it was busy before"
+                self._release(Phase.COMPLETE, None, words, now)
             else:
                 self._release(Phase.EXPIRED, Reason.EXPIRED, f"{self.car} was busy until its time was over", now)
         self._waiting.give_up_old(now)

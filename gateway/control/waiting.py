@@ -24,6 +24,8 @@ class Held:
     motion: Motion
     pending: Pending
     expires_at: float
+    began_at: float | None = None
+    """When its frame was written."""
 
     @property
     def sender(self) -> Sender:

@@ -320,6 +320,19 @@ def test_a_signal_stops_the_car_first(fleet: Fleet, number: int, car: str) -> No
     assert wait_for(lambda: not fleet.get("fleet/red/**"), "nobody answers for it")
 
 
+def test_who_drives_is_told_at_once_that_the_gateway_was_killed(fleet: Fleet) -> None:
+    """Nothing stops the car then but a person, who would be told when the drive is over."""
+    sim, (link,) = fleet.simulate("red:arduino:tcp")
+    gateway = fleet.gateway(link)
+    fleet.ready()
+    drive = fleet.start("-m", "fleet.cli", "drive", "red", "forward", "--for", "9s")
+    wait_for(lambda: driving(sim), "it drives")
+    gateway.end(signal.SIGKILL)
+    assert drive.wait() == 1
+    assert "its gateway went away, so whether red moves is not known" in drive.stderr
+    assert driving(sim)
+
+
 def test_a_joystick_that_dies_stops_the_car(fleet: Fleet) -> None:
     """A stream of drives by a sender with a token, killed: the car stops long before the last drive is over."""
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")

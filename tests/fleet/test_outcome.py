@@ -69,6 +69,20 @@ def test_giving_up_says_what_was_heard_last() -> None:
     assert progress.outcome.words == "not known what became of it after 15.0 s: last heard was 'queued', 14.0 s ago"
 
 
+def test_a_gateway_that_went_is_told_after_half_a_second_in_which_it_may_have_been_the_hub() -> None:
+    progress = told(Until.OVER, [("answer", "sent", 0.0)], 9.0)
+    progress.gone(102.0)
+    assert progress.deadline == 102.5
+    progress.stays()
+    assert progress.deadline == 109.0
+    progress.gone(103.0)
+    progress.gone(103.4)
+    progress.give_up(103.5)
+    assert progress.outcome is not None
+    assert (progress.outcome.ok, progress.outcome.phase) == (False, "sent")
+    assert progress.outcome.words.startswith("its gateway went away, so whether red moves is not known")
+
+
 def test_a_drive_that_only_prolonged_another_is_over_when_its_time_is() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
     assert progress.deadline == 102.0

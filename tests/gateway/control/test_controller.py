@@ -175,6 +175,15 @@ def test_a_drive_expires_and_stops_softly(desk: Desk) -> None:
     assert desk.control.motors == "off"
 
 
+def test_a_drive_that_had_to_wait_says_how_long_the_car_was_driven(desk: Desk) -> None:
+    desk.ask(SetMode(Mode.MANUAL))
+    desk.run(0.1)
+    desk.ask(Drive(Motion.BACK, 1.5), identity="it")
+    desk.run(4.0)
+    (words,) = [record.words for record in desk.records if record.phase is Phase.COMPLETE and record.words]
+    assert words == "its time is over, of which red was driven for 0.44 s: it was busy before"
+
+
 def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Desk) -> None:
     desk.ask(Drive(Motion.FORWARD, 0.3))
     desk.run(0.6)
