@@ -10,8 +10,8 @@ from typing import Final
 SENDERS: Final = 16
 """Whose numbers are remembered per key: every `fleet drive` is a sender of its own."""
 HOLES: Final = 256
-LATE: Final = 4096
-"""Publications had again whose first coming may still be under way."""
+LATE: Final = 512
+"""Publications had again before they came: those may still be under way. What a publisher holds, twice."""
 _WRAP: Final = 1 << 32
 _BACKWARDS: Final = 1 << 31
 
@@ -50,7 +50,10 @@ class Numbers:
             self.last[sender] = number
             return True
         if self._late.get((sender, number)) == published_ns:
+            del self._late[sender, number]
             return False
+        if self._fill(sender, number):  # overtaken by what was had again
+            return True
         self._forget(sender)  # a new stream of the same sender, not a gap of four thousand million
         self._begin(sender, number)
         return True
@@ -60,18 +63,23 @@ class Numbers:
         last = self.last.get(sender)
         if last is None:
             self._begin(sender, number)
+            self._expect(sender, number, published_ns)
         elif 0 < (ahead := (number - last) % _WRAP) < _BACKWARDS:
             self._skip(sender, last, ahead)
             self.last[sender] = number
+            self._expect(sender, number, published_ns)
         elif 0 < (before := (self._first[sender] - number) % _WRAP) < _BACKWARDS:
             self._skip(sender, number, before)
             self._first[sender] = number
         elif not self._fill(sender, number):
             return False
+        return True
+
+    def _expect(self, sender: Hashable, number: int, published_ns: int) -> None:
+        """It may come yet. What newer ones overtook never does: publications of one publisher keep their order."""
         self._late[sender, number] = published_ns
         if len(self._late) > LATE:
             del self._late[next(iter(self._late))]
-        return True
 
     def _begin(self, sender: Hashable, number: int) -> None:
         """Its first number says nothing about what was missed before it."""

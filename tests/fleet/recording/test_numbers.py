@@ -51,6 +51,15 @@ def test_what_was_recalled_before_it_came_is_not_written_again() -> None:
     assert numbers.missing == 0
 
 
+def test_what_comes_after_later_ones_were_recalled_is_no_new_stream() -> None:
+    numbers = Numbers()
+    live(numbers, 1)
+    assert numbers.recalled("a", 5, 50)
+    assert numbers.missing == 3
+    assert live(numbers, 2, 3, 4, 5, 6) == [True, True, True, False, True]
+    assert numbers.missing == 0
+
+
 def test_a_number_that_goes_back_is_a_new_stream() -> None:
     numbers = Numbers()
     assert live(numbers, 7, 8, 1, 2, 4) == [True] * 5
