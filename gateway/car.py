@@ -11,7 +11,6 @@ import gc
 import logging
 import os
 import random
-import signal
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,7 +34,7 @@ from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Event, Rejected
 from gateway.publish import RAW_PER_S, STALLED_S, Publications, wall_ns
 from gateway.store import Store
-from schemas import bus, keys, messages, topics
+from schemas import bus, ending, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
 TICK_S: Final = 0.2
@@ -533,14 +532,10 @@ class Car:
 
 
 async def serve(settings: Settings, opened: bus.Bus, doors: Doors) -> bool:
-    """Serve one car until SIGINT or SIGTERM; False if it could not be stopped. Raises AlreadyServed or LinkError."""
+    """Serve one car until a signal ends it; False if it could not be stopped. Raises AlreadyServed or LinkError."""
     car = Car(settings, opened, doors)
     # What was imported stays: the collector need not look at it again while readings wait.
     gc.freeze()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        try:
-            loop.add_signal_handler(number, car.stop)
-        except NotImplementedError:  # Windows has no signal handlers on the loop
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(car.stop))
+    ending.calls_in(loop, car.stop)
     return await car.run()

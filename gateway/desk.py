@@ -112,11 +112,15 @@ class Paint:
 
 
 def run_until_interrupted(work: Coroutine[Any, Any, None]) -> None:
-    """Run it; SIGTERM is taken as Ctrl-C is: the work is cancelled, may clean up, and KeyboardInterrupt is raised."""
+    """Run it; what ends a process is taken as Ctrl-C is: the work may clean up, and KeyboardInterrupt is raised."""
     import asyncio
 
-    before = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    from schemas import ending
+
+    others = [number for number in ending.signals() if number is not signal.SIGINT]
+    before = [signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT)) for number in others]
     try:
         asyncio.run(work)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(others, before, strict=True):
+            signal.signal(number, handler)

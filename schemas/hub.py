@@ -5,7 +5,6 @@ The listening port is the mutex: a second hub on it fails at once. Started by `b
 """
 
 import argparse
-import signal
 import sys
 import threading
 import time
@@ -13,6 +12,7 @@ from typing import Final
 
 import zenoh
 
+from schemas import ending
 from schemas.bus import DEFAULT_ENDPOINT, BusError, router_config
 
 IDLE_S: Final = 10.0
@@ -39,8 +39,7 @@ def main() -> int:
     parser.add_argument("--idle-s", type=float, default=IDLE_S, help="end after so long without a link (default 10)")
     arguments = parser.parse_args()
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    ending.calls(stop.set)
     try:
         serve(arguments.endpoint, arguments.idle_s, stop)
     except (zenoh.ZError, BusError) as error:

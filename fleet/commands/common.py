@@ -14,7 +14,7 @@ import click
 from fleet.client import Fleet
 from fleet.outcome import Outcome
 from fleet.verbs import LONGEST_DRIVE_S, Request
-from schemas import keys
+from schemas import ending, keys
 from schemas.bus import BadEndpoint, BusError
 
 INTERRUPTED: Final = 130
@@ -139,13 +139,12 @@ def _words(outcome: Outcome) -> str:
 
 @contextmanager
 def sigterm_interrupts() -> Iterator[None]:
-    """SIGTERM and SIGHUP are taken as Ctrl-C is: as KeyboardInterrupt."""
+    """What ends a process, SIGTERM above all, is taken as Ctrl-C is: as KeyboardInterrupt."""
 
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
-    # SIGHUP is a terminal that was closed.
-    numbers = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    numbers = [number for number in ending.signals() if number is not signal.SIGINT]
     before = [signal.signal(number, interrupt) for number in numbers]
     try:
         yield

@@ -2,10 +2,8 @@
 
 import json
 import os
-import signal
 import threading
 from pathlib import Path
-from types import FrameType
 
 import click
 
@@ -18,6 +16,7 @@ from fleet.marked import read_text
 from fleet.policy.check import faults
 from fleet.policy.decision import Decision
 from fleet.policy.reader import parse
+from schemas import ending
 
 
 @click.command(
@@ -56,11 +55,7 @@ def coordinate(
         click.echo(f"fleet: {path}: {each}", err=True)
     stop = threading.Event()
 
-    def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGINT, ask_to_stop)
-    signal.signal(signal.SIGTERM, ask_to_stop)
+    ending.calls(stop.set)
 
     def decided(decision: Decision) -> None:
         click.echo(_json(decision) if as_json else line(decision))

@@ -22,7 +22,7 @@ from fleet.policy.reader import parse as parse_plan
 from fleet.supervise.desk import AnotherSupervisor
 from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, listing, wanted
 from fleet.supervisor import Happening, Supervisor
-from schemas import keys
+from schemas import ending, keys
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
 _Tell = Callable[[Happening], None]
@@ -136,14 +136,12 @@ async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool
         from fleet.supervise.table import Table
 
         table = Table(supervisor)
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
-        if number is not None:
-            words = {"SIGINT": "Ctrl-C", "SIGHUP": "the terminal was closed"}.get(name, "told to end")
-            try:
-                loop.add_signal_handler(number, supervisor.end, words)
-            except NotImplementedError:  # Windows has no signal handlers on the loop
-                signal.signal(number, lambda *_, words=words: loop.call_soon_threadsafe(supervisor.end, words))
+    for number in ending.signals():
+        words = {"SIGINT": "Ctrl-C", "SIGHUP": "the terminal was closed"}.get(number.name, "told to end")
+        try:
+            loop.add_signal_handler(number, supervisor.end, words)
+        except NotImplementedError:  # Windows has no signal handlers on the loop
+            signal.signal(number, lambda *_, words=words: loop.call_soon_threadsafe(supervisor.end, words))
     if as_json and wish.simulated:
         await _pass_stdin(loop, supervisor.tell_simulator)
     if table is None:

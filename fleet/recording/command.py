@@ -3,12 +3,10 @@
 import json
 import os
 import re
-import signal
 import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
 import click
@@ -16,7 +14,7 @@ from click.core import ParameterSource
 
 from fleet.commands.asked import Span
 from fleet.recording import asking
-from schemas import keys
+from schemas import ending, keys
 from schemas.bus import BadEndpoint, Bus, BusError, ensure_hub
 
 LOOK_S: Final = 0.25
@@ -139,7 +137,7 @@ def record(
     )
     parent = os.getppid() if with_parent else None
     stop = threading.Event()
-    _on_signals(stop)
+    ending.calls(stop.set)
     try:
         with Bus.open(connect, start_hub=True) as bus:
             recorder = Recorder(bus, fleet, out, options, tell=_warn)
@@ -163,14 +161,6 @@ def record(
         f"{session}: {outcome.messages} messages, {outcome.bytes} bytes, "
         f"{_count(outcome.drops, 'dropped here')}, {_count(outcome.missed, 'missed on the bus')}",
     )
-
-
-def _on_signals(stop: threading.Event) -> None:
-    def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGINT, ask_to_stop)
-    signal.signal(signal.SIGTERM, ask_to_stop)
 
 
 def _wait(bus: Bus, stop: threading.Event, ended: threading.Event, parent: int | None) -> None:

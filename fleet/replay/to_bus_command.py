@@ -1,17 +1,15 @@
 """`fleet replay SESSION --to-bus`: its options, and what it says. What is published is to_bus.py's."""
 
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from schemas import keys
+from schemas import ending, keys
 
 if TYPE_CHECKING:
     from fleet.recording.session import Recorded, Session
@@ -86,7 +84,7 @@ def to_bus(
     from schemas.bus import Bus
 
     stop = threading.Event()
-    _on_signals(stop)
+    ending.calls(stop.set)
     with explained():
         try:
             session = Session.open(path)
@@ -207,11 +205,3 @@ class _Progress:
         """Leave the line."""
         if self._shown:
             sys.stderr.write("\r" + " " * 40 + "\r")
-
-
-def _on_signals(stop: threading.Event) -> None:
-    def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGINT, ask_to_stop)
-    signal.signal(signal.SIGTERM, ask_to_stop)

@@ -7,7 +7,6 @@ import argparse
 import asyncio
 import math
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ from gateway.sim.faults import Fault, Scheduled, parse_fault, parse_press, targe
 from gateway.sim.links import LinkError, Taken
 from gateway.sim.shell import SimCar, Simulation
 from gateway.sim.spec import BadSpec, CarSpec, ReplaySpec, parse_cars, parse_replay, refuse_twins
-from schemas import keys
+from schemas import ending, keys
 
 WORLDS: Final = {"room": World.room, "open": World.open_field}
 PARENT_EVERY_S: Final = 0.1
@@ -213,7 +212,7 @@ async def _serve(
     loop = asyncio.get_running_loop()
     parent = os.getppid()
     ended = asyncio.Event()
-    _on_signals(loop, ended)
+    ending.calls_in(loop, ended.set)
     simulation = Simulation(specs, seed=args.seed, world=world, replays=replays)
     for car in simulation.cars.values():
         car.failed = lambda failed, error: _complain(f"car {failed.spec.name}: {error}")
@@ -222,7 +221,7 @@ async def _serve(
     if endpoint is not None:
         from gateway.sim.truth import TruthPublisher
 
-        tasks.append(loop.create_task(TruthPublisher(simulation, endpoint, args.fleet).run()))
+        tasks.append(loop.create_task(TruthPublisher(simulation, endpoint, args.fleet, _complain).run()))
     if args.with_parent:
         tasks.append(loop.create_task(_watch_parent(parent, ended)))
 
@@ -258,14 +257,6 @@ def _introduce(car: SimCar) -> None:
 
 def _take_leave(car: SimCar) -> None:
     say({"car": car.spec.name, "replay": "ended"})
-
-
-def _on_signals(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        try:
-            loop.add_signal_handler(number, ended.set)
-        except NotImplementedError:  # Windows
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(ended.set))
 
 
 async def _strike(simulation: Simulation, scheduled: Scheduled) -> None:

@@ -25,15 +25,20 @@ PERIOD_S: Final = 0.1
 REPEAT_S: Final = 1.0
 LOOK_AGAIN_S: Final = 0.3
 OPEN_WITHIN_S: Final = 0.3
+PATIENCE_S: Final = 10.0
+"""Cars may be started before their gateways; after so long somebody may wonder."""
 
 
 class TruthPublisher:
     """Publishes every car of a simulation once a hub is there."""
 
-    def __init__(self, simulation: Simulation, endpoint: str, fleet: str) -> None:
+    def __init__(
+        self, simulation: Simulation, endpoint: str, fleet: str, complain: Callable[[str], object] = lambda _: None
+    ) -> None:
         self._simulation = simulation
         self._endpoint = endpoint
         self._fleet = fleet
+        self._complain = complain
         self._bus: Bus | None = None
         self._publishers: dict[str, Publisher] = {}
 
@@ -86,7 +91,14 @@ class TruthPublisher:
 
     async def _open(self, loop: asyncio.AbstractEventLoop) -> Bus:
         """Opening blocks, so it has a thread; a daemon, since a hub that is not there must not hold up our end."""
+        patience_until = loop.time() + PATIENCE_S
         while True:
+            if loop.time() >= patience_until:
+                patience_until = inf
+                self._complain(
+                    f"there is no hub at {self._endpoint} yet, so nobody can see what is true of the cars: "
+                    "gateway run and fleet up start one (--no-truth: publish nothing)"
+                )
             opened: asyncio.Future[Bus | None] = loop.create_future()
             threading.Thread(target=self._try, args=(loop, opened), daemon=True).start()
             bus = await opened

@@ -301,8 +301,13 @@ def test_of_two_that_start_at_the_same_moment_one_remains(fleet: Fleet, tcp_car:
 
 @pytest.mark.parametrize(
     ("number", "car"),
-    [(signal.SIGINT, "red:arduino:pty"), (signal.SIGTERM, "red:arduino:tcp"), (signal.SIGTERM, "red:raspberry_pi:tcp")],
-    ids=["SIGINT-arduino", "SIGTERM-arduino", "SIGTERM-raspberry_pi"],
+    [
+        (signal.SIGINT, "red:arduino:pty"),
+        (signal.SIGTERM, "red:arduino:tcp"),
+        (signal.SIGTERM, "red:raspberry_pi:tcp"),
+        (signal.SIGHUP, "red:arduino:pty"),
+    ],
+    ids=["SIGINT-arduino", "SIGTERM-arduino", "SIGTERM-raspberry_pi", "SIGHUP-arduino"],
 )
 def test_a_signal_stops_the_car_first(fleet: Fleet, number: int, car: str) -> None:
     sim, (link,) = fleet.simulate(car)

@@ -29,7 +29,7 @@ def ready(process: "subprocess.Popen[str]") -> Path:
     return Path(json.loads(process.stdout.readline())["session"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_closes_the_session_whole(number: signal.Signals, endpoint: str, bus: Bus, tmp_path: Path) -> None:
     process = start(RECORD, "--out", str(tmp_path), "--connect", endpoint, "--json")
     session = ready(process)

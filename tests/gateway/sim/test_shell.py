@@ -23,8 +23,10 @@ from gateway.sim.faults import Fault, FaultKind
 from gateway.sim.links import LinkError, Taken
 from gateway.sim.shell import Simulation
 from gateway.sim.spec import parse_cars
+from gateway.sim.truth import LOOK_AGAIN_S, TruthPublisher
 from schemas.bus import Bus, Sample
 from tests.gateway.sim.strangers import MODE00, RUN, STOP, opening
+from tests.support.ports import free_endpoint
 
 PATIENCE = 20.0
 
@@ -546,3 +548,18 @@ def test_lamps_and_things_are_on_the_bus_too(started: list[Process]) -> None:
     finally:
         sim.popen.terminate()
         assert sim.popen.wait(PATIENCE) == 0
+
+
+async def test_truth_that_nobody_can_see_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gateway.sim.truth.PATIENCE_S", 0.0)
+    said: list[str] = []
+    simulation = Simulation(parse_cars(["red:arduino:tcp://127.0.0.1:0"]), seed=1)
+    publishing = asyncio.create_task(TruthPublisher(simulation, free_endpoint(), "fleet", said.append).run())
+    async with asyncio.timeout(20):
+        while not said:
+            await asyncio.sleep(0.01)
+    await asyncio.sleep(3 * LOOK_AGAIN_S)
+    publishing.cancel()
+    await asyncio.gather(publishing, return_exceptions=True)
+    (words,) = said
+    assert words.startswith("there is no hub at tcp/127.0.0.1:")

@@ -1,0 +1,31 @@
+"""The signals that end a process of ours, so that it ends in order: Ctrl-C, `kill`, and a terminal that was closed."""
+
+import signal
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # most processes have no loop
+    import asyncio
+
+
+def signals() -> list[signal.Signals]:
+    """Those that there are here; SIGHUP only if whoever started the process did not have it ignored (`nohup`)."""
+    hup = getattr(signal, "SIGHUP", None)  # Windows has none
+    if hup is None or signal.getsignal(hup) is signal.SIG_IGN:
+        return [signal.SIGINT, signal.SIGTERM]
+    return [signal.SIGINT, signal.SIGTERM, hup]
+
+
+def calls(end: Callable[[], object]) -> None:
+    """From now on each of them calls `end`, in the main thread."""
+    for number in signals():
+        signal.signal(number, lambda *_: end())
+
+
+def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[], object]) -> None:
+    """From now on each of them calls `end` in this loop."""
+    for number in signals():
+        try:
+            loop.add_signal_handler(number, end)
+        except NotImplementedError:  # Windows has no signal handlers on the loop
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(end))
