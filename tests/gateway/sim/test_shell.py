@@ -552,14 +552,12 @@ def test_lamps_and_things_are_on_the_bus_too(started: list[Process]) -> None:
 
 async def test_truth_that_nobody_can_see_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gateway.sim.truth.PATIENCE_S", 0.0)
-    said: list[str] = []
+    said: asyncio.Queue[str] = asyncio.Queue()
     simulation = Simulation(parse_cars(["red:arduino:tcp://127.0.0.1:0"]), seed=1)
-    publishing = asyncio.create_task(TruthPublisher(simulation, free_endpoint(), "fleet", said.append).run())
-    async with asyncio.timeout(20):
-        while not said:
-            await asyncio.sleep(0.01)
+    publishing = asyncio.create_task(TruthPublisher(simulation, free_endpoint(), "fleet", said.put_nowait).run())
+    words = await asyncio.wait_for(said.get(), 20)
+    assert words.startswith("there is no hub at tcp/127.0.0.1:")
     await asyncio.sleep(3 * LOOK_AGAIN_S)
     publishing.cancel()
     await asyncio.gather(publishing, return_exceptions=True)
-    (words,) = said
-    assert words.startswith("there is no hub at tcp/127.0.0.1:")
+    assert said.empty()
