@@ -74,18 +74,18 @@ class Evidence(Execution):
         for no more than a reading, and no number of stops would tell.
         """
         shown = self._obedience.heard(event.at, echo=bool(event.range_cm))
-        if shown is Shown.OBEYED and self._deaf:
-            self._deaf = False
+        if shown is Shown.OBEYED and self.deaf:
+            self.deaf = False
             self._ledger.log(Level.INFO, "hears", f"{self.car} was silent for MODE00's second: it hears", now)
         if shown is not Shown.LOST:
             return
         self.disobeyed += 1
         seen = f"{self.car} reported as before through the second for which MODE00 blocks a car that obeys it: "
         if not self._obedience.ever:
-            if not self._deaf:
+            if not self.deaf:
                 words = "it has not shown yet that it hears (is its receiving line connected?): rely on no stop"
                 self._ledger.log(Level.WARNING, "not_obeyed", seen + words, now)
-            self._deaf = True
+            self.deaf = True
             return
         words = "it did not get it, and perhaps nothing else (a link that loses what is written); stopping it again"
         self._ledger.log(Level.WARNING, "not_obeyed", seen + words, now)

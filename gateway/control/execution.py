@@ -84,7 +84,7 @@ class Execution:
         self._senders = Senders()
         self._waiting = Waiting(self._ledger, self._senders, self.safety)
         self._obedience = Obedience()
-        self._deaf = False
+        self.deaf = False
         """It reports as if it had not got `MODE00`, and has not shown on this link that it hears at all."""
         self.disobeyed = 0
         """How often what was heard has shown that a frame was lost."""
@@ -96,7 +96,7 @@ class Execution:
     @property
     def motors(self) -> str:
         """`off` only after a stop that is complete; `unknown` while the car's state is."""
-        if not self.known or self._unsure or self._deaf or self.mode.verdict is Verdict.CONTRADICTED:
+        if not self.known or self._unsure or self.deaf or self.mode.verdict is Verdict.CONTRADICTED:
             return "unknown"
         return "on" if self.believed.motors_on else "off"
 
@@ -140,7 +140,7 @@ class Execution:
     def link_up(self, now: float) -> None:
         """The link is open: bring the car to a known state."""
         self._link_open = self.was_open = True
-        self._gave_up = self._unheard = self._deaf = False
+        self._gave_up = self._unheard = self.deaf = False
         self._obedience = Obedience()
         self.known = False
         if self.platform.auto:  # another car may have been plugged in
@@ -393,14 +393,14 @@ class Execution:
     def _finish(self, running: Running, now: float) -> None:
         """The stop is complete: the motors are off."""
         self._running = None
-        if not self.known and not self._deaf:
+        if not self.known and not self.deaf:
             self._ledger.log(Level.INFO, "recovered", f"{self.car} is in a known state: stopped, mode manual", now)
         self.known = True
         self._gave_up = self._unsure = False
         self.believed.motors_on = False
         for pending in running.commands:
             if not isinstance(pending.command.what, SetMode):
-                words = f"as far as it was sent: {self.car} has not shown that it hears" if self._deaf else ""
+                words = f"as far as it was sent: {self.car} has not shown that it hears" if self.deaf else ""
                 self._ledger.record(pending, Phase.COMPLETE, now, words=words)
 
     def _overdue(self, running: Running, now: float) -> None:

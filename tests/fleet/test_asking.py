@@ -306,7 +306,7 @@ async def test_no_reading_falls_between_the_current_value_and_those_that_come(en
 def test_the_topics_that_a_key_expression_can_match() -> None:
     assert [topic.name for topic in topics_under("fleet/red/sensor/range")] == ["sensor/range"]
     assert [topic.name for topic in topics_under("fleet/*/*/battery")] == ["sensor/battery"]
-    assert [topic.name for topic in topics_under("fleet/@recorder/**")] == ["@recorder/status"]
+    assert [topic.name for topic in topics_under("fleet/@recorder/**")] == ["@recorder/status", "@recorder/mark"]
     assert {topic.family for topic in topics_under("fleet/**")} == {"sensor", "state", "frame", "event", "sim"}
     assert topics_under("fleet/red/@cmd/*") == []
 
