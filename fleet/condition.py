@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
-from fleet.expression import BadExpression, Expression, contradictory, fields_of, parse, value_in
+from fleet.expression import BadExpression, Expression, fields_of, parse, value_in
 from fleet.expression.fields import LAST
+from fleet.expression.known import outside
 from fleet.expression.tree import written
 from fleet.readings import Reading
 from schemas import keys, messages, topics
@@ -43,9 +44,12 @@ class Condition:
             )
         names = {topic.message: fields_of(messages.message_class(topic.message)) for topic in under}
         found: dict[str, Expression] = {}
+        never: list[str] = []
+        short = {topic.message: topic.name.rpartition("/")[2] for topic in under}
         for message, fields in names.items():
             try:
                 found[message] = parse(text, fields)
+                never += filter(None, [outside(found[message], fields, short[message])])
             except BadExpression:
                 if len(names) == 1:
                     raise
@@ -53,8 +57,8 @@ class Condition:
             every = {name: kind for fields in names.values() for name, kind in fields.items()}
             parse(text, {name: every[name] for name in sorted(every, key=LAST.__contains__)})
             raise BadExpression(text, 1, f"no message under {written} has all of its fields: it is about one message")
-        if all(contradictory(expression) for expression in found.values()):
-            raise BadExpression(text, 1, "it can never be true")
+        if len(never) == len(found):
+            raise BadExpression(text, 1, never[0])
         return cls(str(next(iter(found.values()))), found)
 
     def __str__(self) -> str:

@@ -110,7 +110,7 @@ examples:
 @click.option(
     "--id", "ids", multiple=True, metavar="ID", help="An e-stop to end, or its beginning; as often as needed."
 )
-@click.option("--estops", is_flag=True, help="End every e-stop that is in force on these cars, then the hold.")
+@click.option("--estops", is_flag=True, help="End every e-stop in force on these cars; they stay on hold.")
 @json_option
 @with_client
 def resume(
@@ -131,8 +131,10 @@ def resume(
         chosen = in_force if estops else [_the_one(car, begun, in_force) for begun in ids]
         if chosen:
             outcomes += client.ask(resume_request(chosen), [car])
-    if estops and all(outcome.ok for outcome in outcomes):
-        outcomes = client.ask(resume_request(), named)
+        elif car not in client.cars():
+            outcomes += client.ask(resume_request(), [car])  # which says that it is not there
+        else:
+            click.echo(f"{car}: no e-stop is in force", err=True)
     end_with(outcomes, as_json=as_json)
 
 

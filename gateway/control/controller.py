@@ -117,14 +117,13 @@ class Controller(Evidence):
 
     def sender_alive(self, name: str, *, alive: bool, now: float) -> None:
         """A sender's liveliness token appeared or went."""
+        driving = self._waiting.held is not None and self._waiting.held.sender.name == name
         if alive:
             self._senders.appeared(name)
-            return
-        driving = self._waiting.held is not None and self._waiting.held.sender.name == name
-        self._senders.vanished(name, now, driving=driving)
-        lease = self.safety.lease
-        if not driving and lease is not None and lease.holder.name == name:
-            self.safety.release(lease.holder)  # a command line that is done: the next one need not wait
+        else:
+            self._senders.vanished(name, now, driving=driving)
+        if not driving:
+            self.safety.holder_there(name, there=alive)
 
     def unite(self, estops: Iterable[Estop], ended: Iterable[str], shown_by: str, now: float) -> None:
         """Take over the fleet-wide e-stops, in force and ended, that another gateway of the fleet shows."""

@@ -450,6 +450,7 @@ class Execution:
         held = self._waiting.held
         if held is not None and now >= self._waiting.held_until:
             if now < held.expires_at:
+                self.safety.holder_there(held.sender.name, there=False)
                 self._release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.name} is gone", now)
             elif held.pending.sent:
                 words = "its time is over"

@@ -4,7 +4,7 @@ What must survive a restart is `Kept`; `gateway.store` writes it to disk.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gateway.control.records import Kind, Sender
@@ -50,13 +50,15 @@ class Lease:
 
     holder: Sender
     until: float
+    gone: bool = False
+    """Its holder is not there any more, a command line that is done: who ranks as high need not wait."""
 
     def refuses(self, sender: Sender, now: float, *, take: bool) -> bool:
         """Whether `sender` may not drive now: it ranks lower, or as high and does not take it as a person may."""
         if now >= self.until or sender == self.holder:
             return False
         mine, theirs = _RANK[sender.kind], _RANK[self.holder.kind]
-        return mine < theirs or (mine == theirs and not (take and sender.kind is Kind.PERSON))
+        return mine < theirs or (mine == theirs and not self.gone and not (take and sender.kind is Kind.PERSON))
 
 
 @dataclass(slots=True)
@@ -92,9 +94,11 @@ class Safety:
     # ------------------------------------------------------------------ hold and e-stops
 
     def held_by(self, name: str, at_ns: int) -> None:
-        """Put the car on hold; the first who did keeps it."""
+        """Put the car on hold, which the coordinator then has no more; the first who did keeps it."""
         if self.hold is None:
             self.hold = Hold(name, at_ns)
+        if self.lease is not None and self.lease.holder.kind is Kind.COORDINATOR:
+            self.lease = None
 
     def latch(self, estop: Estop) -> Estop:
         """Latch an e-stop and hold the car; an id that was ended already is latched under a new one, never ignored."""
@@ -137,7 +141,12 @@ class Safety:
     def driven_no_more(self, now: float) -> None:
         """The holder's motion has ended: what is left of the lease is `LEASE_S`."""
         if self.lease is not None:
-            self.lease = Lease(self.lease.holder, min(self.lease.until, now + LEASE_S))
+            self.lease = replace(self.lease, until=min(self.lease.until, now + LEASE_S))
+
+    def holder_there(self, name: str, *, there: bool) -> None:
+        """Its token came or went: the lease lasts, but for whoever ranks as high."""
+        if self.lease is not None and self.lease.holder.name == name:
+            self.lease = replace(self.lease, gone=not there)
 
     def release(self, sender: Sender) -> bool:
         """The holder gives it back; False if somebody else, or nobody, has it."""

@@ -283,6 +283,19 @@ def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
     assert resumed.returncode == 0
 
 
+def test_ending_its_e_stops_does_not_end_a_cars_hold(cars: Cars) -> None:
+    assert run(cars.endpoint, "estop", "blue").returncode == 0
+    ended = run(cars.endpoint, "resume", "blue", "--estops")
+    assert ended.returncode == 0
+    assert "on hold (by " in ended.stdout
+    again = run(cars.endpoint, "resume", "blue", "--estops")
+    assert (again.returncode, again.stderr) == (0, "blue: no e-stop is in force\n")
+    nobody = run(cars.endpoint, "resume", "pink", "--estops")
+    assert nobody.returncode == 1
+    assert "no car pink on the bus" in nobody.stderr
+    assert "the hold by " in run(cars.endpoint, "resume", "blue").stdout
+
+
 def test_watch_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
     command = [*FLEET, "watch", "red/state/health", "--json", "--connect", cars.endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:

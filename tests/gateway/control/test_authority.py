@@ -123,6 +123,37 @@ def test_who_drives_has_the_car_and_two_seconds_more(desk: Desk) -> None:
     assert desk.ask(Drive(Motion.LEFT), other).status is QUEUED
 
 
+def test_a_command_line_that_is_done_keeps_the_car_from_those_of_lower_rank_only(desk: Desk) -> None:
+    """A person who stops a car, and drives it a little, is not to see it driven off by the coordinator at once."""
+    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
+    desk.run(1.1)
+    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    for other in (SCRIPT, COORDINATOR):
+        assert desk.ask(FORWARD, other).reason is Reason.LEASED
+    desk.run(1.8)
+    assert desk.ask(SetMode(Mode.TRACKING), COORDINATOR).reason is Reason.LEASED
+    assert desk.ask(Drive(Motion.LEFT, 1.0), BOB).status is QUEUED
+    desk.run(3.1)
+    assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
+
+
+def test_a_holder_that_is_back_has_its_lease_again(desk: Desk) -> None:
+    """A hub that was restarted takes all tokens down for a moment."""
+    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
+    desk.run(1.1)
+    for alive in (False, True):
+        desk.control.sender_alive("mia", alive=alive, now=desk.now)
+    assert desk.ask(FORWARD, BOB).reason is Reason.LEASED
+
+
+def test_a_held_car_is_no_coordinators(desk: Desk) -> None:
+    desk.ask(FORWARD, COORDINATOR)
+    desk.ask(Stop(), PERSON)
+    assert desk.control.safety.leased(desk.now) is None
+
+
 def test_a_release_shortens_the_lease(desk: Desk) -> None:
     desk.ask(Drive(Motion.FORWARD, 9.0), SCRIPT)
     desk.ask(Drive(Motion.STOP), SCRIPT)
