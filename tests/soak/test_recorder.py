@@ -18,7 +18,7 @@ CARS = 20
 MESSAGES = 10_000_000
 PUBLISHERS = 40
 AT_ONCE = 50
-LEAD = 20_000
+LEAD = 4_000
 """How many may be under way."""
 SETTLED = 1_000_000
 GROWN = 1.1
