@@ -7,6 +7,7 @@ from typing import Any, Final
 import click
 
 from fleet.client import Fleet
+from fleet.condition import topics_under
 from schemas import keys
 from schemas.bus import canon
 
@@ -41,6 +42,9 @@ def written_out(keyexpr: str, fleet: str) -> str:
 
 def what_there_is(client: Fleet, written: str) -> str:
     """The readings of the car that was meant, or else the cars."""
+    under = topics_under(written)
+    if under and all(topic.family == "sim" for topic in under):
+        return f"what is true of a simulated car is only published: fleet watch {written.partition('/')[2]}"
     cars = client.cars()
     key = keys.parse(written)
     if key is not None and key.car in cars:

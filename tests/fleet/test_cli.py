@@ -221,6 +221,8 @@ def test_get_prints_one_line_or_one_object_for_each_reading(cars: Cars) -> None:
     done = run(cars.endpoint, "get", "purple")
     assert done.returncode == 1
     assert done.stderr == "fleet: nothing under fleet/purple/sensor/*; the cars on the bus are: blue, green, red\n"
+    done = run(cars.endpoint, "get", "red/sim/truth")
+    assert done.stderr.endswith("what is true of a simulated car is only published: fleet watch red/sim/truth\n")
 
 
 def test_each_car_has_a_line_and_a_missing_one_makes_the_exit_code_1(cars: Cars) -> None:
