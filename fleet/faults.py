@@ -63,12 +63,14 @@ def fault(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str
     if kind in ("value_error", "assertion_error"):
         return str(error["ctx"]["error"]), ""
     head = "has no value" if value is None else f"{shown(value)} is not allowed"
-    if kind in ("enum", "literal_error"):
+    chosen = ["enum" in each or "const" in each for each in here]
+    if kind in ("enum", "literal_error") and (all(chosen) or not any(chosen)):
         words = [str(word) for each in here for word in each.get("enum", [each["const"]] if "const" in each else [])]
         listed = f"one of {', '.join(words)}" if words else str(error["ctx"]["expected"])
         return head, listed + meant(str(value), words)
     allowed_here = [words for words in map(_allowed, here) if words and words != "nothing"]
-    if allowed_here and (kind.endswith(("_type", "_than", "_equal", "_parsing")) or kind == "int_from_float"):
+    kinds = ("_type", "_than", "_equal", "_parsing", "int_from_float", "enum", "literal_error")
+    if allowed_here and kind.endswith(kinds):
         quotes = " (write it in quotes)" if kind == "string_type" and isinstance(value, bool | int | float) else ""
         return head, " or ".join(dict.fromkeys(allowed_here)) + quotes
     message = str(error["msg"])
@@ -77,6 +79,8 @@ def fault(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str
 
 def _allowed(schema: Mapping[str, Any]) -> str:
     """What one member of the schema allows, with its range."""
+    if "const" in schema:
+        return f"the word {schema['const']}"
     if "enum" in schema:
         return f"one of {', '.join(map(str, schema['enum']))}"
     words = _TYPES.get(schema.get("type", ""), "")

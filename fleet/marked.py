@@ -6,7 +6,7 @@ put into words is `faults`' part; what a fleet file or a plan means is not decid
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from yamlcore import CoreLoader  # type: ignore[import-untyped]  # has no stubs
 
 from fleet.faults import Where, fault, shown, spelled
+from fleet.sound import Sound
 
 LARGEST_BYTES: Final = 256 * 1024
 """A fleet of a hundred cars has 20 kB; PyYAML reads about 100 kB in a second."""
@@ -101,6 +102,7 @@ class Document:
         self._problems: list[Problem] = []
         self._faulty: set[Where] = set()
         self._places: dict[Where, tuple[yaml.Mark | None, yaml.Node]] = {}
+        self._sound = Sound(None)
         self._values = 0
         if len(text.encode(errors="surrogatepass")) > LARGEST_BYTES:
             raise BadFile(source, [_too_large()])
@@ -123,6 +125,7 @@ class Document:
 
     def complain(self, where: Where, words: str, *, on_key: bool = False) -> None:
         """Note a fault of a value (or of its key; or of something missing below the last that is there)."""
+        where = self._sound.original(where)
         self._faulty.add(where)
         self._problems.append(self._problem(where, words, on_key=on_key))
 
@@ -133,6 +136,35 @@ class Document:
         except ValidationError as error:
             self._note(error, model)
             return None
+
+    def take_sound(self, model: type[_Model], missing: Mapping[str, object]) -> _Model | None:
+        """The document as this model without its faulty values, after `take` has noted them: to look for other faults.
+
+        `missing`: what stands for a field that has to be there, by name. None: too little is sound.
+        """
+        dropped, added = set(self._faulty), dict[Where, object]()
+        for _ in range(DEEPEST):
+            self._sound = Sound(self.tree, dropped, added)
+            try:
+                return model.model_validate_json(json.dumps(self._sound.tree), strict=True)
+            except ValidationError as error:
+                for where, _, each in self._found(error):
+                    if each["type"] == "missing" and where[-1] in missing:
+                        added[where] = missing[str(where[-1])]
+                    else:
+                        dropped.add(where[:-1] if each["type"] == "missing" else where)
+            if () in dropped:
+                break
+        return None
+
+    def faulty_within(self, where: Where) -> bool:
+        """Whether a field of what stands there was faulty, so that something else of it may only seem to be."""
+        there = self._sound.original(where)
+        return any(each[:-1] == there for each in self._faulty if each)
+
+    def is_faulty(self, where: Where) -> bool:
+        """Whether what stands there could not be read as it is."""
+        return self._sound.original(where) in self._faulty
 
     def end(self) -> None:
         """Raise BadFile if there was a fault."""
@@ -145,28 +177,34 @@ class Document:
 
     def _note(self, error: ValidationError, model: type[BaseModel]) -> None:
         schema = model.model_json_schema()
-        found = []
-        for each in error.errors(include_url=False):
-            where, on_key = self._where(each["loc"], missing=each["type"] == "missing")
-            found.append((where, on_key or each["type"] == "extra_forbidden", each))
         heads: dict[tuple[Where, bool, str], list[str]] = {}
-        for where, on_key, each in found:
-            # A union's member that the value was not meant to be says nothing when another has looked into the value.
-            looked_into = any(len(other) > len(where) and other[: len(where)] == where for other, _, _ in found)
-            if where in self._faulty or (looked_into and each["type"].endswith("_type")):
+        for where, on_key, each in self._found(error):
+            if where in self._faulty:
                 continue
             head, allowed = fault(each["type"], each, where, schema)
             heads.setdefault((where, on_key, head), []).append(allowed)
         for (where, on_key, head), allowed_words in heads.items():
             allowed = ", or ".join(dict.fromkeys(word for word in allowed_words if word))
             self._problems.append(self._problem(where, f"{head}: {allowed}" if allowed else head, on_key=on_key))
+        self._faulty.update(where for where, _, _ in heads)
+
+    def _found(self, error: ValidationError) -> list[tuple[Where, bool, Any]]:
+        """Pydantic's errors, each with its place and whether it is one of the key that stands there."""
+        found = []
+        for each in error.errors(include_url=False):
+            where, on_key = self._where(each["loc"], missing=each["type"] == "missing")
+            found.append((where, on_key or each["type"] == "extra_forbidden", each))
+        # A union's member that the value was not meant to be says nothing when another has looked into the value.
+        inner = {where[:depth] for where, _, _ in found for depth in range(len(where))}
+        return [each for each in found if each[0] not in inner or not each[2]["type"].endswith("_type")]
 
     def _where(self, loc: Sequence[str | int], *, missing: bool) -> tuple[Where, bool]:
         """Pydantic's place in the document (its loc names members of unions, too), and whether it is that of a key."""
         where: Where = ()
-        for part in loc:
-            if (*where, part) in self._places:
+        for part in loc[:-1] if missing else loc:
+            if self._sound.original((*where, part)) in self._places:
                 where = (*where, part)
+        where = self._sound.original(where)
         if missing:
             where = (*where, loc[-1])
         return where, bool(loc) and loc[-1] == "[key]"

@@ -8,7 +8,7 @@ words:      in quotes, 'low' or "low", and nothing is escaped in them
 import difflib
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Never
 
@@ -215,14 +215,40 @@ class _Parser:
             return KINDS[self._names[token.text]]
         if token.text in ("and", "or", "not"):
             self._fail(token, f"a field or a value is missing here, before {token.text}")
-        near = difflib.get_close_matches(token.text, [*self._names, *_KEYWORDS], n=2)
+        near = self._near(token.text)
         meant = f"did you mean {' or '.join(near)}? " if near else ""
         compared = self._at > 1 and self._tokens[self._at - 2].text in tuple(Op)
         quoted = f"; a word is quoted, as '{token.text}'" if compared else ""
-        raise self._wrong(token, f"there is no {token.text}: {meant}{self._there_are()}{quoted}")
+        raise self._wrong(token, f"there is no {token.text}: {meant}{self._there_are(self._able())}{quoted}")
 
-    def _there_are(self) -> str:
-        listed = list(self._names)
+    def _near(self, text: str) -> list[str]:
+        """Names that may have been meant, of the kind that is compared here: first those that have it as a part."""
+        wanted, able = self._compared_with(), self._able()
+        parts = [name for name in able if text in name.split(".")]
+        others = able if wanted not in (None, Kind.TRUTH) else [*able, *_KEYWORDS]
+        return list(dict.fromkeys([*parts, *difflib.get_close_matches(text, others, n=2)]))[:2]
+
+    def _able(self) -> list[str]:
+        """The names of the kind that is wanted here, or all."""
+        wanted = self._compared_with()
+        return [name for name, kind in self._names.items() if wanted in (None, KINDS[kind])] or list(self._names)
+
+    def _compared_with(self) -> Kind | None:
+        """What the name before the next token must be, by what stands beside it; None: that does not tell."""
+        before, after = self._at - 2, self._at
+        for sign, other in ((after, after + 1), (before, before - 1)):
+            if 0 <= sign < len(self._tokens) and self._tokens[sign].text in tuple(Op):
+                token = self._tokens[other]
+                if self._tokens[sign].text not in (Op.EQ, Op.NE) or token.what == "number":
+                    return Kind.NUMBER
+                if token.what == "word":
+                    return Kind.WORD
+                named = self._names.get(token.text)
+                return Kind.TRUTH if token.text in ("true", "false") else None if named is None else KINDS[named]
+        return Kind.TRUTH
+
+    def _there_are(self, names: Sequence[str] | None = None) -> str:
+        listed = list(self._names if names is None else names)
         more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
         return f"there are {', '.join(listed[:_LISTED])}{more}" if listed else "there are no names here"
 

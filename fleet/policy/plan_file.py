@@ -6,8 +6,10 @@ from pydantic import Field
 
 from fleet.marked import Entry
 from gateway.protocol.values import Mode
+from schemas import keys
 
-_Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$", description="1 to 32 of a-z, 0-9, _ and -")]
+_Name = Annotated[str, Field(description=keys.NAME_RULE)]
+"""Checked by reader.py, which goes on with a name that is not allowed: a refused key would hide what it has."""
 _Seconds = Annotated[float, Field(ge=0, le=86_400)]
 _Byte = Annotated[int, Field(ge=0, le=255)]
 
@@ -37,16 +39,16 @@ class RuleEntry(Entry):
     """While `when` is so (or from then on until `until` is), `then`."""
 
     name: str = Field("", max_length=60, description="as it is called in explanations")
-    when: ConditionEntry
+    when: ConditionEntry = Field(description="the condition, as `{any: light.left, for_s: 1}`")
     until: ConditionEntry | None = None
-    then: EffectEntry | list[EffectEntry]
+    then: EffectEntry | list[EffectEntry] = Field(description="what follows, as `{who: that, role: rest}`, or a list")
     during: list[_Name] | None = Field(None, description="the phases in which it counts; all, if left out")
 
 
 class RoleEntry(Entry):
     """What some cars should do."""
 
-    mode: Mode
+    mode: Mode = Field(description=f"the mode of a car that has it, one of {', '.join(Mode)}")
     needs: str | None = Field(None, description="an expression that must be so of a car that has it")
     count: Annotated[int, Field(ge=1, le=1000)] | Literal["all"] = Field(1, description="how many cars, or all")
     priority: int = Field(0, ge=-100, le=100, description="the higher is filled first")

@@ -63,7 +63,7 @@ def test_what_a_condition_means(text: str, held: bool | None) -> None:
         ("range_m < and no_echo", 11, "a field or a value is missing here, before and"),
         ("< 0.3", 1, "a field or a value is missing here, before <"),
         ("()", 2, "a field or a value is missing here, before )"),
-        ("range < 0.3", 1, "there is no range: did you mean range_m? there are range_m, voltage_v, level, verdict"),
+        ("range < 0.3", 1, "there is no range: did you mean range_m? there are range_m, voltage_v"),
         ("level == low", 10, "; a word is quoted, as 'low'"),
         ("light.left == True", 15, "did you mean true?"),
         ("range_m", 1, "range_m is a number, not a condition: compare it, as range_m < 0.3"),

@@ -61,7 +61,17 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
             "roles: {a: {mode: tracking, count: 0}}",
             "p:1:36: roles.a.count: 0 is not allowed: a whole number, at least 1",
         ),
+        (
+            "roles: {a: {mode: tracking, count: two}}",
+            "'two' is not allowed: a whole number, at least 1 and at most 1000 or the word all",
+        ),
+        ("cars: {Red: manual}", "cars.Red: name 'Red' is not allowed: use 1 to 32 of a-z, 0-9, _ and -, beginning"),
+        ("roles: {a: {}}", "p:1:9: roles.a.mode: is missing: the mode of a car that has it, one of manual, remote_con"),
         ("roles: {a: {mode: tracking, needs: volts > 7}}", "column 1: there is no volts"),
+        (
+            "roles: {a: {mode: tracking, needs: battery > 7.0}}",
+            "there is no battery: did you mean battery.voltage_v or",
+        ),
         ("roles: {a: {mode: tracking, platforms: [raspberry_pi]}}", "raspberry_pi cars do not know mode tracking"),
         ("roles: {a: {mode: tracking, fallback: b}}", "roles.a.fallback: there is no role b: there are a"),
         ("roles: {a: {mode: tracking, fallback: a}}", "roles that stand in for each other: a -> a"),
@@ -108,3 +118,61 @@ def test_all_mistakes_are_told_at_once() -> None:
             "p",
         )
     assert [line.split(":")[1] for line in str(raised.value).splitlines()] == ["2", "3", "4"]
+
+
+EVERYTHING_WRONG = """\
+roles:
+  Big Role: {mode: tracking, needs: volts > 7}
+  a: {mode: dancing, needs: battery > 7.0, count: two}
+  b: {fallback: zed}
+  c: 5
+cars: {red: fast, Blue: manual}
+rules:
+  - 7
+  - {when: {any: light.left}, then: {who: that, role: c}}
+  - {when: {any: light.leftt}, then: {who: that, role: nobody}}
+  - {when: {car: red}, then: {whoo: that, role: a}}
+  - {then: {who: that, mode: flying}}
+  - {when: {any: light.left}, then: [{who: that, mode: 3}, {who: X Y, phase: q}]}
+phases:
+  x: {until: {any: light.left}, nxt: y}
+  y: {timeout_s: soon, next: z}
+"""
+
+
+def test_what_a_field_may_not_be_hides_no_other_fault_and_seems_to_be_none_itself() -> None:
+    """Names, types, references and conditions at once; what looks wrong only because something else is, is left out."""
+    with pytest.raises(BadFile) as raised:
+        parse(EVERYTHING_WRONG, "p")
+    assert [(each.line, each.field) for each in raised.value.problems] == [
+        (2, "roles.'Big Role'"),
+        (2, "roles.'Big Role'.needs"),
+        (3, "roles.a.mode"),
+        (3, "roles.a.needs"),
+        (3, "roles.a.count"),
+        (4, "roles.b.mode"),
+        (4, "roles.b.fallback"),
+        (5, "roles.c"),
+        (6, "cars.red"),
+        (6, "cars.Blue"),
+        (8, "rules[0]"),
+        (10, "rules[2].when.any"),
+        (10, "rules[2].then.role"),
+        (11, "rules[3].when"),
+        (11, "rules[3].then.whoo"),
+        (12, "rules[4].when"),
+        (12, "rules[4].then.mode"),
+        (13, "rules[5].then[0].mode"),
+        (13, "rules[5].then[1]"),
+        (13, "rules[5].then[1].who"),
+        (13, "rules[5].then[1].phase"),
+        (15, "phases.x.nxt"),
+        (16, "phases.y.timeout_s"),
+        (16, "phases.y.next"),
+    ]
+
+
+@pytest.mark.parametrize("text", ["7", "[]", "roles: 7", "roles: [a]\nrules: 3", "cars: {red: !!set {}}", "rules: {}"])
+def test_with_little_that_is_sound_there_is_a_fault_all_the_same(text: str) -> None:
+    with pytest.raises(BadFile):
+        parse(text, "p")
