@@ -22,7 +22,7 @@ LEAD = 4_000
 """How many may be under way."""
 SETTLED = 1_000_000
 GROWN = 1.1
-"""Of the first million: what waits, and the index of the file that is being written."""
+"""From one half to the other; within each it goes up and down with the index of the file that is being written."""
 
 
 @pytest.mark.soak
@@ -85,4 +85,5 @@ def test_memory_is_flat_over_ten_million_messages(tmp_path: Path) -> None:
     # Faster than any fleet, the bus itself loses some: that is counted, and nothing is lost here.
     assert found["drops"] == {}
     assert found["messages"] + missed >= MESSAGES
-    assert max(memory[1:]) < memory[0] * GROWN
+    half = len(memory) // 2
+    assert max(memory[half:]) < max(memory[:half]) * GROWN
