@@ -79,7 +79,12 @@ What was marked is spared by the quota.""",
     help="When the disk is waited for. A crash of the recorder costs a second at most, whatever this is; one of the "
     "computer costs what was not synced.",
 )
-@click.option("--session-size", type=Size(10**6), help="A session that has so much is closed, and the next one begins.")
+@click.option(
+    "--session-size",
+    type=Size(10**6),
+    help="A session that has so much is closed, and the next one begins; with --quota half of it at "
+    "most, and if this is not given a tenth.",
+)
 @click.option(
     "--quota", type=Size(10**6), help="What all sessions in --out may have; the oldest that nobody marked are removed."
 )
@@ -126,6 +131,13 @@ def record(
     from fleet.recording.tape import Options, Sync
 
     copied = {FLEET_FILE: fleet_file, PLAN: plan}
+    if session_size and quota and session_size > quota // 2:
+        raise click.BadParameter(
+            f"{session_size / 10**6:g} MB is more than half of --quota, which is kept by removing whole sessions: "
+            f"at most {quota / 2 / 10**6:g} MB are allowed",
+            ctx,
+            param_hint="--session-size",
+        )
     options = Options(
         segment_bytes=segment_size,
         segment_s=segment_time,
@@ -142,7 +154,10 @@ def record(
         with Bus.open(connect, start_hub=True) as bus:
             recorder = Recorder(bus, fleet, out, options, tell=_warn)
             session = recorder.start()
-            _say(as_json, {"session": str(session), "state": "recording"}, f"recording fleet {fleet} to {session}")
+            if full := recorder.full:
+                _say(as_json, {"session": str(session), "state": "full"}, f"fleet {fleet} waits for room: {full}")
+            else:
+                _say(as_json, {"session": str(session), "state": "recording"}, f"recording fleet {fleet} to {session}")
             _wait(bus, stop, recorder.ended, parent)
             outcome = recorder.close()
     except (BadEndpoint, keys.BadKey) as error:
@@ -161,6 +176,8 @@ def record(
         f"{session}: {outcome.messages} messages, {outcome.bytes} bytes, "
         f"{_count(outcome.drops, 'dropped here')}, {_count(outcome.missed, 'missed on the bus')}",
     )
+    if outcome.error:
+        raise click.ClickException(outcome.error)
 
 
 def _wait(bus: Bus, stop: threading.Event, ended: threading.Event, parent: int | None) -> None:

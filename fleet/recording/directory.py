@@ -2,27 +2,36 @@
 
 `sessions/20260314T151617Z-fleet/` holds `session.json`, the segments `0001.mcap`, `0002.mcap`, ..., copies of the fleet
 file and the plan if there are any, and `index.json`: by segment what is in it, for who is in a hurry. A cache only.
+While it is recorded there is also `session.json.spare`, into which the description is written when the disk is full.
 """
 
 import contextlib
+import errno
 import json
 import platform
+import shutil
 import socket
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
+from io import FileIO
 from pathlib import Path
 from typing import Any, Final, Self
 
 DESCRIPTION: Final = "session.json"
 INDEX: Final = "index.json"
+SPARE: Final = "session.json.spare"
+SPARE_BYTES: Final = 256 * 1024
+"""Room for a hundred cars' drops by key; a file system that never writes in place (btrfs) may refuse it in need."""
 FLEET_FILE: Final = "fleet.yaml"
 PLAN: Final = "plan.yaml"
 SEGMENTS: Final = "[0-9][0-9][0-9][0-9].mcap"
 FORMAT: Final = 1
 """Raised when a reader of the old layout could misread a session."""
 
+_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT} if sys.platform != "win32" else {errno.ENOSPC})
 _PACKAGES: Final = ("zenoh-car-fleet", "eclipse-zenoh", "mcap", "protobuf")
 
 
@@ -73,8 +82,46 @@ class Description:
             return None
 
     def write(self, directory: Path) -> None:
-        """Replace the description in a directory, whole or not at all; raises OSError."""
-        replace(directory / DESCRIPTION, {name: getattr(self, name) for name in self.__slots__}, indent=2)
+        """Replace the description in a directory, whole or not at all; raises OSError.
+
+        On a full disk it takes the room that was reserved, if it was.
+        """
+        values = {name: getattr(self, name) for name in self.__slots__}
+        try:
+            replace(directory / DESCRIPTION, values, indent=2)
+        except OSError as error:
+            spare = directory / SPARE
+            if not is_full(error) or not spare.is_file():
+                raise
+            with spare.open("r+b", buffering=0) as file:
+                file.truncate(_write_all(file, (json.dumps(values) + "\n").encode()))
+            spare.replace(directory / DESCRIPTION)
+            with contextlib.suppress(OSError):  # of what the old one took, and the rest of the spare one
+                reserve(directory)
+
+
+def is_full(error: OSError) -> bool:
+    """Whether there was no room, on the disk or in the user's share of it."""
+    return error.errno in _FULL
+
+
+def reserve(directory: Path) -> None:
+    """Keep room for one more description; raises OSError, and keeps what there was then."""
+    with (directory / SPARE).open("ab", buffering=0) as file:
+        _write_all(file, bytes(max(0, SPARE_BYTES - file.tell())))
+
+
+def release(directory: Path) -> None:
+    """Keep no more room; raises OSError."""
+    (directory / SPARE).unlink(missing_ok=True)
+
+
+def _write_all(file: FileIO, data: bytes) -> int:
+    """Write without a buffer, which would be written again, and fail again, when the file is closed."""
+    rest = memoryview(data)
+    while rest:
+        rest = rest[file.write(rest) :]
+    return len(data)
 
 
 def replace(path: Path, values: object, indent: int | None = None) -> None:
@@ -113,22 +160,35 @@ def iso(now: datetime) -> str:
     return now.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def create(root: Path, fleet: str, now: datetime) -> tuple[Path, Description]:
-    """Make the directory of a new session below `root`, described as not closed; raises OSError."""
+def plan(root: Path, fleet: str, now: datetime) -> tuple[Path, Description]:
+    """Where a new session is to be, and its description; nothing is made."""
     stem = f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{fleet}"
-    directory = root / stem
-    root.mkdir(parents=True, exist_ok=True)
-    number = 2
+    return _unused(root / stem), Description(fleet, iso(now), socket.gethostname(), versions())
+
+
+def create(directory: Path, description: Description) -> Path:
+    """Make a session's directory, under another name if that one is taken by now; raises OSError, and leaves none."""
+    directory.parent.mkdir(parents=True, exist_ok=True)
     while True:
         try:
             directory.mkdir()
             break
         except FileExistsError:
-            directory = root / f"{stem}-{number}"
-            number += 1
-    description = Description(fleet, iso(now), socket.gethostname(), versions())
-    description.write(directory)
-    return directory, description
+            directory = _unused(directory)
+    try:
+        reserve(directory)
+        description.write(directory)
+    except OSError:
+        shutil.rmtree(directory, ignore_errors=True)
+        raise
+    return directory
+
+
+def _unused(directory: Path) -> Path:
+    found, number = directory, 2
+    while found.exists():
+        found, number = directory.with_name(f"{directory.name}-{number}"), number + 1
+    return found
 
 
 def segment(directory: Path, number: int) -> Path:

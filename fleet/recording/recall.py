@@ -1,7 +1,7 @@
 """Asking publishers again for what a recorder missed: when, and for how long back. What is new is tape.py's to say.
 
-Publishers hold the last ten seconds (`Topic.held`). They are asked after a hub was away, after a gap in their numbers,
-and by a recorder that goes on for one that was killed.
+Publishers hold ten seconds at their topic's rate, a hundred publications at least (`Topic.held`). They are asked after
+a hub was away, after a gap in their numbers, and by a recorder that goes on for one that was killed.
 """
 
 import threading

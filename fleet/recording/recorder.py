@@ -9,14 +9,13 @@ import contextlib
 import json
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import zenoh
 
-from fleet.recording import room
 from fleet.recording.recall import Recall
 from fleet.recording.tape import Options, Tape
 from schemas import keys, messages
@@ -69,6 +68,8 @@ class Outcome:
     bytes: int
     drops: Mapping[str, int]
     missed: Mapping[str, int]
+    error: str = ""
+    """What the end cost for want of room."""
 
 
 _Item = tuple[str, bytes, zenoh.Encoding, "zenoh.Timestamp | None", "zenoh.SourceInfo | None", int]
@@ -76,6 +77,8 @@ _Item = tuple[str, bytes, zenoh.Encoding, "zenoh.Timestamp | None", "zenoh.Sourc
 
 class Recorder:
     """Records from `start` to `close`. If the disk fails, `ended` is set and `close` raises RecordingFailed.
+
+    A disk that is full is waited for, also at the start: `full` says so then.
 
     `tell` hears what a person should know: a full disk, an old session that was removed, a session that begins.
     """
@@ -103,6 +106,7 @@ class Recorder:
         self._told: set[str] = set()
         self._lock = threading.Lock()
         self._waiting: list[_Item] = []
+        self._writing: Iterator[_Item] = iter(())
         self._held_messages = 0
         self._held_bytes = 0
         self._questions: list[zenoh.Query] = []
@@ -118,15 +122,13 @@ class Recorder:
     def start(self) -> Path:
         """Return the session's directory once every subscription is declared.
 
-        Raises AnotherRecorder, and OSError if the session cannot be made.
+        Raises AnotherRecorder, and OSError if the session cannot be made for anything but want of room.
         """
         self._refuse_a_second()
         for expression in keys.recorded(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, CHANNEL))
         self._tape = Tape(self._root, self._fleet, self._options, self._now())
         self._drops = self._tape.drops
-        for words in self._tape.uncopied:
-            self._tell(words)
         session = self._tape.path
         key = keys.topic_key(self._fleet, keys.RECORDER, STATUS.name.partition("/")[2])
         self._publisher = self._bus.publisher(key, STATUS, keys.RECORDER)
@@ -147,6 +149,11 @@ class Recorder:
         self._bus.tokens(token)
         return session
 
+    @property
+    def full(self) -> str:
+        """Why nothing is written for now; empty if it is."""
+        return self._tape.full
+
     def close(self) -> Outcome:
         """Write what has come until now, and close the session whole; raises RecordingFailed."""
         if not self.ended.is_set():
@@ -161,7 +168,7 @@ class Recorder:
         if self._error:
             raise RecordingFailed(self._error)
         tape = self._tape
-        return Outcome(tape.path, tape.messages, tape.bytes, dict(tape.drops), tape.missed)
+        return Outcome(tape.path, tape.messages, tape.bytes, dict(tape.drops), tape.missed, tape.cost)
 
     def _refuse_a_second(self) -> None:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
@@ -239,7 +246,7 @@ class Recorder:
                 self._fail(f"{type(self._reader_error).__name__}: {self._reader_error}")
                 return
             if self._recording:
-                self._tape.close(self._now())
+                self._end(self._tape)
             self._publish("closed")
         except OSError as error:
             self._fail(f"{error.filename or self._tape.path}: {error.strerror or error}")
@@ -255,7 +262,8 @@ class Recorder:
         recalled = self._recall.taken()
         if self._recording:
             add = self._tape.add
-            for item in batch:
+            self._writing = iter(batch)
+            for item in self._writing:
                 add(*item)
             for sample in recalled:
                 self._tape.add_recalled(sample, self._now())
@@ -272,27 +280,34 @@ class Recorder:
         tape = self._tape
         if self._recording:
             tape.tick(self._now())
-            if tape.over:
+            if tape.over and not tape.full:
                 self._begin()
-                tape.close(self._now())
-        self._say_once(tape)
+                self._end(tape)
+        self._say_once(self._tape)
         self._publish()
 
     def _begin(self) -> None:
         """The next session; raises OSError if none can be made."""
         self._tape = Tape(self._root, self._fleet, self._options, self._now())
         self._drops = self._tape.drops
-        self._tell(f"recording fleet {self._fleet} to {self._tape.path}")
-        for words in self._tape.uncopied:
-            self._tell(words)
+        if not self._tape.full:
+            self._tell(f"recording fleet {self._fleet} to {self._tape.path}")
+
+    def _end(self, tape: Tape) -> None:
+        """Close a session."""
+        tape.close(self._now())
+        self._say_once(tape)
 
     def _say_once(self, tape: Tape) -> None:
         """Tell what is new of what should be known."""
         for session in tape.removed:
             self._tell(f"{session} was removed: the oldest that nobody marked, to keep the quota")
+        for words in tape.uncopied:
+            self._tell(words)
         tape.removed.clear()
-        words = {"full": tape.full, "warning": "" if tape.full else tape.warning.partition(",")[0]}
-        now = {f"{kind}: {text}" for kind, text in words.items() if text}
+        tape.uncopied.clear()
+        states = {"full": tape.full, "warning": "" if tape.full else tape.warning.partition(",")[0]}
+        now = {f"{kind}: {text}" for kind, text in states.items() if text}
         for text in sorted(now - self._told):
             self._tell(text)
         if any(text.startswith("full") for text in self._told) and not tape.full and self._recording:
@@ -300,11 +315,15 @@ class Recorder:
         self._told = now
 
     def _fail(self, words: str) -> None:
-        self._error = f"recording to {self._tape.path} failed: {words}. What was written until then is whole"
-        self._limit_messages = 0
-        self._tape.abandon(self._error, self._now())
+        with self._lock:
+            self._limit_messages = 0
+            unwritten, self._waiting = [*self._writing, *self._waiting], []
+        for item in unwritten:
+            self._tape.drop(item[0])
+        self._error = self._tape.abandon(f"recording to {self._tape.path} failed: {words}", self._now())
         # From the last status: asking the disk again may fail again.
         self._last.state, self._last.error, self._last.messages = "failed", self._error, self._tape.messages
+        self._last.drops.update(self._tape.drops)
         self._publisher.put(self._last, self._now())
 
     def _status(self, state: str = "") -> fleet_v1_pb2.Recording:
@@ -315,8 +334,8 @@ class Recorder:
             bytes=tape.bytes,
             messages=tape.messages,
             drops=dict(tape.drops),
-            free_bytes=room.free_bytes(tape.path),
-            error=self._error or tape.full,
+            free_bytes=tape.free_bytes,
+            error=self._error or tape.cost or (f"{tape.full}; {tape.waiting} messages wait" if tape.full else ""),
             missed=tape.missed,
             recovered=tape.recovered,
             segments=tape.segments,
@@ -373,9 +392,9 @@ class Recorder:
         if not self._recording:
             raise _Refused(f"nothing is being recorded; the last session is {self._tape.path}")
         self._drain()
-        self._tape.close(self._now())
+        self._end(self._tape)
         self._recording = False
-        self._tell(f"{self._tape.path} is closed, as was asked")
+        self._tell(f"{self._tape.path} is closed, as was asked{'; ' * bool(self._tape.cost)}{self._tape.cost}")
         self._publish()
 
     def _mark(self, query: zenoh.Query) -> None:

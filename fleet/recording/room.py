@@ -18,6 +18,11 @@ def free_bytes(path: Path) -> int:
     return shutil.disk_usage(path).free
 
 
+def free_bytes_for(path: Path) -> int:
+    """What may be written where `path` is to be made; raises OSError."""
+    return free_bytes(next(each for each in (path, *path.absolute().parents) if each.exists()))
+
+
 def size(session: Path) -> int:
     """What a session takes, bytes; of one that somebody removes meanwhile, what was left."""
     found = 0

@@ -4,10 +4,8 @@ Called from one thread. No bus here, and no thread.
 """
 
 import contextlib
-import errno
 import shutil
-import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -17,12 +15,10 @@ from typing import Any, Final
 
 import zenoh
 
-from fleet.recording import directory, room
+from fleet.recording import before, directory, room
 from fleet.recording.numbers import Numbers
 from fleet.recording.segment import Segment
-from fleet.recording.session import NoSession, Session
 from schemas.bus import sequence_of
-from schemas.topics import HELD_S
 
 MB: Final = 1_000_000
 HELD_MESSAGES: Final = 100_000
@@ -35,9 +31,12 @@ MOST_SEGMENTS: Final = 9990
 LEAST_ROOM: Final = 500_000
 MOST_MORE: Final = 50 * MB
 """With less than that beyond what is to stay free nothing is begun again: it would soon be full again."""
-TAIL_S: Final = 3 * HELD_S
-"""Of a session that was cut off: what of it publishers may still hold."""
-_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT} if sys.platform != "win32" else {errno.ENOSPC})
+END_ROOM: Final = 200_000
+"""With less than that on the disk not even the end of a session is written: a file's index is to have room."""
+BATCH: Final = 100_000
+"""Bytes: of what waited so much is written, and certain, before there is another look at the room."""
+SHARE: Final = 10
+"""A quota is kept by removing whole sessions, so one has no more than a tenth of it."""
 
 
 class Sync(StrEnum):
@@ -57,13 +56,18 @@ class Options:
     """The index of an open file is in memory: of a hundred cars, 0.1 MB a second."""
     sync: Sync = Sync.SEGMENT
     session_bytes: int = 0
-    """A session that has so much is closed, and the next one begins."""
+    """A session that has so much is closed, and the next one begins; 0: a tenth of `root_bytes`."""
     root_bytes: int = 0
     """What all sessions may have together; the oldest that nobody marked go first."""
     keep_free_bytes: int = 50 * MB
     """With less than that on the disk recording pauses."""
     copied: Mapping[str, Path] = field(default_factory=lambda: MappingProxyType({}))
     """Files that are copied into each session, by the name that they have there."""
+
+    @property
+    def session_limit(self) -> int:
+        """What one session may have, bytes; 0 is no limit."""
+        return self.session_bytes or self.root_bytes // SHARE
 
 
 class Lane:
@@ -87,18 +91,21 @@ class Tape:
     """Begins with a new session; raises OSError if none can be made, later also if it cannot be written.
 
     A full disk is not an error: `full` says so, what comes is held for a while, and it goes on when there is room.
+    If it is full from the start, `path` is where the session will be.
     """
 
     def __init__(self, root: Path, fleet: str, options: Options, now_ns: int) -> None:
         self._root = root
         self._options = options
-        self._since_ns, self._known = now_ns, frozenset[tuple[str, int, int]]()
-        before = _cut_off(root, fleet, now_ns)
-        self.path, self.description = directory.create(root, fleet, _wall(now_ns))
+        self.path, self.description = directory.plan(root, fleet, _wall(now_ns))
+        self._made = False
+        follows = before.cut_off(root, fleet, now_ns)
+        self.description.continues = follows.name
+        self._since_ns, self._known = follows.since_ns, follows.known
         self._about = {"fleet": fleet, "started": self.description.started, "host": self.description.host}
         self._about |= {**self.description.versions, "format": str(directory.FORMAT)}
         self.uncopied: list[str] = []
-        self._copy()
+        """Whoever tells of them clears it."""
         self._numbers: dict[str, Numbers] = {}
         self._odd: set[str] = set()
         """Keys whose numbers did not always follow."""
@@ -108,15 +115,16 @@ class Tape:
         """By key: there was no room, here or on the way here. Another thread may count its own."""
         self.recovered: dict[str, int] = {}
         self.full = ""
+        self.cost = ""
+        """What the end of the session cost for want of room."""
         self.warning = ""
         self.removed: list[Path] = []
         """Old sessions that gave way; whoever tells of them clears it."""
         self._index: list[dict[str, Any]] = []
         self._written = self._closed_bytes = self._held_bytes = 0
         self._unflushed: list[_Row] = []
-        self._begin(now_ns)
-        if before is not None:
-            self._follow(before, now_ns)
+        self._forget_lanes(now_ns)
+        self._open(now_ns, self._options.keep_free_bytes + LEAST_ROOM)
 
     # ------------------------------------------------------------------ messages
 
@@ -222,6 +230,16 @@ class Tape:
         return len(self._index) + (self._segment is not None)
 
     @property
+    def waiting(self) -> int:
+        """How many wait for room; 0 while there is some."""
+        return len(self._unflushed) if self.full else 0
+
+    @property
+    def free_bytes(self) -> int:
+        """What is free on the disk; raises OSError."""
+        return room.free_bytes(self.path) if self._made else room.free_bytes_for(self._root)
+
+    @property
     def missed(self) -> dict[str, int]:
         """By key: how many publications are missing, by their publishers' numbers."""
         return {key: missing for key in sorted(self._odd) if (missing := self._numbers[key].missing)}
@@ -229,7 +247,7 @@ class Tape:
     @property
     def over(self) -> bool:
         """Whether the session has all that it may have."""
-        return 0 < self._options.session_bytes <= self.bytes or self.segments >= MOST_SEGMENTS
+        return 0 < self._options.session_limit <= self.bytes or self.segments >= MOST_SEGMENTS
 
     # ------------------------------------------------------------------ each second, and the end
 
@@ -239,13 +257,13 @@ class Tape:
             self._resume(now_ns)
             return
         try:
-            self._segment.flush(sync=self._options.sync is Sync.SECOND)
-            self._count()
+            self._flush(sync=self._options.sync is Sync.SECOND)
             segment_s = self._options.segment_s
             late = bool(segment_s) and now_ns - self._begun_ns >= segment_s * 1e9
-            if late or 0 < self._options.segment_bytes <= self._segment.bytes:
+            if (late or 0 < self._options.segment_bytes <= self._segment.bytes) and not self.over:
                 self._finish()
-                self._begin(now_ns)
+                if not self.over:  # its index counts, too
+                    self._begin(now_ns)
         except OSError as error:
             self._stumble(error)
         self._look()
@@ -254,39 +272,91 @@ class Tape:
         """Note a mark, and that the session is to be kept; raises OSError."""
         marks = [*self.description.marks, {"time": directory.iso(_wall(now_ns)), "text": text, "by": by}]
         self.description.marks, self.description.kept = marks, True
-        self.description.write(self.path)
+        if self._made:
+            self.description.write(self.path)
 
     def close(self, now_ns: int) -> None:
-        """Write what there is, and end the session; what finds no room even now is counted as dropped."""
-        if self._segment is None:
-            self._resume(now_ns)
+        """Write what there is, and end the session, also where room was to stay free.
+
+        What finds none even now is counted as dropped, and `cost` says it.
+        """
+        try:
+            self._flush()
+        except OSError as error:
+            self._stumble(error)
+        dropped = 0
+        if self._segment is None and self._unflushed and self._open(now_ns, END_ROOM):
+            dropped = self._drop_all(self._write_held(END_ROOM))
         try:
             if self._segment is not None:
-                self._segment.flush()
-                self._count()
                 self._finish()
         except OSError as error:
             self._stumble(error)
-        for lane, *_ in self._unflushed:
-            self._drop(lane.key)
-        self._unflushed.clear()
-        self._describe(now_ns, closed=True)
+            self.cost = "there was no room for the end of the last file, whose messages are all there"
+        if dropped := dropped + self._drop_waiting():
+            self.cost = f"there was no room to the end: {dropped} messages that waited for it are dropped"
+        if self.cost:
+            self.description.error = self.cost = f"{self._root}: {self.cost}"
+        if self._made:
+            try:
+                self._describe(now_ns, closed=True)
+            except OSError as error:
+                if not directory.is_full(error):
+                    raise
+                self.cost = f"{self.cost or self._root}; session.json there has no room to say so"
+            directory.release(self.path)
 
-    def abandon(self, words: str, now_ns: int) -> None:
-        """End a session that cannot be written any more; what was flushed stays as it is."""
-        self.description.error = words
+    def abandon(self, why: str, now_ns: int) -> str:
+        """End a session that cannot be written any more; what was flushed stays as it is. The whole story in words."""
         if self._segment is not None:
             self._segment.cut()
+        self._drop_waiting()
+        dropped = sum(self.drops.values())
+        words = f"{why}. What was written until then is whole: {self._written} messages; {dropped} are dropped"
+        self.description.error = words
         with contextlib.suppress(OSError):  # the disk that failed; said already
             self._describe(now_ns, closed=False)
+            directory.release(self.path)
+        return words
 
     # ------------------------------------------------------------------ segments
 
-    def _begin(self, now_ns: int) -> None:
+    def _open(self, now_ns: int, room_bytes: int) -> bool:
+        """Begin a file, and before the first one the session; False, and paused, if there is no such room."""
+        free = self.free_bytes
+        if self._unflushed:  # or a file would be begun for a large one again and again
+            room_bytes += len(self._unflushed[0][2])
+        if free < room_bytes:
+            if not self.full:
+                self._pause(f"{free / MB:.1f} MB are left on the disk, {room_bytes / MB:.1f} MB are needed")
+            return False
+        made = self._made
+        try:
+            if not made:
+                self.path = directory.create(self.path, self.description)
+                self._made = True
+            self._begin(now_ns)
+        except OSError as error:
+            if self._made and not made:  # a session without a file is none
+                shutil.rmtree(self.path, ignore_errors=True)
+                self._made = False
+            self._stumble(error)
+            return False
+        if not made:
+            self._copy()
+        with contextlib.suppress(OSError):
+            directory.reserve(self.path)
+        self.full = ""
+        return True
+
+    def _forget_lanes(self, now_ns: int) -> None:
         self._lanes: dict[str, Lane] = {}
         self._others: dict[tuple[str, str], Lane] = {}
         self._begun_ns, self._first_ns, self._last_ns = now_ns, 0, 0
         self._segment: Segment | None = None
+
+    def _begin(self, now_ns: int) -> None:
+        self._forget_lanes(now_ns)
         path = directory.segment(self.path, len(self._index) + 1)
         try:
             self._segment = Segment(path, self._about)
@@ -294,6 +364,12 @@ class Tape:
             path.unlink(missing_ok=True)
             raise
         self._put = self._segment.add
+
+    def _flush(self, *, sync: bool = False) -> None:
+        """Make certain what has come."""
+        if self._segment is not None:
+            self._segment.flush(sync=sync)
+            self._count()
 
     def _count(self) -> None:
         """What was flushed, for the index."""
@@ -341,29 +417,47 @@ class Tape:
 
     def _stumble(self, error: OSError) -> None:
         """What was not flushed is held; anything but a full disk is raised."""
-        if error.errno not in _FULL:
+        if not directory.is_full(error):
             raise error
         if self._segment is not None:
             self._segment.cut()
-            self._ended()
+            if self._index and not any(lane.count for lane in self._others.values()):
+                self._segment.path.unlink(missing_ok=True)  # nothing is in it
+                self._segment = None
+            else:
+                self._ended()
         self._pause(f"{error.strerror or error}")
 
     def _pause(self, words: str) -> None:
         self.full = f"{self._root}: {words}: nothing is written until there is room"
         self.description.error = self.full
         self._held_bytes = sum(len(row[2]) for row in self._unflushed)
+        if self._made:
+            with contextlib.suppress(OSError):  # it is told on the bus, and written at the end
+                self._describe(None, closed=False)
 
     def _hold(self) -> None:
         """Whether what came last can wait for room."""
         lane, _, payload, _, _ = self._unflushed[-1]
         if len(self._unflushed) > HELD_MESSAGES or self._held_bytes + len(payload) > HELD_BYTES:
             self._unflushed.pop()
-            self._drop(lane.key)
+            self.drop(lane.key)
         else:
             self._held_bytes += len(payload)
 
-    def _drop(self, key: str) -> None:
+    def drop(self, key: str) -> None:
+        """Count one that cannot be written."""
         self.drops[key] = self.drops.get(key, 0) + 1
+
+    def _drop_waiting(self) -> int:
+        """Count what is not written as dropped; how many."""
+        rows, self._unflushed = self._unflushed, []
+        return self._drop_all(rows)
+
+    def _drop_all(self, rows: Sequence[_Row]) -> int:
+        for lane, *_ in rows:
+            self.drop(lane.key)
+        return len(rows)
 
     def _look(self) -> None:
         """See whether there is room, and make some among the old sessions."""
@@ -373,9 +467,9 @@ class Tape:
             removed, over = room.make_room(self._root, limit, self.path)
             self.removed += removed
             if over:
-                more = f"{self._root} has {over / MB:.1f} MB more than its quota"
-                self.warning = f"{more}, all of it marked, in use or not to be removed"
-        free = room.free_bytes(self.path)
+                what = f"by {over / MB:.1f} MB that are marked, in use or not to be removed"
+                self.warning = f"{self._root} has more than its quota, {what}"
+        free = self.free_bytes
         if free < keep * WARN_FREE:
             self.warning = f"{self._root}: the disk is nearly full, {free / MB:.0f} MB are left"
         if free < keep and self._segment is not None:
@@ -388,18 +482,39 @@ class Tape:
 
     def _resume(self, now_ns: int) -> None:
         keep = self._options.keep_free_bytes
-        if room.free_bytes(self.path) < keep + max(min(keep, MOST_MORE), LEAST_ROOM):
-            return
+        if self._open(now_ns, keep + max(min(keep, MOST_MORE), LEAST_ROOM)):
+            rest = self._write_held(keep + END_ROOM)
+            try:
+                if rest and self._segment is not None:
+                    self._finish()
+            except OSError as error:
+                self._stumble(error)
+            self._unflushed += rest
+            if self._segment is None:
+                self._pause(f"{len(self._unflushed)} messages that wait need more than is free")
+
+    def _write_held(self, keep_bytes: int) -> list[_Row]:
+        """Write what waited, as long as so much stays free; what the disk has no room for."""
         rows, self._unflushed = self._unflushed, []
+        done = size = 0
+        most = self.free_bytes - keep_bytes
         try:
-            self._begin(now_ns)
+            while done < len(rows) and self._segment is not None:
+                lane, received_ns, payload, published_ns, sequence = rows[done]
+                if size + len(payload) > most:
+                    break
+                done += 1
+                self._write((self._lane(lane.key, lane.encoding), received_ns, payload, published_ns, sequence))
+                size += len(payload)
+                if size >= BATCH:
+                    self._flush()
+                    size, most = 0, self.free_bytes - keep_bytes
+            self._flush()
         except OSError as error:
-            self._unflushed = rows
+            if not directory.is_full(error):
+                self._unflushed += rows[done:]  # whoever ends this counts them
             self._stumble(error)
-            return
-        self.full = ""
-        for lane, received_ns, payload, published_ns, sequence in rows:
-            self._write((self._lane(lane.key, lane.encoding), received_ns, payload, published_ns, sequence))
+        return rows[done:]
 
     # ------------------------------------------------------------------ the directory
 
@@ -417,67 +532,11 @@ class Tape:
         description = self.description
         if now_ns is not None:
             description.ended, description.closed = directory.iso(_wall(now_ns)), closed
-        description.messages = self.messages
+        description.messages = self._written
         description.drops, description.missed = dict(self.drops), self.missed
         description.recovered = dict(self.recovered)
         description.write(self.path)
 
-    def _follow(self, before: Session, now_ns: int) -> None:
-        """Go on where a recorder was killed: what it has is not written again, what it has not is."""
-        start_ns = now_ns - int(TAIL_S * 1e9)
-        # Killed again before it had what the one before it lacked, it lacks that still.
-        chain = [before, *_continued(before, start_ns)]
-        self._known = frozenset(
-            (each.key, each.sequence, each.published_ns)
-            for session in chain
-            for each in session.messages(start_ns=start_ns)
-        )
-        self._since_ns = max(start_ns, _begun_ns(chain[-1]))
-        self.description.continues = before.path.name
-        self.description.write(self.path)
-
 
 def _wall(now_ns: int) -> datetime:
     return datetime.fromtimestamp(now_ns / 1e9, UTC)
-
-
-def _continued(session: Session, start_ns: int) -> list[Session]:
-    """The sessions that one goes on with, the latest first, back to the one in which `start_ns` lies."""
-    found = [session]
-    while _begun_ns(found[-1]) > start_ns:
-        description = found[-1].description
-        assert description is not None
-        name = description.continues
-        if not name or Path(name).name != name:
-            break
-        try:
-            earlier = Session.open(session.path.parent / name)
-        except NoSession:
-            break
-        if earlier.description is None or earlier.path in [each.path for each in found]:
-            break
-        found.append(earlier)
-    return found[1:]
-
-
-def _begun_ns(session: Session) -> int:
-    assert session.description is not None
-    return int(datetime.fromisoformat(session.description.started).timestamp() * 1e9)
-
-
-def _cut_off(root: Path, fleet: str, now_ns: int) -> Session | None:
-    """The session of a recorder that ended a moment ago without closing it; None if there is none."""
-    there = sorted(root.glob(f"*/{directory.DESCRIPTION}"), key=lambda path: path.parent.name)
-    for path in reversed(there):
-        description = directory.Description.read(path.parent)
-        if description is None or description.fleet != fleet:
-            continue
-        if description.closed or description.ended is not None:
-            return None
-        try:
-            session = Session.open(path.parent)
-            written_ns = session.segments[-1].stat().st_mtime_ns
-        except (NoSession, OSError):
-            return None
-        return session if now_ns - written_ns < HELD_S * 2e9 else None
-    return None

@@ -7,20 +7,23 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fleet.recording.session import Session
+from fleet.recording import directory
+from fleet.recording.session import NoSession, Session
 from fleet.recording.sessions.verify import verify
+from fleet.recording.tape import MB, Options, Tape
 from schemas.bus import Bus, Failure, Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
 from .conftest import publisher, wait_for
 from .test_command import ready
+from .test_tape import BEGUN_NS, SECOND_NS, feed
 
 BALLAST = 300_000_000
 TINY = 6_000_000
@@ -37,6 +40,9 @@ def can_mount() -> bool:
     )
 
 
+DISKS = ["keep free", *(["a disk of its own"] if can_mount() else [])]
+
+
 class Disk:
     """A disk that can be filled, and emptied again."""
 
@@ -46,9 +52,9 @@ class Disk:
         self._ballast = ballast
         self._size = size
 
-    def fill(self) -> None:
+    def fill(self, but: int = 0) -> None:
         with self._ballast.open("wb") as file:
-            size = min(self._size, shutil.disk_usage(self._ballast.parent).free)
+            size = min(self._size, shutil.disk_usage(self._ballast.parent).free) - but
             os.posix_fallocate(file.fileno(), 0, size)
 
     def free(self) -> None:
@@ -87,7 +93,7 @@ def status(bus: Bus) -> Any:
     return answer.message()
 
 
-@pytest.mark.parametrize("kind", ["keep free", *(["a disk of its own"] if can_mount() else [])])
+@pytest.mark.parametrize("kind", DISKS)
 def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_there_is_room(
     kind: str, endpoint: str, bus: Bus, tmp_path: Path
 ) -> None:
@@ -138,6 +144,162 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
         assert (verdict.missing, verdict.twice, verdict.closed) == ([], [], True)
         # Nearly full, a file is closed in time; where there is no room at all, not even its index can be written.
         assert list(verdict.damage) == ([] if kind == "keep free" else ["0001.mcap"])
+
+
+def holds(session: Path, key: str) -> list[int]:
+    return [message.sequence for message in Session.open(session).messages() if message.key == key]
+
+
+@pytest.mark.parametrize("kind", DISKS)
+def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_drops(
+    kind: str, endpoint: str, bus: Bus, tmp_path: Path
+) -> None:
+    with disk(kind, tmp_path) as there:
+        process = record(endpoint, there.root, *there.options)
+        session = ready(process)
+        out = publisher(bus, "red", "frame/rx")
+        sent = 0
+        there.fill()
+
+        def publish_until(enough: Callable[[Any], bool]) -> None:
+            def so() -> bool:
+                nonlocal sent
+                for _ in range(100):
+                    out.put(pb.RxFrame(data=os.urandom(2000)), time.time_ns())
+                    time.sleep(0.001)
+                sent += 100
+                return enough(status(bus))
+
+            wait_for(so, "what was published is seen")
+
+        publish_until(lambda seen: seen.state == "full")
+        publish_until(lambda seen: seen.messages > sent // 2 and "messages wait" in seen.error)
+        process.send_signal(signal.SIGINT)
+        text, errors = process.communicate(timeout=60)
+        end = json.loads(text)
+        description = directory.Description.read(session)
+        assert description is not None
+        assert description.closed
+        dropped = end["drops"].get(out.key, 0)
+        assert description.drops == end["drops"]
+        assert len(holds(session, out.key)) + dropped == sent
+        assert description.messages == end["messages"] == sum(1 for _ in Session.open(session).messages())
+        assert not (session / directory.SPARE).exists()
+        if kind == "keep free":  # there was room, which only was to stay free
+            assert (process.returncode, dropped) == (0, 0)
+            assert verify(Session.open(session)).whole
+        else:
+            assert process.returncode == 1
+            total = sum(end["drops"].values())
+            assert total >= dropped > 100
+            assert f"no room to the end: {total} messages that waited for it are dropped" in errors.splitlines()[-1]
+            assert f"{total} messages that waited" in description.error
+
+
+@pytest.mark.parametrize("kind", DISKS)
+def test_a_disk_that_is_full_at_the_start_is_waited_for_and_nothing_is_left_lying_there(
+    kind: str, endpoint: str, bus: Bus, tmp_path: Path
+) -> None:
+    with disk(kind, tmp_path) as there:
+        there.fill()
+        process = record(endpoint, there.root, *there.options)
+        session = ready(process)
+        assert status(bus).state == "full"
+        out = publisher(bus, "red", "sensor/range")
+        for _ in range(100):
+            out.put(pb.Range(range_m=1.0), time.time_ns())
+        wait_for(lambda: status(bus).messages > 100, "those wait")
+        assert list(there.root.glob("*")) == []
+        assert fleet(endpoint, "mark", "full").returncode == 0
+        there.free()
+        wait_for(lambda: status(bus).state == "recording", "it records")
+        process.send_signal(signal.SIGTERM)
+        text, errors = process.communicate(timeout=60)
+        end = json.loads(text)
+        assert (process.returncode, end["session"], end["drops"]) == (0, str(session), {})
+        assert holds(session, out.key) == list(range(1, 101))
+        opened = Session.open(session)
+        assert verify(opened).whole
+        assert opened.description is not None
+        assert [mark["text"] for mark in opened.description.marks] == ["full"]
+        assert "nothing is written until there is room" in errors
+        assert f"there is room again: recording goes on to {session}" in errors
+
+
+@pytest.mark.parametrize("kind", DISKS)
+def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_nothing(
+    kind: str, endpoint: str, tmp_path: Path
+) -> None:
+    with disk(kind, tmp_path) as there:
+        there.fill()
+        process = record(endpoint, there.root, *there.options)
+        session = ready(process)
+        process.send_signal(signal.SIGTERM)
+        text, errors = process.communicate(timeout=60)
+        if kind == "keep free":
+            assert process.returncode == 0
+            assert verify(Session.open(session)).whole
+            return
+        assert process.returncode == 1
+        dropped = sum(json.loads(text)["drops"].values())
+        assert f"no room to the end: {dropped} messages that waited for it are dropped" in errors.splitlines()[-1]
+        assert list(there.root.glob("*")) == []
+        with pytest.raises(NoSession):
+            Session.open(session)
+
+
+@pytest.mark.skipif(len(DISKS) < 2, reason="may not mount a disk of its own")
+def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing(tmp_path: Path) -> None:
+    with disk("a disk of its own", tmp_path) as there:
+        tape = Tape(there.root, "fleet", Options(keep_free_bytes=0), BEGUN_NS)
+        there.fill()
+        written = []
+        for second in range(3):
+            feed(tape, BEGUN_NS + second * SECOND_NS, count=500, size=1000)
+            tape.tick(BEGUN_NS + second * SECOND_NS)
+        assert tape.full
+        assert tape.waiting == tape.messages == 1500
+        there.free()
+        there.fill(but=MB)
+        for second in range(3, 10):
+            tape.tick(BEGUN_NS + second * SECOND_NS)
+            written.append(tape.messages - tape.waiting)
+        assert 0 < written[-1] < 1500
+        assert all(any(Session.open(segment).messages()) for segment in tape.path.glob("000[2-9].mcap"))
+        assert tape.segments < 4
+        description = directory.Description.read(tape.path)
+        assert description is not None
+        assert (description.messages, description.error) == (written[-1], tape.full)
+        there.free()
+        tape.tick(BEGUN_NS + 10 * SECOND_NS)
+        assert not tape.full
+        tape.close(BEGUN_NS + 11 * SECOND_NS)
+        assert (tape.drops, tape.cost) == ({}, "")
+        times = [message.recorded_ns for message in Session.open(tape.path).messages()]
+        assert times == [BEGUN_NS + second * SECOND_NS + number for second in range(3) for number in range(500)]
+
+
+def test_a_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    process = record(endpoint, tmp_path, "--quota", "1MB")
+    session = ready(process)
+    out = publisher(bus, "red", "frame/rx")
+    sent = 0
+
+    def gone() -> bool:
+        nonlocal sent
+        for _ in range(10):
+            sent += len(out.put(pb.RxFrame(data=os.urandom(2000)), time.time_ns()))
+            time.sleep(0.002)
+        return not session.exists()
+
+    wait_for(gone, "the oldest session gave way")
+    process.send_signal(signal.SIGTERM)
+    text, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert Path(json.loads(text)["session"]) != session
+    assert f"{session} was removed" in errors
+    assert errors.count("more than its quota") <= 2  # told when it begins, not with every figure
+    assert all(verify(Session.open(path)).whole for path in tmp_path.iterdir())
 
 
 def test_a_directory_that_vanishes_is_said_and_ends_the_recorder(endpoint: str, bus: Bus, tmp_path: Path) -> None:
@@ -213,6 +375,7 @@ def test_a_mark_that_cannot_be_is_refused(endpoint: str, bus: Bus, tmp_path: Pat
         (("--quota", "much"), "1 MB to 1000 TB"),
         (("--keep-free=-1",), "0 to 1000 TB"),
         (("--segment-time", "0s"), "more than 0"),
+        (("--quota", "5GB", "--session-size", "3GB"), "at most 2500 MB are allowed"),
         (("--quota", "5GB", "status"), "--quota goes behind 'status'"),
     ],
 )

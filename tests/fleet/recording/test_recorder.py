@@ -1,6 +1,7 @@
 """What comes over the bus lies in the file as it came; what is lost is counted. Read with the stock mcap reader."""
 
 import json
+import os
 import threading
 import time
 from collections import Counter
@@ -164,6 +165,26 @@ def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
     assert held < sent <= held + dropped
     assert missed <= sent - held
     assert json.loads(metadata(session / "0001.mcap")["recording"]["drops"]) == dict(outcome.drops)
+
+
+def test_a_huge_publication_is_read_by_the_stock_reader_and_one_that_is_too_large_is_counted(
+    endpoint: str, bus: Bus, tmp_path: Path
+) -> None:
+    payload = os.urandom(20_000_000)
+    with Bus.open(endpoint) as own, zenoh.open(own_config(endpoint)) as stranger:
+        recorder = Recorder(own, "fleet", tmp_path, limit_bytes=30_000_000)
+        session = recorder.start()
+        stranger.put("fleet/red/map", payload)
+        wait_for(lambda: recorder._tape.bytes > len(payload), "it is in the file")
+        stranger.put("fleet/red/larger", bytes(30_000_001))
+        stranger.put("fleet/red/note", b"still there")
+        outcome = recorder.close()
+    held = {channel.topic: message.data for _, channel, message in stock(session / "0001.mcap")}
+    assert held["fleet/red/map"] == payload
+    assert held["fleet/red/note"] == b"still there"
+    assert "fleet/red/larger" not in held
+    assert outcome.drops == {"fleet/red/larger": 1}
+    assert json.loads((session / "session.json").read_text())["drops"] == {"fleet/red/larger": 1}
 
 
 def test_status_is_published_answered_and_recorded(endpoint: str, bus: Bus, tmp_path: Path) -> None:

@@ -94,6 +94,17 @@ def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
     tape.close(BEGUN_NS)
 
 
+@pytest.mark.parametrize("limit", [{"session_bytes": 100_000}, {"root_bytes": MB}])
+def test_a_session_that_has_enough_begins_no_other_file(limit: dict[str, int], tmp_path: Path) -> None:
+    tape = Tape(tmp_path, "fleet", Options(segment_bytes=100_000, **limit), BEGUN_NS)
+    feed(tape, BEGUN_NS, count=200)
+    tape.tick(BEGUN_NS)
+    assert tape.over
+    tape.close(BEGUN_NS)
+    assert [path.name for path in sorted(tape.path.glob("*.mcap"))] == ["0001.mcap"]
+    assert verify(Session.open(tape.path)).whole
+
+
 def session(root: Path, number: int, *, closed: bool = True) -> Path:
     """One of half a megabyte, an hour after the one before."""
     now = BEGUN_NS + number * 3600 * SECOND_NS
@@ -131,7 +142,8 @@ def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp
     tape.close(BEGUN_NS)
     after = Tape(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS + SECOND_NS)
     after.tick(BEGUN_NS + SECOND_NS)
-    assert "more than its quota, all of it marked, in use or not to be removed" in after.warning
+    assert "has more than its quota, by 0." in after.warning
+    assert "MB that are marked, in use or not to be removed" in after.warning
     assert after.removed == []
     after.close(BEGUN_NS + SECOND_NS)
     assert payloads([tape.path]) == 400
