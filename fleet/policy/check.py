@@ -7,18 +7,14 @@ file, or (without one) cars of any platform.
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
 
 from fleet.faults import meant
 from fleet.policy.conflicts import alternations, fights, implies, outside
-from fleet.policy.picture import CarPicture, topic_of
-from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Phase, Plan, Role, Rule
-from fleet.policy.staffing import unfit
+from fleet.policy.measured import Outlook, Reach, seen, unmeasured
+from fleet.policy.picture import CarPicture
+from fleet.policy.plan import ALL, OTHERS, THAT, Effect, Phase, Plan, Role, Rule
 from fleet.policy.steady import HYSTERESIS_S
-from gateway.protocol.profile import Platform, Profile, parse_platform
 from gateway.protocol.values import Mode
-
-_ANY_CAR: Final = "a car"
 
 
 class Gravity(StrEnum):
@@ -85,8 +81,7 @@ class _Check:
         self._plan = plan
         self._named = _named(plan)
         self._known = fleet
-        # Without a fleet file: a car of each platform under every name.
-        self._cars = fleet if fleet is not None else dict.fromkeys((*sorted(self._named), _ANY_CAR), CarPicture())
+        self._reach = Reach(plan, fleet, self._named)
 
     def findings(self) -> Iterator[Finding]:
         yield from self._unknown_cars()
@@ -116,9 +111,9 @@ class _Check:
             if role.needs is not None and (why := outside(role.needs)):
                 yield Finding(Gravity.ERROR, part, f"no car can fill it: {why}")
                 continue
-            able = [car for car in self._cars if self._able(car, role)]
+            able = [car for car in self._reach.cars if self._reach.able(car, role)]
             if not able:
-                whys = "; ".join(f"{car}: {self._why_not(car, role)}" for car in list(self._cars)[:4])
+                whys = "; ".join(f"{car}: {self._reach.why_not(car, role)}" for car in list(self._reach.cars)[:4])
                 yield Finding(Gravity.ERROR, part, f"no car can fill it{f': {whys}' if whys else ''}")
             elif (
                 role.count is not None and len(able) < role.count and (self._known is not None or role.cars is not None)
@@ -142,35 +137,18 @@ class _Check:
         phases = [phase for phase in self._plan.phases.values() if during is None or phase.name in during]
         return not phases or any(phase.roles is None or role.name in phase.roles for phase in phases)
 
-    def _able(self, car: str, role: Role) -> bool:
-        return self._why_not(car, role) == ""
-
-    def _why_not(self, car: str, role: Role) -> str:
-        """Why this car can never have this role; empty if it can."""
-        if car != _ANY_CAR and not self._plan.may(car, role):
-            return "the plan gives it to others"
-        if car == _ANY_CAR and role.cars is not None:
-            return "only for certain cars"
-        known = self._cars.get(car)
-        if known is None:
-            return "the fleet file has no such car"
-        if known.listed:
-            barrier = unfit(known, role, 0.0)
-            if barrier is not None:
-                return barrier.why
-        if role.needs is None:
-            return ""
-        missing = self._never(role.needs.names, [(profile, mode) for profile in self._profiles(car) for mode in Mode])
-        return f"it needs {role.needs}, and {missing} is never measured on it" if missing else ""
-
     # ------------------------------------------------------------------ rules
 
     def _rules(self) -> Iterator[Finding]:
         for rule in self._plan.rules:
-            yield from self._out_of_phase(rule)
+            apart = [*self._out_of_phase(rule)]
+            yield from apart
             for condition, word in ((rule.when, "fire"), (rule.until, "end by `until`")):
-                if condition is not None and (why := self._never_so(condition)):
-                    yield Finding(Gravity.ERROR, rule.name, f"it can never {word}: {why}")
+                outlook = Outlook() if condition is None or apart else self._reach.outlook(condition, rule.during)
+                if outlook.never:
+                    yield Finding(Gravity.ERROR, rule.name, f"it can never {word}: {outlook.never}")
+                elif outlook.only:
+                    yield Finding(Gravity.WARNING, rule.name, f"it can {word} only by {outlook.only}")
             if rule.until is not None and implies(rule.when, rule.until):
                 words = f"it can never fire: {rule.until.text} ends it, and is so whenever it begins"
                 yield Finding(Gravity.ERROR, rule.name, words)
@@ -195,11 +173,11 @@ class _Check:
         if who == OTHERS and self._known is not None and len(self._known) < 2:
             yield Finding(Gravity.ERROR, rule.name, f"there are no others: the fleet file has {len(self._known)} car")
         certain = bool(who) and self._plan.is_car(who)
-        cars = [who] if certain else list(self._cars)
-        cars = [car for car in cars if car in self._cars]
+        cars = [who] if certain else list(self._reach.cars)
+        cars = [car for car in cars if car in self._reach.cars]
         if effect.role is not None:
             role = self._plan.roles[effect.role]
-            whys = {car: self._why_not(car, role) for car in cars}
+            whys = {car: self._reach.why_not(car, role) for car in cars}
             if certain and cars and all(whys.values()):
                 yield Finding(Gravity.ERROR, rule.name, f"{who} can never have role {role.name}: {whys[who]}")
         mode = effect.mode
@@ -210,66 +188,11 @@ class _Check:
 
     def _cannot(self, car: str, mode: Mode) -> str:
         """Why it is never in this mode; empty if it can be."""
-        profiles = self._profiles(car)
+        profiles = self._reach.profiles(car)
         if not any(mode in profile.modes for profile in profiles):
             return f"a {profiles[0].name} car, which does not know mode {mode}"
-        known = self._cars[car]
+        known = self._reach.cars[car]
         return f"not let do mode {mode} by the fleet file" if known.lacks(mode) else ""
-
-    def _never_so(self, condition: Condition) -> str:
-        """Why a condition can never be so; empty if it may be."""
-        if why := outside(condition.expression):
-            return why
-        if condition.car is not None:
-            if condition.car not in self._cars:
-                return f"there is no car {condition.car}"
-            cars = [condition.car]
-        else:
-            cars = list(self._cars)
-        names = condition.expression.names
-        missing = ""
-        for car in cars:
-            missing = self._never(names, [*self._states(car, condition)])
-            if not missing:
-                return ""
-        whom = condition.car or f"{condition.of} car{f' with role {condition.role}' if condition.role else ''}"
-        return f"{missing} is never measured on {whom}, in the modes that this plan gives it" if missing else ""
-
-    def _states(self, car: str, condition: Condition) -> Iterator[tuple[Profile, Mode]]:
-        """In which modes a car may be when the condition is looked at."""
-        if condition.role is not None:
-            modes = {self._plan.roles[condition.role].mode}
-            modes |= {effect.mode for rule in self._plan.rules for effect in rule.effects if effect.mode is not None}
-        else:
-            modes = self._modes(car)
-        return ((profile, mode) for profile in self._profiles(car) for mode in modes if mode in profile.modes)
-
-    def _modes(self, car: str) -> set[Mode]:
-        """The modes that the plan may bring a car into, and mode 0, which every car begins with."""
-        modes = {role.mode for role in self._plan.roles.values() if self._able(car, role)}
-        for rule in self._plan.rules:
-            for effect in rule.effects:
-                if (
-                    effect.mode is not None
-                    and effect.who != ""
-                    and (not self._plan.is_car(effect.who) or effect.who == car)
-                ):
-                    modes.add(effect.mode)
-        rests = self._plan.idle is Mode.MANUAL and not (car in self._plan.fixed and len(modes) == 1)
-        return modes | ({Mode.MANUAL} if rests or not modes else set())
-
-    def _profiles(self, car: str) -> list[Profile]:
-        known = self._cars.get(car)
-        profile = known.profile if known is not None else None
-        return [profile] if profile is not None else [parse_platform(kind) for kind in Platform if kind != "unknown"]
-
-    def _never(self, names: tuple[str, ...], states: list[tuple[Profile, Mode]]) -> str:
-        """A name that is measured in none of these states; empty if each is in one."""
-        for name in names:
-            family, _, topic = topic_of(name).partition("/")
-            if family == "sensor" and not any(topic in profile.measurable(mode) for profile, mode in states):
-                return name
-        return ""
 
     def _fights(self) -> Iterator[Finding]:
         for rule, words, always in fights(self._plan):
@@ -289,10 +212,10 @@ class _Check:
                 )
                 if mode is None or not hits or effect.who == OTHERS:
                     continue
-                cars = [rule.when.car] if rule.when.of is Of.CAR and rule.when.car in self._cars else list(self._cars)
-                states = [(profile, mode) for car in cars if car is not None for profile in self._profiles(car)]
-                missing = self._never(rule.when.expression.names, states)
-                if missing:
+                cars = [car for car in self._reach.cars if rule.when.car in (None, car)]
+                kinds = [profile for car in cars for profile in self._reach.profiles(car)]
+                if kinds and not any(seen(rule.when.expression, profile, mode) for profile in kinds):
+                    missing = ", ".join(unmeasured(rule.when.expression, kinds[0], mode))
                     words = f"it ends itself: in mode {mode}, {missing} is not measured; give it until"
                     yield Finding(Gravity.WARNING, rule.name, words)
 
@@ -317,13 +240,36 @@ class _Check:
             if phase.timeout_s is not None and phase.timeout_s < HYSTERESIS_S:
                 words = f"it lasts {HYSTERESIS_S:g} s at least, whatever timeout_s says"
                 yield Finding(Gravity.WARNING, part, words)
-            if phase.until is not None and (why := self._never_so(phase.until) or self._no_role(phase)):
-                words = f"it never ends: {why}; give it timeout_s"
-                if phase.timeout_s is not None:
-                    words = f"only its time-out ends it: {why}"
-                yield Finding(Gravity.ERROR if phase.timeout_s is None else Gravity.WARNING, part, words)
+            yield from self._endless(phase)
         for name, words in alternations(plan):
             yield Finding(Gravity.ERROR, f"phase {name}", words)
+
+    def _endless(self, phase: Phase) -> Iterator[Finding]:
+        """A phase that its condition does not end."""
+        if phase.until is None:
+            return
+        outlook, jumps = self._reach.outlook(phase.until, {phase.name}), self._jumps_out(phase)
+        why = self._no_role(phase) or outlook.never
+        if phase.timeout_s is not None and phase.until.for_s >= phase.timeout_s:
+            why = why or f"until wants {phase.until.for_s:g} s, and timeout_s is {phase.timeout_s:g}"
+        part = f"phase {phase.name}"
+        if why and phase.timeout_s is None and not jumps:
+            yield Finding(Gravity.ERROR, part, f"it never ends: {why}; or give it timeout_s")
+        elif why:
+            other = " or ".join([*(["its time-out"] if phase.timeout_s is not None else []), *jumps])
+            yield Finding(Gravity.WARNING, part, f"only {other} ends it: {why}")
+        elif outlook.only:
+            yield Finding(Gravity.WARNING, part, f"it can end only by {outlook.only}")
+
+    def _jumps_out(self, phase: Phase) -> list[str]:
+        """The rules that can end it."""
+        return [
+            rule.name
+            for rule in self._plan.rules
+            if any(effect.phase not in (None, phase.name) for effect in rule.effects)
+            and (rule.during is None or phase.name in rule.during)
+            and not self._reach.outlook(rule.when, {phase.name}).never
+        ]
 
     def _no_role(self, phase: Phase) -> str:
         role = None if phase.until is None else phase.until.role

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -464,3 +465,34 @@ def test_when_nothing_changes_any_more_nothing_is_decided_any_more(plan: Any, co
 
 def test_gone_is_gone() -> None:
     assert step(FIXED, Picture({"red": GONE}), Memory(began=-9.0), 0.0).asks == ()
+
+
+DEPLOYED = parse((Path(__file__).parents[3] / "deploy" / "plan.yaml").read_text(encoding="utf-8"))
+LINE = dict.fromkeys(("left_outer", "left_inner", "right_inner", "right_outer"), False)
+
+
+def test_the_starting_plans_guide_stands_while_it_sees_no_line() -> None:
+    run = Run(DEPLOYED, "blue", "green", "red")
+    for car in run.cars:
+        run.sees(car, battery={"voltage_v": 7.9, "level": "ok"})
+    run.until(2.0)
+    (guide,) = (car for car, role in run.roles.items() if role == "guide")
+    while run.now < 8.0:
+        run.sees(guide, line=LINE)
+        run.until(run.now + 0.5)
+    assert (run.of(guide).mode, run.of(guide).kind) == ("manual", "rule")
+    while run.now < 11.0:
+        run.sees(guide, line={**LINE, "left_inner": True})
+        run.until(run.now + 0.5)
+    assert run.of(guide).mode == "tracking"
+
+
+def test_the_starting_plan_shows_which_car_is_too_weak() -> None:
+    run = Run(DEPLOYED, "blue", "red")
+    run.sees("blue", battery={"voltage_v": 7.9, "level": "ok"})
+    asked = []
+    while run.now < 8.0:
+        run.sees("red", battery={"voltage_v": 6.8, "level": "low"})
+        asked += [(ask.car, ask.led) for ask in run.until(run.now + 0.5, every=0.5).asks if ask.led is not None]
+    assert asked == [("red", (255, 0, 0))]
+    assert run.roles == {"blue": "patrol"}

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from fleet.marked import BadFile
+from fleet.policy.check import check
 from fleet.policy.plan import Of
 from fleet.policy.reader import parse
 from gateway.protocol.values import Mode
@@ -16,6 +17,7 @@ DEPLOY = Path(__file__).parents[3] / "deploy"
 def test_the_plans_in_deploy_are_some(path: Path) -> None:
     plan = parse(path.read_text(encoding="utf-8"))
     assert plan.rules
+    assert check(plan) == ()
 
 
 def test_a_mode_for_a_car_is_a_role_of_its_own() -> None:

@@ -1,0 +1,180 @@
+"""What no car measures in the modes that a plan gives it makes no rule fire and ends no phase: that is found."""
+
+import pytest
+
+from fleet.policy.check import Gravity, check
+from fleet.policy.picture import CarPicture
+from fleet.policy.reader import parse
+from gateway.protocol.profile import parse_platform
+
+
+def listed(platform: str) -> CarPicture:
+    profile = parse_platform(platform)
+    able = frozenset(str(word) for word in (*profile.capabilities, *profile.modes))
+    return CarPicture(platform=platform, capabilities=able, listed=True)
+
+
+TWO = {"red": listed("arduino"), "blue": listed("arduino")}
+THREE = {**TWO, "green": listed("arduino")}
+GUIDE = "roles: {guide: {mode: tracking, count: all}}\n"
+PATROL = "roles: {patrol: {mode: obstacle_avoidance, count: all}}\n"
+SEARCH = """
+roles: {patrol: {mode: obstacle_avoidance, count: all}, rest: {mode: manual, count: all, priority: -1}}
+phases: {search: {SEARCH, until: {any: light.left or light.right, for_s: 1}, next: gather}, gather: {roles: [rest]}}
+"""
+LIGHT = "rules: [{when: {any: light.left or light.right, for_s: 1}, then: {who: others, mode: following}}]"
+
+
+def found(text: str, fleet: dict[str, CarPicture] | None, gravity: Gravity) -> list[str]:
+    return [str(each) for each in check(parse(text), fleet) if each.gravity is gravity]
+
+
+@pytest.mark.parametrize("fleet", [None, THREE], ids=["any cars", "three cars"])
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            (
+                "roles: {guide: {mode: tracking}}\n"
+                "rules: [{when: {any: battery.level == 'low', role: guide, for_s: 5}, then: {who: that, mode: manual}}]"
+            ),
+            (
+                "rule 1: it can never fire: battery.level is never measured on any car with role guide: this plan lets"
+                " it be in tracking only, and it is measured in manual: let a car be in such a mode then"
+            ),
+        ),
+        (
+            GUIDE + "rules: [{when: {any: range.range_m < 0.3, role: guide}, then: {who: that, mode: manual}}]",
+            "rule 1: it can never fire: range.range_m is never measured on any car with role guide",
+        ),
+        (
+            GUIDE + "rules: [{when: {any: light.left, role: guide, for_s: 2}, then: {who: that, mode: light_seeking}}]",
+            "it is measured in manual or light_seeking: let a car be in such a mode then",
+        ),
+        (PATROL + LIGHT, "rule 1: it can never fire: light.left is never measured on any car: this plan lets it be in"),
+        (
+            SEARCH.replace("SEARCH", "roles: [patrol]"),
+            (
+                "phase search: it never ends: light.left is never measured on any car: this plan lets it be in"
+                " obstacle_avoidance only in phase search, and it is measured in manual or light_seeking: let a car be"
+                " in such a mode then; or give it timeout_s"
+            ),
+        ),
+        # Two rules that only each other would make true.
+        (
+            GUIDE
+            + "rules:\n  - {when: {any: light.left}, then: {who: all, mode: following}}\n"
+            + "  - {when: {any: obstacle.left}, then: {who: all, mode: light_seeking}}",
+            "rule 1: it can never fire: light.left is never measured",
+        ),
+        # A role that only such a rule gives.
+        (
+            (
+                "roles: {guide: {mode: tracking, count: all}, seek: {mode: light_seeking, on_call: true}}\n"
+                "rules:\n  - {when: {any: light.left}, then: {who: that, role: seek}}\n"
+                "  - {when: {any: light.right, role: seek}, then: {who: that, mode: manual}}"
+            ),
+            "rule 2: it can never fire: there is never a car with role seek",
+        ),
+        # Each is measured in some mode, but in none that the plan has both.
+        (
+            (
+                "roles: {guide: {mode: tracking, count: all}, seek: {mode: light_seeking, count: all}}\n"
+                "rules: [{when: {any: light.left and line.left_outer}, then: {who: that, mode: manual}}]"
+            ),
+            "rule 1: it can never fire: all of light.left, line.left_outer is never measured on any car",
+        ),
+    ],
+)
+def test_what_the_plan_never_lets_be_measured_is_an_error(
+    text: str, told: str, fleet: dict[str, CarPicture] | None
+) -> None:
+    assert any(told in each for each in found(text, fleet, Gravity.ERROR)), check(parse(text), fleet)
+
+
+@pytest.mark.parametrize(
+    ("text", "fleet", "told"),
+    [
+        (
+            PATROL.replace("count: all", "count: all, needs: battery.voltage_v > 7") + LIGHT,
+            None,
+            "rule 1: it can fire only by a car that has no role because it has not battery.voltage_v > 7",
+        ),
+        (
+            SEARCH.replace("SEARCH", "timeout_s: 60, roles: [patrol]"),
+            THREE,
+            "phase search: only its time-out ends it: light.left is never measured on any car",
+        ),
+        (
+            SEARCH.replace("SEARCH", "roles: [patrol]")
+            + "rules: [{name: home, when: {car: red, is: motion.fan}, then: {phase: gather}, during: [search]}]",
+            THREE,
+            "phase search: only rule home ends it: light.left is never measured on any car",
+        ),
+        (
+            SEARCH.replace("SEARCH", "timeout_s: 1.6, roles: [rest]").replace("for_s: 1", "for_s: 2"),
+            THREE,
+            "phase search: only its time-out ends it: until wants 2 s, and timeout_s is 1.6",
+        ),
+    ],
+)
+def test_what_may_be_measured_by_chance_is_a_warning(text: str, fleet: dict[str, CarPicture] | None, told: str) -> None:
+    assert any(told in each for each in found(text, fleet, Gravity.WARNING)), check(parse(text), fleet)
+    assert found(text, fleet, Gravity.ERROR) == []
+
+
+TWO_PATROLS = PATROL.replace("count: all", "count: 2")
+
+
+@pytest.mark.parametrize(
+    ("text", "fleet"),
+    [
+        (TWO_PATROLS + LIGHT, None),  # a third car has no role, and stands
+        (TWO_PATROLS + LIGHT, THREE),
+        (SEARCH.replace("SEARCH", "roles: [rest]"), None),
+        # What is so is measured, whatever else is not.
+        (GUIDE + "rules: [{when: {any: light.left or line.left_outer}, then: {who: that, mode: manual}}]", THREE),
+        # The first rule brings the cars to where the second one sees.
+        (
+            GUIDE
+            + "rules:\n  - {when: {any: line.left_outer}, until: {any: light.left}, then: {who: that, mode: manual}}\n"
+            + "  - {when: {any: light.left, for_s: 9}, then: {phase: b}}\nphases: {a: {}, b: {}}",
+            THREE,
+        ),
+        # A rule about what a role needs is for the cars that lack it.
+        (
+            (
+                "roles: {guide: {mode: tracking, count: all, needs: battery.voltage_v > 7}}\n"
+                "rules: [{when: {any: battery.level == 'low', for_s: 5}, then: {who: that, led: [255, 0, 0]}}]"
+            ),
+            THREE,
+        ),
+        (
+            (
+                "roles: {guide: {mode: manual, count: all}}\nphases: {b: {}, a: {}}\n"
+                "rules: [{when: {any: imu.gyro_x_raw > 9}, then: {phase: a}}]"
+            ),
+            None,
+        ),
+    ],
+)
+def test_what_can_be_measured_is_let_alone(text: str, fleet: dict[str, CarPicture] | None) -> None:
+    assert [str(each) for each in check(parse(text), fleet) if "measured" in str(each) or "only" in str(each)] == []
+
+
+def test_two_cars_for_two_places_leave_none_that_stands() -> None:
+    (told,) = found(TWO_PATROLS + LIGHT, TWO, Gravity.ERROR)
+    assert told.startswith("rule 1: it can never fire: light.left is never measured on any car")
+
+
+def test_a_large_fleet_and_a_long_plan_are_checked_in_time() -> None:
+    """A hundred cars, each with a place of its own, and the most rules that a plan may have."""
+    cars = {f"car{number}": listed("arduino") for number in range(100)}
+    roles = "".join(f"  role{number}: {{mode: tracking, count: 5}}\n" for number in range(20))
+    rules = "".join(
+        f"  - {{when: {{any: range.range_m < 0.{number + 1}}}, then: {{who: that, mode: following}}}}\n"
+        for number in range(200)
+    )
+    plan = parse(f"roles:\n{roles}rules:\n{rules}")
+    told = check(plan, cars)
+    assert len([each for each in told if "it can never fire: range.range_m is never measured" in str(each)]) == 200
