@@ -95,7 +95,7 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     staffing = fill(staff)
     held = _held(staff, staffing, memory.held, barriers)
     overrides = _overrides(plan, picture, rules, subjects, staffing.roles, staff.pinned)
-    decisions = [explain.of_phase(plan, phase)] if phase.name else []
+    decisions = [explain.of_phase(plan, phase, picture)] if phase.name else []
     for car in subjects:
         if car in barriers:
             decisions.append(explain.alone(car, barriers[car], reserved.get(car)))
@@ -251,7 +251,7 @@ def _places(staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier], p
         if len(staffing.holders(name)) < min(least, staffing.places[name]):
             found.append(explain.vacancy(name, staff, staffing, barriers))
         else:
-            found.append(explain.filled(name, staffing))
+            found.append(explain.filled(name, staff, staffing, barriers))
     return found
 
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from fleet.policy.decision import LEFT_ALONE, Decision, Kind
+from fleet.policy.measured import blind
 from fleet.policy.memory import Held
-from fleet.policy.picture import NOBODY
-from fleet.policy.plan import ALL, OTHERS, THAT, Effect, Of, Plan, Role, Rule
+from fleet.policy.picture import NOBODY, CarPicture, Picture
+from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Plan, Role, Rule
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.staffing import Barrier, Staff, Staffing
 from fleet.policy.steady import HYSTERESIS_S
@@ -28,15 +29,15 @@ class Override:
     effect: Effect
 
 
-def of_phase(plan: Plan, state: PhaseState) -> Decision:
+def of_phase(plan: Plan, state: PhaseState, picture: Picture) -> Decision:
     """The phase, and what ends it."""
     phase, ends = plan.phases[state.name], list[str]()
     if phase.until is not None:
-        ends.append(f"{phase.until.text}: then {phase.next}")
+        ends.append(f"{phase.until.text}{_unseen(phase.until, picture)}: then {phase.next}")
     if phase.timeout_s is not None:
         ends.append(f"{phase.timeout_s:g} s of it being over: then {phase.on_timeout}")
     ends += [
-        f"{rule.name}: {rule.when.text}: then {effect.phase}"
+        f"{rule.name}: {rule.when.text}{_unseen(rule.when, picture)}: then {effect.phase}"
         for rule in plan.rules
         for effect in rule.effects
         if effect.phase not in (None, state.name) and (rule.during is None or state.name in rule.during)
@@ -50,6 +51,12 @@ def of_phase(plan: Plan, state: PhaseState) -> Decision:
         state.used,
         "; or ".join(ends) or "another plan: nothing ends it",
     )
+
+
+def _unseen(condition: Condition, picture: Picture) -> str:
+    """What of a condition no car measures that is there; empty if one can."""
+    cars = [known for car, known in picture.cars.items() if known.present and condition.car in (None, car)]
+    return blind(condition.expression, [(known, known.mode) for known in cars])
 
 
 def alone(car: str, barrier: Barrier, kept: str | None) -> Decision:
@@ -97,7 +104,7 @@ def in_role(
     role = plan.roles[name]
     pinned = staff.pinned.get(car)
     cause = f"role {name}, {pinned[1]}" if pinned is not None else f"role {name}"
-    why = f"role {name} ({len(staffing.holders(name))} of {staffing.places[name]})"
+    why = f"role {name} ({_count(role, staffing)})"
     if pinned is not None:
         why += f", as {pinned[1]} wants"
     elif name in staffing.stands_in:
@@ -107,8 +114,12 @@ def in_role(
     before = told.get(car)
     if before is not None and (before.cause, before.why) == (cause, why):
         return before
-    changes = [f"{role.needs_text} no longer being so"] if role.needs is not None else []
-    changes += [f"the end of {pinned[1]}"] if pinned is not None else _rules_for(car, role, plan, phase)
+    known = staff.picture.cars.get(car, NOBODY)
+    changes = []
+    if role.needs is not None:
+        old = blind(role.needs, [(known, role.mode)], ": the last value counts")
+        changes.append(f"{role.needs_text} no longer being so{old}")
+    changes += [f"the end of {pinned[1]}"] if pinned is not None else _rules_for(car, known, role, plan, phase)
     if any(each.roles is not None and name not in each.roles for each in plan.phases.values()):
         changes.append(f"the end of phase {phase}")
     changes.append("a person's stop or drive")
@@ -126,14 +137,15 @@ def in_role(
     )
 
 
-def _rules_for(car: str, role: Role, plan: Plan, phase: str) -> list[str]:
+def _rules_for(car: str, known: CarPicture, role: Role, plan: Plan, phase: str) -> list[str]:
     """The rules that could give the car something else than this role."""
-    told = [
-        f"{rule.name}: {rule.when.text}"
-        for rule in plan.rules
-        if (rule.during is None or phase in rule.during)
-        and any(_could(effect, rule, car, role, plan) for effect in rule.effects)
-    ]
+    told = []
+    for rule in plan.rules:
+        could = [effect for effect in rule.effects if _could(effect, rule, car, role, plan)]
+        if could and (rule.during is None or phase in rule.during):
+            own = rule.when.car == car or all(effect.who == THAT for effect in could)
+            unseen = blind(rule.when.expression, [(known, role.mode)]) if own else ""
+            told.append(f"{rule.name}: {rule.when.text}{unseen}")
     return told[:_NAMED]
 
 
@@ -203,52 +215,78 @@ def repaired(decision: Decision, evidence: str) -> Decision:
     )
 
 
-def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> Decision:
-    """A role with fewer cars than it wants."""
-    plan = staff.plan
-    role = plan.roles[name]
-    holders = staffing.holders(name)
-    decided = f"{len(holders)} of {staffing.places[name] if role.count is not None else 'all'}"
-    whys: list[str] = []
-    used: list[str] = []
-    kinds: list[str] = []
-    able = False
+def _count(role: Role, staffing: Staffing) -> str:
+    """How many cars have it, of how many that it wants."""
+    return f"{len(staffing.holders(role.name))} of {'all' if role.count is None else staffing.places[role.name]}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Others:
+    """The cars that have not a role."""
+
+    whys: tuple[str, ...]
+    """Why each has not."""
+    told: str
+    """The same, cut if they are many."""
+    used: tuple[str, ...]
+    able: bool
+    """Whether one could have it."""
+
+
+def _others(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> _Others:
+    role, whys, used, able = staff.plan.roles[name], list[str](), list[str](), False
     for car in sorted({*staff.free, *barriers}):
-        if car in holders or not plan.may(car, role):
+        if staffing.roles.get(car) == name or not staff.plan.may(car, role):
             continue
         barrier = barriers.get(car) or staff.barrier(car, role)
         able = able or barrier is None
         words = barrier.why if barrier is not None else f"it has role {staffing.roles.get(car, 'none')}"
-        kinds.append(words)
-        if len(whys) < _NAMED:
-            whys.append(words if words.startswith((car, f"the link of {car}")) else f"{car}: {words}")
+        whys.append(words if words.startswith((car, f"the link of {car}")) else f"{car}: {words}")
+        if len(whys) <= _NAMED:
             used += staff.seen(car, barrier)
-    more = f"; and {len(kinds) - _NAMED} more" if len(kinds) > _NAMED else ""
+    more = f"; and {len(whys) - _NAMED} more" if len(whys) > _NAMED else ""
+    return _Others(tuple(whys), "; ".join(whys[:_NAMED]) + more, tuple(dict.fromkeys(used)), able)
+
+
+def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> Decision:
+    """A role with fewer cars than it wants."""
+    role, holders = staff.plan.roles[name], staffing.holders(name)
+    decided, others = _count(role, staffing), _others(name, staff, staffing, barriers)
     instead = f"; {role.fallback} gets the place" if role.fallback is not None else ""
-    none = "no car is left for it" if able else "no other car can"
+    if others.whys:
+        why = f"{'no car is left for it' if others.able else 'no other car can'}: {others.told}"
+        change = "one of them being left for it, or able to" if others.able else "one of them being able to"
+    elif {*staff.free, *barriers} - {*holders}:
+        why, change = "the plan gives it to no other car that is there", "a car coming up that may have it"
+    else:
+        why, change = f"no{' other' if holders else ''} car is there", "another car coming up"
     return Decision(
         f"role {name}",
         Kind.VACANT,
         decided,
-        f"{decided}: {'; '.join(kinds)}",
-        f"{none}: {'; '.join(whys)}{more}{instead}" if whys else f"no car there may have it{instead}",
-        tuple(dict.fromkeys(used)),
-        "one of them being left for it, or able to" if able else "one of them being able to",
+        f"{decided}: {'; '.join(others.whys)}",
+        f"{why}{instead}",
+        others.used,
+        change,
         role=name,
     )
 
 
-def filled(name: str, staffing: Staffing) -> Decision:
+def filled(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> Decision:
     """A role that has the cars it wants."""
-    holders = staffing.holders(name)
+    role, holders = staff.plan.roles[name], staffing.holders(name)
+    why, change, used = f"its places are taken: {', '.join(holders)}", "one of them dropping out", tuple[str, ...]()
+    if role.count is None:
+        others = _others(name, staff, staffing, barriers)
+        why = f"{', '.join(holders)} {'have' if len(holders) > 1 else 'has'} it, and "
+        if others.whys:
+            why += f"no other car is left for it: {others.told}"
+        else:
+            more = {*staff.free, *barriers} - {*holders}
+            why += "the plan gives it to no other car that is there" if more else "no other car is there"
+        change, used = f"another car being left for it, or {change}", others.used
     return Decision(
-        f"role {name}",
-        Kind.FILLED,
-        f"{len(holders)} of {staffing.places[name]}",
-        "filled",
-        f"its places are taken: {', '.join(holders)}",
-        would_change="one of them dropping out",
-        role=name,
+        f"role {name}", Kind.FILLED, _count(role, staffing), "filled", why, used, would_change=change, role=name
     )
 
 

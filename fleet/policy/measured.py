@@ -260,3 +260,16 @@ def _first_missing(expression: Expression, kinds: Iterable[Profile], modes: Iter
 
 def _or(modes: Iterable[Mode]) -> str:
     return " or ".join(modes)
+
+
+def blind(expression: Expression, cars: Iterable[tuple[CarPicture, str]], more: str = "") -> str:
+    """` (light.left is not measured in mode tracking)` if none of these cars can see it to be so, each in this mode."""
+    names, modes = dict[str, None](), dict[Mode, None]()
+    for known, word in cars:
+        mode = next((mode for mode in Mode if mode == word), None)
+        if known.profile is None or mode is None or seen(expression, known.profile, mode):
+            return ""
+        names |= dict.fromkeys(unmeasured(expression, known.profile, mode))
+        modes[mode] = None
+    told = f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not measured in mode {_or(modes)}{more}"
+    return f" ({told})" if modes else ""

@@ -146,6 +146,38 @@ def _pair(case: str) -> Run:
     return run
 
 
+LEFT_OVER = parse("roles: {lead: {mode: tracking, cars: [red]}, rest: {mode: manual, count: all}}")
+REST = parse("roles: {rest: {mode: manual, count: all}}")
+CERTAIN = parse("roles: {lead: {mode: tracking, cars: [red], count: 2}, rest: {mode: manual}}")
+UNSEEN = parse("""
+roles: {guide: {mode: tracking}}
+rules: [{name: weak, when: {any: battery.level == 'low', role: guide, for_s: 5}, then: {who: that, mode: manual}}]
+""")
+HANGING = parse("""
+roles: {patrol: {mode: obstacle_avoidance, count: all}}
+phases: {search: {until: {any: light.left}, next: gather}, gather: {}}
+""")
+OF_ALL = {
+    "all that are left": (LEFT_OVER, ("blue", "green", "red")),
+    "all but one on hold": (LEFT_OVER, ("blue", "green", "red")),
+    "all there are": (REST, ("blue", "red")),
+    "given to no other": (CERTAIN, ("blue", "red")),
+    "not measured in its mode": (UNSEEN, ("red",)),
+    "phase that nothing ends": (HANGING, ("red",)),
+}
+
+
+def _of_all(case: str) -> Run:
+    plan, cars = OF_ALL[case]
+    run = Run(plan, *cars)
+    if case == "all but one on hold":
+        run.change("green", held_by="ann")
+    if case == "phase that nothing ends":
+        run.change("red", mode="obstacle_avoidance")
+    run.at(0.0)
+    return run
+
+
 def _in_vain() -> Run:
     run = Run(parse("roles: {one: {mode: tracking}}"), "green", "red", obey=False)
     run.change("green", mode="tracking", verdict="contradicted", evidence="silent for 3.1 s")
@@ -170,7 +202,9 @@ TABLE = rows("decisions")
 @pytest.mark.parametrize("row", TABLE, ids=lambda row: f"{row['case']}, {row['subject']}")
 def test_a_decision_is_explained(row: dict[str, str]) -> None:
     case, subject = row["case"], row["subject"]
-    if case.startswith("phase ") and case != "phase without a role":
+    if case in OF_ALL:
+        run = _of_all(case)
+    elif case.startswith("phase ") and case != "phase without a role":
         run = _phase(case)
     elif case in ("phase without a role", "on call no more"):
         run = _out(case)
