@@ -224,28 +224,29 @@ def _count(role: Role, staffing: Staffing) -> str:
 class _Others:
     """The cars that have not a role."""
 
-    whys: tuple[str, ...]
+    kinds: tuple[str, ...]
     """Why each has not."""
     told: str
-    """The same, cut if they are many."""
+    """The same with their names, cut if they are many."""
     used: tuple[str, ...]
     able: bool
     """Whether one could have it."""
 
 
 def _others(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> _Others:
-    role, whys, used, able = staff.plan.roles[name], list[str](), list[str](), False
+    role, kinds, whys, used, able = staff.plan.roles[name], list[str](), list[str](), list[str](), False
     for car in sorted({*staff.free, *barriers}):
         if staffing.roles.get(car) == name or not staff.plan.may(car, role):
             continue
         barrier = barriers.get(car) or staff.barrier(car, role)
         able = able or barrier is None
         words = barrier.why if barrier is not None else f"it has role {staffing.roles.get(car, 'none')}"
-        whys.append(words if words.startswith((car, f"the link of {car}")) else f"{car}: {words}")
-        if len(whys) <= _NAMED:
+        kinds.append(words)
+        if len(whys) < _NAMED:
+            whys.append(words if words.startswith((car, f"the link of {car}")) else f"{car}: {words}")
             used += staff.seen(car, barrier)
-    more = f"; and {len(whys) - _NAMED} more" if len(whys) > _NAMED else ""
-    return _Others(tuple(whys), "; ".join(whys[:_NAMED]) + more, tuple(dict.fromkeys(used)), able)
+    more = f"; and {len(kinds) - _NAMED} more" if len(kinds) > _NAMED else ""
+    return _Others(tuple(kinds), "; ".join(whys) + more, tuple(dict.fromkeys(used)), able)
 
 
 def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> Decision:
@@ -253,7 +254,7 @@ def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
     role, holders = staff.plan.roles[name], staffing.holders(name)
     decided, others = _count(role, staffing), _others(name, staff, staffing, barriers)
     instead = f"; {role.fallback} gets the place" if role.fallback is not None else ""
-    if others.whys:
+    if others.kinds:
         why = f"{'no car is left for it' if others.able else 'no other car can'}: {others.told}"
         change = "one of them being left for it, or able to" if others.able else "one of them being able to"
     elif {*staff.free, *barriers} - {*holders}:
@@ -264,7 +265,7 @@ def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
         f"role {name}",
         Kind.VACANT,
         decided,
-        f"{decided}: {'; '.join(others.whys)}",
+        f"{decided}: {'; '.join(others.kinds)}",
         f"{why}{instead}",
         others.used,
         change,
@@ -279,7 +280,7 @@ def filled(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, B
     if role.count is None:
         others = _others(name, staff, staffing, barriers)
         why = f"{', '.join(holders)} {'have' if len(holders) > 1 else 'has'} it, and "
-        if others.whys:
+        if others.kinds:
             why += f"no other car is left for it: {others.told}"
         else:
             more = {*staff.free, *barriers} - {*holders}

@@ -258,18 +258,27 @@ def _first_missing(expression: Expression, kinds: Iterable[Profile], modes: Iter
     return next((name for name in expression.names if name in never), f"all of {', '.join(expression.names)}")
 
 
-def _or(modes: Iterable[Mode]) -> str:
+def _or(modes: Iterable[str]) -> str:
     return " or ".join(modes)
 
 
 def blind(expression: Expression, cars: Iterable[tuple[CarPicture, str]], more: str = "") -> str:
     """` (light.left is not measured in mode tracking)` if none of these cars can see it to be so, each in this mode."""
-    names, modes = dict[str, None](), dict[Mode, None]()
-    for known, word in cars:
-        mode = next((mode for mode in Mode if mode == word), None)
-        if known.profile is None or mode is None or seen(expression, known.profile, mode):
+    names, modes = dict[str, None](), dict[str, None]()
+    for known, mode in cars:
+        missing = _blind(expression, known.platform, mode)
+        if not missing:
             return ""
-        names |= dict.fromkeys(unmeasured(expression, known.profile, mode))
+        names |= dict.fromkeys(missing)
         modes[mode] = None
     told = f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not measured in mode {_or(modes)}{more}"
     return f" ({told})" if modes else ""
+
+
+@cache  # asked for at each decision: by the platform's name, which is looked up faster than a profile
+def _blind(expression: Expression, platform: str, mode: str) -> tuple[str, ...]:
+    """What keeps a car from seeing it to be so in this mode; nothing if it can, or that is not known."""
+    profile = CarPicture(platform=platform).profile
+    if profile is None or mode not in set(Mode) or seen(expression, profile, Mode(mode)):
+        return ()
+    return unmeasured(expression, profile, Mode(mode))
