@@ -8,10 +8,11 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from fleet.expression.known import outside
 from fleet.faults import meant
-from fleet.policy.conflicts import alternations, fights, implies, outside
+from fleet.policy.conflicts import alternations, fights, implies
 from fleet.policy.measured import Outlook, Reach, seen, unmeasured
-from fleet.policy.picture import CarPicture
+from fleet.policy.picture import NAMES, CarPicture
 from fleet.policy.plan import ALL, OTHERS, THAT, Effect, Phase, Plan, Role, Rule
 from fleet.policy.steady import HYSTERESIS_S
 from gateway.protocol.values import Mode
@@ -108,7 +109,7 @@ class _Check:
     def _roles(self) -> Iterator[Finding]:
         for role in self._plan.roles.values():
             part = f"role {role.name}"
-            if role.needs is not None and (why := outside(role.needs)):
+            if role.needs is not None and (why := outside(role.needs, NAMES)):
                 yield Finding(Gravity.ERROR, part, f"no car can fill it: {why}")
                 continue
             able = [car for car in self._reach.cars if self._reach.able(car, role)]

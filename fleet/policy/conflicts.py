@@ -5,57 +5,13 @@ What a part can never do by itself is check.py's.
 
 from collections.abc import Iterator
 from functools import cache
-from typing import Final
 
-from fleet.expression import Expression, contradictory
+from fleet.expression import contradictory
 from fleet.expression import parse as parse_expression
 from fleet.policy.picture import NAMES
 from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Plan, Rule
 from fleet.policy.steady import HYSTERESIS_S
 from gateway.protocol.values import Mode
-
-_MOTIONS: Final = ("stop", "forward", "back", "left", "right", "spin_left", "spin_right", "unknown")
-_MODES: Final = (*Mode, "unknown")
-WORDS: Final = {
-    "battery.level": ("ok", "low", "critical"),
-    "link.state": ("online", "quiet", "stale", "lost"),
-    "mode.asked": _MODES,
-    "mode.inferred": _MODES,
-    "mode.verdict": ("assumed", "confirmed", "contradicted"),
-    "motion.motion": _MOTIONS,
-    "motion.source": ("commanded", "assumed", "unknown"),
-    "safety.motors": ("off", "on", "unknown"),
-}
-"""All that these ever are (schemas/proto)."""
-RANGES: Final = {
-    "range.range_m": (0.0, 12.0),
-    "battery.voltage_v": (0.0, 12.0),
-    "battery.charge": (0.0, 1.0),
-    "battery.charge_error": (0.0, 1.0),
-    "grayscale.raw": (0.0, 1023.0),
-    "motion.speed": (0.0, 1.0),
-    "motion.servo_deg": (0.0, 180.0),
-    "link.tx_airtime": (0.0, 1.0),
-}
-"""Beyond these nothing is published: protocol.md, "From the car"."""
-
-
-def outside(expression: Expression) -> str:
-    """Why it can never be so, by what its names ever are; empty if it can."""
-    if contradictory(expression):
-        return f"{expression} is never so"
-    for name in dict.fromkeys(expression.names):
-        if name in WORDS:
-            allowed = " or ".join(f"{name} == '{word}'" for word in WORDS[name])
-            told = f"one of {', '.join(WORDS[name])}"
-        elif name in RANGES:
-            least, most = RANGES[name]
-            allowed, told = f"{name} >= {least} and {name} <= {most}", f"{least:g} .. {most:g}"
-        else:
-            continue
-        if _contradictory(f"({expression}) and ({allowed})"):
-            return f"{expression} is never so: {name} is {told}"
-    return ""
 
 
 @cache

@@ -9,10 +9,10 @@ from functools import cache
 from typing import Final
 
 from fleet.expression import Expression, contradictory
+from fleet.expression.known import outside
 from fleet.expression.tree import Compare, Every, Literal, Name, Node, Not, Some
 from fleet.policy.assign import assign
-from fleet.policy.conflicts import outside
-from fleet.policy.picture import CarPicture, topic_of
+from fleet.policy.picture import NAMES, CarPicture, topic_of
 from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Plan, Role, Rule
 from fleet.policy.staffing import unfit
 from gateway.protocol.profile import OPTIONS, Platform, Profile, parse_platform
@@ -110,7 +110,7 @@ class Reach:
 
     def outlook(self, condition: Condition, during: Iterable[str] | None) -> Outlook:
         """Whether it can be so in one of these phases (None: in any), of a car that is as the plan wants it."""
-        if why := outside(condition.expression):
+        if why := outside(condition.expression, NAMES):
             return Outlook(why)
         if condition.car is not None and condition.car not in self.cars:
             return Outlook(f"there is no car {condition.car}")
