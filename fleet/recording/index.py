@@ -15,8 +15,9 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
-LIMIT: Final = 16 * 2**20
-"""No record, and no chunk when uncompressed, is read if it is larger: 16 times the chunks that we write."""
+LIMIT: Final = 80 * 2**20
+"""No record, and no chunk when uncompressed, is read if it is larger. The recorder takes up to 64 MiB at once, and
+ends a chunk with the message that brings it over 1 MiB."""
 HEAD: Final = struct.Struct("<BQ")  # opcode, length
 
 _CHUNK: Final = struct.Struct("<QQQQI")  # first and last log time, offset, length, bytes of the table of channels
@@ -49,8 +50,9 @@ class Index:
 
     @property
     def complete(self) -> bool:
-        """Whether it names every chunk."""
-        return self.statistics is not None and 0 < self.statistics.chunk_count == len(self.places)
+        """Whether it names every chunk, and no message is outside of them."""
+        said = self.statistics
+        return said is not None and said.chunk_count == len(self.places) and bool(self.places or not said.message_count)
 
     @property
     def describes(self) -> bool:

@@ -1,43 +1,34 @@
 """What is whole of one MCAP file, and where and why the rest is not. No sessions here, and nothing is repaired.
 
-The mcap library reads every record but the messages. The way from record to record is our own, because the library's is
-made for whole files: it allocates what a damaged length says, reads to the end for a negative one, gives up at the
-first damage without saying where, and takes eight times as long (1.0 instead of 0.12 us a message) as it reads each
-message's index. So is the way within a chunk, for its speed. A file with an end is not walked at all: its index
+The mcap library reads every record but the messages. The way from record to record (walk.py) and within a chunk
+(chunk.py) is our own, because the library's is made for whole files: it allocates what a damaged length says, reads to
+the end for a negative one, gives up at the first damage without saying where, and takes eight times as long (1.0
+instead of 0.12 us a message) as it reads each message's index. A file with an end is not walked at all: its index
 (index.py) says where chunks are, so that a damaged one hides no other, and only those that are asked for are read.
 """
 
 import os
-import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]  # it has no types
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, DataEnd, Footer, Schema
-from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from mcap.records import Channel, DataEnd, Footer, Header, Schema
 
 from fleet.recording import index as mcap_index
-from fleet.recording.index import HEAD as _HEAD
-from fleet.recording.index import LIMIT, Index, Place
+from fleet.recording.chunk import BROKEN, Damage, Piece, Record, read
+from fleet.recording.index import HEAD, LIMIT, Index, Place
 from fleet.recording.selection import EVERYTHING, Selection
+from fleet.recording.walk import MAGIC, Walk
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-_MESSAGE: Final = struct.Struct("<BQHIQQ")  # the head, channel, sequence, log time, publish time
-_FOOTER_SIZE: Final = _HEAD.size + 20
-_DATA_END_SIZE: Final = _HEAD.size + 4
+_FOOTER_SIZE: Final = HEAD.size + 20
+_DATA_END_SIZE: Final = HEAD.size + 4
 _BLOCK: Final = 2**20
-_HOLDS_MESSAGES: Final = (Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-# The ways in which the library, and what it decompresses with, say that bytes are not what they should be.
-_BROKEN: Final = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
+_HEADER_LIMIT: Final = 2**16
 
 
 class NotMcap(Exception):
@@ -55,64 +46,6 @@ Row = tuple[Lane, int, int, int, bytes]
 """One message: lane, sequence, log time and publish time in ns, payload. A plain tuple: there are millions."""
 
 
-@dataclass(frozen=True, slots=True)
-class Damage:
-    """One thing that is wrong with a file."""
-
-    at: int
-    """Offset in bytes of what could not be read."""
-    words: str
-
-    def __str__(self) -> str:
-        return f"byte {self.at}: {self.words}"
-
-
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    """A chunk, or in a file without chunks one record, as bytes."""
-
-    at: int
-    opcode: int
-    body: bytes
-    span: str = ""
-    """From when to when it has messages; empty where the index does not say so."""
-
-    def chunk(self) -> Chunk:
-        """Its records, uncompressed, not yet checked; raises one of _BROKEN."""
-        if self.opcode != Opcode.CHUNK:
-            return Chunk("", _HEAD.pack(self.opcode, len(self.body)) + self.body, 0, 0, 0, _HEAD.size + len(self.body))
-        chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(self.body)))
-        size = chunk.uncompressed_size
-        if size > LIMIT:
-            raise ValueError(f"says that it has {size} bytes: no more than {LIMIT} are read")
-        # One byte more than it should have: to see one that has more, without making room for all of it.
-        data: bytes
-        match chunk.compression:
-            case "":
-                return chunk
-            case "zstd":
-                data = zstandard.ZstdDecompressor(max_window_size=LIMIT).stream_reader(chunk.data).read(size + 1)
-            case "lz4":
-                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-            case other:
-                raise ValueError(f"has a compression that is not known: {other[:20]!r}")
-        if len(data) != size:
-            raise EndOfFile
-        plain: Chunk = replace(chunk, compression="", data=data)
-        return plain
-
-    def lost(self, error: Exception) -> Damage:
-        """Why this was not read."""
-        match error:
-            case CRCValidationError():
-                words = "fails its checksum"
-            case ValueError() if not isinstance(error, UnicodeError):
-                words = str(error)
-            case _:
-                words = "cannot be taken apart"
-        return Damage(self.at, f"the {_named(self.opcode)} there {words}{self.span}")
-
-
 class Salvage:
     """One file; raises NotMcap. What is wrong is in `damage`, as far as `check` or `messages` have looked."""
 
@@ -121,16 +54,18 @@ class Salvage:
         self.damage: list[Damage] = []
         self.cut = False
         """Whether it has no end: whoever wrote it was killed, or is still writing."""
+        self._bad_magic = False
         if not path.is_file():
             raise NotMcap("is not a regular file" if path.exists() else "is missing")
         try:
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
+                self._bad_magic = len(head) == len(MAGIC) and head != MAGIC and _is_mcap(file)
         except OSError as error:
             raise NotMcap(f"cannot be read: {error.strerror}") from None
         if not head:
             raise NotMcap("is empty: the recorder ended before it wrote anything")
-        if head != MAGIC:
+        if head != MAGIC and not self._bad_magic:
             early = MAGIC.startswith(head)
             raise NotMcap(
                 f"is cut at byte {len(head)}, before anything was recorded"
@@ -143,9 +78,16 @@ class Salvage:
         """What is wrong, on one line; empty if nothing is."""
         if not self.damage:
             return ""
-        kind = "is cut (the recorder was killed or is still at work)" if self.cut else "is damaged"
+        kind = "is damaged"
+        if self.cut:
+            kind = "is cut (the recorder was killed or is still at work)" + ("" if self.only_cut else " and damaged")
         more = f" and in {len(self.damage) - 3} other places" if len(self.damage) > 3 else ""
         return f"{kind}: {'; '.join(str(damage) for damage in self.damage[:3])}{more}"
+
+    @property
+    def only_cut(self) -> bool:
+        """Whether all that is wrong is that it stops somewhere."""
+        return self.cut and len(self.damage) == 1
 
     def check(self) -> None:
         """Hold every checksum against what it is for; no message is taken apart."""
@@ -155,8 +97,8 @@ class Salvage:
                 footer, summary = self._index(file)
                 for piece in self._pieces(file, summary):
                     try:
-                        get_chunk_data_stream(piece.chunk(), validate_crc=True)
-                    except _BROKEN as error:
+                        piece.check()
+                    except BROKEN as error:
                         self.damage.append(piece.lost(error))
                 if footer is not None and not self.damage:
                     self._check_data(file, footer)
@@ -178,8 +120,8 @@ class Salvage:
                 strays: list[int] = []
                 for piece in self._pieces(file, index, selection):
                     try:
-                        records = _records(piece.chunk())
-                    except _BROKEN as error:
+                        records = piece.records()
+                    except BROKEN as error:
                         self.damage.append(piece.lost(error))
                         continue
                     yield from lanes.rows(records, piece.at, strays)
@@ -198,6 +140,8 @@ class Salvage:
 
     def _begin(self) -> None:
         self.damage, self.cut = [], False
+        if self._bad_magic:
+            self.damage.append(Damage(0, "the magic bytes of the beginning are damaged"))
 
     def _unreadable(self, error: OSError) -> None:
         self.damage.append(Damage(0, f"it cannot be read: {error.strerror}"))
@@ -206,14 +150,14 @@ class Salvage:
         """What stands at the end of a file, if its checksum says that it is whole."""
         size = file.seek(0, os.SEEK_END)
         at = size - _FOOTER_SIZE - len(MAGIC)
-        tail = _read(file, max(at, 0), _FOOTER_SIZE + len(MAGIC))
+        tail = read(file, max(at, 0), _FOOTER_SIZE + len(MAGIC))
         if at < len(MAGIC) or not tail.endswith(MAGIC):
             self.cut = True
             return None, None
-        if _HEAD.unpack_from(tail) != (Opcode.FOOTER, _FOOTER_SIZE - _HEAD.size):
+        if HEAD.unpack_from(tail) != (Opcode.FOOTER, _FOOTER_SIZE - HEAD.size):
             self.damage.append(Damage(at, "there is no footer"))
             return None, None
-        footer = Footer.read(ReadDataStream(BytesIO(tail[_HEAD.size :])))
+        footer = Footer.read(ReadDataStream(BytesIO(tail[HEAD.size :])))
         if not footer.summary_start or not footer.summary_crc:
             return None, None  # somebody else's file: without an index, or with one that cannot be checked
         if not len(MAGIC) + _DATA_END_SIZE <= footer.summary_start <= at:
@@ -224,14 +168,20 @@ class Salvage:
             return None, None
         try:
             return footer, mcap_index.read(file, footer.summary_start, at)
-        except _BROKEN:
+        except BROKEN:
             self.damage.append(Damage(footer.summary_start, "the index there cannot be taken apart"))
             return None, None
 
-    def _pieces(self, file: IO[bytes], index: Index | None, selection: Selection = EVERYTHING) -> Iterator[_Piece]:
+    def _pieces(self, file: IO[bytes], index: Index | None, selection: Selection = EVERYTHING) -> Iterator[Piece]:
         """What holds messages, by the index or, without one, from record to record."""
         if index is None or not index.complete:
-            yield from self._walk(file)
+            walk = Walk(file)
+            for piece in walk.pieces():
+                self.damage += walk.damage
+                walk.damage.clear()
+                yield piece
+            self.damage += walk.damage
+            self.cut = self.cut or walk.cut
             return
         places = index.places
         if index.describes:
@@ -245,67 +195,27 @@ class Salvage:
         for place in places:
             yield from self._indexed(file, place)
 
-    def _indexed(self, file: IO[bytes], place: Place) -> Iterator[_Piece]:
-        at, length = place.at, place.length - _HEAD.size
+    def _indexed(self, file: IO[bytes], place: Place) -> Iterator[Piece]:
+        at, length = place.at, place.length - HEAD.size
         if length > LIMIT:
             self.damage.append(Damage(at, f"the chunk there has {length} bytes: no more than {LIMIT} are read"))
             return
         if length < 0 or at + place.length > file.seek(0, os.SEEK_END):
             self.damage.append(Damage(at, "the index says that a chunk is there, where none can be"))
             return
-        record = _read(file, at, place.length)
-        if record[: _HEAD.size] != _HEAD.pack(Opcode.CHUNK, length):
+        record = read(file, at, place.length)
+        if record[: HEAD.size] != HEAD.pack(Opcode.CHUNK, length):
             self.damage.append(Damage(at, "the head of the chunk there is damaged, its messages are shown if whole"))
-        yield _Piece(at, Opcode.CHUNK, record[_HEAD.size :], _span(place))
-
-    def _walk(self, file: IO[bytes]) -> Iterator[_Piece]:
-        """Step from record to record until the end or to where none can be."""
-        size = file.seek(0, os.SEEK_END)
-        at = len(MAGIC)
-        in_data = True
-        while at < size:
-            head = _read(file, at, _HEAD.size)
-            left = size - at - _HEAD.size
-            if left < 0:
-                self.damage.append(Damage(at, "the record there is cut"))
-                return
-            opcode, length = _HEAD.unpack(head)
-            if not opcode:
-                self.damage.append(Damage(at, f"no record begins there, and the last {size - at} bytes are not read"))
-                return
-            if length > left:
-                self.damage.append(
-                    Damage(at, f"the {_named(opcode)} there should have {length} bytes, {left} are there")
-                )
-                return
-            in_data = in_data and opcode != Opcode.DATA_END
-            if in_data and opcode in _HOLDS_MESSAGES:
-                if length > LIMIT:
-                    words = f"the {_named(opcode)} there has {length} bytes: no more than {LIMIT} are read"
-                    self.damage.append(Damage(at, words))
-                else:
-                    yield _Piece(at, opcode, _read(file, at + _HEAD.size, length))
-            at += _HEAD.size + length
-            if opcode == Opcode.FOOTER:
-                after = size - at - len(MAGIC)
-                self.cut = after < 0
-                if self.cut:
-                    break
-                if after:
-                    self.damage.append(Damage(size - after, f"{after} bytes follow the end"))
-                elif _read(file, at, len(MAGIC)) != MAGIC:
-                    self.damage.append(Damage(at, "the magic bytes of the end are damaged"))
-                return
-        self.damage.append(Damage(at, "it stops there"))
+        yield Piece(at, Opcode.CHUNK, record[HEAD.size :], _span(place))
 
     def _check_data(self, file: IO[bytes], footer: Footer) -> None:
         """What lies between the chunks has one checksum, if its writer made one: ours does."""
         at = footer.summary_start - _DATA_END_SIZE
-        record = _read(file, at, _DATA_END_SIZE)
-        if _HEAD.unpack_from(record) != (Opcode.DATA_END, _DATA_END_SIZE - _HEAD.size):
+        record = read(file, at, _DATA_END_SIZE)
+        if HEAD.unpack_from(record) != (Opcode.DATA_END, _DATA_END_SIZE - HEAD.size):
             self.damage.append(Damage(at, "the end of the messages is damaged, no message is"))
             return
-        said = DataEnd.read(ReadDataStream(BytesIO(record[_HEAD.size :]))).data_section_crc
+        said = DataEnd.read(ReadDataStream(BytesIO(record[HEAD.size :]))).data_section_crc
         if said and said != _checksum(file, 0, at):
             words = "the checksum there fails: something before it is damaged, but no message"
             self.damage.append(Damage(at, words))
@@ -320,7 +230,7 @@ class _Lanes:
         self._selection = selection
         self._found: dict[int, Lane | None] = {}
 
-    def rows(self, records: list[tuple[int, int, int, int, bytes]], at: int, strays: list[int]) -> Iterator[Row]:
+    def rows(self, records: list[Record], at: int, strays: list[int]) -> Iterator[Row]:
         """The selected messages of one chunk; each of an unknown channel adds `at` to `strays`."""
         found, selection = self._found, self._selection
         timed = selection.start_ns is not None or selection.end_ns is not None
@@ -354,39 +264,21 @@ class _Lanes:
                 self._found.clear()
 
 
-def _records(chunk: Chunk) -> list[tuple[int, int, int, int, bytes]]:
-    """A chunk's messages as (channel, sequence, log time, publish time, payload); raises one of _BROKEN.
-
-    What describes channels stands between them as (minus the opcode, 0, 0, 0, body).
-    """
-    stream, end = get_chunk_data_stream(chunk, validate_crc=True)
-    data = chunk.data if not chunk.compression else stream.read(end)
-    found: list[tuple[int, int, int, int, bytes]] = []
-    unpack = _MESSAGE.unpack_from
-    at = 0
-    while at < end:
-        if data[at] == Opcode.MESSAGE:
-            _, length, channel, sequence, log_ns, publish_ns = unpack(data, at)
-            begin, at = at + _MESSAGE.size, at + _HEAD.size + length
-            if at < begin or at > end:
-                raise EndOfFile
-            found.append((channel, sequence, log_ns, publish_ns, data[begin:at]))
+def _is_mcap(file: IO[bytes]) -> bool:
+    """Whether a file that does not begin as one has the end, the header or a whole chunk of one."""
+    end = file.seek(0, os.SEEK_END) - len(MAGIC)
+    if end > len(MAGIC) and read(file, end, len(MAGIC)) == MAGIC:
+        return True
+    head = read(file, len(MAGIC), HEAD.size)
+    if len(head) == HEAD.size and (length := HEAD.unpack(head)[1]) < _HEADER_LIMIT and head[0] == Opcode.HEADER:
+        body = BytesIO(file.read(length))
+        try:
+            Header.read(ReadDataStream(body))
+        except BROKEN:
+            pass
         else:
-            opcode, length = _HEAD.unpack_from(data, at)
-            begin, at = at + _HEAD.size, at + _HEAD.size + length
-            if at > end:
-                raise EndOfFile
-            if opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
-                body = data[begin:at]
-                # Taken apart here too: a chunk of which one record is broken gives none.
-                (Channel if opcode == Opcode.CHANNEL else Schema).read(ReadDataStream(BytesIO(body)))
-                found.append((-opcode, 0, 0, 0, body))
-    return found
-
-
-def _read(file: IO[bytes], at: int, length: int) -> bytes:
-    file.seek(at)
-    return file.read(length)
+            return bool(body.tell() == length)
+    return Walk(file).chunk_from(len(MAGIC)) is not None
 
 
 def _checksum(file: IO[bytes], start: int, end: int) -> int:
@@ -396,13 +288,6 @@ def _checksum(file: IO[bytes], start: int, end: int) -> int:
         crc = zlib.crc32(block, crc)
         start += len(block)
     return crc
-
-
-def _named(opcode: int) -> str:
-    try:
-        return Opcode(opcode).name.lower().replace("_", " ")
-    except ValueError:
-        return "record"
 
 
 def _span(place: Place) -> str:

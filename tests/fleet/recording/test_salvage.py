@@ -4,6 +4,7 @@ import io
 import os
 import random
 import struct
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +15,9 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
+from fleet.recording.recorder import LIMIT_BYTES
 from fleet.recording.salvage import LIMIT, NotMcap, Salvage
+from fleet.recording.segment import Segment
 from fleet.recording.session import NoSession, Session
 
 from .damaged import CHUNKS, PER_CHUNK, Original, judge, places, written
@@ -86,10 +89,98 @@ def flipped_it_loses_its_own_chunk_at_most(original: Original, at: int, bits: It
     hit = {number for number, (begin, end) in enumerate(original.chunks) if begin <= at < end}
     for bit in bits:
         shown = judge(original, flipped(original.data, at, bit), at, tmp_path / "x.mcap")
-        if at >= 8:
-            missing = [message for message in original.messages if message not in shown]
-            assert {original.chunk_of(message) for message in missing} <= hit, (at, bit)
-            assert [message for message in original.messages if message in shown] == shown, (at, bit)
+        missing = [message for message in original.messages if message not in shown]
+        assert {original.chunk_of(message) for message in missing} <= hit, (at, bit)
+        assert [message for message in original.messages if message in shown] == shown, (at, bit)
+
+
+def test_without_an_index_too_a_flipped_bit_loses_its_own_chunk_at_most(original: Original, tmp_path: Path) -> None:
+    """Cut between chunks and within one; what describes the channels of a lost chunk is lost with it."""
+    described = {0: {"fleet/red/sensor/range", "fleet/red/state/link"}, 1: {"fleet/blue/note"}}
+    heads = [at for begin, end in original.chunks for at in (*range(begin, begin + 60), *range(end, end + 40))]
+    for length in (original.chunks[-1][1], original.chunks[-1][1] - 30, len(original.data) - 9):
+        whole = original.until(length)
+        for at in sorted({*range(8, length, 97), *heads} & {*range(length)}):
+            hit = {number for number, (begin, end) in enumerate(original.chunks) if begin <= at < end}
+            keys = {key for number in hit for key in described.get(number, ())}
+            data = flipped(original.data[:length], at, chance(at))
+            shown = judge(original, data, at, tmp_path / "x.mcap")
+            expected = [one for one in whole if original.chunk_of(one) not in hit and one.key not in keys]
+            assert [one for one in shown if one in expected] == expected, (length, at, report(tmp_path / "x.mcap"))
+
+
+def chance(at: int) -> int:
+    """A bit."""
+    return random.Random(at).randrange(8)
+
+
+def test_a_length_that_leads_nowhere_is_said_and_hides_no_whole_chunk(original: Original, tmp_path: Path) -> None:
+    begin, end = original.chunks[1][0], original.chunks[2][0]
+    data = flipped(original.data[: original.chunks[-1][1]], begin + 1 + 5, 3)
+    shown = judge(original, data, begin, tmp_path / "x.mcap")
+    assert {original.chunk_of(message) for message in shown} == {0, 2, 3, 4}
+    words = report(tmp_path / "x.mcap")
+    assert "is cut (the recorder was killed or is still at work) and damaged: " in words
+    assert f"byte {begin}: no whole record begins there, {end - begin} bytes are passed over" in words
+
+
+@pytest.mark.parametrize("at", range(8))
+@pytest.mark.parametrize("cut", [0, 8, 900])
+def test_a_file_whose_first_bytes_are_damaged_is_no_other_kind_of_file(
+    original: Original, tmp_path: Path, at: int, cut: int
+) -> None:
+    path = tmp_path / "x.mcap"
+    length = len(original.data) - cut
+    path.write_bytes(flipped(original.data, at, chance(at))[:length])
+    session = Session.open(path)
+    assert list(session.messages()) == original.until(length)
+    assert "byte 0: the magic bytes of the beginning are damaged" in session.damage_words
+    path.write_bytes(bytes(60) + original.data[60:length])  # nor if more than those are
+    assert list(Session.open(path).messages()) == original.until(length)
+
+
+def test_what_looks_like_chunks_and_is_none_takes_no_time(tmp_path: Path) -> None:
+    """Every 57 bytes the head of a chunk that goes on almost to the end of the file."""
+    path = tmp_path / "x.mcap"
+    size = 2_000_000
+    parts = [b"\x89MCAP0\r\n"]
+    for at in range(8, size - 200_000, 57):
+        length = size - 100_000 - at
+        parts.append(struct.pack("<BQQQQII4sQ", 6, length, 1, 2, 2**20, 7, 4, b"zstd", length - 44) + bytes(4))
+    path.write_bytes(b"".join(parts).ljust(size, b"x"))
+    began = time.process_time()
+    assert list(Session.open(path).messages()) == []
+    assert time.process_time() - began < 20
+
+
+def test_what_the_recorder_takes_is_read(tmp_path: Path) -> None:
+    chance = random.Random(1)
+    path = tmp_path / "0001.mcap"
+    segment = Segment(path, {})
+    channel = segment.channel("fleet/red/big", "application/octet-stream")
+    sizes = (2**20 - 100, LIMIT_BYTES, 10, 20_000_000, 5)
+    for number, size in enumerate(sizes):
+        segment.add(channel, number, chance.randbytes(size), number, 0)
+    segment.finish({})
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-8])
+    for each in (path, cut):
+        salvage = Salvage(each)
+        assert [len(row[4]) for row in salvage.messages()] == list(sizes)
+        assert salvage.only_cut or not salvage.damage
+        salvage.check()
+        assert salvage.only_cut or not salvage.damage
+
+
+def test_a_file_in_which_nothing_was_recorded_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "0001.mcap"
+    Segment(path, {}).finish({})
+    salvage = Salvage(path)
+    index = salvage.index()
+    assert index is not None
+    assert index.complete
+    assert list(salvage.messages()) == []
+    assert not salvage.damage
 
 
 def test_a_damaged_chunk_is_named_with_its_place_its_time_and_its_cause(original: Original, tmp_path: Path) -> None:

@@ -295,7 +295,7 @@ def test_cut_or_damaged_anywhere_every_whole_chunk_is_recovered(
         shutil.rmtree(old, ignore_errors=True)
     path.mkdir()
     (path / "0001.mcap").write_bytes(broken)
-    if at < len(MAGIC):
+    if at < len(MAGIC) and len(broken) < len(whole):
         with pytest.raises(NoSession, match=re.escape(str(path))):
             Session.open(path)
         return
