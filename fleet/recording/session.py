@@ -48,6 +48,8 @@ class Session:
     """Those that can be read."""
     description: directory.Description | None
     damage: dict[Path, str] = field(default_factory=dict)
+    unended: set[Path] = field(default_factory=set)
+    """Those of which nothing is known to be wrong but that they stop somewhere, as one does that is being written."""
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -110,8 +112,7 @@ class Session:
             except NotMcap as error:  # it was one when it was opened
                 self.damage[segment] = str(error)
             else:
-                if salvage.damage:
-                    self.damage[segment] = salvage.words
+                self._note(salvage)
 
     def rescue(self, out: Path) -> "Session":
         """Write every whole message into a new, whole file; it as a session. Raises OSError, and NoSession if none is.
@@ -150,6 +151,18 @@ class Session:
         for segment in self.segments:
             yield from self._whole(segment, selection)
 
+    def expected(self) -> dict[Path, int | None]:
+        """How many messages each segment should have, by its own end or what the recorder noted; None: not known."""
+        noted = {each["file"]: each.get("messages") for each in _noted(self.path)}
+        found: dict[Path, int | None] = {}
+        for segment, index in self.indexes().items():
+            statistics = None if index is None else index.statistics
+            count = noted.get(segment.name) if statistics is None else statistics.message_count
+            found[segment] = count if isinstance(count, int) else None
+        gone = (path for path in self.damage if path.suffix == ".mcap" and path not in found)
+        counts = {path: noted.get(path.name) for path in gone}
+        return found | {path: count if isinstance(count, int) else None for path, count in counts.items()}
+
     def indexes(self) -> dict[Path, Index | None]:
         """What stands at the end of each segment; None where it is not whole, or cannot be read."""
         found: dict[Path, Index | None] = {}
@@ -167,15 +180,23 @@ class Session:
             self.damage[segment] = str(error)
             return
         yield from salvage.messages(selection)
+        self._note(salvage)
+
+    def _note(self, salvage: Salvage) -> None:
         if salvage.damage:
-            self.damage[segment] = salvage.words
+            self.damage[salvage.path] = salvage.words
+            (self.unended.add if salvage.only_cut else self.unended.discard)(salvage.path)
 
 
 def _closed(path: Path) -> set[Path]:
     """The segments that the recorder noted when it closed them: of one that was last, nothing else tells."""
-    noted = _json(path / directory.INDEX).get("segments")
-    names = [one.get("file") for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
-    return {path / name for name in names if isinstance(name, str) and fnmatch(name, directory.SEGMENTS)}
+    return {path / one["file"] for one in _noted(path)}
+
+
+def _noted(path: Path) -> list[dict[str, Any]]:
+    noted = _json(path / directory.INDEX).get("segments") if path.is_dir() else None
+    named = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
+    return [one for one in named if isinstance(one.get("file"), str) and fnmatch(one["file"], directory.SEGMENTS)]
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -144,7 +144,7 @@ class Walk:
         if opcode == Opcode.MESSAGE_INDEX:
             body = read(self._file, at + HEAD.size, _INDEX.size)
             entries = _INDEX.unpack(body)[1] if len(body) == _INDEX.size else 1
-            return length == _INDEX.size + entries and not entries % _INDEX_ENTRY
+            return bool(length == _INDEX.size + entries and not entries % _INDEX_ENTRY)
         if opcode not in _EXACT or length > min(LIMIT, self._size - at):
             return False
         stream = BytesIO(read(self._file, at + HEAD.size, length))
@@ -163,7 +163,7 @@ class Walk:
         if opcode in _FIXED or opcode in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
             return self._agrees(at, opcode, length)
         known = 0 < opcode <= Opcode.DATA_END or opcode >= _PRIVATE
-        return known and at + HEAD.size + length <= self._size
+        return bool(known and at + HEAD.size + length <= self._size)
 
     def _hopeless(self, at: int, opcode: int, length: int) -> str:
         """Why nothing from there on is read; empty: what the head says is all there is to go by."""

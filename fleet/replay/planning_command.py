@@ -109,6 +109,7 @@ class _Compared:
                 f"{self._session.path} has no decisions of a coordinator (FLEET/@coordinator/decision): "
                 f"there is nothing to compare a plan with{damage}"
             )
+        self._refuse_without_cars()
         tokens = coordinated.presence(self._session.messages(coordinated.STATES), about.end_ns)
         kept = Kept()
         for run in self._runs:
@@ -124,6 +125,20 @@ class _Compared:
                 raise click.ClickException(f"{self._session.path} has no plan: name one with --plan")
             again = Replanning(run, plans, self._listed, kept)
             kept = self._one(run, again, tokens)
+
+    def _refuse_without_cars(self) -> None:
+        """A session that was cut to some cars has not what the decisions were made of."""
+        from fleet.recording.sessions.making import origin_of
+
+        left = origin_of(self._session).get("cars")
+        if not left:
+            return
+        decided = {car for run in self._runs for car in (*run.roles, *(each for each in run.said if " " not in each))}
+        if others := sorted(decided - {*left, "phase"}):
+            raise click.ClickException(
+                f"{self._session.path} was cut to {', '.join(left)}: what was decided then was decided with "
+                f"{', '.join(others)} too, and what they said is not in it; replan the session it was cut from"
+            )
 
     def _one(self, run: "Run", again: "Replanning", tokens: "list[Token]") -> Any:
         from fleet.replay.coordinated import differences

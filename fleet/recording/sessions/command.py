@@ -199,6 +199,8 @@ def _say_contents(about: "Overview") -> None:
 
     size = f"{about.messages} messages, {_size(about.bytes)}"
     click.echo(f"  from {about.started or 'an unknown time'}, {times.words(about.length_s)}: {size}, {about.lost} lost")
+    if about.clock_back_s:
+        click.echo(f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length is what passed on it")
     click.echo(f"  cars: {', '.join(about.cars) or 'none'}")
     for mark in about.marks:
         click.echo(f"  mark: {mark.get('time', '')} {mark.get('text', '')!r} by {mark.get('by') or 'somebody'}")
@@ -221,12 +223,12 @@ def verify(session: Path, *, as_json: bool) -> None:
 
     Says exactly what is missing; ends with 1 if anything is.
     """
-    from fleet.recording.sessions.overview import total
+    from fleet.recording.sessions.overview import growing, total
     from fleet.recording.sessions.verify import verify as look
 
     with _explained():
         found = _open(session)
-        verdict = look(found, watched("verify", total(found)))
+        verdict = look(found, watched("verify", total(found)), growing(found))
     if as_json:
         click.echo(json.dumps(verdict.to_dict()))
     else:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from fleet.recording import directory, times
 from fleet.recording.copying import Copy
@@ -61,8 +61,24 @@ def recover(session: Session, out: Path, watched: Watched = iter) -> tuple[int, 
         words = session.damage_words
         if not count:
             raise NoSession(f"{session.path} holds no message that is whole: {words or 'it is empty'}")
-        _describe(session, new, count, {"by": "recover", "lost": words})
+        if session.lacking(count) or (session.description is not None and not session.description.closed):
+            words = "; ".join(filter(None, (words, session.lacking(count) or "its recorder did not close it")))
+        _describe(session, new, count, {"by": "recover", "lost": words, "missing": _missing(session, count, words)})
     return count, words
+
+
+def _missing(session: Session, count: int, words: str) -> int | None:
+    """How many messages are known not to be among those that were had; None: not known."""
+    description = session.description
+    if not words:
+        return 0
+    if description is not None and description.closed and description.messages:
+        return max(description.messages - count, 0)
+    expected = list(session.expected().values())
+    if description is not None and not description.closed:
+        return None
+    known = [each for each in expected if each is not None]
+    return max(sum(known) - count, 0) if len(known) == len(expected) else None
 
 
 def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), watched: Watched = iter) -> int:
@@ -121,6 +137,13 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
     assert first is not None
     assert last is not None
     old = session.description
+    before = origin_of(session)
+    if lost := before.get("lost"):  # what was missing before is missing still
+        origin = {**origin, "lost": "; ".join(str(each) for each in (origin["lost"], lost) if each)}
+        counts = origin.get("missing"), before.get("missing")
+        origin["missing"] = sum(counts) if all(isinstance(each, int) for each in counts) else None  # type: ignore[arg-type]  # they are
+    if not origin.get("cars") and before.get("cars"):
+        origin = {**origin, "cars": before["cars"]}
     base = old if old is not None else directory.Description(fleet, times.iso(first), "", {})
     made = {"by": origin["by"], "of": session.name, **origin}
     replace(
@@ -137,6 +160,21 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
         for name in COPIED:
             if (session.path / name).is_file():
                 shutil.copyfile(session.path / name, new / name)
+
+
+def origin_of(session: Session) -> Mapping[str, Any]:
+    """Of what a session was made, and what that lacked; empty if it was recorded."""
+    return session.description.origin if session.description is not None else {}
+
+
+def lost_words(session: Session) -> str:
+    """What is missing since before a session was made of another; empty if nothing is."""
+    origin = origin_of(session)
+    if not origin.get("lost") or origin.get("missing") == 0:
+        return ""
+    missing = origin.get("missing")
+    many = f"{missing} messages" if isinstance(missing, int) else "messages, it is not known how many,"
+    return f"made of {origin.get('of')} by {origin.get('by')}: {many} are missing ({origin['lost']})"
 
 
 def origin_words(origin: object) -> str:

@@ -10,6 +10,7 @@ from fleet.recording import directory, times
 from fleet.recording.decoding import SAME, Decoder, compared
 from fleet.recording.salvage import Lane, Row
 from fleet.recording.session import Session, message_of
+from fleet.recording.sessions.making import lost_words
 from fleet.recording.sessions.numbers import Stream
 from schemas import keys
 
@@ -45,6 +46,10 @@ class Verdict:
     closed: bool = True
     ended: str = ""
     """What its end says that it should not; empty if the recorder closed it."""
+    lost: str = ""
+    """What the session that this one was made of lacked already."""
+    recording: bool = False
+    """Whether it grew while it was looked at: its end is still to come."""
     missing: list[dict[str, Any]] = field(default_factory=list)
     """Per key and publisher: which numbers are not there, and when they would have come."""
     twice: list[dict[str, Any]] = field(default_factory=list)
@@ -64,8 +69,8 @@ class Verdict:
     @property
     def whole(self) -> bool:
         """Whether nothing is missing and nothing is there twice."""
-        return self.closed and not any(
-            (self.damage, self.missing, self.twice, self.dropped, self.missed, self.undecoded)
+        return (self.closed or self.recording) and not any(
+            (self.damage, self.lost, self.missing, self.twice, self.dropped, self.missed, self.undecoded)
         )
 
     @property
@@ -81,9 +86,14 @@ class Verdict:
         """What there is to say, a line each; the first is the verdict."""
         length = times.words(max(self.last_ns - self.first_ns, 0) / 1e9)
         span = f", {times.iso(self.first_ns)} to {times.iso(self.last_ns)} ({length})" if self.messages else ""
-        yield f"{self.session}: {'whole' if self.whole else 'NOT whole'}, {self.messages} messages{span}"
+        state = "whole" if self.whole else "NOT whole"
+        if self.recording:
+            state = f"is being recorded, {'nothing is missing until now' if self.whole else state}"
+        yield f"{self.session}: {state}, {self.messages} messages{span}"
         for name, words in self.damage.items():
             yield f"  damage: {name} {words}"
+        if self.lost:
+            yield f"  lost: {self.lost}"
         if self.ended:
             yield f"  end: {self.ended}"
         for one in self.missing[:MOST_WORDS]:
@@ -212,8 +222,12 @@ def _owner(key: str) -> str:
     return parsed.car if parsed is not None else key
 
 
-def verify(session: Session, watched: Callable[[Iterable[Row]], Iterable[Row]] = iter) -> Verdict:
-    """Look at every byte and every message; `watched` may look on as they pass."""
+def verify(
+    session: Session,
+    watched: Callable[[Iterable[Row]], Iterable[Row]] = iter,
+    recording: Callable[[], bool] = lambda: False,
+) -> Verdict:
+    """Look at every byte and every message; `watched` may look on as they pass, `recording` is asked at the end."""
     verdict = Verdict(str(session.path))
     audit = _Audit(verdict)
     for row in watched(session.rows()):
@@ -228,10 +242,14 @@ def verify(session: Session, watched: Callable[[Iterable[Row]], Iterable[Row]] =
         verdict.damage[directory.DESCRIPTION] = "is missing, or cannot be understood: who recorded what, and the marks"
     if words := session.lacking(verdict.messages):
         verdict.damage[directory.DESCRIPTION] = words
+    verdict.lost = lost_words(session)
     if description is not None:
         verdict.closed = description.closed
         verdict.dropped, verdict.missed = dict(description.drops), dict(description.missed)
-        if not description.closed:
+        verdict.recording = not description.closed and recording()
+        if verdict.recording and session.segments[-1] in session.unended:
+            verdict.damage.pop(session.segments[-1].name, None)
+        elif not description.closed:
             until = f"everything until {times.iso(verdict.last_ns)} is here" if verdict.messages else "nothing is here"
             why = description.error or "it was killed, or is still recording"
             verdict.ended = f"the recorder did not close it ({why}); {until}, what came after is not"

@@ -130,6 +130,16 @@ def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp
     assert (summary["differences"], summary["begun_before"]) == (0, 1), result.output
 
 
+def test_a_session_without_cars_that_were_decided_on_is_refused(recorded: Path, tmp_path: Path) -> None:
+    for source, out, more in ((recorded, "red", ["--cars", "red"]), (tmp_path / "red", "part", ["--from", "1s"])):
+        assert run("sessions", "cut", source, *more, "--out", tmp_path / out).exit_code == 0
+        result = run("replan", tmp_path / out)
+        assert result.exit_code == 1
+        assert "was cut to red" in result.output
+        assert "blue, green too" in result.output
+        assert "then:" not in result.output
+
+
 def said(at_s: float, decided: str) -> Said:
     return Said(int(at_s * S), "role", decided, "")
 

@@ -1,0 +1,124 @@
+"""What is said of sessions that are not as usual: made of others, empty at their end, with a clock that went back."""
+
+import itertools
+import json
+import threading
+from pathlib import Path
+
+from click.testing import CliRunner, Result
+
+from fleet.cli import cli
+from fleet.recording import directory
+from fleet.recording.segment import Segment
+from fleet.recording.session import Session
+from fleet.recording.sessions.overview import State, growing, overview
+
+START = 1_790_000_000_000_000_000
+S = 1_000_000_000
+
+
+def write(path: Path, at_s: list[list[float]], *, closed: bool = True, cut: bool = True) -> Segment:
+    """A session; of each list one chunk. Its segment is finished if it is closed."""
+    path.mkdir(parents=True, exist_ok=True)
+    segment = Segment(path / "0001.mcap", {})
+    channel = segment.channel("fleet/red/x", "application/json")
+    numbers = itertools.count(1)
+    for chunk in at_s:
+        for at in chunk:
+            ns = START + int(at * S)
+            segment.add(channel, ns, b"{}" * 100, ns, next(numbers))
+        segment.flush()
+    if closed:
+        segment.finish({})
+    elif cut:
+        segment.cut()
+    count = sum(map(len, at_s))
+    directory.Description("fleet", "2026-09-21T14:13:20Z", "here", {}, closed=closed, messages=count).write(path)
+    return segment
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["sessions", *map(str, arguments)])
+
+
+def test_what_was_made_of_a_damaged_one_says_how_much_is_missing(tmp_path: Path) -> None:
+    old, new, again = tmp_path / "old", tmp_path / "new", tmp_path / "again"
+    write(old, [[1, 2], [3, 4, 5], [6]])
+    data = bytearray((old / "0001.mcap").read_bytes())
+    index = Session.open(old).indexes()[old / "0001.mcap"]
+    assert index is not None
+    place = index.places[1]
+    data[place.at + place.length - 2] ^= 1
+    (old / "0001.mcap").write_bytes(data)
+    assert run("recover", old, "--out", new).exit_code == 0
+    assert run("recover", new, "--out", again).exit_code == 0  # which makes nothing good
+    for path in (new, again):
+        result = run("verify", path)
+        assert result.exit_code == 1
+        assert "NOT whole" in result.output
+        assert "3 messages are missing" in result.output
+        found = overview(path)
+        assert (found.state, found.lost) == (State.RECOVERED, 3)
+        assert "3 messages are missing" in found.words
+
+
+def test_what_lost_nothing_when_it_was_recovered_is_whole(tmp_path: Path) -> None:
+    old, new = tmp_path / "old", tmp_path / "new"
+    write(old, [[1, 2], [3]])
+    (old / "0001.mcap").write_bytes((old / "0001.mcap").read_bytes()[:-8])
+    assert run("recover", old, "--out", new).exit_code == 0
+    assert overview(new).state is State.WHOLE
+    assert run("verify", new).exit_code == 0
+
+
+def test_a_file_in_which_nothing_was_recorded_cuts_no_session(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    write(path, [[1, 2], [3]])
+    Segment(path / "0002.mcap", {}).finish({})
+    found = overview(path)
+    assert (found.state, found.words, found.length_s) == (State.WHOLE, "", 2.0)
+
+
+def test_a_clock_that_went_back_makes_no_hour(tmp_path: Path) -> None:
+    times: tuple[list[list[float]], ...] = (
+        [[0, 1], [2, 3], [-3596, -3595], [-3594]],
+        [[0, 1], [2, 3, -3596.5], [-3595.5], [-3594.5]],
+    )
+    for number, at_s in enumerate(times):
+        for closed in (True, False):
+            path = tmp_path / f"{number}{closed}"
+            write(path, at_s, closed=closed)
+            found = overview(path)
+            assert found.length_s == 5.0, at_s
+            assert found.clock_back_s in (3599.0, 3599.5)
+    assert "the recorder's clock went back by 3599.0 s" in run("info", tmp_path / "0True").output
+
+
+def test_what_is_being_recorded_is_not_called_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    segment = write(path, [[1, 2]], closed=False, cut=False)
+    ended = threading.Event()
+
+    def record() -> None:
+        at_ns = START + 3 * S
+        while not ended.wait(0.02):
+            at_ns += 1
+            segment.add(1, at_ns, b"{}", at_ns, 0)
+            segment.flush()
+
+    recorder = threading.Thread(target=record)
+    recorder.start()
+    try:
+        result = run("verify", path)
+    finally:
+        ended.set()
+        recorder.join()
+        segment.cut()
+    assert "is being recorded, nothing is missing until now" in result.output
+    assert "damage" not in result.output
+    assert result.exit_code == 0
+    assert not growing(Session.open(path))()
+    killed = run("verify", path)
+    assert killed.exit_code == 1
+    assert "the recorder did not close it" in killed.output
+    assert json.loads(run("verify", path, "--json").output)["recording"] is False
