@@ -24,6 +24,7 @@ from fleet.replay.lenses import MESSAGE, lenses
 from schemas.topics import TOPICS
 
 APPLICATION: Final = "zenoh-car-fleet"
+_INTERRUPT: Final = re.compile(rf"\b{KeyboardInterrupt.__name__}\b")
 TEXT: Final = "TextLog:text"
 _LOGS: Final = tuple(f"/{topic.name}" for topic in TOPICS.values() if topic.message == "foxglove.Log")
 
@@ -92,6 +93,8 @@ def export(
             recording.send_chunks(stream)
         except RuntimeError as error:
             words = " ".join(str(error).split())
+            if _INTERRUPT.search(words):  # which came while a lens was at work: Rerun has only its text
+                raise KeyboardInterrupt from None
             raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
         contents = drawing.contents()
         if not contents.cars and not contents.services:

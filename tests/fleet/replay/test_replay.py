@@ -1,6 +1,7 @@
 """A session becomes an .rrd with its layout; what is in it is counted by Rerun's own reader."""
 
 import os
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -11,7 +12,7 @@ import rerun.chunk as rrc
 from click.testing import CliRunner
 
 from fleet.recording.session import NoSession, Session
-from fleet.replay import mapping, to_rerun
+from fleet.replay import lenses, mapping, to_rerun
 from fleet.replay.command import replay
 from schemas.topics import TOPICS
 
@@ -227,6 +228,22 @@ def test_a_full_disk_is_said_in_our_words_only(
     assert f"{out} could not be written whole" in said[-1]
     assert "bytes are free" in said[-1]
     assert list(tmp_path.iterdir()) == [source], "nothing is left behind"
+
+
+@pytest.mark.parametrize("where", ["between chunks", "in a lens"])
+def test_ctrl_c_does_not_blame_the_recording(
+    made: tuple[Path, Counter[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    def interrupt(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    if where == "in a lens":
+        monkeypatch.setattr(lenses, "_words", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        to_rerun.export(
+            Session.open(made[0]), tmp_path / "out.rrd", seen=interrupt if where == "between chunks" else lambda _: None
+        )
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
