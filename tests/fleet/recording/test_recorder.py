@@ -178,6 +178,7 @@ def test_a_huge_publication_is_read_by_the_stock_reader_and_one_that_is_too_larg
         wait_for(lambda: recorder._tape.bytes > len(payload), "it is in the file")
         stranger.put("fleet/red/larger", bytes(30_000_001))
         stranger.put("fleet/red/note", b"still there")
+        wait_for(lambda: recorder._tape.drops, "it has come, and is counted")
         outcome = recorder.close()
     held = {channel.topic: message.data for _, channel, message in stock(session / "0001.mcap")}
     assert held["fleet/red/map"] == payload
