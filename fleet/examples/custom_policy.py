@@ -20,6 +20,8 @@ def main() -> None:
                     time.sleep(5)
                     fleet.car(car).mode("manual")  # closes the mode, and stops
                     break
+            else:
+                time.sleep(5)  # nobody may, or can
 
 
 if __name__ == "__main__":

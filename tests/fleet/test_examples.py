@@ -76,6 +76,7 @@ def test_follow_the_leader(cars: Cars) -> None:
 
 def test_custom_policy(cars: Cars) -> None:
     """Red alone can avoid obstacles; when a person has stopped it, the policy leaves it alone."""
+    wait_for(lambda: not cars.state("safety").HasField("lease"), "nobody has red any more")
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
         process = cars.start("-m", "fleet.examples.custom_policy")
         wait_for(lambda: cars.state("mode").asked == "obstacle_avoidance", "red avoids obstacles")
