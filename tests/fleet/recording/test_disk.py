@@ -25,6 +25,8 @@ from .conftest import publisher, wait_for
 from .test_command import ready
 from .test_tape import BEGUN_NS, SECOND_NS, feed
 
+pytestmark = pytest.mark.xdist_group("disk")  # what one fills, another has not
+
 BALLAST = 1_200_000_000
 """Half of it is more than what others write on the machine's disk meanwhile."""
 TINY = 6_000_000
@@ -67,7 +69,10 @@ def disk(kind: str, place: Path) -> Iterator[Disk]:
     """A disk of its own, or of the machine's so much that nothing is really full."""
     if kind == "keep free":
         keep = shutil.disk_usage(place).free - BALLAST // 2
-        yield Disk(place / "sessions", place / "ballast", BALLAST, ("--keep-free", str(keep)))
+        try:
+            yield Disk(place / "sessions", place / "ballast", BALLAST, ("--keep-free", str(keep)))
+        finally:
+            (place / "ballast").unlink(missing_ok=True)
         return
     mounted = place / "disk"
     mounted.mkdir()
