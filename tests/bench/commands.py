@@ -6,7 +6,7 @@ from statistics import median
 from time import monotonic, sleep
 
 from tests.bench.measured import Measured, in_turns
-from tests.bench.stage import Arrival, Stage, Tty, perf_counter, stage
+from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, stage
 from tests.support.processes import PATIENCE_S
 
 COMMANDS = 30
@@ -52,6 +52,7 @@ def run() -> list[Measured]:
         watch = here.session.liveliness().declare_subscriber("bench/answer/alive", alive.note, history=True)
         here.bare("answer", "bench/answer")
         alive.wait()
-        ours, floor = in_turns(lambda: _command(here, port), lambda: _query(here))
+        with frames(port, READING, rate_hz=1.0):  # a car that is silent for long is not driven
+            ours, floor = in_turns(lambda: _command(here, port), lambda: _query(here))
         watch.undeclare()
     return [Measured("command to tty, p50", tuple(ours), tuple(floor), "ms", 1.5, slack=1.0)]

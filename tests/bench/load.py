@@ -5,15 +5,12 @@ The floors: a bare loop that publishes the same; a query that a bare process ans
 
 import json
 import subprocess
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, sleep
 
 from tests.bench.commands import GAP_S, TURNS
 from tests.bench.measured import Measured, in_turns, percentile
-from tests.bench.stage import READING, Arrival, Stage, Tty, perf_counter, stage
+from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, stage
 from tests.support.processes import PATIENCE_S, Process
 
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
@@ -40,29 +37,9 @@ def cpu_s(process: Process) -> float:
     return int(minutes or 0) * 60 + float(seconds)
 
 
-@contextmanager
-def _frames(port: Tty, frame: bytes) -> Iterator[None]:
-    """Frames at the rate of a tracking car, from a thread of their own."""
-    over = threading.Event()
-
-    def send() -> None:
-        due = monotonic()
-        while not over.wait(max(0.0, due - monotonic())):
-            port.write(frame)
-            due += 1 / RATE_HZ
-
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
-
-
 def _cpu(process: Process, port: Tty) -> float:
     """Share of a core, in percent."""
-    with _frames(port, TRACKING):
+    with frames(port, TRACKING, RATE_HZ):
         sleep(0.5)
         before, began = cpu_s(process), monotonic()
         sleep(WINDOW_S)
@@ -82,20 +59,19 @@ def _track(here: Stage, port: Tty) -> None:
 def _commands(here: Stage, port: Tty) -> list[float]:
     """From asking to the tty, ms, while mode-0 frames (six readings each) come at the same rate."""
     times = []
-    with _frames(port, READING):
-        for _ in range(COMMANDS):
-            motion, frame = next(TURNS)
-            sleep(GAP_S)
-            port.drain()
-            began = perf_counter()
-            payload = json.dumps({"motion": motion, "duration_s": 5})
-            replies = here.session.get("fleet/red/@cmd/drive", payload=payload, encoding="application/json")
-            seen, deadline = b"", monotonic() + PATIENCE_S
-            while frame not in seen:
-                assert monotonic() < deadline, seen
-                seen += port.read()
-            times.append((perf_counter() - began) * 1e3)
-            assert all(reply.ok is not None for reply in replies)
+    for _ in range(COMMANDS):
+        motion, frame = next(TURNS)
+        sleep(GAP_S)
+        port.drain()
+        began = perf_counter()
+        payload = json.dumps({"motion": motion, "duration_s": 5})
+        replies = here.session.get("fleet/red/@cmd/drive", payload=payload, encoding="application/json")
+        seen, deadline = b"", monotonic() + PATIENCE_S
+        while frame not in seen:
+            assert monotonic() < deadline, seen
+            seen += port.read()
+        times.append((perf_counter() - began) * 1e3)
+        assert all(reply.ok is not None for reply in replies)
     return times[1:]  # the first may have met the stop of what was held before
 
 
@@ -137,7 +113,8 @@ def run() -> list[Measured]:
         here.bare("answer", "bench/answer")
         alive.wait()
         answering.wait()
-        ours, floor = in_turns(lambda: _commands(here, port), lambda: _queries(here))
+        with frames(port, READING, RATE_HZ):
+            ours, floor = in_turns(lambda: _commands(here, port), lambda: _queries(here))
         _track(here, port)
         cpu, bare_cpu = in_turns(lambda: _cpu(gateway, port), lambda: _cpu(bare, bare_port))
         _feed(here, port, SETTLED)

@@ -19,6 +19,8 @@ from tests.support.processes import PATIENCE_S, Fleet, Process
 FLOORS = Path(__file__).parent / "floors"
 SCRATCH = Path(__file__).resolve().parents[2] / ".tmp"
 READING = b"$4WD,CSB57.24,PV7.91,GS214,LF1011,HW01,GM10#"
+BLOCKED_S = 2.0
+"""How long a car is silent that gets `MODE00`: the second of its beep, and the one until its next report."""
 
 
 @contextlib.contextmanager
@@ -55,6 +57,26 @@ class Tty:
         os.close(self._port)
 
 
+@contextlib.contextmanager
+def frames(port: Tty, frame: bytes, rate_hz: float) -> Iterator[None]:
+    """A frame at a rate, from a thread of its own."""
+    over = threading.Event()
+
+    def send() -> None:
+        due = monotonic()
+        while not over.wait(max(0.0, due - monotonic())):
+            port.write(frame)
+            due += 1 / rate_hz
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
 class Stage:
     """A hub, its endpoint and a bare session at it."""
 
@@ -84,7 +106,8 @@ class Stage:
         deadline = monotonic() + PATIENCE_S
         while (safety := self.fleet.state("safety")) is None or safety.motors != "off":
             assert monotonic() < deadline, process.stderr
-            port.drain(0.2)
+            if b"MODE00" in port.read(0.2):
+                port.drain(BLOCKED_S)
             port.write(READING)
         return process
 
