@@ -76,16 +76,16 @@ def test_follow_the_leader(cars: Cars) -> None:
 
 def test_custom_policy(cars: Cars) -> None:
     """Red alone can avoid obstacles; when a person has stopped it, the policy leaves it alone."""
-    wait_for(lambda: not cars.state("safety").HasField("lease"), "nobody has red any more")
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
         process = cars.start("-m", "fleet.examples.custom_policy")
         wait_for(lambda: cars.state("mode").asked == "obstacle_avoidance", "red avoids obstacles")
         mia.stop(["red"])
         assert process.wait() == 0, process.stderr
         lines = process.lines()
-        assert lines[0] == "red: carried out: sent"
+        assert lines.count("red: carried out: sent") == 1
         assert len([line for line in lines if line.startswith("red: not carried out: held: red is on hold (mia")]) == 2
-        assert len([line for line in lines if line.startswith("blue: not carried out: unsupported")]) == 2
+        # In the first round only if it has more room than red.
+        assert len([line for line in lines if line.startswith("blue: not carried out: unsupported")]) in (2, 3)
         assert cars.state("mode").asked == "manual"
         assert mia.car("red").resume().ok
 
