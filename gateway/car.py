@@ -537,5 +537,5 @@ async def serve(settings: Settings, opened: bus.Bus, doors: Doors) -> bool:
     # What was imported stays: the collector need not look at it again while readings wait.
     gc.freeze()
     loop = asyncio.get_running_loop()
-    ending.calls_in(loop, car.stop)
+    ending.calls_in(loop, lambda _: car.stop())
     return await car.run()

@@ -117,10 +117,5 @@ def run_until_interrupted(work: Coroutine[Any, Any, None]) -> None:
 
     from schemas import ending
 
-    others = [number for number in ending.signals() if number is not signal.SIGINT]
-    before = [signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT)) for number in others]
-    try:
+    with ending.taken_as_ctrl_c(lambda: signal.raise_signal(signal.SIGINT)):
         asyncio.run(work)
-    finally:
-        for number, handler in zip(others, before, strict=True):
-            signal.signal(number, handler)

@@ -1,7 +1,8 @@
 """The signals that end a process of ours, so that it ends in order: Ctrl-C, `kill`, and a terminal that was closed."""
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # most processes have no loop
@@ -22,10 +23,22 @@ def calls(end: Callable[[], object]) -> None:
         signal.signal(number, lambda *_: end())
 
 
-def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[], object]) -> None:
-    """From now on each of them calls `end` in this loop."""
+def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[signal.Signals], object]) -> None:
+    """From now on each of them calls `end` in this loop, with its number."""
     for number in signals():
         try:
-            loop.add_signal_handler(number, end)
+            loop.add_signal_handler(number, end, number)
         except NotImplementedError:  # Windows has no signal handlers on the loop
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(end))
+            signal.signal(number, lambda *_, number=number: loop.call_soon_threadsafe(end, number))
+
+
+@contextmanager
+def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
+    """Meanwhile each of them but SIGINT, which Python takes itself, calls `interrupt` in the main thread."""
+    others = [number for number in signals() if number is not signal.SIGINT]
+    before = [signal.signal(number, lambda *_: interrupt()) for number in others]
+    try:
+        yield
+    finally:
+        for number, handler in zip(others, before, strict=True):
+            signal.signal(number, handler)

@@ -3,7 +3,6 @@
 import functools
 import json
 import re
-import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -141,13 +140,8 @@ def _words(outcome: Outcome) -> str:
 def sigterm_interrupts() -> Iterator[None]:
     """What ends a process, SIGTERM above all, is taken as Ctrl-C is: as KeyboardInterrupt."""
 
-    def interrupt(_number: int, _frame: object) -> None:
+    def interrupt() -> None:
         raise KeyboardInterrupt
 
-    numbers = [number for number in ending.signals() if number is not signal.SIGINT]
-    before = [signal.signal(number, interrupt) for number in numbers]
-    try:
+    with ending.taken_as_ctrl_c(interrupt):
         yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)

@@ -3,7 +3,6 @@
 import asyncio
 import json
 import os
-import signal
 import stat
 import sys
 from collections.abc import Callable
@@ -136,12 +135,8 @@ async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool
         from fleet.supervise.table import Table
 
         table = Table(supervisor)
-    for number in ending.signals():
-        words = {"SIGINT": "Ctrl-C", "SIGHUP": "the terminal was closed"}.get(number.name, "told to end")
-        try:
-            loop.add_signal_handler(number, supervisor.end, words)
-        except NotImplementedError:  # Windows has no signal handlers on the loop
-            signal.signal(number, lambda *_, words=words: loop.call_soon_threadsafe(supervisor.end, words))
+    why = {"SIGINT": "Ctrl-C", "SIGHUP": "the terminal was closed"}
+    ending.calls_in(loop, lambda number: supervisor.end(why.get(number.name, "told to end")))
     if as_json and wish.simulated:
         await _pass_stdin(loop, supervisor.tell_simulator)
     if table is None:

@@ -212,7 +212,7 @@ async def _serve(
     loop = asyncio.get_running_loop()
     parent = os.getppid()
     ended = asyncio.Event()
-    ending.calls_in(loop, ended.set)
+    ending.calls_in(loop, lambda _: ended.set())
     simulation = Simulation(specs, seed=args.seed, world=world, replays=replays)
     for car in simulation.cars.values():
         car.failed = lambda failed, error: _complain(f"car {failed.spec.name}: {error}")
