@@ -19,6 +19,10 @@ from schemas.bus import BadEndpoint, BusError
 INTERRUPTED: Final = 130
 _Function = Callable[..., Any]
 
+from_option = click.option(
+    "--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date."
+)
+to_option = click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not part of it.")
 json_option = click.option("--json", "as_json", is_flag=True, help="One JSON object per line.")
 
 

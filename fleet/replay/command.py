@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from fleet.commands.common import INTERRUPTED, Cars
+from fleet.commands.common import INTERRUPTED, Cars, from_option
 from fleet.replay.to_bus_command import refuse_without, to_bus_options
 from fleet.replay.to_bus_command import to_bus as play_to_bus
 
@@ -31,7 +31,7 @@ examples:
 )
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--car", "--cars", "cars", type=Cars(), default=(), help="Only these cars, and the services.")
-@click.option("--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date.")
+@from_option
 @click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not shown.")
 @click.option(
     "--save",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fleet.commands.common import Cars, json_option
+from fleet.commands.common import Cars, from_option, json_option, to_option
 from schemas import keys
 
 if TYPE_CHECKING:
@@ -177,8 +177,8 @@ example:
 )
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--car", required=True, callback=lambda _ctx, _param, value: keys.check_name(value), help="Whose frames.")
-@click.option("--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date.")
-@click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not part of it.")
+@from_option
+@to_option
 @click.option(
     "--out",
     required=True,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from fleet.commands.common import Cars, json_option
+from fleet.commands.common import Cars, from_option, json_option, to_option
 from fleet.replay.decoding_commands import vector
 
 if TYPE_CHECKING:
@@ -266,8 +266,8 @@ examples:
 """,
 )
 @session_argument
-@click.option("--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date.")
-@click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not part of it.")
+@from_option
+@to_option
 @click.option("--cars", type=Cars(), default=(), help="Only these cars, and the services.")
 @click.option(
     "--out",
