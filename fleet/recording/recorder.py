@@ -324,7 +324,8 @@ class Recorder:
         # From the last status: asking the disk again may fail again.
         self._last.state, self._last.error, self._last.messages = "failed", self._error, self._tape.messages
         self._last.drops.update(self._tape.drops)
-        self._publisher.put(self._last, self._now())
+        with contextlib.suppress(zenoh.ZError):  # the bus may be why; `close` says it, and session.json
+            self._publisher.put(self._last, self._now())
 
     def _status(self, state: str = "") -> fleet_v1_pb2.Recording:
         tape = self._tape
