@@ -194,9 +194,32 @@ class Supervisor:
         """
         if wish.plan is None:
             return ()
-        plan = copied(self.crew.directory, "plan", wish.plan_text)
+        return self._coordinator_of(wish, wish.plan_text)
+
+    def _coordinator_of(self, wish: Wanted, text: str) -> tuple[str, ...]:
+        plan = copied(self.crew.directory, "plan", text)
         listed = copied(self.crew.directory, "fleet", wanted.listing(wish))
         return wanted.coordinator_command(wish, plan, listed, self.endpoint)
+
+    def _in_force(self, plan: pb.Plan) -> None:
+        """A plan that was given over the bus outlives the coordinator that took it, until a reload."""
+        coordinator = self.crew.get(COORDINATOR)
+        # The last words of one that is to begin anew say what was, and a reload sees to the command itself.
+        if coordinator is None or coordinator.ward.state is not State.RUNNING or self._reloading.locked():
+            return
+        given = plan.text != self._wish.plan_text
+        try:
+            command = self._coordinator_of(self._wish, plan.text)
+        except OSError as error:
+            if given:
+                words = f"was given over the bus, and cannot be kept for a coordinator after this one: {error.strerror}"
+                self._say("process", COORDINATOR, f"plan {plan.version} {words}")
+            return
+        if command != coordinator.command:
+            coordinator.command = command
+            if given:
+                words = f"plan {plan.version} was given over the bus: it is in force until a reload"
+                self._say("process", COORDINATOR, words)
 
     async def _set_plan(self, desk: Desk, old: Wanted, command: tuple[str, ...]) -> str:
         """See that the coordinator does what is wanted now; what is new about its plan."""
@@ -281,6 +304,8 @@ class Supervisor:
         row = self.rows.get(car)
         if car == RECORDER and self.crew.heard(RECORDER):
             self._gateways_from = now
+        elif car == COORDINATOR:
+            self._in_force(value)
         elif row is not None and topic == "state/health":
             # The last words of a process that has ended are no sign of life of the next, nor what it shows.
             if self.crew.heard(car, value.pid):

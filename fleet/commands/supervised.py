@@ -13,7 +13,7 @@ from fleet.client import default_sender
 from fleet.commands.common import INTERRUPTED, bus_options, json_option, sigterm_interrupts
 from fleet.supervise.desk import STATUS, ask_service, ask_status
 from fleet.supervise.farewell import NOT_STOPPED
-from fleet.supervise.process import runs
+from fleet.supervise.process import entry, runs
 from schemas import keys, messages
 from schemas.bus import Bus, BusError
 
@@ -113,11 +113,12 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     raise SystemExit(2 if answer.status == "rejected" else 0)
 
 
-@click.command(epilog="\b\nexamples:\n  fleet logs red\n  fleet logs hub --follow")
+@click.command(epilog="\b\nexamples:\n  fleet logs red\n  fleet logs hub --follow\n  fleet logs red --json")
 @click.argument("name", metavar="CAR")
 @click.option("--follow", is_flag=True, help="Go on until Ctrl-C.")
+@json_option
 @bus_options
-def logs(name: str, connect: str | None, fleet: str, *, follow: bool) -> None:
+def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: bool) -> None:
     """What a car's gateway has said, or hub, simulator, coordinator, recorder; of the run that is up, else the last."""
     directory = _directory(connect, keys.check_name(fleet, "fleet name"))
     found = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]
@@ -128,7 +129,7 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool) -> None:
     with sigterm_interrupts():
         try:
             for line in _lines(path, follow=follow):
-                click.echo(line, nl=False)
+                click.echo(json.dumps(entry(line)) + "\n" if as_json else line, nl=False)
         except KeyboardInterrupt:
             raise SystemExit(INTERRUPTED) from None
 

@@ -18,7 +18,7 @@ STATUS: Final = topics.TOPICS[f"{keys.SUPERVISOR}/status"]
 TOGETHER_S: Final = 0.3
 """Two that start at the same moment see each other when both have declared."""
 PING_S: Final = 2.0
-_HEARD: Final = ("*/state/*", "*/sensor/battery", "*/event/log", f"{keys.RECORDER}/status")
+_HEARD: Final = ("*/state/*", "*/sensor/battery", "*/event/log", f"{keys.RECORDER}/status", f"{keys.COORDINATOR}/plan")
 _WAITING: Final = 8192
 """Messages that may wait: some seconds of a hundred cars."""
 SERVICES: Final = {"down": "fleet.v1.DownCommand", "reload": "fleet.v1.ReloadCommand"}

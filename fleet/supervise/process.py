@@ -53,6 +53,13 @@ class Log:
         return self.path.with_suffix(".log.1")
 
 
+def entry(line: str) -> dict[str, str]:
+    """A line of a log taken apart: when, which process, and what it said; of one that was cut, only that."""
+    when, bar, words = line.rstrip("\n").partition(" | ")
+    stamp, _, name = when.partition(" ")
+    return {"time": stamp, "name": name, "line": words} if bar else {"time": "", "name": "", "line": when}
+
+
 def state_directory() -> Path:
     """What outlives a process lies there: FLEET_STATE_DIR, else the user's state directory of the platform."""
     if chosen := os.environ.get(STATE_VARIABLE):

@@ -95,6 +95,10 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
     assert {"@hub", "@recorder", "@simulator", "red", "green"} == {each["name"] for each in told["processes"]}
     assert "bringing the car to a known state" in up.fleet("logs", "red").stdout
     assert " simulator | {" in up.fleet("logs", "simulator").stdout
+    lines = [json.loads(line) for line in up.fleet("logs", "red", "--json").stdout.splitlines()]
+    assert {each["name"] for each in lines} == {"red"}
+    assert any("bringing the car to a known state" in each["line"] for each in lines)
+    assert [each["time"] for each in lines] == sorted(each["time"] for each in lines if each["time"].endswith("Z"))
     wrong = up.fleet("logs", "gren")
     assert wrong.returncode == 2
     assert "there are green, " in wrong.stderr
@@ -379,6 +383,20 @@ def test_reload_restores_a_plan_that_was_replaced_over_the_bus(tmp_path: Path) -
         wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows again")
         assert started.running("@coordinator") == pid
         assert started.fleet("reload").stdout == "nothing has changed\n"
+
+
+def test_a_plan_that_was_given_over_the_bus_outlives_its_coordinator(tmp_path: Path) -> None:
+    with Up(tmp_path, free_endpoint(), str(_job(tmp_path)), "--no-record") as started:
+        pid = started.running("@coordinator")
+        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
+        (answer,) = started.bus.query("fleet/@coordinator/@cmd/plan", payload=OTHER_JOB.encode(), timeout_s=5.0)
+        assert isinstance(answer, bus.Sample)
+        started.until("process", "@coordinator", "was given over the bus: it is in force until a reload")
+        started.kill(pid)
+        assert started.running("@coordinator", but=pid)
+        plan = wait_for(lambda: started.get("@coordinator/plan"), "a coordinator answers")
+        assert plan.text == OTHER_JOB
+        wait_for(lambda: _asked(started, "ann") == "obstacle_avoidance", "ann does as the plan over the bus says")
 
 
 def test_reload_on_a_full_disk_changes_nothing(tmp_path: Path) -> None:
