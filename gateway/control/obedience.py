@@ -10,6 +10,8 @@ from typing import Final
 
 EARLY_S: Final = 0.95
 """A report that comes so soon after `MODE00` was written was sent before it had come, or the car never got it."""
+HELD_UP_S: Final = 0.8
+"""Reports that are closer than this were held up on the way, so when they came says nothing."""
 UNBLOCKED_S: Final = 1.4
 """Reports that are no further apart have no block of a second between them."""
 BLOCKED_S: Final = 1.7
@@ -52,7 +54,7 @@ class Obedience:
         gap_s = at - before
         if self._early:
             self._early, self._closed_at = False, None
-            return Shown.LOST if gap_s < UNBLOCKED_S else self._obeyed() if gap_s > BLOCKED_S else None
+            return Shown.LOST if HELD_UP_S < gap_s < UNBLOCKED_S else self._obeyed() if gap_s > BLOCKED_S else None
         if at < closed_at + EARLY_S:
             self._early = at > closed_at
             return None

@@ -8,6 +8,7 @@ from pathlib import Path
 from fleet.recording.session import Session
 from fleet.recording.sessions.making import recover
 from fleet.recording.sessions.verify import verify
+from schemas.bus import NoFleet
 from tests.support.processes import Fleet, wait_for
 from tests.support.recording import Load, Recording, faults, kill_hub, numbers
 
@@ -55,7 +56,14 @@ def hub_killed(fleet: Fleet, out: Path, *, cars: int, times: int, chance: random
 
 def fleet_back(fleet: Fleet, cars: int) -> None:
     """Wait until every publisher is back at the hub: who answers holds what the recorder still asks for."""
-    wait_for(lambda: len({str(s.key_expr) for s in fleet.bus.recall("fleet/*/sensor/line", 1.0)}) == cars, "all back")
+
+    def answering() -> int:
+        try:
+            return len({str(sample.key_expr) for sample in fleet.bus.recall("fleet/*/sensor/line", 1.0)})
+        except NoFleet:  # nobody has started the next hub yet
+            return 0
+
+    wait_for(lambda: answering() == cars, "all back")
     time.sleep(2 * SECOND_S)  # the recorder asks for the last time some seconds after a hub is back
 
 

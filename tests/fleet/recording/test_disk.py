@@ -28,8 +28,10 @@ from .test_tape import BEGUN_NS, SECOND_NS, feed
 pytestmark = pytest.mark.xdist_group("disk")  # what one fills, another has not
 
 BALLAST = 1_200_000_000
-"""Half of it is more than what others write on the machine's disk meanwhile."""
+"""Half of it is more than what others write on the machine's disk meanwhile, where only that can be used."""
 TINY = 6_000_000
+SMALL = 150_000_000
+KEPT = SMALL // 3
 
 
 def can_mount() -> bool:
@@ -43,7 +45,9 @@ def can_mount() -> bool:
     )
 
 
-DISKS = ["keep free", *(["a disk of its own"] if can_mount() else [])]
+MAY_MOUNT = can_mount()
+DISKS = ["keep free", *(["really full"] if MAY_MOUNT else [])]
+"""What fills a disk of its own, where one can be mounted: nobody else has a part in how full that is."""
 
 
 class Disk:
@@ -66,19 +70,20 @@ class Disk:
 
 @contextmanager
 def disk(kind: str, place: Path) -> Iterator[Disk]:
-    """A disk of its own, or of the machine's so much that nothing is really full."""
-    if kind == "keep free":
+    """One that is kept free, or can be filled to the last byte."""
+    if not MAY_MOUNT:
         keep = shutil.disk_usage(place).free - BALLAST // 2
         try:
             yield Disk(place / "sessions", place / "ballast", BALLAST, ("--keep-free", str(keep)))
         finally:
             (place / "ballast").unlink(missing_ok=True)
         return
+    size, keep, ballast = (TINY, 0, TINY) if kind == "really full" else (SMALL, KEPT, SMALL - KEPT // 2)
     mounted = place / "disk"
     mounted.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={TINY}", "tmpfs", str(mounted)], check=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(mounted)], check=True)
     try:
-        yield Disk(mounted / "sessions", mounted / "ballast", TINY, ("--keep-free", "0"))
+        yield Disk(mounted / "sessions", mounted / "ballast", ballast, ("--keep-free", str(keep)))
     finally:
         subprocess.run(["umount", "-l", str(mounted)], check=True)
 
@@ -254,9 +259,9 @@ def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_noth
             Session.open(session)
 
 
-@pytest.mark.skipif(len(DISKS) < 2, reason="may not mount a disk of its own")
+@pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
 def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing(tmp_path: Path) -> None:
-    with disk("a disk of its own", tmp_path) as there:
+    with disk("really full", tmp_path) as there:
         tape = Tape(there.root, "fleet", Options(keep_free_bytes=0), BEGUN_NS)
         there.fill()
         written = []

@@ -17,6 +17,7 @@ CLOSED_AT = 10.0
         ([9.1, 10.1, 11.1], Shown.LOST),
         ([9.4, 10.4, 12.4], Shown.OBEYED),  # a slow link: what had been sent before it came
         ([9.4, 10.4, 11.95], None),  # another block, of a servo, lies between
+        ([9.1, 10.6, 11.1], None),  # the one before was held up on the way, the next one perhaps as well
         ([], None),
         ([11.5], None),
         ([10.5, 11.5], None),  # of what was before the first nothing is known

@@ -276,7 +276,7 @@ def test_a_good_file_with_something_changed_is_a_world_or_a_list_of_faults(chanc
     [
         ("nothing.yaml", None, "No such file or directory: write room, open or the path of a file"),
         ("bytes.yaml", b"room: \xff", "is no UTF-8"),
-        ("large.yaml", b"\xff" * 2 * LARGEST_BYTES, "has more than 64 KiB"),
+        pytest.param("large.yaml", b"\xff" * 2 * LARGEST_BYTES, "has more than 64 KiB", id="large.yaml"),
         ("faulty.yaml", b"foo: 1\nbar: 2\n", "faulty.yaml:2:1: bar: is not known here"),
         ("carried.yaml", b"lamps: {a: {carried_by: blue}}", "no car or thing 'blue' is simulated here: use red"),
     ],
