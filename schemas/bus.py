@@ -322,7 +322,7 @@ class Bus:
         self.boot_id = os.urandom(16).hex()
 
     @classmethod
-    def open(cls, endpoint: str | None = None, *, start_hub: bool = False, timeout_s: float = 3.0) -> Self:
+    def open(cls, endpoint: str | None = None, *, start_hub: bool = False, timeout_s: float = 5.0) -> Self:
         """Open a session at the endpoint (see `resolve_endpoint`).
 
         `start_hub`: for those who must run: start a hub if there is none. Without it a missing hub raises NoFleet.

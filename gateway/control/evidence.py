@@ -148,6 +148,7 @@ class Evidence(Execution):
 
     def stalled(self, gap_s: float, now: float) -> None:
         """The loop slept for `gap_s`: with motion held the car is stopped first."""
+        self._obedience.stalled(gap_s)
         if gap_s > STALL_S and self._waiting.held is not None:
             words = f"the gateway stalled for {gap_s:.1f} s with motion held: stopping"
             self._ledger.log(Level.ERROR, "stalled", words, now)

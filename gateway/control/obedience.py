@@ -61,6 +61,11 @@ class Obedience:
         self._closed_at = None
         return self._obeyed() if gap_s > BLOCKED_S else None
 
+    def stalled(self, gap_s: float) -> None:
+        """The loop slept for so long, so reports may have been taken later than they came."""
+        if gap_s > 1.0 - HELD_UP_S:
+            self._closed_at, self._early = None, False
+
     @property
     def doubt_until(self) -> float:
         """Until when it is open whether `MODE00` was lost; -inf if there is no doubt."""

@@ -4,7 +4,7 @@ import signal
 import time
 from typing import Any
 
-from schemas import bus
+from schemas import bus, messages
 from tests.support.judge import Judge
 from tests.support.processes import Fleet, wait_for
 from tests.support.tap import Tap
@@ -21,6 +21,11 @@ class Records:
 
     def phases(self, identity: str) -> list[str]:
         return [event.phase for event in self.events if event.id == identity]
+
+    def recall(self, fleet: Fleet) -> None:
+        """As whoever came back to the bus later than the gateway: ask for what was told."""
+        for sample in fleet.bus.recall("fleet/red/event/log", 30.0):
+            self.logs.append(messages.parse("foxglove.Log", sample.payload.to_bytes(), str(sample.encoding)))
 
     def codes(self) -> list[str]:
         return [log.name.removeprefix("red ") for log in self.logs]
@@ -53,7 +58,7 @@ def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(flee
         fleet.hub.popen.send_signal(signal.SIGKILL)
         wait_for(lambda: fleet.left() and bus.accepts(fleet.endpoint), "another hub")
         back_ns = time.time_ns()
-        wait_for(lambda: "link_lost" in records.codes(), "the loss of the link is told")
+        wait_for(lambda: "link_lost" in records.codes() or records.recall(fleet), "the loss of the link is told")
         lost = next(log for log in records.logs if log.name == "red link_lost")
         assert lost.timestamp.ToNanoseconds() < back_ns, "with the time at which it happened"
     finally:

@@ -53,6 +53,17 @@ def test_what_it_was_told_behind_a_block_shows_nothing() -> None:
     assert [obedience.heard(at, echo=True) for at in (10.5, 11.5)] == [None, None]
 
 
+@pytest.mark.parametrize(("gap_s", "shown"), [(0.1, Shown.LOST), (0.3, None)])
+def test_a_loop_that_slept_has_perhaps_taken_reports_late(gap_s: float, shown: Shown | None) -> None:
+    obedience = Obedience()
+    obedience.heard(9.5, echo=True)
+    obedience.closed(CLOSED_AT, awake=True)
+    obedience.heard(10.5, echo=True)
+    obedience.stalled(gap_s)
+    assert obedience.heard(11.5, echo=True) is shown
+    assert obedience.doubt_until == float("-inf")
+
+
 def test_there_is_doubt_until_the_next_report_or_until_it_should_have_come() -> None:
     obedience = Obedience()
     obedience.heard(9.5, echo=True)

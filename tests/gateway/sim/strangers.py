@@ -171,7 +171,7 @@ class WireStranger:
         host, _, port = self._car.url.removeprefix("tcp://").rpartition(":")
         try:
             _, writer = await asyncio.open_connection(host, int(port))
-        except ConnectionRefusedError:
+        except (ConnectionRefusedError, ConnectionResetError):  # reset: it was in the queue of a socket that was closed
             return True
         writer.close()
         return False
