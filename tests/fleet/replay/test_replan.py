@@ -11,7 +11,8 @@ from mcap.writer import Writer
 
 from fleet.cli import cli
 from fleet.client import Fleet
-from fleet.recording.session import Recorded
+from fleet.recording import times
+from fleet.recording.session import Recorded, Session
 from fleet.replay.coordinated import Difference, Said, Timeline, Token, add, differences, presence
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars
@@ -122,7 +123,10 @@ def test_its_frames_are_decoded_as_they_were(recorded: Path) -> None:
 
 def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "part"
-    assert run("sessions", "cut", recorded, "--from", "4s", "--out", out).exit_code == 0
+    # A plan is published again every ten seconds: between the first two times there is none.
+    first, second, *_ = (each.recorded_ns for each in Session.open(recorded).messages(["fleet/@coordinator/plan"]))
+    between = ("--from", times.iso(first + S), "--to", times.iso(second))
+    assert run("sessions", "cut", recorded, *between, "--out", out).exit_code == 0
     assert "has no plan: name one with --plan" in run("replan", out).output
     (out / "plan.yaml").write_text(PLAN, encoding="utf-8")
     result = run("replan", out, "--json")
