@@ -1,4 +1,5 @@
 import socket
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -22,6 +23,15 @@ def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = 30.0) -
         time.sleep(0.01)
 
 
+_started: list["subprocess.Popen[str]"] = []
+
+
+def popen(command: list[str]) -> "subprocess.Popen[str]":
+    """Start a process, which ends with the test's hub at the latest, also if the test fails."""
+    _started.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+    return _started[-1]
+
+
 @pytest.fixture
 def endpoint() -> Iterator[str]:
     """A hub of this test's own."""
@@ -30,6 +40,9 @@ def endpoint() -> Iterator[str]:
         where = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     with zenoh.open(router_config(where)):
         yield where
+        while _started:
+            with _started.pop() as left:
+                left.kill()
 
 
 @pytest.fixture
@@ -45,3 +58,9 @@ def publisher(bus: Bus, car: str, topic: str) -> Publisher:
     with bus._session.declare_publisher(made.key) as plain:  # zenoh.ext's publishers cannot be asked this
         wait_for(lambda: plain.matching_status.matching, f"a subscriber of {made.key}")
     return made
+
+
+def heard(session: zenoh.Session) -> None:
+    """Wait until the recorder has what this session has published: a question of the same priority is behind it."""
+    ask = "fleet/@recorder/status"
+    wait_for(lambda: any(reply.ok for reply in session.get(ask, timeout=10.0)), "the recorder answers")

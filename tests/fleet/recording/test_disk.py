@@ -21,7 +21,7 @@ from fleet.recording.tape import MB, Options, Tape
 from schemas.bus import Bus, Failure, Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
-from .conftest import publisher, wait_for
+from .conftest import heard, popen, publisher, wait_for
 from .test_command import ready
 from .test_tape import BEGUN_NS, SECOND_NS, feed
 
@@ -95,7 +95,7 @@ def fleet(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
 
 def record(endpoint: str, out: Path, *options: str) -> "subprocess.Popen[str]":
     command = [sys.executable, "-m", "fleet.cli", "record", "--out", str(out), "--connect", endpoint, "--json"]
-    return subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return popen([*command, *options])
 
 
 def status(bus: Bus) -> Any:
@@ -142,6 +142,7 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
             publish()
         there.free()
         publish_until("recording")
+        heard(bus._session)
         process.send_signal(signal.SIGTERM)
         text, errors = process.communicate(timeout=60)
         end = json.loads(text)
@@ -185,6 +186,7 @@ def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_dro
 
         publish_until(lambda seen: seen.state == "full")
         publish_until(lambda seen: seen.messages > sent // 2 and "messages wait" in seen.error)
+        heard(bus._session)
         process.send_signal(signal.SIGINT)
         text, errors = process.communicate(timeout=60)
         end = json.loads(text)

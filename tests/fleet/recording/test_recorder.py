@@ -20,7 +20,7 @@ from schemas.bus import Bus, Sample
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 
-from .conftest import publisher, wait_for
+from .conftest import heard, publisher, wait_for
 
 
 def stock(segment: Path) -> list[Any]:
@@ -48,6 +48,7 @@ def test_every_message_of_who_comes_later_lies_in_the_file_as_it_was_published(e
                 ):
                     out = late.publisher(keys.topic_key("fleet", f"car{number}", topic), TOPICS[topic], f"car{number}")
                     sent[out.key] = [out.put(message, time.time_ns()) for _ in range(20)]
+                heard(late._session)
         outcome = recorder.close()
     rows = stock(session / "0001.mcap")
     for key, payloads in sent.items():
@@ -70,6 +71,7 @@ def test_schemas_decode_without_our_code_and_there_is_one_per_type(endpoint: str
         session = recorder.start()
         for car in ("red", "blue"):
             publisher(bus, car, "sensor/range").put(pb.Range(range_m=2.5), time.time_ns())
+        heard(bus._session)
         recorder.close()
     ranges = [
         (schema, message) for schema, channel, message in stock(session / "0001.mcap") if "range" in channel.topic
@@ -89,6 +91,8 @@ def test_encodings_that_we_do_not_know_are_recorded_too(endpoint: str, bus: Bus,
         for encoding in ("text/plain", "application/protobuf;other.Thing", "application/json"):
             stranger.put("fleet/red/x", b"\xff\x00", encoding=encoding)
         bus.put_command("fleet/red/@cmd/drive", b'{"motion":"forward"}', "application/json", 1)
+        heard(stranger)
+        heard(bus._session)
         recorder.close()
     rows = [
         (s, c.message_encoding, c.metadata["zenoh_encoding"])
@@ -127,6 +131,7 @@ def test_gaps_in_a_publishers_numbers_are_counted_and_a_restart_is_none(
                 wait_for(lambda out=out: out.matching_status.matching, "a subscriber")
                 for number in numbers:
                     out.put(b"", source_info=zenoh.SourceInfo(out.id, number))
+        heard(stranger)
         outcome = recorder.close()
     assert outcome.missed == {key: 2}
     assert not outcome.drops
@@ -157,6 +162,7 @@ def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
                 out.put(pb.Range(range_m=1.0), time.time_ns())
             sent += 50
             time.sleep(0.01)  # a pace that the hub carries whole: what is lost is lost in the queue
+        heard(bus._session)
         outcome = recorder.close()
     held = Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))[out.key]
     dropped, missed = outcome.drops[out.key], outcome.missed.get(out.key, 0)
@@ -181,6 +187,7 @@ def test_a_huge_publication_is_read_by_the_stock_reader_and_one_that_is_too_larg
         stranger.put("fleet/red/larger", bytes(30_000_001), **whole)
         stranger.put("fleet/red/note", b"still there", **whole)
         wait_for(lambda: recorder._tape.drops, "it has come, and is counted")
+        heard(stranger)
         outcome = recorder.close()
     held = {channel.topic: message.data for _, channel, message in stock(session / "0001.mcap")}
     assert held["fleet/red/map"] == payload
@@ -198,8 +205,8 @@ def test_status_is_published_answered_and_recorded(endpoint: str, bus: Bus, tmp_
         session = recorder.start()
         publisher(bus, "red", "sensor/range").put(pb.Range(range_m=1.0), time.time_ns())
         wait_for(lambda: any(status.messages > 1 for status in seen), "a status that counts")
-        (answer,) = bus.query("fleet/@recorder/status")
-        (as_json,) = bus.query("fleet/@recorder/status?format=json")
+        (answer,) = bus.query("fleet/@recorder/status", timeout_s=10.0)
+        (as_json,) = bus.query("fleet/@recorder/status?format=json", timeout_s=10.0)
         assert isinstance(answer, Sample)
         assert isinstance(as_json, Sample)
         assert answer.message().session == json.loads(as_json.payload)["session"] == str(session)  # type: ignore[attr-defined]
