@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import queue
+import re
 import signal
 import socket
 import subprocess
@@ -152,7 +153,8 @@ class Fleet:
 
     def state(self, name: str, car: str = "red") -> Any:
         """One state of one car; None while nobody answers."""
-        return next(iter(self.get(f"fleet/{car}/state/{name}")), None)
+        found = self.get(f"fleet/{car}/state/{name}")
+        return next((each for each in found if not isinstance(each, str)), None)
 
     def ready(self, car: str = "red") -> None:
         """Wait until the car is in a known state."""
@@ -202,10 +204,16 @@ def driving(sim: Process, car: str = "red") -> bool:
     return bool(truth["motor_left"] or truth["motor_right"])
 
 
-class TcpCar:
-    """A TCP server that knows nothing of us: it keeps what each receive brought, and sends what it is told to.
+def frames(data: bytes) -> list[bytes]:
+    """The frames of one receive; what has no end yet is the last."""
+    return re.findall(rb"[^#]*#|[^#]+", data)
 
-    `echoes`: it sends back all that comes.
+
+class TcpCar:
+    """A TCP server that knows nothing of us: it keeps what comes, and sends what it is told to.
+
+    Of writes that one receive brought together, for it was late to ask, each frame is kept by itself; half a frame is
+    kept as it came. `echoes`: it sends back all that comes.
     """
 
     def __init__(self, *, echoes: bool = False) -> None:
@@ -256,6 +264,6 @@ class TcpCar:
     def _read(self, peer: socket.socket) -> None:
         with contextlib.suppress(OSError):
             while data := peer.recv(4096):
-                self.received.append(data)
+                self.received += frames(data)
                 if self._echoes:
                     peer.sendall(data)
