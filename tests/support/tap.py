@@ -79,7 +79,7 @@ class Tap:
             self._ends = []
 
     def _pass(self, host: socket.socket, car: socket.socket) -> None:
-        while True:
+        while not self._closing:  # who connects while this is being closed would keep it
             self._flows.wait()
             ready, _, _ = select.select([host, car], [], [], 0.05)
             if not self._flows.is_set():
