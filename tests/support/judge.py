@@ -30,6 +30,8 @@ class Judge:
     modes: list[tuple[int, str]] = field(default_factory=list)
     opened: list[int] = field(default_factory=list)
     """When a gateway had opened its link."""
+    motors_said: list[tuple[int, str]] = field(default_factory=list)
+    """What gateways say of the motors, whenever they say it."""
     heard_ns: int = 0
     """The newest truth."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -41,6 +43,7 @@ class Judge:
         bus.subscribe(f"fleet/{car}/sim/truth", judge._truth)
         bus.subscribe(f"fleet/{car}/frame/tx", judge._frame)
         bus.subscribe(f"fleet/{car}/event/log", judge._log)
+        bus.subscribe(f"fleet/{car}/state/safety", judge._safety)
         return judge
 
     @property
@@ -71,6 +74,11 @@ class Judge:
         with self._lock:
             return [((at - moment_ns) / 1e9, data) for at, _, data in self.frames if at >= moment_ns]
 
+    def said_after(self, moment_ns: int) -> list[str]:
+        """What was said of the motors after a moment."""
+        with self._lock:
+            return [motors for at, motors in self.motors_said if at >= moment_ns]
+
     def _truth(self, sample: Sample) -> None:
         truth: Any = sample.message()
         at, on = stamp_ns(truth), bool(truth.motor_left or truth.motor_right)
@@ -93,3 +101,8 @@ class Judge:
         if event.name == f"{self.car} link_open":
             with self._lock:
                 self.opened.append(event.timestamp.seconds * 1_000_000_000 + event.timestamp.nanos)
+
+    def _safety(self, sample: Sample) -> None:
+        safety: Any = sample.message()
+        with self._lock:
+            self.motors_said.append((stamp_ns(safety), safety.motors))
