@@ -13,6 +13,8 @@ import pytest
 import serial
 
 from schemas import bus
+from tests.support.judge import Judge
+from tests.support.kills import BUSY_S
 from tests.support.processes import PATIENCE_S, Fleet, Process, TcpCar, driving, wait_for
 
 ANY_CLIENT = Path(__file__).parent / "any_client.py"
@@ -212,6 +214,7 @@ def test_history(fleet: Fleet, tcp_car: TcpCar) -> None:
 def test_bad_commands_are_answered_and_nothing_dies(fleet: Fleet, tcp_car: TcpCar) -> None:
     gateway = fleet.gateway(tcp_car.link, platform="raspberry_pi")
     fleet.ready()
+    wait_for(lambda: tcp_car.received == [STOP, STOP, STOP], "recovery")
     quiet = len(tcp_car.received)
     for verb, fields, reason in [
         ("drive", {}, "bad_value"),
@@ -310,16 +313,19 @@ def test_of_two_that_start_at_the_same_moment_one_remains(fleet: Fleet, tcp_car:
     ids=["SIGINT-arduino", "SIGTERM-arduino", "SIGTERM-raspberry_pi", "SIGHUP-arduino"],
 )
 def test_a_signal_stops_the_car_first(fleet: Fleet, number: int, car: str) -> None:
-    sim, (link,) = fleet.simulate(car)
+    judge = Judge.follow(fleet.bus)
+    sim, (link,) = fleet.simulate(car, truth=True)
     gateway = fleet.gateway(link, platform=car.split(":")[1])
     fleet.ready()
     assert fleet.ask("drive", motion="forward", duration_s=10)["status"] in TAKEN
-    wait_for(lambda: driving(sim), "it drives")
-    began = time.monotonic()
+    wait_for(lambda: judge.driving, "it drives")
+    asked_ns = time.time_ns()
     assert gateway.end(number) == 0, gateway.stderr
-    took = time.monotonic() - began
+    ended_s = (time.time_ns() - asked_ns) / 1e9
     assert not driving(sim)
-    assert took < 1.2 + 1.0 + 2.0, "its recipe, one second, and two for a machine that is busy"
+    took_s = judge.wait_off(asked_ns, watched_s=0.5)
+    assert took_s < min(1.2 + BUSY_S, ended_s), "its recipe, on a machine that is busy, and before it ends"
+    assert ended_s < 1.2 + 1.0 + 2 * BUSY_S, "its recipe, one second, and a process that ends on such a machine"
     assert "Traceback" not in gateway.stderr
     assert fleet.left() == []
     assert wait_for(lambda: not fleet.get("fleet/red/**"), "nobody answers for it")
@@ -368,11 +374,14 @@ def test_a_killed_gateway_leaves_a_car_that_drives_and_its_successor_stops_it(fl
     gateway.end(signal.SIGKILL)
     wait_for(lambda: not fleet.get("fleet/red/**"), "it is gone")
 
+    said: list[Any] = []
+    fleet.bus.subscribe("fleet/red/state/safety", lambda sample: said.append(sample.message()))
     gateway = fleet.gateway(link)
-    wait_for(lambda: fleet.state("safety"), "a successor")
-    assert fleet.state("safety").hold.by == "mia", "a hold survives"
-    assert fleet.state("safety").motors == "unknown"
     fleet.ready()
+    first = wait_for(lambda: said, "a successor")[0]
+    assert first.hold.by == "mia", "a hold survives"
+    assert first.motors == "unknown"
+    assert fleet.state("safety").hold.by == "mia"
     assert fleet.ask("drive", motion="forward", duration_s=10)["status"] in TAKEN
     assert not fleet.state("safety").HasField("hold"), "a script's drive ends it"
     wait_for(lambda: driving(sim), "it drives")
@@ -404,7 +413,8 @@ def test_a_link_that_drops_comes_back_by_itself(fleet: Fleet, tmp_path: Path) ->
     fleet.ready()
     wait_for(lambda: fleet.state("link").state == "online", "online")
     assert fleet.state("link").reconnects == 1
-    assert [(end.phase, end.reason) for end in ends if end.id == "long"] == [("failed", "link_down")]
+    ended = [(end.phase, end.reason) for end in ends if end.id == "long" and end.phase not in TAKEN]
+    assert ended == [("failed", "link_down")]
     assert fleet.ask("drive", motion="forward", duration_s=0.3)["status"] in TAKEN
     assert gateway.end() == 0
 
