@@ -75,11 +75,12 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
         lines.until("red", "tracking", "role tracking")
         wait_for(lambda: truth(cars, "red") == "tracking", "red tracks again")
         # A rule.
-        drive = threading.Thread(target=lambda: client.car("green").drive("spin_left", 3.0))
+        drive = threading.Thread(target=lambda: client.car("green").drive("spin_left", 10.0))
         drive.start()
         ruled = lines.until("red", "light_seeking", "rule 1")
-        assert ruled["readings"][0].startswith("green/state/motion motion=spin_left (0.")
+        assert re.match(r"green/state/motion motion=spin_left \(\d+\.", ruled["readings"][0])
         wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
+        assert client.car("green").drive("stop").ok
         drive.join()
         lines.until("red", "tracking", "role tracking")
         # A gateway that comes back: its car is brought to its mode again.
@@ -261,14 +262,16 @@ def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Car
     cars.bus.subscribe("fleet/*/event/command", asked.append)
     process.kill()
     process.wait()
+    wait_for(lambda: not cars.bus.tokens("fleet/@coordinator"), "its token is gone")
     following = coordinator(cars, tmp_path / "plan.yaml", TEAM)
     Lines(following).until("red", "tracking", "role scout (1 of 1): it had it before")
     # What it has asked for would have come before what is asked for now.
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
         assert client.car("blue").stop().ok
     Lines(following).until("blue", None, "on hold by ann")
-    verbs = {sample.message().verb for sample in asked}  # type: ignore[attr-defined]  # a fleet.v1.CommandEvent
-    assert verbs == {"stop"}
+    events: list[Any] = [sample.message() for sample in asked]
+    # What became of a command of the first may be told late.
+    assert {each.verb for each in events if not each.sender.endswith(f"-{process.pid}")} == {"stop"}
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
         assert client.car("blue").resume().ok
     assert truth(cars, "red") == "tracking"
