@@ -68,7 +68,7 @@ def test_keys_are_those_alive_with_type_unit_rate_and_age(cars: Cars) -> None:
     battery = rows["fleet/red/sensor/battery"]
     assert (battery["type"], battery["units"]["voltage_v"]) == ("fleet.v1.Battery", "V")
     assert 0.2 < battery["rate_hz"] < 5, "about once a second"
-    assert 0 <= battery["age_s"] < 3
+    assert 0 <= battery["age_s"] < 4, "it came while it was looked"
     assert rows["fleet/red/event/command"]["age_s"] is None
     for car in cars.gateways:
         assert 0.2 < rows[f"fleet/{car}/state/health"]["rate_hz"] < 5
@@ -159,9 +159,9 @@ def test_wait_ends_when_it_becomes_so(cars: Cars) -> None:
 
 
 def test_wait_says_what_was_instead_when_the_time_is_over(cars: Cars) -> None:
-    done = run(cars.endpoint, "wait", "red/state/safety", "estops and motors == 'on'", "--timeout", "500ms")
+    done = run(cars.endpoint, "wait", "red/state/safety", "estops and motors == 'on'", "--timeout", "3s")
     assert (done.returncode, done.stdout) == (1, "")
-    words = "fleet: estops and motors == 'on' did not hold within 0.5 s: fleet/red/state/safety had "
+    words = "fleet: estops and motors == 'on' did not hold within 3 s: fleet/red/state/safety had "
     assert done.stderr.startswith(words)
     assert "estops=false, motors='o" in done.stderr
     assert done.stderr.endswith(" s ago\n")
@@ -180,7 +180,7 @@ def test_wait_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
         there = f"-{process.pid}"
         wait_for(lambda: [token for token in cars.bus.tokens(operators) if token.endswith(there)], "it is on the bus")
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=20)
+        out, err = process.communicate(timeout=60)
     assert (process.returncode, out, err.strip()) == (130, "", "")
 
 
@@ -248,8 +248,8 @@ async def test_the_sdk_does_the_same_both_ways(cars: Cars) -> None:
         assert found.key.endswith("/state/health")
         assert await asyncio.to_thread(fleet.sync.wait, "red/state/mode", "asked == 'manual'", timeout_s=20)
         for late in (
-            fleet.wait("red/state/mode", "asked == 'following'", timeout_s=0.2),
-            asyncio.to_thread(fleet.sync.wait, "red/state/mode", "asked == 'following'", timeout_s=0.2),
+            fleet.wait("red/state/mode", "asked == 'following'", timeout_s=3),
+            asyncio.to_thread(fleet.sync.wait, "red/state/mode", "asked == 'following'", timeout_s=3),
         ):
             with pytest.raises(NotInTime, match="had asked='manual', ") as ended:
                 await late

@@ -1,6 +1,7 @@
 """The `fleet` command: exit codes, what is said of a mistake, what Ctrl-C does; real processes where it matters."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -183,7 +184,7 @@ def test_a_reading_of_an_hour_ago_is_not_shown_as_if_it_were_so_now(cars: Cars) 
             row: dict[str, Any] = lines(run(cars.endpoint, "list", "--json"))[2]
             return row if "sensor/battery" in row["stale"] else None
 
-        row = wait_for(old, "red's battery has not been measured for 3 s", 20.0)
+        row = wait_for(old, "red's battery has not been measured for 3 s")
         assert row["battery_age_s"] > 3
         assert "state/link" not in row["stale"]
         assert run(cars.endpoint, "list").stdout.splitlines()[3].endswith(" s old")
@@ -247,7 +248,9 @@ def test_a_refusal_says_why(cars: Cars) -> None:
 def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
     done = run(cars.endpoint, "drive", "green", "forward", "--for", "700ms")
     assert done.returncode == 0
-    assert done.stdout.startswith("green: complete after 0.7")
+    told = re.match(r"green: complete after (\d+\.\d+) s", done.stdout)
+    assert told, done.stdout
+    assert float(told[1]) >= 0.7
     wait_for(lambda: not driving(cars.sim, "green"), "green stands")
 
 
@@ -258,7 +261,7 @@ def test_an_interrupted_drive_stops_its_cars(cars: Cars, number: signal.Signals)
         for car in ("green", "blue"):
             wait_for(lambda car=car: driving(cars.sim, car), f"{car} drives")
         drive.send_signal(number)
-        out, err = drive.communicate(timeout=20)
+        out, err = drive.communicate(timeout=60)
     assert drive.returncode == 130
     assert "Traceback" not in err
     assert [line.split(" after")[0] for line in out.splitlines()] == ["blue: complete", "green: complete"]
@@ -271,7 +274,7 @@ def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drive:
         wait_for(lambda: driving(cars.sim, "green"), "green drives")
         done = run(cars.endpoint, "stop")
-        _, err = drive.communicate(timeout=20)
+        _, err = drive.communicate(timeout=60)
     assert done.returncode == 0
     assert [line.split(" after")[0] for line in done.stdout.splitlines()] == [
         "blue: complete",
@@ -304,7 +307,7 @@ def test_watch_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
         assert watch.stdout is not None
         assert json.loads(watch.stdout.readline())["key"] == "fleet/red/state/health"
         watch.send_signal(signal.SIGINT)
-        _, err = watch.communicate(timeout=20)
+        _, err = watch.communicate(timeout=60)
     assert watch.returncode == 130
     assert err.strip() == ""
 
@@ -317,11 +320,11 @@ def test_watch_says_that_a_car_is_not_there_and_a_broken_pipe_is_silent(cars: Ca
         watch.stdout.close()
         assert watch.stderr is not None
         assert watch.stderr.read() == ""
-        assert watch.wait(20) == 1
+        assert watch.wait(60) == 1
     command = [*FLEET, "watch", "purple", "--connect", cars.endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
         assert watch.stderr is not None
         said = watch.stderr.readline()
         watch.send_signal(signal.SIGINT)
-        watch.communicate(timeout=20)
+        watch.communicate(timeout=60)
     assert said == "fleet: no car purple on the bus yet (there are: blue, green, red); waiting\n"
