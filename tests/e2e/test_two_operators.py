@@ -91,21 +91,22 @@ def test_on_the_command_line(fleet: Fleet, sim: Process) -> None:
     record = Record(fleet)
     ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "10s")
     wait_for(lambda: drives(fleet, "ann@"), "ann drives")
+    # All at once: on a slow machine, one after the other take longer than a drive may.
+    table, refused = operator(fleet, "eve", "list"), operator(fleet, "bob", "drive", "red", "back")
     row = listed(fleet)
     assert row["driver"].startswith("ann@")
     assert row["driver"].endswith(f"-{ann.pid}")
     assert row["driver_kind"] == "person"
-    table = operator(fleet, "eve", "list")
     assert table.wait() == 0
     assert f"{row['driver']} (person)" in table.lines()[1]
 
-    code, words = ended(operator(fleet, "bob", "drive", "red", "back"))
+    code, words = ended(refused)
     assert code == 1
     assert words.startswith(f"red: not carried out: leased: red is driven by {row['driver']} (person), for ")
     assert words.endswith("wait, or take it (--take)")
     assert drives(fleet, "ann@"), "a refusal changed who drives"
 
-    bob = operator(fleet, "bob", "drive", "red", "back", "--for", "8s", "--take")
+    bob = operator(fleet, "bob", "drive", "red", "back", "--for", "10s", "--take")
     code, words = ended(ann)
     assert code == 1
     assert words.startswith("red: not carried out: superseded: back by bob@")
@@ -149,7 +150,7 @@ def test_a_person_and_a_script(fleet: Fleet, sim: Process) -> None:
     wait_for(lambda: drives(fleet, "bot"), "the script drives")
     assert (listed(fleet)["driver"], listed(fleet)["driver_kind"]) == ("bot", "script")
 
-    ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "8s")
+    ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "10s")
     assert script.wait() == 1
     assert script.stderr.startswith("lost: red was taken by ann@"), script.stderr
     wait_for(lambda: driving(sim), "ann's frame is obeyed")
