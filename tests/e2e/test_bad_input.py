@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.kills import BUSY_S
 from tests.support.processes import Fleet, Process, TcpCar, driving, wait_for
 
 MODE00 = b"$4WD,MODE00#"
@@ -145,14 +146,14 @@ def test_a_wall_clock_that_jumps_changes_no_motion(fleet: Fleet) -> None:
     for number in (signal.SIGUSR1, signal.SIGUSR2, signal.SIGUSR2):
         fleet.ready()  # the stop of the round before is complete
         stamp_s = fleet.state("health").stamp.seconds
-        answer = fleet.ask("drive", motion="forward", duration_s=1.0)
+        answer = fleet.ask("drive", motion="forward", duration_s=3.0)
         assert answer["status"] in ("sent", "queued"), answer
-        wait_for(lambda: driving(sim), "it drives")
+        wait_for(lambda: driving(sim), "it drives")  # and still does when the clock jumps, though we be late
         os.kill(gateway.pid, number)
         wait_for(
             lambda stamp_s=stamp_s: abs(fleet.state("health").stamp.seconds - stamp_s) > 80_000, "the clock has jumped"
         )
-        wait_for(lambda: not driving(sim), "it stops when its time is over", 5.0)
+        wait_for(lambda: not driving(sim), "it stops when its time is over", 8.0)
         assert fleet.ask("drive", motion="back", duration_s=10)["status"] in ("sent", "queued"), "undated is fresh"
         wait_for(lambda: driving(sim), "it drives back")
         asked = {"asked": f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())}"}
@@ -186,7 +187,7 @@ def test_a_firehose_of_10_megabytes_a_second(fleet: Fleet, tcp_car: TcpCar, gate
     assert tcp_car.pour(nonsense, 10 * MEGABYTE, 1.0) > 0
     asked_at, written = time.monotonic(), len(tcp_car.received)
     assert fleet.ask("stop", kind="person")["status"] in ("sent", "queued")
-    assert time.monotonic() - asked_at < 2.0, "it answers in between"
+    assert time.monotonic() - asked_at < 2.0 + BUSY_S, "it answers in between"
     wait_for(lambda: len(tcp_car.received) > written, "a stop is written")
     assert gateway.rss_mb() < before_mb + BOUND_MB
     good_frame_counts(fleet, tcp_car.send)
