@@ -34,12 +34,12 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
 
 @pytest.mark.parametrize("name", ["@hub", "@recorder", "@simulator", "red"])
 def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) -> None:
-    before = {each.name: each.pid for each in up.status().processes}
+    before = {each.name: each.pid for each in up.processes()}
     os.kill(up.running(name), signal.SIGKILL)
     up.running(name, but=before[name])
     state = up.state(name)
     assert state.words == "was ended by signal 9" or state.state == "elsewhere"
-    after = {each.name: each.pid for each in up.status().processes}
+    after = {each.name: each.pid for each in up.processes()}
     assert {other for other in before if other != name and before[other] != after[other]} == set()
     for car in ("red", "green"):
         up.ready(car)
@@ -68,7 +68,7 @@ def test_a_hub_that_hangs_is_replaced_by_ours_or_by_a_gateways(tmp_path: Path) -
 
 
 def test_one_that_sleeps_itself_blames_nobody(up: Up) -> None:
-    before = {each.name: up.running(each.name) for each in up.status().processes}
+    before = {each.name: up.running(each.name) for each in up.processes()}
     os.kill(up.process.pid, signal.SIGSTOP)
     try:
         began = time.monotonic()
@@ -78,7 +78,7 @@ def test_one_that_sleeps_itself_blames_nobody(up: Up) -> None:
     finally:
         os.kill(up.process.pid, signal.SIGCONT)
     wait_for(lambda: up.status() is not None, "it answers again")
-    assert {each.name: up.running(each.name) for each in up.status().processes} == before
+    assert {each.name: up.running(each.name) for each in up.processes()} == before
 
 
 def test_a_second_one_refuses_and_names_the_first(up: Up) -> None:
@@ -106,7 +106,8 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
 
 def test_a_command_that_is_none_is_refused(up: Up) -> None:
     for verb, payload, words in (("up", "{}", "allowed are down, reload"), ("down", "{", "is not the JSON")):
-        (answer,) = up.bus.query(f"fleet/@supervisor/@cmd/{verb}?format=json", payload=payload.encode())
+        selector = f"fleet/@supervisor/@cmd/{verb}?format=json"
+        (answer,) = up.bus.query(selector, payload=payload.encode(), timeout_s=PATIENCE_S)
         assert isinstance(answer, bus.Sample)
         told = json.loads(answer.payload)
         assert told["status"] == "rejected"
@@ -164,9 +165,9 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
             wait_for(lambda: _known(client) == 2, "both cars are in a known state")
             wait_for(lambda: b"red" in shown and b"green" in shown, "the table shows them")
             payload = b'{"motion": "forward", "duration_s": 10}'
-            (answer,) = client.query("fleet/red/@cmd/drive?format=json", payload=payload)
+            (answer,) = client.query("fleet/red/@cmd/drive?format=json", payload=payload, timeout_s=5.0)
             assert isinstance(answer, bus.Sample)
-            wait_for(lambda: truths["red"].message().motor_left, "red drives")  # type: ignore[attr-defined]
+            wait_for(lambda: "red" in truths and truths["red"].message().motor_left, "red drives")  # type: ignore[attr-defined]
             os.write(master, b"\x03")
             wait_for(lambda: b"Ctrl-C: stopping every car" in shown, "it ends")
             os.write(master, b"\x03")
@@ -195,7 +196,7 @@ def test_a_car_that_is_off_holds_up_nobody_and_costs_no_restart(fleet: Fleet, tm
     with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
         started.ready("red")
         pid = started.running("blue")
-        assert started.get("blue/state/link").state == "lost"
+        wait_for(lambda: (state := started.get("blue/state/link")) and state.state == "lost", "blue's gateway tries")
         late = fleet.start("-m", "gateway.cli", "sim", "--no-truth", "--car", f"blue:arduino:{off}")
         late.line()
         started.ready("blue")
@@ -210,7 +211,7 @@ def test_killed_its_cars_are_stopped(fleet: Fleet, tmp_path: Path) -> None:
         started.ready("red")
         assert started.ask("drive", "red", motion="forward", duration_s=10)["status"] == "sent"
         wait_for(lambda: driving(sim), "red drives")
-        theirs = {each.pid for each in started.status().processes if each.HasField("pid")}
+        theirs = {each.pid for each in started.processes() if each.HasField("pid")}
         began = time.monotonic()
         started.process.kill()
         wait_for(lambda: not driving(sim), "red is stopped")

@@ -82,6 +82,10 @@ class Up:
         """The supervisor's status; None while it does not answer."""
         return next(iter(ask_status(self.bus, "fleet")), None)
 
+    def processes(self) -> list[Any]:
+        """Its processes, as soon as it answers: it may be on its way back to the bus."""
+        return list(wait_for(self.status, "it answers").processes)
+
     def state(self, name: str) -> Any:
         """Of one process; None while there is none."""
         status = self.status()
