@@ -139,7 +139,8 @@ async def test_a_slow_link_trickles_both_ways(cars: Simulation) -> None:
 async def test_a_firehose_over_either_link(cars: Simulation) -> None:
     reader, writer = await asyncio.open_connection(*address(cars))
     with open_port(cars) as port:
-        await cars.inflict(Fault(FaultKind.FIREHOSE, for_s=0.5, rate=1e6))
+        # Until so much has come: what finds no room in a terminal while nobody reads is lost.
+        await cars.inflict(Fault(FaultKind.FIREHOSE, for_s=2 * PATIENCE, rate=1e6))
         await cars.inflict(Fault(FaultKind.FIREHOSE, "plain", for_s=0))
         over_tcp, over_pty = bytearray(), bytearray()
         begun = time.monotonic()
@@ -153,7 +154,7 @@ async def test_a_firehose_over_either_link(cars: Simulation) -> None:
 
 async def test_a_frame_that_never_ends(cars: Simulation) -> None:
     with open_port(cars, "plain") as port:
-        await cars.inflict(Fault(FaultKind.FIREHOSE, "plain", for_s=0.2, rate=50_000, flood=Flood.FRAME))
+        await cars.inflict(Fault(FaultKind.FIREHOSE, "plain", for_s=2 * PATIENCE, rate=50_000, flood=Flood.FRAME))
         data = bytearray()
         await until(lambda: data.extend(port.read(65536)) or len(data) > 5_000, "zeros")
         assert data.startswith(b"$4WD,CSB000")
@@ -185,7 +186,7 @@ async def test_a_write_that_is_cut_reaches_the_car_and_then_the_link_is_gone(car
         while True:
             try:
                 return (await asyncio.open_connection(host, port))[1]
-            except ConnectionRefusedError:
+            except ConnectionError:  # a reset: it was in the queue of a socket that was closed
                 assert time.monotonic() < end
                 await asyncio.sleep(0.01)
 
