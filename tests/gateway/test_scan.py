@@ -208,7 +208,7 @@ def test_progress_is_for_a_terminal(stranger: Callable[[], Stranger]) -> None:
     silent = stranger()
     controller, device = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-m", "gateway.cli", "scan", "--link", silent.link, "--seconds", "2"],
+        [sys.executable, "-m", "gateway.cli", "scan", "--link", silent.link, "--seconds", "5"],
         stderr=device,
         stdout=subprocess.PIPE,
         text=True,
@@ -219,7 +219,7 @@ def test_progress_is_for_a_terminal(stranger: Callable[[], Stranger]) -> None:
         out, _ = scan.communicate(timeout=PATIENCE_S)
     os.close(device)
     os.close(controller)
-    assert b"opening and listening: 1 link, 2 s left" in shown
+    assert b"opening and listening: 1 link, 5 s left" in shown
     assert out.startswith(silent.link)
 
 
@@ -274,8 +274,8 @@ def test_bluetooth_devices_are_listed_likely_cars_first(monkeypatch: pytest.Monk
     bluez = FakeBluez(other, car, nordic)
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", bluez.address)
     try:
-        shown = command("scan", "--seconds", "1")
-        told = command("scan", "--seconds", "1", "--json")
+        shown = command("scan", "--seconds", "3")
+        told = command("scan", "--seconds", "3", "--json")
     finally:
         bluez.close()
     assert shown.returncode == 0

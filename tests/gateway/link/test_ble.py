@@ -122,9 +122,9 @@ async def test_by_name(peer: BlePeer) -> None:
     peer.send(READING)
     assert await read(link, len(READING)) == READING
     await link.close()
-    words = await refused(peer, BleUrl(name="BT4"), timeout_s=1.0)
+    words = await refused(peer, BleUrl(name="BT4"), timeout_s=3.0)
     assert "no such device was heard: is it on, in range, and no phone connected to it? There are: " in words
-    assert f"{peer.module.address} (BT04), {peer.bluez.modules[1].address} (BT05) (waited 1 s)" in words
+    assert f"{peer.module.address} (BT04), {peer.bluez.modules[1].address} (BT05) (waited 3 s)" in words
 
 
 async def test_of_several_with_one_name_none_is_taken(peer: BlePeer) -> None:
@@ -141,7 +141,7 @@ async def test_of_several_with_one_name_none_is_taken(peer: BlePeer) -> None:
 
 async def test_a_module_that_does_not_connect(peer: BlePeer) -> None:
     peer.module.connects = False
-    words = await refused(peer, timeout_s=1.0)
+    words = await refused(peer, timeout_s=3.0)
     assert f"{peer.module.address} is there, but does not connect: is a phone or another computer" in words
     assert not peer.module.waiting, "the try was ended"
     peer.module.connects = True
@@ -164,7 +164,7 @@ async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: py
 
 async def test_a_module_whose_notifications_do_not_begin(peer: BlePeer) -> None:
     peer.module.notifies = False
-    assert "is connected, but its notifications do not begin" in await refused(peer, timeout_s=1.0)
+    assert "is connected, but its notifications do not begin" in await refused(peer, timeout_s=3.0)
     assert not peer.module.connected, "it can be found again"
 
 
