@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -44,6 +45,14 @@ def publish(bus: Bus, car: str, distances: range) -> None:
 
 def start_view(fleet: Fleet, *arguments: str) -> Process:
     return fleet.start("-m", "fleet.cli", "view", *arguments)
+
+
+def ended(program: psutil.Process) -> bool:
+    """Whether it is gone, or only waits for its parent to look."""
+    try:
+        return not program.is_running() or program.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
 
 
 def viewers(process: Process) -> list[psutil.Process]:
@@ -111,13 +120,16 @@ def test_a_page_on_loopback_that_goes_with_the_command(fleet: Fleet) -> None:
     page = process._lines.get(timeout=PATIENCE_S).strip()
     assert page.startswith("http://127.0.0.1:")
     (viewer,) = viewers(process)
-    listening = [each for each in viewer.net_connections() if each.status == psutil.CONN_LISTEN]
-    assert len(listening) == 2
+
+    def listens() -> list[Any]:
+        return [each for each in viewer.net_connections() if each.status == psutil.CONN_LISTEN]
+
+    listening = wait_for(lambda: len(found := listens()) == 2 and found, "it takes data, too")
     assert {each.laddr.ip for each in listening} == {"127.0.0.1"}
     assert "--memory-limit" in viewer.cmdline()
     assert "--server-memory-limit" in viewer.cmdline()
     assert process.end(signal.SIGINT) == 0
-    wait_for(lambda: not viewer.is_running(), "the viewer has ended")
+    wait_for(lambda: ended(viewer), "the viewer has ended")
 
 
 @pytest.mark.parametrize("who", ["the command", "the guard", "the viewer"])
@@ -128,7 +140,7 @@ def test_killed_it_leaves_no_viewer(fleet: Fleet, who: str) -> None:
     victim = {"the command": process.pid, "the guard": viewer.ppid(), "the viewer": viewer.pid}[who]
     os.kill(victim, signal.SIGKILL)
     process.wait()
-    wait_for(lambda: not viewer.is_running() or viewer.status() == psutil.STATUS_ZOMBIE, "the viewer has ended")
+    wait_for(lambda: ended(viewer), "the viewer has ended")
 
 
 def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
