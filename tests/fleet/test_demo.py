@@ -36,8 +36,10 @@ def test_a_demo_that_is_terminated_stops_its_cars_and_leaves_nothing(tmp_path: P
     )
     assert demo.stdout is not None
     with demo, demo.stdout:
-        wait_for(lambda: "coordinator" in demo.stdout.readline(), "the coordinator starts")  # type: ignore[union-attr]
-        demo.send_signal(signal.SIGTERM)
+        try:
+            wait_for(lambda: "coordinator" in demo.stdout.readline(), "the coordinator starts")  # type: ignore[union-attr]
+        finally:
+            demo.send_signal(signal.SIGTERM)
         assert demo.wait(60) == 130
     wait_for(lambda: not _left(str(tmp_path)), "everything has ended")
 
