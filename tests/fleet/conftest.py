@@ -1,6 +1,8 @@
 """A fleet of real processes for the tests of a module: three simulated cars with their gateways, all at rest."""
 
+import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -27,6 +29,16 @@ class Cars(Fleet):
     def serve(self, car: str) -> Process:
         """Start the gateway of a car."""
         return self.gateway(self.links[car], car=car, platform=CARS[car])
+
+
+@contextmanager
+def running(command: list[str]) -> "Iterator[subprocess.Popen[str]]":
+    """A process that does not outlive the block, also when an assertion in it fails; its exit would be waited for."""
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 @pytest.fixture(scope="module")

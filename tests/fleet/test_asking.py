@@ -28,7 +28,7 @@ from fleet.waiting import NotInTime, Waiting
 from schemas import keys, topics
 from schemas.bus import Bus, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
-from tests.fleet.conftest import Cars
+from tests.fleet.conftest import Cars, running
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet as Processes
 from tests.support.processes import wait_for
@@ -147,7 +147,7 @@ def test_wait_ends_at_once_if_the_current_value_is_so(cars: Cars) -> None:
 
 def test_wait_ends_when_it_becomes_so(cars: Cars) -> None:
     command = [*FLEET, "wait", "*/state/mode", "asked == 'tracking'", "--for", "1s", "--connect", cars.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with running(command) as process:
         try:
             assert run(cars.endpoint, "mode", "red", "tracking").returncode == 0
             out, err = process.communicate(timeout=40)
@@ -175,7 +175,7 @@ def test_wait_says_what_was_instead_when_the_time_is_over(cars: Cars) -> None:
 
 def test_wait_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
     command = [*FLEET, "wait", "red/sensor/range", "range_m > 11", "--connect", cars.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with running(command) as process:
         operators = f"fleet/{keys.OPERATOR}/*"
         there = f"-{process.pid}"
         wait_for(lambda: [token for token in cars.bus.tokens(operators) if token.endswith(there)], "it is on the bus")

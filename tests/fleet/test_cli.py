@@ -12,7 +12,7 @@ import click
 import pytest
 
 from fleet import cli
-from tests.fleet.conftest import Cars
+from tests.fleet.conftest import Cars, running
 from tests.support.ports import free_endpoint
 from tests.support.processes import driving, wait_for
 
@@ -257,7 +257,7 @@ def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_drive_stops_its_cars(cars: Cars, number: signal.Signals) -> None:
     command = [*FLEET, "drive", "green,blue", "forward", "--for", "10s", "--connect", cars.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drive:
+    with running(command) as drive:
         for car in ("green", "blue"):
             wait_for(lambda car=car: driving(cars.sim, car), f"{car} drives")
         drive.send_signal(number)
@@ -271,7 +271,7 @@ def test_an_interrupted_drive_stops_its_cars(cars: Cars, number: signal.Signals)
 
 def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
     command = [*FLEET, "drive", "green", "forward", "--for", "10s", "--connect", cars.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drive:
+    with running(command) as drive:
         wait_for(lambda: driving(cars.sim, "green"), "green drives")
         done = run(cars.endpoint, "stop")
         _, err = drive.communicate(timeout=60)
@@ -303,7 +303,7 @@ def test_ending_its_e_stops_does_not_end_a_cars_hold(cars: Cars) -> None:
 
 def test_watch_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
     command = [*FLEET, "watch", "red/state/health", "--json", "--connect", cars.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
+    with running(command) as watch:
         assert watch.stdout is not None
         assert json.loads(watch.stdout.readline())["key"] == "fleet/red/state/health"
         watch.send_signal(signal.SIGINT)
@@ -314,7 +314,7 @@ def test_watch_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
 
 def test_watch_says_that_a_car_is_not_there_and_a_broken_pipe_is_silent(cars: Cars) -> None:
     command = [*FLEET, "watch", "*/state/*", "--json", "--connect", cars.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
+    with running(command) as watch:
         assert watch.stdout is not None
         watch.stdout.readline()
         watch.stdout.close()
@@ -322,7 +322,7 @@ def test_watch_says_that_a_car_is_not_there_and_a_broken_pipe_is_silent(cars: Ca
         assert watch.stderr.read() == ""
         assert watch.wait(60) == 1
     command = [*FLEET, "watch", "purple", "--connect", cars.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
+    with running(command) as watch:
         assert watch.stderr is not None
         said = watch.stderr.readline()
         watch.send_signal(signal.SIGINT)

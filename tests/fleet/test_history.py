@@ -21,6 +21,7 @@ from fleet.readings import Reading
 from schemas import topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import HISTORY
+from tests.fleet.conftest import running
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, TcpCar, wait_for
 
@@ -171,13 +172,13 @@ def test_what_cannot_be_had_is_told_in_one_line(remembered: Remembered, argument
 
 def test_whoever_reads_may_have_seen_enough(remembered: Remembered) -> None:
     command = [sys.executable, "-m", "fleet.cli", "get", "red", "--last", "1500", "--connect", remembered.endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with running(command) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         process.stdout.readline()
         process.stdout.close()
-        assert process.stderr.read() == b""
-        assert process.wait(20) == 1
+        assert process.stderr.read() == ""
+        assert process.wait(60) == 1
 
 
 # ---------------------------------------------------------------------- pure
