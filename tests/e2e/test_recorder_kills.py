@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.kills import BUSY_S
 from tests.support.lossless import hub_killed, recorder_killed
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet
@@ -26,6 +27,6 @@ def test_of_a_hub_that_is_killed_nothing_is_lost_and_nothing_comes_twice(tmp_pat
 def test_of_a_recorder_that_is_killed_the_last_second_is_missing_and_the_next_one_has_it(tmp_path: Path) -> None:
     fleet = Fleet(free_endpoint(), tmp_path)
     try:
-        recorder_killed(fleet, tmp_path / "sessions", cars=10, times=5, chance=random.Random(7))
+        recorder_killed(fleet, tmp_path / "sessions", cars=10, times=5, chance=random.Random(7), slack_s=BUSY_S)
     finally:
         fleet.close()
