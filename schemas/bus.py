@@ -35,8 +35,10 @@ ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
 
 _ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
 _LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})
-_HISTORY_S: Final = 0.5
-"""The longest that a watch waits for what is there already: for a token that goes in this very moment."""
+_HISTORY_S: Final = 2.0
+"""The longest that a watch waits for what is there already: for a token that goes in this very moment.
+
+On a busy machine what is there may take a while to be told, and who asks meanwhile would be told that there is less."""
 
 _QOS: Final[dict[Qos, dict[str, Any]]] = {
     Qos.READING: {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA},
@@ -407,7 +409,7 @@ class Bus:
 
     def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> None:
         """Call back with (key, alive) for every token there is and every change, on a Zenoh thread, until closed."""
-        awaited = set(self.tokens(expression))
+        awaited = set(self.tokens(expression, timeout_s=5.0))
         alive: set[str] = set()
         told = threading.Event()
 
