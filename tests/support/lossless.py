@@ -44,6 +44,7 @@ def hub_killed(fleet: Fleet, out: Path, *, cars: int, times: int, chance: random
         wait_for(lambda: all(len(load.sent[key]) > count for key, count in running.items()), "all are publishing")
         fleet_back(fleet, cars)
         load.rest()
+        all_there(load, [recording.session])
         last = recording.end()
     assert faults(load, [recording.session]) == ({}, {})
     assert (last["drops"], last["missed"]) == ({}, {})
@@ -68,6 +69,11 @@ def fleet_back(fleet: Fleet, cars: int) -> None:
     time.sleep(2 * SECOND_S)  # the recorder asks for the last time some seconds after a hub is back
 
 
+def all_there(load: Load, sessions: list[Path]) -> None:
+    """Wait until the last that was published is on the disk: a recorder that is told to end waits for it for 0.1 s."""
+    wait_for(lambda: not faults(load, sessions)[0], "all that was published is recorded")
+
+
 def recorder_killed(
     fleet: Fleet, out: Path, *, cars: int, times: int, chance: random.Random, slack_s: float = SLACK_S
 ) -> Told:
@@ -88,6 +94,7 @@ def recorder_killed(
             recording_ns.append(time.time_ns())
         fleet_back(fleet, cars)
         load.rest()
+        all_there(load, sessions)
         last = recording.end()
     assert (last["drops"], last["missed"]) == ({}, {})
     missing_s = []

@@ -16,7 +16,7 @@ from schemas import keys
 from schemas.bus import Bus, Publisher
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
-from tests.support.processes import Fleet, Process, wait_for
+from tests.support.processes import PATIENCE_S, Fleet, Process, wait_for
 
 RATE_HZ = 25.0
 CARS_PER_SESSION = 5
@@ -31,6 +31,7 @@ class Load:
         """By key: when each was published, ns since the epoch; the first has number 1."""
         self._over = threading.Event()
         self._resting = threading.Event()
+        self._rested = threading.Semaphore(0)
         names = [f"car{number}" for number in range(cars)]
         groups = [names[begun : begun + CARS_PER_SESSION] for begun in range(0, cars, CARS_PER_SESSION)]
         self._threads = [threading.Thread(target=self._run, args=(endpoint, group)) for group in groups]
@@ -46,9 +47,8 @@ class Load:
     def rest(self) -> None:
         """Publish no more; who published stays, and holds what it has."""
         self._resting.set()
-        before = -1
-        while before != (before := self.count()):
-            time.sleep(2 / RATE_HZ)
+        for _ in self._threads:
+            assert self._rested.acquire(timeout=PATIENCE_S), "one still publishes"
 
     def end(self) -> None:
         """Publish no more, and leave the bus: what publishers held is gone with them."""
@@ -67,6 +67,7 @@ class Load:
             due = time.monotonic()
             while not self._over.wait(max(0.0, due - time.monotonic())):
                 if self._resting.is_set():
+                    self._rested.release()
                     self._over.wait()
                     return
                 for lines, frames in pairs:
