@@ -16,6 +16,7 @@ from schemas.topics import TOPICS
 from tests.bench.load import cpu_s
 from tests.bench.measured import Measured, in_turns
 from tests.bench.stage import READING, Stage, perf_counter, stage
+from tests.support.lossless import all_there
 from tests.support.processes import Process
 from tests.support.recording import Load, Recording, faults
 
@@ -75,6 +76,7 @@ def _crowd(here: Stage) -> list[Measured]:
     with Load(here.fleet.endpoint, CROWD) as load:
         ours, rate = _share(recording.process, load, CROWD_S)
         load.rest()
+        all_there(load, [recording.session])
         found = recording.end()
     assert faults(load, [recording.session]) == ({}, {})
     assert (found["drops"], found["missed"]) == ({}, {}), found
