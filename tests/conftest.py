@@ -1,6 +1,18 @@
-"""How many tests run at once."""
+"""How many tests run at once, and how long an example of Hypothesis may take."""
 
 import os
+
+from hypothesis import HealthCheck, settings
+
+# By default an example that takes 200 ms fails, and so do examples that take a second to make: a machine that stalls
+# for as long says nothing of the product. What never ends is pytest's time-out's.
+settings.register_profile(
+    "patient",
+    parent=settings(),
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+settings.load_profile("patient")
 
 
 def pytest_xdist_auto_num_workers() -> int:

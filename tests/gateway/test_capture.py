@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.capture import FORMAT, LINE_LIMIT, BadCapture, Piece, Writer, read
@@ -14,7 +14,6 @@ MICROSECONDS = st.integers(0, 10**13)
 PIECES = st.lists(st.tuples(MICROSECONDS, st.binary(max_size=300)), max_size=12).map(
     lambda found: [Piece(at / 1e6, data) for at, data in sorted(found)]
 )
-IN_ONE_PLACE = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def _kept(path: Path, pieces: list[Piece]) -> bytes:
@@ -26,7 +25,6 @@ def _kept(path: Path, pieces: list[Piece]) -> bytes:
     return path.read_bytes()
 
 
-@IN_ONE_PLACE
 @given(PIECES)
 def test_any_bytes_are_given_back(tmp_path: Path, pieces: list[Piece]) -> None:
     path = tmp_path / "kept"
@@ -34,7 +32,6 @@ def test_any_bytes_are_given_back(tmp_path: Path, pieces: list[Piece]) -> None:
     assert list(read(path)) == pieces
 
 
-@IN_ONE_PLACE
 @given(PIECES, st.data())
 def test_a_capture_that_was_cut_anywhere_gives_its_whole_pieces(
     tmp_path: Path, pieces: list[Piece], data: st.DataObject
@@ -53,7 +50,6 @@ def test_a_capture_that_was_cut_anywhere_gives_its_whole_pieces(
             list(read(path))
 
 
-@IN_ONE_PLACE
 @given(PIECES, st.integers(0, 10**6), st.binary(min_size=1, max_size=20))
 def test_a_damaged_capture_is_refused_or_still_pieces(
     tmp_path: Path, pieces: list[Piece], place: int, damage: bytes
@@ -71,7 +67,6 @@ def test_a_damaged_capture_is_refused_or_still_pieces(
     assert "\n" not in refusal
 
 
-@IN_ONE_PLACE
 @given(st.binary(max_size=200))
 def test_any_other_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "other"

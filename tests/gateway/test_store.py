@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.safety import Estop, Hold, Kept
@@ -85,7 +85,6 @@ def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
     held.by.encode()
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.one_of(st.binary(), st.text().map(str.encode), st.integers(0, 80).map(lambda cut: SAVED[:cut])))
 def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: bytes) -> None:
     store = Store(tmp_path, "fleet", "red")

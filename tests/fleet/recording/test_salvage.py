@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
@@ -343,7 +343,7 @@ def test_any_spliced_file_makes_nothing_up(original: Original, tmp_path: Path) -
 
 
 @given(opcode=st.sampled_from([*Opcode, 0, 0x20, 0x80, 0xFF]), body=st.binary(max_size=200), data=st.data())
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=300)
 def test_any_record_anywhere_gives_no_surprise(
     original: Original, tmp_path: Path, opcode: int, body: bytes, data: st.DataObject
 ) -> None:

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -283,7 +283,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Original:
 
 
 @given(data=st.data())
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150)
 def test_cut_or_damaged_anywhere_every_whole_chunk_is_recovered(
     original: Original, tmp_path: Path, data: st.DataObject
 ) -> None:
