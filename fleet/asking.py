@@ -72,7 +72,7 @@ class Asking:
             for progress in waiting:
                 if now >= progress.deadline and self._hubs() != self._hubs_then:
                     progress.stays()
-                if now >= progress.deadline:
+                if now >= progress.deadline and self.inbox.empty():  # we may have slept while the answer came
                     progress.give_up(now)
             until = min((each.deadline for each in waiting), default=now + ANSWER_S)
             try:

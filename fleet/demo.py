@@ -13,7 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
@@ -22,7 +22,7 @@ import click
 
 from fleet.client import Fleet
 from fleet.commands.common import sigterm_interrupts
-from schemas import bus, keys, messages
+from schemas import bus, ending, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 
 CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
@@ -141,24 +141,25 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
 def _run(run: Demo) -> tuple[Path | None, Path | None]:
     began = time.monotonic()
     with ExitStack() as stack:
-        stack.enter_context(_process(run, "hub", "schemas.hub", "--endpoint", run.endpoint))
+        _started(stack, _process(run, "hub", "schemas.hub", "--endpoint", run.endpoint))
         if not run.until(lambda: bus.accepts(run.endpoint)):
             raise click.ClickException(f"no hub came up at {run.endpoint}")
-        recorder = stack.enter_context(
+        recorder = _started(
+            stack,
             _process(
                 run,
                 "recorder",
                 "fleet.cli",
                 "record",
                 *("--connect", run.endpoint, "--out", str(run.folder), "--json", "--with-parent"),
-            )
+            ),
         )
         session = Path(_line(recorder, "recorder")["session"])
         client = stack.enter_context(Fleet(run.endpoint, sender="demo", kind="person"))
         watcher = stack.enter_context(bus.Bus.open(run.endpoint))
         watcher.subscribe(f"{keys.DEFAULT_FLEET}/**", run.witness)
         simulator, links = _simulator(run, stack, session)
-        gateways = {car: stack.enter_context(_gateway(run, car, link)) for car, link in links.items()}
+        gateways = {car: _started(stack, _gateway(run, car, link)) for car, link in links.items()}
         _act(run, stack, client, simulator, session)
         run.say("ending the gateways, the simulated cars and the recorder")
         for process in gateways.values():
@@ -200,18 +201,15 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     run.say("the coordinator assigns modes")
     plan = session / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
-    coordinator = stack.enter_context(
+    coordinator = _started(
+        stack,
         _process(
             run,
             "coordinator",
             "fleet.cli",
             "coordinate",
-            "--connect",
-            run.endpoint,
-            "--plan",
-            str(plan),
-            "--with-parent",
-        )
+            *("--connect", run.endpoint, "--plan", str(plan), "--with-parent"),
+        ),
     )
     for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):
         seen = run.truly(car, "mode", mode)
@@ -359,6 +357,12 @@ def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[su
             run.say(f"{name} ended with {process.returncode}: {''.join(said[-3:]).strip()}")
 
 
+def _started(stack: ExitStack, process: "AbstractContextManager[subprocess.Popen[str]]") -> "subprocess.Popen[str]":
+    """Start a process that the stack ends. A signal that comes meanwhile waits: it would leave the process behind."""
+    with ending.held_back():
+        return stack.enter_context(process)
+
+
 def _drain(pipe: IO[str], said: list[str]) -> None:
     for line in pipe:
         said.append(line)
@@ -368,11 +372,8 @@ def _drain(pipe: IO[str], said: list[str]) -> None:
 def _simulator(run: Demo, stack: ExitStack, session: Path) -> "tuple[subprocess.Popen[str], dict[str, str]]":
     links = {"red": f"pty:{session / 'red.tty'}", "green": "pty", "blue": "tcp://127.0.0.1:0"}
     cars = [part for car, platform in CARS.items() for part in ("--car", f"{car}:{platform}:{links[car]}")]
-    process = stack.enter_context(
-        _process(
-            run, "simulator", "gateway.cli", "sim", *cars, "--seed", "7", "--connect", run.endpoint, "--with-parent"
-        )
-    )
+    where = ("--connect", run.endpoint, "--with-parent")
+    process = _started(stack, _process(run, "simulator", "gateway.cli", "sim", *cars, "--seed", "7", *where))
     told = [_line(process, "simulator") for _ in CARS]
     return process, {each["car"]: each["link"] for each in told}
 

@@ -398,8 +398,8 @@ class Bus:
         self._kept.append(token)
         return token
 
-    def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
-        """The tokens alive now."""
+    def tokens(self, expression: str, timeout_s: float = 5.0) -> list[str]:
+        """The tokens alive now; none as well if nothing answers in time."""
         # While a watch is told what is there already, Zenoh answers a get for the same tokens with some or none.
         with self._lock:
             if expression in self._alive:
@@ -409,7 +409,7 @@ class Bus:
 
     def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> None:
         """Call back with (key, alive) for every token there is and every change, on a Zenoh thread, until closed."""
-        awaited = set(self.tokens(expression, timeout_s=5.0))
+        awaited = set(self.tokens(expression))
         alive: set[str] = set()
         told = threading.Event()
 

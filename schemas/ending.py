@@ -33,6 +33,23 @@ def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[signal.Signals], 
 
 
 @contextmanager
+def held_back() -> Iterator[None]:
+    """What comes meanwhile counts afterwards: for what must be done wholly, as starting a process that is to be ended.
+
+    In the main thread only.
+    """
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in signals()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for each in came:
+            signal.raise_signal(each)
+
+
+@contextmanager
 def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
     """Meanwhile each of them but SIGINT, which Python takes itself, calls `interrupt` in the main thread."""
     others = [number for number in signals() if number is not signal.SIGINT]

@@ -36,7 +36,7 @@ CHANNEL: Final = 16_384
 """What a channel holds until it is taken: three seconds of a hundred cars."""
 ROUND: Final = 4_096
 """Taken from one channel before the others have their turn."""
-LINGER_S: Final = 0.1
+LINGER_S: Final = 0.3
 """What was published before we were told to end is still under way."""
 QUESTIONS: Final = 64
 LONGEST_MARK: Final = 1000

@@ -21,6 +21,9 @@ STALL_S: Final = 0.5
 """A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
 UNDER_WAY_S: Final = 0.06
 """A reading that came sooner after a frame was under way when the frame was sent."""
+TRIES: Final = 3
+TRY_AGAIN_S: Final = 5.0
+"""So often, and after so long each time more, a car that showed nothing of `MODE00` is sent another by itself."""
 FAN_SETTLED_S: Final = 2.0
 """Readings this long after a toggle were sent with the fan as it is now."""
 
@@ -122,6 +125,7 @@ class Evidence(Execution):
         before = self.mode.verdict
         if self._link_open and self.known and self._running is None:
             self._weigh_silence(now)
+            self._try_again(now)
         self._note_verdict(before, now)
 
     def _weigh_silence(self, now: float) -> None:
@@ -137,6 +141,16 @@ class Evidence(Execution):
                 "(off, out of reach, or its link stuck); it is stopped when it is heard again"
             )
             self._ledger.log(Level.WARNING, "unheard", words, now)
+
+    def _try_again(self, now: float) -> None:
+        """Ask a doubted car whether it hears: it may have been us, a link or a machine that stood for a second.
+
+        Only one that nobody has told anything yet: of what is done to others, their stops show it.
+        """
+        due = self.pacing.written_at + TRY_AGAIN_S * (self._tries + 1)
+        if self.deaf and self._untold and self.at_rest and self._tries < TRIES and now >= due:
+            self._tries += 1
+            self._begin(self._full(now), Why.RECOVERY, now)
 
     def _heard_again(self, now: float) -> None:
         """A link that was stuck may deliver at once what was written meanwhile, of which a car obeys only the first."""

@@ -86,6 +86,10 @@ class Execution:
         self._obedience = Obedience()
         self.deaf = False
         """It reports as if it had not got `MODE00`, and has not shown on this link that it hears at all."""
+        self._untold = True
+        """Nobody has told the car anything since the link was opened."""
+        self._tries = 0
+        """How often it was asked since then, by itself, whether it hears."""
         self.disobeyed = 0
         """How often what was heard has shown that a frame was lost."""
         self._left_at = self._left_until = float("-inf")
@@ -142,6 +146,7 @@ class Execution:
         self._link_open = self.was_open = True
         self._gave_up = self._unheard = self.deaf = False
         self._obedience = Obedience()
+        self._untold, self._tries = True, 0
         self.known = False
         if self.platform.auto:  # another car may have been plugged in
             self.platform = PlatformTruth(self.platform.told, auto=True)

@@ -196,6 +196,32 @@ def test_a_car_that_never_showed_that_it_hears_is_driven_and_stopped_and_doubted
     assert pair.control.motors == "off"
 
 
+def test_a_car_that_is_doubted_is_asked_again_by_itself_three_times_at_most() -> None:
+    pair = Pair("arduino", start_s=2.0)
+    deaf(pair)
+    pair.ready()
+    pair.run(1.0)
+    sent = len(pair.sent)
+    pair.run(120.0)
+    mode00, stop = encode(ModeClose()), encode(General(Motion.STOP))
+    assert [data for _, data in pair.sent[sent:]] == [mode00, stop] * 3
+    assert pair.control.motors == "unknown"
+    assert [log.code for log in pair.logs] == ["not_obeyed"], "said once"
+
+
+def test_a_car_that_was_doubted_for_no_reason_is_known_to_hear_before_anybody_asks() -> None:
+    """A machine that stood for a second looks like a car that has not heard."""
+    pair = Pair("arduino", start_s=2.0)
+    hears = pair.car.feed
+    deaf(pair)
+    pair.ready()
+    pair.run(1.0)
+    assert pair.control.motors == "unknown"
+    pair.car.feed = hears  # type: ignore[method-assign]
+    pair.until(lambda: pair.control.motors == "off", 10.0)
+    assert [log.code for log in pair.logs] == ["not_obeyed", "hears"]
+
+
 @pytest.mark.parametrize("delay_s", [0.02, 0.1, 0.25, 0.4])
 def test_a_slow_link_is_no_deaf_one(delay_s: float) -> None:
     """What a car sent before `MODE00` had come to it says nothing of whether it came."""

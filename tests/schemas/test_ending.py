@@ -1,0 +1,32 @@
+"""Signals that end a process, in this very process."""
+
+import os
+import signal
+
+import pytest
+
+from schemas import ending
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_comes_while_it_is_held_back_counts_when_all_is_done(number: signal.Signals) -> None:
+    done: list[str] = []
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    def work() -> None:
+        with ending.taken_as_ctrl_c(interrupt), ending.held_back():
+            os.kill(os.getpid(), number)
+            done.append("whole")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done == ["whole"]
+
+
+def test_nothing_that_came_is_nothing_that_counts() -> None:
+    before = [signal.getsignal(number) for number in ending.signals()]
+    with ending.held_back():
+        assert before != [signal.getsignal(number) for number in ending.signals()]
+    assert before == [signal.getsignal(number) for number in ending.signals()]
