@@ -139,6 +139,8 @@ def test_a_tcp_server_that_knows_nothing_of_us(
         for name, fields in readings.items():
             expected[name].append(fields)
     wait_for(lambda: recording[-1][0] in raw, "the last frame is published")
+    counts = {name: len(readings) for name, readings in expected.items()}
+    wait_for(lambda: all(len(published[name]) >= count for name, count in counts.items()), "its readings, too")
     assert published.keys() == expected.keys()
     for name, readings_of in expected.items():
         got = [
