@@ -47,7 +47,7 @@ class Controller(Evidence):
     def command(self, command: Command, now: float) -> Answer:
         """Take a command: refuse it with a reason, or begin to carry it out. What becomes of it is recorded."""
         pending, what = Pending(command, now), command.what
-        self._untold = False
+        self._tries_left = 0
         if self._ledger.known(command) and not isinstance(what, Stop | EmergencyStop):
             words = f"a command with id {command.id} came already"
             if not command.streamed:  # not under its id: that is the record of the first

@@ -3,7 +3,7 @@
 from typing import Final
 
 from gateway.control.battery import Action, BatteryLevel
-from gateway.control.execution import Execution
+from gateway.control.execution import TRIES, Execution
 from gateway.control.mode import MANUAL_SILENCE_S, Verdict
 from gateway.control.obedience import Shown
 from gateway.control.records import (
@@ -21,9 +21,8 @@ STALL_S: Final = 0.5
 """A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
 UNDER_WAY_S: Final = 0.06
 """A reading that came sooner after a frame was under way when the frame was sent."""
-TRIES: Final = 3
 TRY_AGAIN_S: Final = 5.0
-"""So often, and after so long each time more, a car that showed nothing of `MODE00` is sent another by itself."""
+"""After so long, each time so much longer, a car that showed nothing of `MODE00` is sent another by itself."""
 FAN_SETTLED_S: Final = 2.0
 """Readings this long after a toggle were sent with the fan as it is now."""
 
@@ -147,9 +146,9 @@ class Evidence(Execution):
 
         Only one that nobody has told anything yet: of what is done to others, their stops show it.
         """
-        due = self.pacing.written_at + TRY_AGAIN_S * (self._tries + 1)
-        if self.deaf and self._untold and self.at_rest and self._tries < TRIES and now >= due:
-            self._tries += 1
+        due = self.pacing.written_at + TRY_AGAIN_S * (TRIES - self._tries_left + 1)
+        if self.deaf and self._tries_left and self.at_rest and now >= due:
+            self._tries_left -= 1
             self._begin(self._full(now), Why.RECOVERY, now)
 
     def _heard_again(self, now: float) -> None:

@@ -33,6 +33,8 @@ from gateway.protocol.encode import Frame, General, ModeClose, ModeOpen, encode
 from gateway.protocol.profile import Profile, StopStyle
 from gateway.protocol.values import Mode, Motion
 
+TRIES: Final = 3
+"""So often a car that showed nothing of `MODE00` is asked by itself whether it hears."""
 LATE_S: Final = 0.1
 """A motion that was written later after it was asked, from which its time counts, is said to be shorter."""
 LISTEN_S: Final = 2.2
@@ -86,10 +88,8 @@ class Execution:
         self._obedience = Obedience()
         self.deaf = False
         """It reports as if it had not got `MODE00`, and has not shown on this link that it hears at all."""
-        self._untold = True
-        """Nobody has told the car anything since the link was opened."""
-        self._tries = 0
-        """How often it was asked since then, by itself, whether it hears."""
+        self._tries_left = 0
+        """How often it may still be asked by itself whether it hears: not once anybody has told it anything."""
         self.disobeyed = 0
         """How often what was heard has shown that a frame was lost."""
         self._left_at = self._left_until = float("-inf")
@@ -146,7 +146,7 @@ class Execution:
         self._link_open = self.was_open = True
         self._gave_up = self._unheard = self.deaf = False
         self._obedience = Obedience()
-        self._untold, self._tries = True, 0
+        self._tries_left = TRIES
         self.known = False
         if self.platform.auto:  # another car may have been plugged in
             self.platform = PlatformTruth(self.platform.told, auto=True)

@@ -51,15 +51,16 @@ class Obedience:
         if closed_at is None or before is None or not echo:
             self._early = False
             return None
-        gap_s = at - before
-        if self._early:
-            self._early, self._closed_at = False, None
-            return Shown.LOST if HELD_UP_S < gap_s < UNBLOCKED_S else self._obeyed() if gap_s > BLOCKED_S else None
-        if at < closed_at + EARLY_S:
+        early, self._early = self._early, False
+        if not early and at < closed_at + EARLY_S:
             self._early = at > closed_at
             return None
         self._closed_at = None
-        return self._obeyed() if gap_s > BLOCKED_S else None
+        gap_s = at - before
+        if gap_s > BLOCKED_S:
+            self.ever = True
+            return Shown.OBEYED
+        return Shown.LOST if early and HELD_UP_S < gap_s < UNBLOCKED_S else None
 
     def stalled(self, gap_s: float) -> None:
         """The loop slept for so long, so reports may have been taken later than they came."""
@@ -70,7 +71,3 @@ class Obedience:
     def doubt_until(self) -> float:
         """Until when it is open whether `MODE00` was lost; -inf if there is no doubt."""
         return self._before + UNBLOCKED_S if self._early and self._before is not None else float("-inf")
-
-    def _obeyed(self) -> Shown:
-        self.ever = True
-        return Shown.OBEYED
