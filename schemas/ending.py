@@ -1,7 +1,7 @@
 """The signals that end a process of ours, so that it ends in order: Ctrl-C, `kill`, and a terminal that was closed."""
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -33,29 +33,34 @@ def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[signal.Signals], 
 
 
 @contextmanager
+def _taken(numbers: Iterable[signal.Signals], handler: Callable[[int, object], object]) -> Iterator[None]:
+    """Meanwhile they are this handler's; afterwards whose they were."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler_before in before.items():
+            signal.signal(number, handler_before)
+
+
+@contextmanager
 def held_back() -> Iterator[None]:
     """What comes meanwhile counts afterwards: for what must be done wholly, as starting a process that is to be ended.
 
     In the main thread only.
     """
     came: list[int] = []
-    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in signals()}
     try:
-        yield
+        with _taken(signals(), lambda number, _: came.append(number)):
+            yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for each in came:
-            signal.raise_signal(each)
+        for number in came:
+            signal.raise_signal(number)
 
 
 @contextmanager
 def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
     """Meanwhile each of them but SIGINT, which Python takes itself, calls `interrupt` in the main thread."""
     others = [number for number in signals() if number is not signal.SIGINT]
-    before = [signal.signal(number, lambda *_: interrupt()) for number in others]
-    try:
+    with _taken(others, lambda *_: interrupt()):
         yield
-    finally:
-        for number, handler in zip(others, before, strict=True):
-            signal.signal(number, handler)
