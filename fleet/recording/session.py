@@ -153,15 +153,14 @@ class Session:
 
     def expected(self) -> dict[Path, int | None]:
         """How many messages each segment should have, by its own end or what the recorder noted; None: not known."""
-        noted = {each["file"]: each.get("messages") for each in _noted(self.path)}
+        counts = ((each["file"], each.get("messages")) for each in _noted(self.path))
+        noted = {name: count for name, count in counts if isinstance(count, int)}
         found: dict[Path, int | None] = {}
         for segment, index in self.indexes().items():
             statistics = None if index is None else index.statistics
-            count = noted.get(segment.name) if statistics is None else statistics.message_count
-            found[segment] = count if isinstance(count, int) else None
+            found[segment] = noted.get(segment.name) if statistics is None else statistics.message_count
         gone = (path for path in self.damage if path.suffix == ".mcap" and path not in found)
-        counts = {path: noted.get(path.name) for path in gone}
-        return found | {path: count if isinstance(count, int) else None for path, count in counts.items()}
+        return found | {path: noted.get(path.name) for path in gone}
 
     def indexes(self) -> dict[Path, Index | None]:
         """What stands at the end of each segment; None where it is not whole, or cannot be read."""

@@ -74,11 +74,20 @@ def _missing(session: Session, count: int, words: str) -> int | None:
         return 0
     if description is not None and description.closed and description.messages:
         return max(description.messages - count, 0)
-    expected = list(session.expected().values())
     if description is not None and not description.closed:
         return None
-    known = [each for each in expected if each is not None]
-    return max(sum(known) - count, 0) if len(known) == len(expected) else None
+    expected = _sum(session.expected().values())
+    return None if expected is None else max(expected - count, 0)
+
+
+def _sum(counts: Iterable[object]) -> int | None:
+    """None if one of them is not known."""
+    total = 0
+    for each in counts:
+        if not isinstance(each, int):
+            return None
+        total += each
+    return total
 
 
 def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), watched: Watched = iter) -> int:
@@ -140,8 +149,7 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
     before = origin_of(session)
     if lost := before.get("lost"):  # what was missing before is missing still
         origin = {**origin, "lost": "; ".join(str(each) for each in (origin["lost"], lost) if each)}
-        counts = origin.get("missing"), before.get("missing")
-        origin["missing"] = sum(counts) if all(isinstance(each, int) for each in counts) else None  # type: ignore[arg-type]  # they are
+        origin["missing"] = _sum((origin.get("missing"), before.get("missing")))
     if not origin.get("cars") and before.get("cars"):
         origin = {**origin, "cars": before["cars"]}
     base = old if old is not None else directory.Description(fleet, times.iso(first), "", {})
