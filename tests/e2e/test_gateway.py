@@ -15,7 +15,7 @@ import serial
 from schemas import bus
 from tests.support.judge import Judge
 from tests.support.kills import BUSY_S
-from tests.support.processes import PATIENCE_S, Fleet, Process, TcpCar, driving, wait_for
+from tests.support.processes import PATIENCE_S, TAKEN, Fleet, Process, TcpCar, driving, wait_for
 
 ANY_CLIENT = Path(__file__).parent / "any_client.py"
 
@@ -23,7 +23,6 @@ STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
 MODE00 = b"$4WD,MODE00#"
 
-TAKEN = ("sent", "queued")
 """Queued: another frame was in flight."""
 
 # What a car sent, and what of it are readings: protocol.md, "From the car: readings".

@@ -4,7 +4,7 @@ import signal
 import time
 from typing import Any
 
-from schemas import bus, messages
+from schemas import bus
 from tests.support.judge import Judge
 from tests.support.processes import Fleet, wait_for
 from tests.support.tap import Tap
@@ -25,7 +25,7 @@ class Records:
     def recall(self, fleet: Fleet) -> None:
         """As whoever came back to the bus later than the gateway: ask for what was told."""
         for sample in fleet.bus.recall("fleet/red/event/log", 30.0):
-            self.logs.append(messages.parse("foxglove.Log", sample.payload.to_bytes(), str(sample.encoding)))
+            self.logs.append(bus.sample_of(sample).message())
 
     def codes(self) -> list[str]:
         return [log.name.removeprefix("red ") for log in self.logs]

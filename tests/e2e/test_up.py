@@ -18,13 +18,11 @@ import pytest
 from schemas import bus
 from tests.support.kills import BUSY_S
 from tests.support.ports import free_endpoint
-from tests.support.processes import PATIENCE_S, Fleet, driving, wait_for
+from tests.support.processes import PATIENCE_S, TAKEN, Fleet, driving, wait_for
 from tests.support.up import Up
 
 pytestmark = pytest.mark.xdist_group("up")
 
-TAKEN = ("sent", "queued")
-"""Queued: another frame was in flight."""
 IN_ITS_PLACE_S = 9.5
 """A gateway that hangs has its time to end, 7 s, is killed, and another stops the car: nothing else does, it has no
 dead-man."""
@@ -381,10 +379,7 @@ def test_reload_tells_the_coordinator_what_the_cars_may_do_now(tmp_path: Path) -
 
 def test_reload_restores_a_plan_that_was_replaced_over_the_bus(tmp_path: Path) -> None:
     with Up(tmp_path, free_endpoint(), str(_job(tmp_path)), "--no-record") as started:
-        pid = started.running("@coordinator")
-        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
-        (answer,) = started.bus.query("fleet/@coordinator/@cmd/plan", payload=OTHER_JOB.encode(), timeout_s=5.0)
-        assert isinstance(answer, bus.Sample)
+        pid = _given_another_job(started)
         wait_for(lambda: _asked(started, "ann") == "obstacle_avoidance", "ann does as the plan over the bus says")
         told = started.fleet("reload").stdout
         assert "which was given over the bus, is replaced by " in told
@@ -395,10 +390,7 @@ def test_reload_restores_a_plan_that_was_replaced_over_the_bus(tmp_path: Path) -
 
 def test_a_plan_that_was_given_over_the_bus_outlives_its_coordinator(tmp_path: Path) -> None:
     with Up(tmp_path, free_endpoint(), str(_job(tmp_path)), "--no-record") as started:
-        pid = started.running("@coordinator")
-        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
-        (answer,) = started.bus.query("fleet/@coordinator/@cmd/plan", payload=OTHER_JOB.encode(), timeout_s=5.0)
-        assert isinstance(answer, bus.Sample)
+        pid = _given_another_job(started)
         started.until("process", "@coordinator", "was given over the bus: it is in force until a reload")
         started.kill(pid)
         assert started.running("@coordinator", but=pid)
@@ -484,6 +476,15 @@ def _job(directory: Path, link: str = "link: sim, ", ann: str = "follow", bob: s
 
 
 OTHER_JOB = "roles: {follow: {mode: obstacle_avoidance}, seek: {mode: light_seeking}}\n"
+
+
+def _given_another_job(started: Up) -> int:
+    """Give the coordinator that does the files' job another one over the bus; which process it is."""
+    pid = started.running("@coordinator")
+    wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
+    (answer,) = started.bus.query("fleet/@coordinator/@cmd/plan", payload=OTHER_JOB.encode(), timeout_s=5.0)
+    assert isinstance(answer, bus.Sample)
+    return pid
 
 
 def _asked(started: Up, car: str) -> str:

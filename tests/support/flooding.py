@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.support.judge import Judge
-from tests.support.processes import Fleet, frames, wait_for
+from tests.support.processes import TAKEN, Fleet, frames, wait_for
 from tests.support.tap import Tap
 
 PER_S: Final = 10_000
@@ -63,7 +63,7 @@ def flood(fleet: Fleet, *, seconds: float, stops: int) -> Flooded:
             if number:
                 fleet.ready()  # a stop that still ran would be joined
             asked_ns = time.time_ns()
-            assert fleet.ask("stop", sender="ann", kind="person")["status"] in ("sent", "queued")
+            assert fleet.ask("stop", sender="ann", kind="person")["status"] in TAKEN
             on_wire = wait_for(
                 lambda at=asked_ns: [when for when, data in tap.passed if when > at and stops_in(data)], "a stop"
             )
@@ -75,7 +75,7 @@ def flood(fleet: Fleet, *, seconds: float, stops: int) -> Flooded:
             assert operator.wait() == 0, operator.stderr
         found.rss_mb.append(gateway.rss_mb())
         found.left_out = fleet.state("health").bus_drops
-        assert fleet.ask("stop", sender="ann", kind="person")["status"] in ("sent", "queued"), "it still answers"
+        assert fleet.ask("stop", sender="ann", kind="person")["status"] in TAKEN, "it still answers"
         fleet.ready()
         assert "Traceback" not in gateway.stderr, gateway.stderr
         found.frames = [each for each in tap.passed if each[0] > began_ns]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.support.judge import Judge
-from tests.support.processes import Fleet, Process, wait_for
+from tests.support.processes import TAKEN, Fleet, Process, wait_for
 from tests.support.tap import Tap
 
 BUSY_S: Final = 2.0
@@ -100,7 +100,7 @@ def kill_operators(fleet: Fleet, operators: tuple[Operator, ...] = OPERATORS, wo
     killed: dict[Operator, int] = {}
     for each, process in started.items():
         if each.also or each.how == "command":
-            assert process.line()["status"] in ("sent", "queued"), each
+            assert process.line()["status"] in TAKEN, each
         wait_for(lambda judge=judges[each.car]: judge.driving, f"{each.car} drives")
         killed[each] = process.kill()
     return {
@@ -125,7 +125,7 @@ class Doing:
             fleet.ask("drive", self.car, motion="forward", duration_s=10)
             wait_for(lambda: judge.driving, f"{self.car} drives")
             if self.what != "driving":
-                assert fleet.ask("servo", self.car, servo="front", deg=40)["status"] in ("sent", "queued")
+                assert fleet.ask("servo", self.car, servo="front", deg=40)["status"] in TAKEN
             return
         mode = self.what.removeprefix("opening ")
         fleet.ask("mode", self.car, mode=mode)
@@ -265,7 +265,7 @@ def stop_in_every_mode(fleet: Fleet, rounds: int, moments: random.Random) -> dic
         for what, car in cars.items():
             fleet.ready(car)
             if MODE_DIGITS.get(what):
-                assert fleet.ask("mode", car, mode=what)["status"] in ("sent", "queued"), what
+                assert fleet.ask("mode", car, mode=what)["status"] in TAKEN, what
         for what, judge in judges.items():
             if MODE_DIGITS.get(what):
                 wait_for(lambda judge=judge, what=what: judge.modes[-1][1] == what, f"a car is in {what}")
@@ -277,7 +277,7 @@ def stop_in_every_mode(fleet: Fleet, rounds: int, moments: random.Random) -> dic
         for what, car in cars.items():
             at_ns = time.time_ns()
             answer = fleet.ask("stop", car, sender="ann", kind="person")
-            assert answer["status"] in ("sent", "queued"), what
+            assert answer["status"] in TAKEN, what
             asked[what] = at_ns, answer["worst_case_s"]
             time.sleep(moments.random() / 3)
         for what, (at_ns, worst_case_s) in asked.items():

@@ -70,7 +70,7 @@ def fleet_back(fleet: Fleet, cars: int) -> None:
 
 
 def all_there(load: Load, sessions: list[Path]) -> None:
-    """Wait until the last that was published is on the disk: a recorder that is told to end waits for it for 0.1 s."""
+    """Wait until the last that was published is on the disk: a recorder that is told to end waits only for a moment."""
     wait_for(lambda: not faults(load, sessions)[0], "all that was published is recorded")
 
 

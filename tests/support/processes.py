@@ -21,6 +21,10 @@ PATIENCE_S = 40.0
 """The machine may be busy with other tests; nothing here is waited for longer than it takes."""
 
 
+TAKEN = ("sent", "queued")
+"""Of a command that is carried out; queued: another frame was in flight."""
+
+
 def wait_for(so: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> Any:
     """Ask until it is so; returns what was so."""
     deadline = time.monotonic() + seconds

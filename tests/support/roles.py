@@ -19,7 +19,7 @@ from schemas import messages
 from schemas.bus import Bus, Sample, sample_of
 from tests.support.judge import stamp_ns
 from tests.support.kills import BUSY_S
-from tests.support.processes import wait_for
+from tests.support.processes import TAKEN, wait_for
 from tests.support.up import Up
 
 ROLES: Final = {"patrol": (Mode.OBSTACLE_AVOIDANCE, 3), "track": (Mode.TRACKING, 2)}
@@ -173,7 +173,7 @@ class Stage:
     def begin(self) -> None:
         """Wait until the plan is in force; a person stops one car, which is then held."""
         wait_for(lambda: all(car in self.watcher.known for car in (*ABLE, HELD)), "all cars are known", 90.0)
-        assert self.up.ask("stop", HELD, sender="ann", kind="person")["status"] in ("sent", "queued")
+        assert self.up.ask("stop", HELD, sender="ann", kind="person")["status"] in TAKEN
         wait_for(lambda: self.watcher.filled, "the plan is in force", 90.0)
         self.held_ns = time.time_ns()
 

@@ -73,9 +73,8 @@ def _is_a_car(image: np.ndarray, shown: Shown) -> None:
     for state in ("tracking", "confirmed", "true"):
         assert share(left, lane(colours.STATES[state])) > 0.002, state
     assert share(left, lane(0xFF0010FF)) > 0.002, "the LED's lanes are in its colour"
-    assert share(right, colours.colour("blue", 0)) > 0.0002, (
-        "distance and battery"
-    )  # 0.00065 seen, less as lines are smoothed
+    # 0.00065 seen, less as lines are smoothed.
+    assert share(right, colours.colour("blue", 0)) > 0.0002, "distance and battery"
     assert share(right, (217, 83, 79)) > 0.00005, "the critical threshold"
 
 

@@ -142,6 +142,18 @@ def deaf(pair: Pair) -> list[bytes]:
     return lost
 
 
+def doubted() -> "tuple[Pair, Callable[[bytes, float], None]]":
+    """A car that has heard nothing yet, and what it would hear with."""
+    pair = Pair("arduino", start_s=2.0)
+    hears = pair.car.feed
+    deaf(pair)
+    pair.ready()
+    pair.run(1.0)
+    assert [log.code for log in pair.logs] == ["not_obeyed"]
+    assert pair.control.motors == "unknown"
+    return pair, hears
+
+
 @pytest.mark.parametrize("platform", ["arduino", "stm32"])
 def test_a_stop_that_is_lost_on_the_way_is_noticed_by_a_report_that_should_not_come(platform: str) -> None:
     """protocol.md: `MODE00` blocks for 1.0 s. Of the reports, one a second, most come where that cannot be."""
@@ -169,13 +181,7 @@ def test_a_stop_that_is_lost_on_the_way_is_noticed_by_a_report_that_should_not_c
 
 def test_a_car_that_never_showed_that_it_hears_is_driven_and_stopped_and_doubted() -> None:
     """Deaf from the start, or a car that does not beep, or none at all: what it is sent is the table's, no more."""
-    pair = Pair("arduino", start_s=2.0)
-    hears = pair.car.feed
-    deaf(pair)
-    pair.ready()
-    pair.run(1.0)
-    assert [log.code for log in pair.logs] == ["not_obeyed"]
-    assert pair.control.motors == "unknown"
+    pair, hears = doubted()
     for _ in range(3):
         pair.sent.clear()
         pair.ask(Drive(Motion.FORWARD, 0.7))
@@ -197,10 +203,7 @@ def test_a_car_that_never_showed_that_it_hears_is_driven_and_stopped_and_doubted
 
 
 def test_a_car_that_is_doubted_is_asked_again_by_itself_three_times_at_most() -> None:
-    pair = Pair("arduino", start_s=2.0)
-    deaf(pair)
-    pair.ready()
-    pair.run(1.0)
+    pair, _ = doubted()
     sent = len(pair.sent)
     pair.run(120.0)
     mode00, stop = encode(ModeClose()), encode(General(Motion.STOP))
@@ -211,12 +214,7 @@ def test_a_car_that_is_doubted_is_asked_again_by_itself_three_times_at_most() ->
 
 def test_a_car_that_was_doubted_for_no_reason_is_known_to_hear_before_anybody_asks() -> None:
     """A machine that stood for a second looks like a car that has not heard."""
-    pair = Pair("arduino", start_s=2.0)
-    hears = pair.car.feed
-    deaf(pair)
-    pair.ready()
-    pair.run(1.0)
-    assert pair.control.motors == "unknown"
+    pair, hears = doubted()
     pair.car.feed = hears  # type: ignore[method-assign]
     pair.until(lambda: pair.control.motors == "off", 10.0)
     assert [log.code for log in pair.logs] == ["not_obeyed", "hears"]
