@@ -1,10 +1,38 @@
 """Endpoints that nobody else uses: every test that opens Zenoh has one of its own."""
 
+import contextlib
+import os
+import random
 import socket
+from collections.abc import Iterator
+from itertools import chain
+
+FIRST, LAST = 10_000, 15_999
+"""Below those that a system gives to whoever does not name one: until a hub listens seconds may pass, and a port that
+was only looked at was given to somebody else meanwhile, in one run of the whole suite out of ten."""
+
+
+def _turn() -> Iterator[int]:
+    """The ports of this worker of pytest-xdist, over and over; another run on this machine begins elsewhere."""
+    worker, workers = os.environ.get("PYTEST_XDIST_WORKER", "gw0"), os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")
+    mine = range(FIRST + int(worker.removeprefix("gw")), LAST + 1, int(workers))
+    begun = random.SystemRandom().randrange(len(mine))
+    while True:
+        yield from chain(mine[begun:], mine[:begun])
+
+
+_ports = _turn()
+
+
+def free_port() -> int:
+    """A port of loopback that was free a moment ago, and that no other test of this run is given."""
+    while True:
+        port = next(_ports)
+        with socket.socket() as probe, contextlib.suppress(OSError):  # it is taken
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint whose port was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """A loopback endpoint with such a port."""
+    return f"tcp/127.0.0.1:{free_port()}"

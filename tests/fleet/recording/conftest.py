@@ -1,4 +1,3 @@
-import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -10,6 +9,7 @@ import zenoh
 from schemas import keys
 from schemas.bus import Bus, Publisher, router_config
 from schemas.topics import TOPICS
+from tests.support.ports import free_endpoint
 
 
 def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = 30.0) -> Any:
@@ -35,9 +35,7 @@ def popen(command: list[str]) -> "subprocess.Popen[str]":
 @pytest.fixture
 def endpoint() -> Iterator[str]:
     """A hub of this test's own."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        where = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    where = free_endpoint()
     with zenoh.open(router_config(where)):
         yield where
         while _started:
