@@ -60,7 +60,11 @@ def held_back() -> Iterator[None]:
 
 @contextmanager
 def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
-    """Meanwhile each of them but SIGINT, which Python takes itself, calls `interrupt` in the main thread."""
+    """Meanwhile each of them but SIGINT, which Python takes itself, calls `interrupt` in the main thread.
+
+    Python does not take it where it came ignored, as a shell has it in what is put in the background: here it does.
+    """
     others = [number for number in signals() if number is not signal.SIGINT]
-    with _taken(others, lambda *_: interrupt()):
+    ignored = [signal.SIGINT] if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else []
+    with _taken(ignored, signal.default_int_handler), _taken(others, lambda *_: interrupt()):
         yield

@@ -25,6 +25,23 @@ def test_what_comes_while_it_is_held_back_counts_when_all_is_done(number: signal
     assert done == ["whole"]
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_counts_also_where_a_shell_had_it_ignored(number: signal.Signals) -> None:
+    """As it has of what it starts in the background; what is taken as Ctrl-C may be made one, and would be nothing."""
+
+    def work() -> None:
+        with ending.taken_as_ctrl_c(lambda: signal.raise_signal(signal.SIGINT)):
+            os.kill(os.getpid(), number)
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            work()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_nothing_that_came_is_nothing_that_counts() -> None:
     before = [signal.getsignal(number) for number in ending.signals()]
     with ending.held_back():
