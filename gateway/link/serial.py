@@ -39,6 +39,8 @@ except ImportError:  # Windows
 # ValueError: a path or a baud rate that the system cannot express.
 _NOT_OPENED: Final[tuple[type[Exception], ...]] = (*_GONE, ValueError)
 _BUSY: Final = frozenset({errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK})
+_UNPLUGGED: Final = frozenset({errno.EIO, errno.ENXIO, errno.ENODEV})
+"""What an open port says while it goes; once it has gone it is an end of file."""
 
 
 _opening: Final[set[str]] = set()
@@ -108,7 +110,7 @@ class SerialLink(Link):
         except serial.SerialTimeoutException:
             written = 0
         except _GONE as error:
-            raise self._lose(f"{self._url} is gone: {_cause(error)}") from None
+            raise self._lose(f"{self._url} is gone: {_why_gone(error)}") from None
         if written is None:
             raise self._lose(f"{self._url} is gone: unplugged")  # the thread knows, and is about to say so
         self._stuck = written != len(data)
@@ -162,7 +164,7 @@ class SerialLink(Link):
         except BlockingIOError:
             return
         except _GONE as error:
-            self._lose(f"{self._url} is gone: {_cause(error)}")
+            self._lose(f"{self._url} is gone: {_why_gone(error)}")
             return
         if data:
             self._received(data)
@@ -198,7 +200,7 @@ class SerialLink(Link):
                     self._room.acquire()
                     self._tell(self._received, data)
         except _GONE as error:
-            reason = f"{self._url} is gone: {_cause(error)}"
+            reason = f"{self._url} is gone: {_why_gone(error)}"
         finally:
             with self._hold:
                 self._port = None
@@ -299,6 +301,10 @@ def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
     if not isinstance(error, ValueError) and os.path.exists(path):  # noqa: PTH110 - likewise
         return f"{which}this is not a serial port ({_cause(error)}); {_ports()}"
     return f"{which}the port cannot be opened ({_cause(error)}); {_ports()}"
+
+
+def _why_gone(error: Exception) -> str:
+    return "unplugged" if getattr(error, "errno", None) in _UNPLUGGED else _cause(error)
 
 
 def _cause(error: Exception) -> str:

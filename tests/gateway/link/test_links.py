@@ -156,7 +156,10 @@ async def test_what_came_before_the_end_is_still_read(peer: Peer) -> None:
 
 async def test_a_write_after_death_is_lost_at_the_latest_when_that_is_known(link: Link, peer: Peer) -> None:
     peer.die()
-    assert (await until_lost(lambda: link.write(STOP))).startswith(str(peer.url))
+    words = await until_lost(lambda: link.write(STOP))
+    assert words.startswith(str(peer.url))
+    if isinstance(peer, PtyPeer):
+        assert words.endswith(" is gone: unplugged"), "whether a read or a write meets it, and however early"
 
 
 async def test_close_again_and_then_nothing_works(link: Link, peer: Peer) -> None:
