@@ -3,6 +3,7 @@
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # most processes have no loop
@@ -33,7 +34,7 @@ def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[signal.Signals], 
 
 
 @contextmanager
-def _taken(numbers: Iterable[signal.Signals], handler: Callable[[int, object], object]) -> Iterator[None]:
+def _taken(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
     """Meanwhile they are this handler's; afterwards whose they were."""
     before = {number: signal.signal(number, handler) for number in numbers}
     try:
