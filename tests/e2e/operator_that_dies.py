@@ -14,7 +14,8 @@ car, how, watched, duration_s, *also = sys.argv[1:]
 
 def ask(opened: bus.Bus, verb: str, payload: bytes) -> None:
     """Give a command, and show the answer."""
-    for answer in opened.query(keys.command_key("fleet", car, verb), payload=payload, encoding=messages.JSON):
+    key = keys.command_key("fleet", car, verb)
+    for answer in opened.query(key, payload=payload, encoding=messages.JSON, timeout_s=20.0):
         sys.stdout.write(json.dumps(json.loads(answer.payload)) + "\n")  # type: ignore[union-attr]  # or it fails
         sys.stdout.flush()
 

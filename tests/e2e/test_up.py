@@ -4,7 +4,6 @@ import json
 import os
 import pty
 import signal
-import socket
 import subprocess
 import sys
 import termios
@@ -15,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from fleet.supervise.desk import ask_status
 from schemas import bus
-from tests.support.kills import BUSY_S
-from tests.support.ports import free_endpoint
+from tests.support.ports import free_endpoint, free_port
 from tests.support.processes import PATIENCE_S, TAKEN, Fleet, driving, wait_for
 from tests.support.up import Up
 
@@ -26,6 +25,8 @@ pytestmark = pytest.mark.xdist_group("up")
 IN_ITS_PLACE_S = 9.5
 """A gateway that hangs has its time to end, 7 s, is killed, and another stops the car: nothing else does, it has no
 dead-man."""
+STARTS_S = 10.0
+"""What a machine that runs other tests may add to that: so long the start of a process takes there."""
 
 
 @pytest.fixture(scope="module")
@@ -173,18 +174,21 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
             (answer,) = client.query("fleet/red/@cmd/drive?format=json", payload=payload, timeout_s=5.0)
             assert isinstance(answer, bus.Sample)
             wait_for(lambda: "red" in truths and truths["red"].message().motor_left, "red drives")  # type: ignore[attr-defined]
+            (status,) = wait_for(lambda: ask_status(client, "fleet"), "it says what runs")
+            (waited_for,) = (each.pid for each in status.processes if each.name == "green")
+            os.kill(waited_for, signal.SIGSTOP)  # or it may have ended before the second is typed
             os.write(master, b"\x03")
             wait_for(lambda: b"Ctrl-C: stopping every car" in shown, "it ends")
             os.write(master, b"\x03")
+            wait_for(lambda: b"Ctrl-C: is ending already, waits for" in shown, "it has heard it")
+            os.kill(waited_for, signal.SIGCONT)
+            wait_for(lambda: not truths["red"].message().motor_left, "red stands")  # type: ignore[attr-defined]
             assert process.wait(PATIENCE_S) == 0
             reader.join()
         said = shown.decode()
-        assert "Ctrl-C: is ending already, waits for" in said
         assert "red: stopped" in said
         assert "green: stopped" in said
         assert " 0 lost" in said
-        last = truths["red"].message()
-        assert not last.motor_left  # type: ignore[attr-defined]
     finally:
         if process.poll() is None:
             process.kill()
@@ -194,9 +198,7 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
 
 def test_a_car_that_is_off_holds_up_nobody_and_costs_no_restart(fleet: Fleet, tmp_path: Path) -> None:
     _, (link,) = fleet.simulate("red:arduino:tcp")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        off = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    off = f"tcp://127.0.0.1:{free_port()}"
     file = _file(tmp_path, blue=off, red=link)
     with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
         started.ready("red")
@@ -244,7 +246,7 @@ def test_the_end_stops_cars_whose_gateways_hang_or_were_killed_and_says_which_it
         started.process.popen.send_signal(signal.SIGINT)
         for car in ("green", "red"):
             wait_for(lambda car=car: not driving(sims[car][0], car), f"{car} is stopped")
-            assert time.monotonic() - began < IN_ITS_PLACE_S + 2 * BUSY_S
+            assert time.monotonic() - began < IN_ITS_PLACE_S + STARTS_S
         assert started.process.wait() == 1
         said = {
             each["name"]: each["words"] for each in map(json.loads, started.process.lines()) if each["what"] == "end"
@@ -281,12 +283,12 @@ def test_a_car_that_is_taken_out_is_stopped_though_its_gateway_hangs(fleet: Flee
         started.ready("green")
         assert started.ask("drive", "green", motion="forward", duration_s=10)["status"] in TAKEN
         wait_for(lambda: driving(sim, "green"), "green drives")
-        began = time.monotonic()
         os.kill(started.running("green"), signal.SIGSTOP)
         file.write_text(_text(red=links[0]))
         assert started.fleet("reload").stdout == "green is taken out\n"
+        began = time.monotonic()
         wait_for(lambda: not driving(sim, "green"), "green is stopped")
-        assert time.monotonic() - began < IN_ITS_PLACE_S + 2 * BUSY_S
+        assert time.monotonic() - began < IN_ITS_PLACE_S + STARTS_S
         started.until("end", "green", "stopped")
         wait_for(lambda: started.state("green") is None, "its gateway has ended")
 

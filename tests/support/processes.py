@@ -121,7 +121,8 @@ class Fleet:
         self.environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(directory / "state")}
         self._started: list[Process] = []
         self._bus: bus.Bus | None = None
-        self.hub = self.start("-m", "schemas.hub", "--endpoint", endpoint)
+        # On a busy machine the first that is its client may come later than a hub waits for one.
+        self.hub = self.start("-m", "schemas.hub", "--endpoint", endpoint, "--idle-s", str(2 * PATIENCE_S))
         wait_for(lambda: bus.accepts(endpoint), "the hub listens")
 
     def start(self, *arguments: str) -> Process:
@@ -145,7 +146,7 @@ class Fleet:
     def bus(self) -> bus.Bus:
         """A client of the fleet's bus."""
         if self._bus is None:
-            self._bus = bus.Bus.open(self.endpoint)
+            self._bus = bus.Bus.open(self.endpoint, timeout_s=PATIENCE_S)
         return self._bus
 
     def get(self, selector: str) -> list[Any]:

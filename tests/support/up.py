@@ -87,9 +87,8 @@ class Up:
         return list(wait_for(self.status, "it answers").processes)
 
     def state(self, name: str) -> Any:
-        """Of one process; None while there is none."""
-        status = self.status()
-        return next((each for each in status.processes if each.name == name), None) if status is not None else None
+        """Of one process, as soon as the supervisor answers; None if there is none."""
+        return next((each for each in self.processes() if each.name == name), None)
 
     def running(self, name: str, but: int = 0) -> int:
         """Wait until it runs, with another process id than that; which. A hub may be a gateway's by then: 1."""
