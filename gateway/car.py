@@ -44,6 +44,8 @@ LONGEST_SLEEP_S: Final = 3600.0
 HUB_GONE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 0.5
 """Two gateways that started at the same moment see each other when both have declared (design.md, "Keys")."""
+YIELDS_S: Final = 10.0
+"""How long the one that remains waits for the link that the other has open: that one looks, and stops the car first."""
 HEALTH_EVERY_S: Final = 1.0
 TURN_BYTES: Final = 1024
 """Bytes that are looked at before others get their turn, a stop above all; a car sends 960 a second."""
@@ -126,7 +128,7 @@ class Car:
         self._hub_gone = asyncio.Event()
         self._ending = False
         self._stopped = asyncio.Event()
-        self._alive_at = now
+        self._began_at = self._alive_at = now
 
     async def run(self) -> bool:
         """Serve the car until `stop` and until its stop is written; False if it could not be stopped.
@@ -191,9 +193,18 @@ class Car:
     async def _look_again(self) -> None:
         """Of two gateways that started at the same moment, the one with the higher id yields."""
         await asyncio.sleep(LOOK_AGAIN_S)
+        await self._has_rival()
+        await self._stopped.wait()
+
+    async def _has_rival(self) -> bool:
+        """Whether another gateway serves the car that is to yield; raises AlreadyServed if this one is."""
         others = await asyncio.to_thread(self._doors.others)
         self._doors.refuse([other for other in others if other.boot_id < self._bus.boot_id])
-        await self._stopped.wait()
+        return bool(others)
+
+    async def _is_yielded_to(self) -> bool:
+        """Whether the link that cannot be opened may still be another's that has not looked again yet."""
+        return self._loop.time() < self._began_at + YIELDS_S and await self._has_rival()
 
     # ------------------------------------------------------------------ the link
 
@@ -204,7 +215,7 @@ class Car:
             try:
                 link = await open_link(self._settings.url)
             except LinkError as error:
-                if not may_fail:
+                if not may_fail and not await self._is_yielded_to():
                     raise
                 self._lost(str(error))
                 await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret

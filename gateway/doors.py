@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 FAMILIES: Final = ("sensor", "state")
 STREAM_WAITING: Final = 32
 """Drives of streams that may wait: of a flood the newest, and few, so that a stop never waits for long behind them."""
+ANSWERS_S: Final = 3.0
+"""Who serves the car and is held up answers within it, or is off the bus: Zenoh's lease is 2 s."""
 
 
 class AlreadyServed(Exception):
@@ -73,7 +75,7 @@ class Doors:
     def others(self) -> list[Any]:
         """The fleet.v1.Health of every other gateway that answers for this car."""
         found = []
-        for answer in self._bus.query(keys.topic_key(self._fleet, self._car, "state/health")):
+        for answer in self._bus.query(keys.topic_key(self._fleet, self._car, "state/health"), timeout_s=ANSWERS_S):
             if isinstance(answer, bus.Sample):
                 health: Any = answer.message()
                 if health.boot_id != self._bus.boot_id:

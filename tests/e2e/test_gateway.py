@@ -303,6 +303,37 @@ def test_of_two_that_start_at_the_same_moment_one_remains(fleet: Fleet, tcp_car:
         wait_for(lambda: not fleet.get("fleet/red/**"), "it is gone")
 
 
+SEES_NOBODY_FIRST = """
+import os
+os.urandom = bytes([0]).__mul__
+from gateway import cli, doors
+looks = iter([lambda _: [], *[doors.Doors.others] * 99])
+doors.Doors.others = lambda self: next(looks)(self)
+cli.main()
+"""
+LOOKS_AGAIN_AT_THE_WORD = """
+import os, sys
+os.urandom = bytes([255]).__mul__
+from gateway import cli, doors
+look, before = doors.Doors.others, iter([lambda: None, sys.stdin.readline])
+doors.Doors.others = lambda self: (next(before)(), look(self))[1]
+cli.main()
+"""
+
+
+def test_the_one_that_remains_gets_the_port_from_the_one_that_yields(fleet: Fleet) -> None:
+    """Neither saw the other in time; the one with the higher id was faster to open the port, and looks again later."""
+    _, (link,) = fleet.simulate("red:arduino:pty")
+    arguments = ("run", "--car", "red", "--link", link, "--platform", "arduino")
+    yields = fleet.start("-c", LOOKS_AGAIN_AT_THE_WORD, *arguments)
+    fleet.ready()
+    stays = fleet.start("-c", SEES_NOBODY_FIRST, *arguments)
+    wait_for(lambda: "in use" in stays.stderr, "it cannot have the port")
+    yields.popen.stdin.write("\n")  # type: ignore[union-attr]  # a pipe
+    yields.popen.stdin.flush()  # type: ignore[union-attr]
+    assert remaining(fleet, [yields, stays]) is stays
+
+
 @pytest.mark.parametrize(
     ("number", "car"),
     [
