@@ -31,9 +31,15 @@ class Ours:
         self._sender = sender
         self._begun = False
         self._hold: tuple[str, int] | None = None
+        self._newest = ("", 0)
+        """Its gateway's number of the newest that was taken."""
 
     def heard(self, safety: Any) -> None:
-        """Take a `fleet.v1.Safety` of this car, in the order in which they were published."""
+        """Take a `fleet.v1.Safety` of this car; what was published before another that was taken is no news."""
+        boot_id, seq = self._newest
+        if boot_id and safety.boot_id == boot_id and safety.seq <= seq:
+            return
+        self._newest = (safety.boot_id, safety.seq)
         hold = (safety.hold.by, safety.hold.since.ToNanoseconds()) if safety.HasField("hold") else None
         holder = safety.lease.holder
         if not self._begun:  # what was so before is not news
@@ -62,6 +68,7 @@ class Lease:
         self._name = name
         self._take = take
         self._ours = Ours(name, fleet.sender)
+        self._hearing = threading.Lock()
         self._over = threading.Event()
         self._undeclare: Any = lambda: None
         self._keeper = threading.Thread(target=self._keep, name=f"fleet-lease-{name}", daemon=True)
@@ -73,6 +80,7 @@ class Lease:
         self._undeclare = self._fleet.bus.subscribe(key, self._heard).undeclare
         try:
             self.checked(self._fleet.ask(lease_request(take=self._take), [self._name])[0])
+            self._look()  # that it is ours is published, and may be under way when it is lost
         except BaseException:
             self._undeclare()
             raise
@@ -94,8 +102,7 @@ class Lease:
             return outcome
         self._ours.refused(outcome)
         if outcome.reason == "superseded":  # by whom is published, and may be under way
-            for reading in self._fleet.get(f"{self._name}/state/safety"):
-                self._ours.heard(reading.value)
+            self._look()
         if self._ours.lost:
             raise LeaseLost(outcome, self._ours.lost)
         raise NotCarriedOut(outcome)
@@ -126,9 +133,17 @@ class Lease:
                 return
             self._ours.refused(outcome)
 
+    def _look(self) -> None:
+        """Ask the gateway how it is now."""
+        for reading in self._fleet.get(f"{self._name}/state/safety"):
+            with self._hearing:
+                self._ours.heard(reading.value)
+
     def _heard(self, sample: Sample) -> None:
         """On a Zenoh thread."""
         try:
-            self._ours.heard(sample.message())
+            message = sample.message()
         except (messages.BadPayload, KeyError):
             return  # no message of a gateway of ours
+        with self._hearing:
+            self._ours.heard(message)

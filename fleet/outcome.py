@@ -85,12 +85,16 @@ class Progress:
         self._heard_at = asked_at
         self._worst_case_s = 0.0
         self._queued = False
+        self._sent_told = False
         self._gone_at: float | None = None
 
     @property
     def _joined(self) -> bool:
-        """It only prolongs a drive that its sender holds already: the end is recorded under the earlier id."""
-        return self._until is Until.OVER and self._phase == SENT and not self._queued
+        """It only prolongs a drive that its sender holds already: the end is recorded under the earlier id.
+
+        The records tell, in order: an answer alone may be here long before them.
+        """
+        return self._until is Until.OVER and self._sent_told and not self._queued
 
     @property
     def deadline(self) -> float:
@@ -119,6 +123,7 @@ class Progress:
 
     def event(self, phase: str, reason: str, words: str, worst_case_s: float, at: float) -> None:
         """Take one record of `event/command`."""
+        self._sent_told = self._sent_told or phase == SENT
         self._worst_case_s = max(self._worst_case_s, worst_case_s)
         self._note(phase, reason, words, at)
 

@@ -10,6 +10,8 @@ import pytest
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, Process, wait_for
 
+LONG_S = 60.0
+"""A drive that is still on when the next process has been started, and has asked for something."""
 CARS = {"red": "arduino", "green": "raspberry_pi", "blue": "raspberry_pi"}
 
 
@@ -28,7 +30,7 @@ class Cars(Fleet):
 
     def serve(self, car: str) -> Process:
         """Start the gateway of a car."""
-        return self.gateway(self.links[car], car=car, platform=CARS[car])
+        return self.gateway(self.links[car], "--longest-drive", f"{LONG_S:g}", car=car, platform=CARS[car])
 
 
 @contextmanager
@@ -55,4 +57,9 @@ def nobody_has_a_car(request: pytest.FixtureRequest) -> None:
     """Who drove in the test before has the car for two seconds more, and whoever ranks lower would be refused."""
     if "cars" in request.fixturenames:
         cars: Cars = request.getfixturevalue("cars")
-        wait_for(lambda: not any(each.HasField("lease") for each in cars.get("fleet/*/state/safety")), "nobody drives")
+
+        def free() -> bool:
+            states = cars.get("fleet/*/state/safety")
+            return not any(isinstance(each, str) or each.HasField("lease") for each in states)
+
+        wait_for(free, "nobody drives")

@@ -70,7 +70,7 @@ def test_giving_up_says_what_was_heard_last() -> None:
 
 
 def test_a_gateway_that_went_is_told_after_half_a_second_in_which_it_may_have_been_the_hub() -> None:
-    progress = told(Until.OVER, [("answer", "sent", 0.0)], 9.0)
+    progress = told(Until.OVER, [("answer", "sent", 0.0), ("event", "sent", 0.0)], 9.0)
     progress.gone(102.0)
     assert progress.deadline == 102.5
     progress.stays()
@@ -84,11 +84,20 @@ def test_a_gateway_that_went_is_told_after_half_a_second_in_which_it_may_have_be
 
 
 def test_a_drive_that_only_prolonged_another_is_over_when_its_time_is() -> None:
-    progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
+    progress = told(Until.OVER, [("answer", "sent", 0.0), ("event", "sent", 0.0)], 2.0)
     assert progress.deadline == 102.0
     progress.give_up(102.0)
     assert progress.outcome is not None
     assert progress.outcome.ok
+
+
+def test_a_drive_whose_records_come_late_is_not_taken_for_one_that_only_prolonged_another() -> None:
+    progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
+    assert progress.deadline == 107.0
+    for at, phase in enumerate(("queued", "sent", "complete"), start=104):
+        progress.event(phase, "", "", 0.0, at)
+    assert progress.outcome is not None
+    assert (progress.outcome.ok, progress.outcome.phase) == (True, "complete")
 
 
 def test_the_first_last_word_stays() -> None:
