@@ -38,6 +38,8 @@ ROUND: Final = 4_096
 """Taken from one channel before the others have their turn."""
 LINGER_S: Final = 0.3
 """What was published before we were told to end is still under way."""
+ANSWER_S: Final = 5.0
+"""Another recorder answers between two looks at its disk, which may take a while."""
 QUESTIONS: Final = 64
 LONGEST_MARK: Final = 1000
 
@@ -174,7 +176,7 @@ class Recorder:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
             return
         where = "it does not say where to"
-        for answer in self._bus.query(f"{self._fleet}/{STATUS.name}"):
+        for answer in self._bus.query(f"{self._fleet}/{STATUS.name}", timeout_s=ANSWER_S):
             if isinstance(answer, Sample):
                 message: Any = answer.message()
                 where = f"to {message.session}"

@@ -37,6 +37,8 @@ SHOWN_S: Final = 120.0
 FLUSH_S: Final = 2.0
 _KEPT: Final = (f"{keys.COORDINATOR}/plan", f"{keys.COORDINATOR}/assignment")
 """Published only when they change: asked for at the start."""
+ANSWER_S: Final = 3.0
+"""A coordinator that is slow to answer is waited for; where there is none nothing is."""
 
 
 class Live:
@@ -71,7 +73,8 @@ class Live:
             self._subscribers.append(self._bus.subscribe_channel(expression, CHANNEL))
         self._reader.start()
         for topic in _KEPT:
-            kept = [each for each in self._bus.query(f"{self._fleet}/{topic}") if isinstance(each, Sample)]
+            found = self._bus.query(f"{self._fleet}/{topic}", timeout_s=ANSWER_S)
+            kept = [each for each in found if isinstance(each, Sample)]
             with self._lock:
                 self._waiting += kept
 

@@ -97,6 +97,7 @@ def test_a_plan_from_before_is_asked_for(fleet: Fleet, tmp_path: Path) -> None:
     fleet.bus.queryable("fleet/@coordinator/plan", answer)
     out = tmp_path / "now.rrd"
     with Bus.open(fleet.endpoint) as bus:
+        wait_for(lambda: list(bus.query("fleet/@coordinator/plan")), "the hub knows who has the plan")
         following = Live(bus, "fleet", lambda recording: recording.save(out))
         following.start()
         following.close()
