@@ -16,6 +16,11 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 TOGETHER_S: Final = 0.2
 """Gateways that come within this time are asked together for the e-stops that they know of."""
+AGAIN_S: Final = 0.5
+"""One that did not answer is asked again after this, then twice this...: it may be starting, and know of an e-stop that
+nobody else knows."""
+SELDOM_S: Final = 30.0
+"""... and so seldom in the end."""
 
 log = logging.getLogger("gateway")
 
@@ -70,12 +75,15 @@ class Neighbours:
     async def keep_united(self, unite: Unite) -> None:
         """Fleet-wide e-stops, in force and ended, are taken over from whoever comes onto the bus; until cancelled."""
         key = keys.topic_key(self._fleet, "*", "state/safety")
+        again_s = AGAIN_S
         while True:
             await self._came.wait()
             await asyncio.sleep(TOGETHER_S)
             self._came.clear()
+            unanswered = False
             for answer in await asyncio.to_thread(lambda: list(self._bus.query(key))):
                 if not isinstance(answer, bus.Sample):
+                    unanswered = True
                     continue
                 try:
                     shown: Any = answer.message()
@@ -83,6 +91,9 @@ class Neighbours:
                     log.warning("%s: no state of a gateway of this fleet: %s", answer.key, error)
                     continue
                 unite([_estop(each) for each in shown.estops], shown.ended, shown.car)
+            if unanswered:
+                asyncio.get_running_loop().call_later(again_s, self.ask_soon)
+            again_s = min(2 * again_s, SELDOM_S) if unanswered else AGAIN_S
 
 
 def _estop(shown: pb.Estop) -> Estop:
