@@ -12,11 +12,12 @@ import click
 import pytest
 
 from fleet import cli
-from tests.fleet.conftest import Cars, running
+from tests.fleet.conftest import LONG_S, Cars, running
 from tests.support.ports import free_endpoint
 from tests.support.processes import driving, wait_for
 
 FLEET = [sys.executable, "-m", "fleet.cli"]
+LONG = f"{LONG_S:g}s"
 
 
 def run(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
@@ -256,7 +257,7 @@ def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_drive_stops_its_cars(cars: Cars, number: signal.Signals) -> None:
-    command = [*FLEET, "drive", "green,blue", "forward", "--for", "10s", "--connect", cars.endpoint]
+    command = [*FLEET, "drive", "green,blue", "forward", "--for", LONG, "--connect", cars.endpoint]
     with running(command) as drive:
         for car in ("green", "blue"):
             wait_for(lambda car=car: driving(cars.sim, car), f"{car} drives")
@@ -270,7 +271,7 @@ def test_an_interrupted_drive_stops_its_cars(cars: Cars, number: signal.Signals)
 
 
 def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
-    command = [*FLEET, "drive", "green", "forward", "--for", "10s", "--connect", cars.endpoint]
+    command = [*FLEET, "drive", "green", "forward", "--for", LONG, "--connect", cars.endpoint]
     with running(command) as drive:
         wait_for(lambda: driving(cars.sim, "green"), "green drives")
         done = run(cars.endpoint, "stop")

@@ -15,15 +15,13 @@ import pytest
 
 from schemas import bus, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
+from tests.support import processes
 from tests.support.ports import free_endpoint
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 15.0) -> None:
+def wait_for(condition: Callable[[], object]) -> None:
     """Poll until it holds; Zenoh's callbacks come when they come."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.01)
+    processes.wait_for(condition, "what is waited for on the bus")
 
 
 @pytest.fixture
@@ -33,7 +31,7 @@ def endpoint() -> Iterator[str]:
     wait_for(lambda: bus.accepts(where))
     yield where
     hub.terminate()
-    assert hub.wait(10) == 0
+    assert hub.wait(processes.PATIENCE_S) == 0
 
 
 def test_a_publication_carries_header_number_encoding_and_time(endpoint: str) -> None:
@@ -100,6 +98,8 @@ def test_who_watches_tokens_sees_all_of_them_when_it_asks_at_once(endpoint: str)
     with bus.Bus.open(endpoint) as cars:
         for token in there:
             cars.token(token)
+        with bus.Bus.open(endpoint) as other:
+            wait_for(lambda: set(other.tokens("fleet/*")) == there)
         for _ in range(40):
             with bus.Bus.open(endpoint) as watcher, ThreadPoolExecutor(3) as pool:
                 watcher.watch_tokens("fleet/*", lambda key, alive: None)
@@ -117,12 +117,12 @@ def test_a_hub_is_started_once_and_ends_by_itself() -> None:
             [sys.executable, "-m", "schemas.hub", "--endpoint", where],
             capture_output=True,
             text=True,
-            timeout=30,
+            timeout=processes.PATIENCE_S,
             check=False,
         )
         assert second.returncode == 1
         assert "cannot listen" in second.stderr
-    assert idle.wait(15) == 0
+    assert idle.wait(processes.PATIENCE_S) == 0
 
 
 def test_a_killed_hub_comes_back_and_everything_with_it() -> None:
