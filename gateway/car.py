@@ -345,7 +345,7 @@ class Car:
             now = self._loop.time()
             self._control.wrote(write, now)
             self._health.wrote(len(write.data), now)
-            self._out.written(write, time.time_ns(), whole=True)
+            self._out.written(write, wall_ns(now), whole=True)
 
     # ------------------------------------------------------------------ commands
 
