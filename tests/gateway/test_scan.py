@@ -5,6 +5,7 @@ import json
 import os
 import pty
 import re
+import select
 import subprocess
 import sys
 import termios
@@ -56,7 +57,7 @@ class Stranger:
                 self.received += data
                 if self.echoes:
                     os.write(self._controller, data)
-            if self.says:
+            with contextlib.suppress(BlockingIOError):  # nobody reads it yet
                 os.write(self._controller, self.says)
 
 
@@ -137,6 +138,7 @@ def test_a_probe_asks_what_is_silent_and_stops_cars_driving_ones_too(
     assert found[silent.link]["verdict"] == "silent"
     assert (found[loop.link]["verdict"], found[loop.link]["frames"]) == ("other", {"echo": len(UNKNOWN_STOP)})
     assert "echoes of what was sent" in found[loop.link]["words"]
+    wait_for(lambda: silent.received.count(b"#") >= len(UNKNOWN_STOP), "all of it has come")
     assert re.findall(rb"\$[^#]*#", silent.received) == UNKNOWN_STOP
     assert other.received == b""
     assert sim.say({"car": "blue", "ask": "truth"})["mode"] == "manual"
@@ -170,7 +172,10 @@ def test_a_link_that_is_not_there_fails_and_the_others_are_shown(
 def test_a_device_that_goes_away_while_it_is_listened_to(start: Started) -> None:
     controller, device = pty.openpty()
     scan = start("scan", "--json", "--link", os.ttyname(device), "--seconds", "100")
-    wait_for(lambda: not termios.tcgetattr(device)[3] & termios.ICANON, "the port is open")
+    wait_for(lambda: not termios.tcgetattr(device)[3] & termios.ICANON, "the port is being opened")
+    for _ in range(2):  # opening throws away what is there, once; what goes then is read
+        os.write(controller, b"\n")
+        wait_for(lambda: not select.select([device], [], [], 0)[0], "it is taken")
     os.close(device)
     os.close(controller)
     told = scan.line()
@@ -219,7 +224,7 @@ def test_progress_is_for_a_terminal(stranger: Callable[[], Stranger]) -> None:
         out, _ = scan.communicate(timeout=PATIENCE_S)
     os.close(device)
     os.close(controller)
-    assert b"opening and listening: 1 link, 5 s left" in shown
+    assert re.search(rb"opening and listening: 1 link, \d s left", shown)
     assert out.startswith(silent.link)
 
 
