@@ -61,7 +61,7 @@ def walk(clone: Path, tmp_path: Path) -> None:
     up = terminal.start(first[-1], log)
     try:
         for words in ("role patrol: 2 of 2", "role guide: 1 of 1", "mode tracking, confirmed"):
-            wait_for(lambda words=words: words in log.read_text(), f"{words}: {log.read_text()}")  # type: ignore[misc]  # bound at once
+            wait_for(lambda words=words: words in log.read_text(), words, 90.0)  # type: ignore[misc]  # bound at once
         told = [(command, other.run(command)) for command in second]
         assert up.wait(60) == 0, log.read_text()
     finally:
@@ -85,6 +85,7 @@ def copied(tmp_path: Path) -> Path:
     return clone
 
 
+@pytest.mark.timeout(600)  # 40 s on a machine that does nothing else, 100 s on a busy one
 def test_the_readmes_path_word_for_word(tmp_path: Path) -> None:
     """With the virtual environment of this checkout."""
     clone = copied(tmp_path)
