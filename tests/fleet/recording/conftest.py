@@ -1,4 +1,5 @@
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -7,7 +8,7 @@ import pytest
 import zenoh
 
 from schemas import keys
-from schemas.bus import Bus, Publisher, router_config
+from schemas.bus import Bus, Publisher, accepts, router_config
 from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint
 
@@ -41,6 +42,22 @@ def endpoint() -> Iterator[str]:
         while _started:
             with _started.pop() as left:
                 left.kill()
+
+
+@pytest.fixture
+def hub_apart() -> Iterator[str]:
+    """A hub in a process of its own, for what is huge.
+
+    The sessions of one process share two threads that receive: while the hub waits on one of them for room on the way
+    to a recorder, and the other sleeps, that recorder does not receive, and after five seconds the hub gives it up.
+    """
+    where = free_endpoint()
+    with subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", where]) as hub:
+        try:
+            wait_for(lambda: accepts(where), "the hub listens")
+            yield where
+        finally:
+            hub.kill()
 
 
 @pytest.fixture

@@ -174,10 +174,10 @@ def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
 
 
 def test_a_huge_publication_is_read_by_the_stock_reader_and_one_that_is_too_large_is_counted(
-    endpoint: str, bus: Bus, tmp_path: Path
+    hub_apart: str, tmp_path: Path
 ) -> None:
     payload = os.urandom(20_000_000)
-    with Bus.open(endpoint) as own, zenoh.open(own_config(endpoint)) as stranger:
+    with Bus.open(hub_apart) as own, zenoh.open(own_config(hub_apart)) as stranger:
         recorder = Recorder(own, "fleet", tmp_path, limit_bytes=30_000_000)
         session = recorder.start()
         # By default Zenoh drops what it cannot pass on at once, on a busy machine most of what is so large.
