@@ -172,9 +172,11 @@ class Stage:
 
     def begin(self) -> None:
         """Wait until the plan is in force; a person stops one car, which is then held."""
-        wait_for(lambda: all(car in self.watcher.known for car in (*ABLE, HELD)), "all cars are known", 90.0)
+        watcher, bus = self.watcher, self.up.bus
+        wait_for(lambda: all(watcher.known_after(0, car, bus) for car in (*ABLE, HELD)), "all cars are known", 90.0)
         assert self.up.ask("stop", HELD, sender="ann", kind="person")["status"] in TAKEN
-        wait_for(lambda: self.watcher.filled, "the plan is in force", 90.0)
+        wait_for(lambda: watcher.filled, "the plan is in force", 90.0)
+        self.up.ready(HELD)  # it may have had a role, and its stop takes longer than another car to take that
         self.held_ns = time.time_ns()
 
     def strike(self, what: str) -> Fault:
