@@ -14,10 +14,11 @@ import tty
 from abc import ABC, abstractmethod
 from pathlib import Path
 
-from gateway.link import LinkUrl
+from gateway.link import LinkUrl, ble
 from gateway.link.url import BleUrl, SerialUrl, TcpUrl
 
 SYSTEM_BUS = "DBUS_SYSTEM_BUS_ADDRESS"
+PATIENCE_S = 20.0
 
 
 class Peer(ABC):
@@ -149,6 +150,8 @@ class BlePeer(Peer):
         self.url = BleUrl(self.module.address)
         self._before = os.environ.get(SYSTEM_BUS)
         os.environ[SYSTEM_BUS] = self.bluez.address
+        self._write_s = ble.WRITE_S
+        ble.WRITE_S = PATIENCE_S  # a busy machine keeps both ends from running for longer than a command may take
 
     def send(self, data: bytes) -> None:
         self.bluez.notify(self.module, data)
@@ -163,10 +166,16 @@ class BlePeer(Peer):
         self.bluez.switch(self.module, on=True)
 
     def stall(self) -> None:
-        self.module.takes = 0
+        self.stall_after(0)
+
+    def stall_after(self, pieces: int) -> None:
+        """Take so many more."""
+        self.module.takes = pieces
+        ble.WRITE_S = self._write_s
 
     def close(self) -> None:
         self.bluez.close()
+        ble.WRITE_S = self._write_s
         if self._before is None:
             del os.environ[SYSTEM_BUS]
         else:
@@ -175,7 +184,7 @@ class BlePeer(Peer):
 
 async def settled() -> None:
     """Wait until bleak has noticed that its bus is gone: it keeps one for as long as there is a loop."""
-    async with asyncio.timeout(20.0):
+    async with asyncio.timeout(PATIENCE_S):
         while others := asyncio.all_tasks() - {asyncio.current_task()}:
             await asyncio.wait(others)
 
@@ -188,6 +197,13 @@ def open_descriptors() -> dict[str, str]:
             with contextlib.suppress(FileNotFoundError):
                 found[each.name] = str(each.readlink())
     return found
+
+
+async def no_threads() -> None:
+    """Wait until the threads of links have ended."""
+    for thread in link_threads():
+        await asyncio.to_thread(thread.join, PATIENCE_S)
+        assert not thread.is_alive()
 
 
 def link_threads() -> list[threading.Thread]:

@@ -92,11 +92,14 @@ async def test_a_frame_goes_in_pieces_of_what_the_module_takes(peer: BlePeer) ->
 async def test_a_write_that_fails_in_the_middle_loses_the_link_and_nothing_follows(
     link: Link, peer: BlePeer, fault: str
 ) -> None:
-    setattr(peer.module, fault, 1)
+    if fault == "takes":
+        peer.stall_after(1)
+    else:
+        peer.module.refuses = 1
     waiting = [asyncio.create_task(link.write(LED)) for _ in range(3)]
     errors = await asyncio.gather(*waiting, return_exceptions=True)
     assert all(isinstance(error, LinkLost) for error in errors), errors
-    setattr(peer.module, fault, None)
+    peer.module.takes = peer.module.refuses = None
     assert len({str(error) for error in errors}) == 1, "the first cause is kept"
     with pytest.raises(LinkLost):
         await link.write(LED)

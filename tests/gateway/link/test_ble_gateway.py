@@ -52,7 +52,7 @@ def test_it_drives_and_stops(fleet: Fleet, peer: BlePeer, sim: Process) -> None:
     assert fleet.ask("led", r=255, g=128, b=100)["status"] in TAKEN, "26 bytes: two pieces"
     drive(fleet, sim)
     assert gateway.end() == 0, gateway.stderr
-    assert not driving(sim), "a gateway that ends stops its car first"
+    wait_for(lambda: not driving(sim), "a gateway that ends stops its car first; nobody else does now")
     assert not peer.module.connected
 
 

@@ -30,6 +30,7 @@ from tests.gateway.link.peers import (
     PtyPeer,
     TcpPeer,
     link_threads,
+    no_threads,
     open_descriptors,
     settled,
 )
@@ -298,7 +299,7 @@ async def test_nothing_is_left_behind(peer: Peer) -> None:
             peer.revive()
         elif isinstance(peer, TcpPeer):
             peer.die()
-        assert not any(thread.is_alive() for thread in link_threads())
+        await no_threads()
     del link, pending
     async with asyncio.timeout(PATIENCE_S):
         while len(open_descriptors()) > len(before):

@@ -16,7 +16,7 @@ import serial
 from gateway.link import BadUrl, CannotOpen, open_link, parse_url
 from gateway.link.tcp import connect_first
 from gateway.link.url import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
-from tests.gateway.link.peers import PtyPeer, link_threads
+from tests.gateway.link.peers import PtyPeer, no_threads
 
 
 @pytest.mark.parametrize(
@@ -114,13 +114,6 @@ def test_what_is_no_url_is_refused_with_what_is(text: str, why: str) -> None:
         "ble://AA:BB:CC:DD:EE:FF (on macOS the UUID that `gateway scan` shows), or ble://name=BT04"
     )
     assert "\n" not in words
-
-
-async def no_threads() -> None:
-    """Wait until the threads of links have ended."""
-    for thread in link_threads():
-        await asyncio.to_thread(thread.join, 20.0)
-        assert not thread.is_alive()
 
 
 async def refused(url: LinkUrl, timeout_s: float = 20.0) -> str:
