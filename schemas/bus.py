@@ -120,11 +120,12 @@ def accepts(endpoint: str, timeout_s: float = 1.0) -> bool:
         return False
 
 
-def ensure_hub(endpoint: str, timeout_s: float = 10.0) -> None:
+def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     """Start a hub if nothing accepts at a loopback endpoint, and wait until it does; raises BusError.
 
     The hub outlives its starter: it is a session leader of its own, so that Ctrl-C at a terminal does not take the bus
-    away before the cars are stopped. It ends by itself 10 s after its last link.
+    away before the cars are stopped. It ends by itself 10 s after its last link. A busy computer may take ten seconds
+    to start it.
     """
     if accepts(endpoint):
         return

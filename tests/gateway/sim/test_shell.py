@@ -500,7 +500,7 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Proce
     worlds: list[Sample] = []
     try:
         end = time.monotonic() + PATIENCE
-        with Bus.open(endpoint, start_hub=True) as bus:
+        with Bus.open(endpoint, start_hub=True, timeout_s=PATIENCE) as bus:
             bus.subscribe("mine/*/sim/truth", seen.append)
             bus.subscribe("mine/@sim/world", worlds.append)
             while not (seen and worlds):
@@ -536,7 +536,7 @@ def test_lamps_and_things_are_on_the_bus_too(started: list[Process]) -> None:
     seen: list[Sample] = []
     end = time.monotonic() + PATIENCE
     try:
-        with Bus.open(endpoint, start_hub=True) as bus:
+        with Bus.open(endpoint, start_hub=True, timeout_s=PATIENCE) as bus:
             bus.subscribe("fleet/@sim/world", seen.append)
             while not seen:
                 assert time.monotonic() < end
