@@ -34,8 +34,9 @@ cars:
 """
 LED: Final = {"red": (255, 0, 16), "green": (0, 255, 64), "blue": (0, 64, 255)}
 PATIENCE_S: Final = 30.0
-END_S: Final = 15.0
-"""How long a process may take to end: the longest stop recipe, its worst case, and a second."""
+"""What is to be so is waited for so long: on a busy machine a process takes 10 s to start, and news of it a second."""
+END_S: Final = 30.0
+"""How long a process may take to end: the longest stop recipe, its worst case, a second, and as long again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +88,8 @@ class Demo:
         return True
 
     def truly(self, car: str, field_name: str, value: object) -> bool:
-        """Wait until the simulated car's truth says so; False if it did not in ten seconds."""
-        return self.until(lambda: getattr(self.truth[car], field_name) == value, 10.0)
+        """Wait until the simulated car's truth says so; False if it did not in time."""
+        return self.until(lambda: getattr(self.truth[car], field_name) == value)
 
 
 @click.command(
@@ -194,6 +195,7 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
         seen = outcome.ok and run.truly(car, "led", colour)
         run.check(f"{car} LED", f"asked {colour}, truly {run.truth[car].led}", ok=seen)
 
+    run.until(lambda: len(client.get("*/sensor/range")) == len(CARS))
     readings = client.get("*/sensor/range")
     told = ", ".join(f"{reading.key} {reading.value.range_m:.2f} m" for reading in readings)
     run.check("sensors by key", told, ok=len(readings) == len(CARS))
@@ -214,21 +216,21 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):
         seen = run.truly(car, "mode", mode)
         run.check(f"{car} mode", f"asked {mode}, truly {run.truth[car].mode}", ok=seen)
-    seen = run.until(lambda: _state(client, "red", "mode").verdict == "confirmed", 5.0)
+    seen = run.until(lambda: _state(client, "red", "mode").verdict == "confirmed")
     run.check("red mode known", _state(client, "red", "mode").evidence, ok=seen)
 
     run.say("red's link is cut; meanwhile blue is driven by hand")
     _ask(simulator, {"car": "red", "fault": "link_drop"})
     start = (run.truth["blue"].x_m, run.truth["blue"].y_m)
-    outcome = client.car("blue").drive("forward", 0.5)
-    moved = run.until(lambda: (run.truth["blue"].x_m, run.truth["blue"].y_m) != start, 3.0)
-    stood = run.until(lambda: run.truth["blue"].motor_left == 0 == run.truth["blue"].motor_right, 5.0)
+    outcome = client.car("blue").drive("forward", 1.0)
+    moved = run.until(lambda: (run.truth["blue"].x_m, run.truth["blue"].y_m) != start)
+    stood = run.until(lambda: run.truth["blue"].motor_left == 0 == run.truth["blue"].motor_right)
     run.check(
         "blue driven",
         f"{outcome.words or outcome.phase}; moved {moved}, stopped by itself {stood}",
         ok=outcome.ok and moved and stood,
     )
-    lost = run.until(lambda: _state(client, "red", "link").state == "lost", 5.0)
+    lost = run.until(lambda: _state(client, "red", "link").state == "lost")
     run.check(
         "red cut",
         f"link {_state(client, 'red', 'link').state}, motors {_state(client, 'red', 'safety').motors}",
@@ -252,13 +254,13 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
         ", ".join(f"{each.car} {each.phase} in {each.took_s:.2f} s" for each in outcomes),
         ok=all(each.ok for each in outcomes),
     )
-    off = run.until(lambda: all(truth.motor_left == 0 == truth.motor_right for truth in run.truth.values()), 1.0)
+    off = run.until(lambda: all(map(_at_rest, run.truth.values())))
     run.check(
         "all motors off",
         str({car: (truth.motor_left, truth.motor_right) for car, truth in sorted(run.truth.items())}),
         ok=off,
     )
-    moved = run.until(lambda: any(truth.mode != "manual" for truth in run.truth.values()), 1.5)
+    moved = run.until(lambda: not all(map(_at_rest, run.truth.values())), 1.5)
     holds = {car: _state(client, car, "safety").hold.by for car in CARS}
     run.check(
         "held", f"on hold by {sorted(set(holds.values()))}, none moved again", ok=not moved and all(holds.values())
@@ -271,6 +273,10 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
 def _state(client: Fleet, car: str, name: str) -> Any:
     found = client.get(f"{car}/state/{name}")
     return found[0].value if found else messages.message_class(f"fleet.v1.{name.capitalize()}")()
+
+
+def _at_rest(truth: pb.Truth) -> bool:
+    return truth.mode == "manual" and truth.motor_left == 0 == truth.motor_right
 
 
 def _motors(client: Fleet) -> dict[str, str]:
