@@ -38,8 +38,8 @@ async def cars(tmp_path: Path) -> AsyncIterator[Simulation]:
     await simulation.stop()
 
 
-def open_port(simulation: Simulation, name: str = "red") -> serial.Serial:
-    return serial.Serial(simulation.cars[name].url.removeprefix("serial://"), timeout=0, write_timeout=0.2)
+def open_port(simulation: Simulation, name: str = "red", *, write_timeout: float = PATIENCE) -> serial.Serial:
+    return serial.Serial(simulation.cars[name].url.removeprefix("serial://"), timeout=0, write_timeout=write_timeout)
 
 
 def address(simulation: Simulation) -> tuple[str, int]:
@@ -52,7 +52,7 @@ def driving(simulation: Simulation, name: str = "red") -> bool:
 
 
 async def test_a_stuck_pty_lets_a_write_wait_and_loses_nothing(cars: Simulation) -> None:
-    with open_port(cars) as port:
+    with open_port(cars, write_timeout=0.2) as port:
         await cars.inflict(Fault(FaultKind.STUCK, "red"))
         with pytest.raises(serial.SerialTimeoutException):
             await asyncio.to_thread(port.write, RUN)
@@ -60,11 +60,10 @@ async def test_a_stuck_pty_lets_a_write_wait_and_loses_nothing(cars: Simulation)
         await until(lambda: data.extend(port.read(4096)) or b"CSB" in data, "its readings come all the same")
         assert not driving(cars)
         await cars.inflict(Fault(FaultKind.STUCK, "red", for_s=0))
+        port.write_timeout = PATIENCE
         port.write(RUN)
         await until(lambda: driving(cars), "it hears again")
         await cars.inflict(Fault(FaultKind.STUCK, "red", for_s=0.05))
-        assert port.write_timeout == 0.2
-        port.write_timeout = PATIENCE
         await asyncio.to_thread(port.write, STOP)
         await until(lambda: not driving(cars), "what waited has arrived")
 
@@ -73,7 +72,7 @@ async def test_a_stuck_pty_is_stuck_after_a_drop_too(cars: Simulation) -> None:
     await cars.inflict(Fault(FaultKind.STUCK, "red"))
     await cars.inflict(Fault(FaultKind.LINK_DROP, "red"))
     await cars.inflict(Fault(FaultKind.LINK_DROP, "red", for_s=0))
-    with open_port(cars) as port, pytest.raises(serial.SerialTimeoutException):
+    with open_port(cars, write_timeout=0.2) as port, pytest.raises(serial.SerialTimeoutException):
         await asyncio.to_thread(port.write, RUN)
 
 
