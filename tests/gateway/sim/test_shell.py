@@ -490,8 +490,7 @@ def test_bad_arguments(arguments: list[str], code: int, words: str) -> None:
 
 
 def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Process]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     sim = Process("--car", "red:arduino:pty", "--connect", endpoint, "--fleet", "mine")
     started.append(sim)
     link = sim.line()["link"]
@@ -527,8 +526,7 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Proce
 
 
 def test_lamps_and_things_are_on_the_bus_too(started: list[Process]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     world = str(Path(__file__).parents[3] / "deploy" / "world.follow.yaml")
     sim = Process("--car", "red:arduino:pty", "--world", world, "--connect", endpoint)
     started.append(sim)
