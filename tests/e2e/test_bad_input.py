@@ -104,6 +104,13 @@ def test_a_car_that_echoes_everything_says_nothing(fleet: Fleet) -> None:
         car.close()
 
 
+def plugged_in(kept: list[int]) -> Path:
+    """Another device; which it is. Of numbers the lowest that is free is given: those before ours are kept."""
+    master, slave = os.openpty()
+    kept += (master, slave)
+    return Path(os.ttyname(slave))
+
+
 def test_a_device_that_comes_back_as_another_number(fleet: Fleet, tmp_path: Path) -> None:
     """Its by-id path, a symlink, is what stays."""
     sim, (link,) = fleet.simulate(f"red:arduino:pty:{tmp_path / 'by-id'}")
@@ -114,8 +121,9 @@ def test_a_device_that_comes_back_as_another_number(fleet: Fleet, tmp_path: Path
     before = (tmp_path / "by-id").readlink()
     sim.say({"car": "red", "fault": "link_drop"})
     wait_for(lambda: fleet.state("link").state == "lost", "lost")
-    taken = os.openpty()  # somebody else is plugged in, and gets its number
+    taken: list[int] = []
     try:
+        wait_for(lambda: plugged_in(taken) == before or before.exists(), "somebody else gets its number")
         sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
         wait_for(lambda: not driving(sim), "it is stopped")
         assert (tmp_path / "by-id").readlink() != before
