@@ -19,7 +19,7 @@ from fleet.edit import CannotEdit, with_link
 from fleet.found import NewCar, new_file
 from fleet.marked import BadFile
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet, Process, TcpCar
+from tests.support.processes import Fleet, Process, TcpCar, wait_for
 from tests.support.terminal import Terminal
 
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -181,6 +181,7 @@ def test_a_bridge_is_connected_to_and_told_nothing(command: Command, tcp: TcpCar
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{platform: arduino, link: '{tcp.link}'}}}}")
     done = command("check")
     assert (done.returncode, done.stdout) == (0, f"red  ok   {tcp.link}: its bridge accepts connections\n")
+    wait_for(lambda: tcp.hung_up, "it is known what was sent")
     assert (tcp.connections, tcp.received) == (1, [])
 
 
@@ -234,7 +235,7 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
     assert done.returncode == 2
     assert "there already" in done.stderr
     assert (tmp_path / "fleet.yaml").read_text() == written
-    done = command("init", "--yes", "--force", "--seconds", "2", "--link", links[1])
+    done = command("init", "--yes", "--force", "--seconds", "5", "--link", links[1])
     assert done.returncode == 0, done.stderr
     assert list(read_fleet(tmp_path / "fleet.yaml").cars) == ["red"]
 

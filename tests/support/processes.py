@@ -227,6 +227,8 @@ class TcpCar:
         self.link = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
         self.received: list[bytes] = []
         self.connections = 0
+        self.hung_up = 0
+        """Connections whose other end has gone, all that it sent having been kept."""
         self._peers: list[socket.socket] = []
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -272,3 +274,4 @@ class TcpCar:
                 self.received += frames(data)
                 if self._echoes:
                     peer.sendall(data)
+        self.hung_up += 1
