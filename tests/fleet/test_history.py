@@ -47,14 +47,19 @@ class Remembered(Fleet):
 
         def measured() -> bool:
             self.car.send(b"$4WD,CSB5.00,PV7.91,GS214,LF1011,HW01,GM10#")
-            return bool(self.get("fleet/red/sensor/range"))
+            return self.newest_m() is not None
 
         wait_for(measured, "a distance is taken for measured")
         for number in range(SENT):
             self.car.send(b"$4WD,CSB%.2f,PV7.91,GS214,LF1011,HW01,GM10#" % centimetres(number))
             if number % AT_ONCE == AT_ONCE - 1:
                 newest = round(centimetres(number) / 100, 4)
-                wait_for(lambda newest=newest: self.get("fleet/red/sensor/range")[0].range_m == newest, "all have come")
+                wait_for(lambda newest=newest: self.newest_m() == newest, "all have come")
+
+    def newest_m(self) -> float | None:
+        """The last distance; None while the gateway gives none, or does not answer in time."""
+        found = [each.range_m for each in self.get("fleet/red/sensor/range") if not isinstance(each, str)]
+        return found[0] if found else None
 
     def close(self) -> None:
         super().close()
