@@ -38,6 +38,8 @@ LOOK_AGAIN_S: Final = 1.0
 AGAIN_S: Final = 10.0
 """Plan, assignment and decisions are published again so often, for a recording that began after them."""
 _ANSWERS_S: Final = 1.0
+_TRIES: Final = 3
+"""How often who has just begun asks: what a car did before counts, and its gateway may be held up for a moment."""
 _QUEUE: Final = 4096
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
@@ -103,8 +105,11 @@ class Coordinator:
         with ThreadPoolExecutor(max_workers=32) as pool:
             try:
                 self._listen(hearing, pool, wait_s=0.0)
-                self._ask_all()
-                self._listen(hearing, pool, wait_s=0.0)
+                for _ in range(_TRIES):
+                    self._ask_all()
+                    self._listen(hearing, pool, wait_s=0.0)
+                    if not hearing.unheard:
+                        break
                 now = time.monotonic()
                 self._memory = restored(self.plan, hearing.picture(()), keeper.load(), now, time.time())
                 while not ended():

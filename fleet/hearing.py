@@ -31,6 +31,11 @@ class Hearing:
         """The cars whose gateways are on the bus."""
         return frozenset(car for car, known in self.cars.items() if known.present)
 
+    @property
+    def unheard(self) -> frozenset[str]:
+        """Those of them of which not all that could forbid a command is known."""
+        return frozenset(car for car in self.present if not self.readings.get(car, {}).keys() >= set(NEEDED))
+
     def picture(self, busy: Iterable[str]) -> Picture:
         """What is known now; `busy`: the cars that something was asked of, with no outcome yet."""
         cars = {**self.cars, **{car: replace(self.cars[car], busy=True) for car in busy if car in self.cars}}
