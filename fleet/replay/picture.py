@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import click
 
-from fleet.replay.viewer import Viewer, free_port
+from fleet.replay.viewer import LOOK_S, Viewer, free_port
 
 SIZE: Final = "1920x1080"
 AT: Final = 0.75
@@ -55,7 +55,7 @@ def take(rrd: Path, out: Path, view: str = "") -> Shown:
     port = free_port()
     with tempfile.TemporaryDirectory() as home, _viewer(port, Path(home)) as viewer:
         try:
-            png, shown = _look(_connect(port), rrd, view)
+            png, shown = _look(_connect(viewer, port), rrd, view)
         except (RuntimeError, OSError, ValueError):  # its ways to say that nobody answers, or no more
             viewer.wait(SETTLE_S)
             raise NoPicture(
@@ -156,7 +156,7 @@ def _viewer(port: int, home: Path) -> Iterator[Viewer]:
         yield viewer
 
 
-def _connect(port: int) -> Any:
+def _connect(viewer: Viewer, port: int) -> Any:
     from rerun.experimental import ViewerClient
 
     deadline = time.monotonic() + UP_WITHIN_S
@@ -165,9 +165,8 @@ def _connect(port: int) -> Any:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
         except (RuntimeError, OSError, ValueError):  # how it says that nothing answers yet
-            if time.monotonic() > deadline:
+            if viewer.wait(LOOK_S) is not None or time.monotonic() > deadline:
                 raise
-            time.sleep(0.1)
         else:
             return client
 
