@@ -104,7 +104,7 @@ OF_A_RASPBERRY_PI: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
     ("platform", "recording", "known", "connected", "stopped"),
     [
         ("arduino+arm+imu", RECORDED, LAST, [b"#", MODE00, MODE00, STOP], [STOP, MODE00]),
-        ("raspberry_pi", OF_A_RASPBERRY_PI, b"", [STOP, STOP, STOP], [STOP, STOP, STOP]),
+        ("raspberry_pi", OF_A_RASPBERRY_PI, OF_A_RASPBERRY_PI[-1][0], [STOP, STOP, STOP], [STOP, STOP, STOP]),
     ],
     ids=["arduino", "raspberry_pi"],
 )
@@ -155,8 +155,13 @@ def test_a_tcp_server_that_knows_nothing_of_us(
     wait_for(lambda: len(tcp_car.received) == len(connected) + 2, "the drive, and its repetition")
     assert fleet.ask("stop")["status"] in TAKEN
     whole_life = [*connected, RUN, RUN, *stopped]
-    wait_for(lambda: tcp_car.send(known) or len(tcp_car.received) >= len(whole_life), "the stop")
-    fleet.ready()
+
+    def heard(so: bool) -> bool:  # of a car that is silent for three seconds it is not known whether it stands
+        tcp_car.send(known)
+        return so
+
+    wait_for(lambda: heard(len(tcp_car.received) >= len(whole_life)), "the stop")
+    wait_for(lambda: heard(fleet.state("safety").motors == "off"), "it stands")
     assert tcp_car.received == whole_life, "one write per frame, and no other"
     assert tcp_car.connections == 1
 
@@ -386,13 +391,14 @@ def test_a_joystick_that_dies_stops_the_car(fleet: Fleet) -> None:
     written: list[str] = []
     fleet.bus.subscribe("fleet/red/frame/tx", lambda sample: written.append(sample.message().why))  # type: ignore[attr-defined]
     joystick = fleet.start(str(Path(__file__).parent / "joystick.py"))
-    wait_for(lambda: written == ["command", "repeat"], "it drives, and a second of the stream has passed")
+    wait_for(lambda: written[-1:] == ["repeat"], "it drives, and a second of the stream has passed")
     assert driving(sim)
     joystick.end(signal.SIGKILL)
     wait_for(lambda: not driving(sim), "it stops", 8.0)
-    wait_for(lambda: records[-1].phase == "expired", "it is said")
-    assert [record.phase for record in records] == ["queued", "sent", "expired"]
-    assert records[-1].words == "its sender stick is gone"
+    wait_for(lambda: records[-1].words == "its sender stick is gone", "it is said")
+    # A gateway that stood for half a second has stopped the car before, and taken the stream anew.
+    assert [record.phase for record in records[-3:]] == ["queued", "sent", "expired"]
+    assert len(records) % 3 == 0
     assert records[-1].count > 1
 
 
