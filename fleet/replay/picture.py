@@ -102,8 +102,11 @@ def pictures(session: Path, folder: Path) -> dict[str, Shown]:
 
 
 def _loaded(client: Any) -> Any:
+    """Its state once it has all: a recording is there, and its time has an end, as soon as it has some of it."""
     deadline = time.monotonic() + UP_WITHIN_S
-    while not ((state := client.get_state()).recordings and state.recordings[0].timelines and state.views):
+    while (state := client.get_state()).loading or not (
+        state.recordings and state.recordings[0].timelines and state.views
+    ):
         if time.monotonic() > deadline:
             raise NoPicture("Rerun's viewer did not load the session")
         time.sleep(0.1)
