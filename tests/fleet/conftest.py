@@ -1,12 +1,13 @@
 """A fleet of real processes for the tests of a module: three simulated cars with their gateways, all at rest."""
 
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from fleet.outcome import NotCarriedOut, Outcome
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, Process, wait_for
 
@@ -41,6 +42,19 @@ def running(command: list[str]) -> "Iterator[subprocess.Popen[str]]":
             yield process
         finally:
             process.kill()
+
+
+def asked(drive: Callable[[], Outcome]) -> Outcome:
+    """What became of a drive; one that is half a second old when it arrives is refused with `ask again`: it is."""
+    while True:
+        try:
+            outcome = drive()
+        except NotCarriedOut as refused:
+            outcome = refused.outcome
+            if outcome.reason != "stale":
+                raise
+        if outcome.reason != "stale":
+            return outcome
 
 
 @pytest.fixture(scope="module")

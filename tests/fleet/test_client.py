@@ -16,7 +16,7 @@ from fleet.verbs import led_request
 from schemas import keys, messages, topics
 from schemas.bus import BadEndpoint, Bus, NoFleet, reply
 from schemas.gen import fleet_v1_pb2 as pb
-from tests.fleet.conftest import LONG_S, Cars
+from tests.fleet.conftest import LONG_S, Cars, asked
 from tests.support.ports import free_endpoint
 from tests.support.processes import driving, wait_for
 
@@ -38,7 +38,7 @@ def test_a_command_is_carried_out_and_seen_in_the_car(client: Fleet, cars: Cars)
 
 
 def test_a_drive_that_is_waited_for_ends_complete_and_not_before_its_time(client: Fleet, cars: Cars) -> None:
-    outcome = client.car("green").drive("forward", 0.7)
+    outcome = asked(lambda: client.car("green").drive("forward", 0.7))
     assert (outcome.ok, outcome.phase) == (True, "complete")
     assert outcome.took_s >= 0.7
     wait_for(lambda: not driving(cars.sim, "green"), "green stands")
@@ -46,7 +46,7 @@ def test_a_drive_that_is_waited_for_ends_complete_and_not_before_its_time(client
 
 def test_a_stop_supersedes_a_drive_and_is_waited_for_until_it_is_complete(client: Fleet, cars: Cars) -> None:
     ended: list[object] = []
-    drive = threading.Thread(target=lambda: ended.append(client.car("blue").drive("forward", LONG_S)))
+    drive = threading.Thread(target=lambda: ended.append(asked(lambda: client.car("blue").drive("forward", LONG_S))))
     drive.start()
     wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
     (outcome,) = client.stop(["blue"])
@@ -95,7 +95,7 @@ def test_whoever_goes_while_driving_leaves_no_car_driving(cars: Cars) -> None:
     events: list[Any] = []
     cars.bus.subscribe("fleet/blue/event/command", lambda sample: events.append(sample.message()))
     with Fleet(cars.endpoint, sender="gone", kind="script") as client:
-        assert client.car("blue").drive("forward", LONG_S, wait=False).ok
+        assert asked(lambda: client.car("blue").drive("forward", LONG_S, wait=False)).ok
         wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
     wait_for(lambda: not driving(cars.sim, "blue"), "blue stands")
     ended = wait_for(

@@ -11,7 +11,7 @@ import pytest
 
 from fleet.client import Fleet
 from schemas import bus
-from tests.fleet.conftest import LONG_S, Cars
+from tests.fleet.conftest import LONG_S, Cars, asked
 from tests.support.processes import Process, wait_for
 
 PLAN = """
@@ -84,7 +84,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
         lines.until("red", "tracking", "role tracking")
         wait_for(lambda: truth(cars, "red") == "tracking", "red tracks again")
         # A rule.
-        drive = threading.Thread(target=lambda: client.car("green").drive("spin_left", LONG_S))
+        drive = threading.Thread(target=lambda: asked(lambda: client.car("green").drive("spin_left", LONG_S)))
         drive.start()
         ruled = lines.until("red", "light_seeking", "rule 1")
         assert re.match(r"green/state/motion motion=spin_left \(\d+\.", ruled["readings"][0])

@@ -9,7 +9,7 @@ import pytest
 
 import fleet.examples
 from fleet import Fleet
-from tests.fleet.conftest import LONG_S, Cars
+from tests.fleet.conftest import LONG_S, Cars, asked
 from tests.support.processes import driving, wait_for
 
 EXAMPLES = Path(fleet.examples.__file__).parent
@@ -62,11 +62,11 @@ def test_follow_the_leader(cars: Cars) -> None:
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
         process = cars.start("-m", "fleet.examples.follow_the_leader", "red", "blue")
         wait_for(lambda: cars.state("safety", "blue").HasField("lease"), "blue is the example's")
-        mia.car("red").drive("forward", LONG_S, wait=False).check()
+        asked(lambda: mia.car("red").drive("forward", LONG_S, wait=False)).check()
         wait_for(lambda: driving(cars.sim, "blue"), "blue does as red does")
         mia.car("red").drive("stop").check()
         wait_for(lambda: not driving(cars.sim, "blue"), "and stops with it")
-        mia.car("red").drive("forward", LONG_S, wait=False).check()
+        asked(lambda: mia.car("red").drive("forward", LONG_S, wait=False)).check()
         wait_for(lambda: driving(cars.sim, "blue"), "blue drives again")
         assert process.end(signal.SIGINT) == 0, process.stderr
         assert not driving(cars.sim, "blue")

@@ -13,7 +13,7 @@ from fleet.client import Car
 from fleet.lease import Ours
 from fleet.outcome import Outcome
 from schemas.gen import fleet_v1_pb2 as pb
-from tests.fleet.conftest import LONG_S, Cars
+from tests.fleet.conftest import LONG_S, Cars, asked
 from tests.support.processes import driving, wait_for
 
 # ---------------------------------------------------------------- whether it is ours
@@ -101,7 +101,7 @@ def holder(cars: Cars, car: str) -> str:
 
 def test_a_leased_car_drives_and_is_given_back(fleet: Fleet, cars: Cars) -> None:
     with fleet.car("red").lease() as car:
-        assert car.drive("forward", 0.5).phase == "complete"
+        assert asked(lambda: car.drive("forward", 0.5)).phase == "complete"
         assert holder(cars, "red") == "bot"
     assert holder(cars, "red") == ""
 
@@ -120,7 +120,7 @@ def test_it_is_held_as_long_as_the_block_runs(fleet: Fleet, cars: Cars) -> None:
 def test_the_car_stops_on_any_exit(fleet: Fleet, cars: Cars, error: type[BaseException]) -> None:
     def block() -> None:
         with fleet.car("blue").lease() as car:
-            car.drive("forward", LONG_S, wait=False)
+            asked(lambda: car.drive("forward", LONG_S, wait=False))
             wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
             raise error
 
@@ -155,9 +155,9 @@ def test_a_person_takes_a_car_and_keeps_it(fleet: Fleet, cars: Cars) -> None:
 
         def block() -> None:
             with fleet.car("red").lease() as car:
-                car.drive("spin_left", LONG_S, wait=False)
+                asked(lambda: car.drive("spin_left", LONG_S, wait=False))
                 wait_for(lambda: driving(cars.sim, "red"), "red drives")
-                mia.car("red").drive("forward", LONG_S, wait=False).check()
+                asked(lambda: mia.car("red").drive("forward", LONG_S, wait=False)).check()
                 go_on(car)
 
         with pytest.raises(LeaseLost, match=TAKEN.format("red")):
