@@ -17,6 +17,9 @@ R = TypeVar("R")
 LONGEST_DRIVE_S: Final = 3600.0
 """No gateway allows more; each allows 10 s unless it was started with a longer `--longest-drive`."""
 
+STOP_TTL_S: Final = 10.0
+"""How old a stop may be when it arrives: a drive that was held up is refused after 0.5 s, its end is wanted still."""
+
 
 @dataclass(frozen=True, slots=True)
 class Request:
@@ -41,6 +44,7 @@ def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) ->
         )
     message = pb.DriveCommand(motion=motion, duration_s=duration_s)
     if motion == "stop":
+        message.ttl_s = STOP_TTL_S
         return Request("drive", message, Until.STOPPED)
     return Request("drive", message, Until.OVER if wait else Until.SENT, duration_s)
 

@@ -33,13 +33,21 @@ def run(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
 def driven(cars: Cars, *names: str) -> "Iterator[subprocess.Popen[str]]":
     """`fleet drive`, for long, when all of these cars drive."""
     command = [*FLEET, "drive", ",".join(names), "forward", "--for", LONG, "--connect", cars.endpoint]
+    events: list[Any] = []
+    cars.bus.subscribe("fleet/*/event/command", lambda sample: events.append(sample.message()))
+
+    def refused() -> bool:
+        return any(each.reason == "stale" for each in events)
+
     while True:
         with running(command) as drive:
-            wait_for(lambda: drive.poll() is not None or all(driving(cars.sim, car) for car in names), "they drive")
-            if drive.poll() is None:
+            wait_for(lambda: refused() or all(driving(cars.sim, car) for car in names), "they drive")
+            if not refused():
                 yield drive
                 return
-            assert STALE in drive.communicate()[1]
+            drive.send_signal(signal.SIGINT)  # of the others, if there are any
+            drive.communicate(timeout=60)
+            events.clear()
 
 
 def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
