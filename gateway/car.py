@@ -32,7 +32,7 @@ from gateway.neighbours import Neighbours
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Event, Rejected
-from gateway.publish import RAW_PER_S, STALLED_S, Publications, wall_ns
+from gateway.publish import RAW_PER_S, STALLED_S, Publications
 from gateway.store import Store
 from schemas import bus, ending, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
@@ -276,7 +276,7 @@ class Car:
         """Publish what was measured, which does not wait for what it means, and take it as evidence."""
         for event in events:
             confirmed = self._control.mode.confirmed
-            if not self._out.event(event, wall_ns(event.at), confirmed, loaded=self._control.motors != "off"):
+            if not self._out.event(event, confirmed, loaded=self._control.motors != "off"):
                 self._flood("raw_not_published", 1, event.at)
             self._control.heard(event, self._loop.time())
             self._out.profile = self._control.profile
@@ -336,8 +336,9 @@ class Car:
                 await link.write(write.data)
             except LinkLost as error:
                 reason = f"a write failed: {error}"
-                self._out.written(write, time.time_ns(), whole=False)
-                self._control.write_failed(reason, self._loop.time())
+                now = self._loop.time()
+                self._out.written(write, now, whole=False)
+                self._control.write_failed(reason, now)
                 if self._link is link:  # what reads it may have met its end first
                     self._lost(reason)
                 await link.close()  # what reads it wakes, and opens it again
@@ -345,7 +346,7 @@ class Car:
             now = self._loop.time()
             self._control.wrote(write, now)
             self._health.wrote(len(write.data), now)
-            self._out.written(write, wall_ns(now), whole=True)
+            self._out.written(write, now, whole=True)
 
     # ------------------------------------------------------------------ commands
 

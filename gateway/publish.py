@@ -23,15 +23,16 @@ from gateway.history import BadRange, Ring
 from gateway.protocol.measured import measured, verdict_of
 from gateway.protocol.readings import Event
 from gateway.protocol.values import Mode
+from gateway.wall import Wall
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
 VERSION: Final = "0.1.0"
 _STATM: Final = Path("/proc/self/statm")
 STATE_EVERY_S: Final = 1.0
+"""States are published on change and once a second (design.md, "Keys")."""
 SLICE: Final = 50
 """Answers to a query without a pause: 3 ms as JSON."""
-"""States are published on change and once a second (design.md, "Keys")."""
 BACK_S: Final = 1.0
 """After the bus was away its other clients, a recorder above all, need so long to be back."""
 STALLED_S: Final = 1.0
@@ -48,11 +49,6 @@ _CLASSES: Final[dict[str, Any]] = {
 }
 """A message is made anew each time: one that is cleared and filled again keeps what it held before in memory."""
 _LEVELS: Final = {Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
-
-
-def wall_ns(at: float) -> int:
-    """The wall clock, ns since the epoch, at moment `at` of the loop's monotonic clock."""
-    return time.time_ns() - int((time.monotonic() - at) * 1e9)
 
 
 class Publications:
@@ -76,6 +72,7 @@ class Publications:
             self._publishers[topic.name] = opened.publisher(key, topic, car)
             if topic.kept:
                 self._rings[topic.name] = Ring(topic.kept)
+        self._wall = Wall()
         self._raw = Allowance(RAW_PER_S, RAW_AT_ONCE)
         self._process = _Process()
         self._away_at = float("-inf")
@@ -86,11 +83,12 @@ class Publications:
 
     # ------------------------------------------------------------------ readings
 
-    def event(self, event: Event, stamp_ns: int, confirmed: Mode | None, *, loaded: bool) -> bool:
+    def event(self, event: Event, confirmed: Mode | None, *, loaded: bool) -> bool:
         """Publish what was measured in an event, then its raw frame; False if there were too many of those.
 
         `loaded`: motors may pull the battery down.
         """
+        stamp_ns = self._wall.ns(event.at)
         published: list[str] = []
         for name, fields in measured(event, self.profile, confirmed).items():
             message = _CLASSES[name]()
@@ -119,14 +117,14 @@ class Publications:
 
     # ------------------------------------------------------------------ frames out, records
 
-    def written(self, write: Write, stamp_ns: int, *, whole: bool) -> None:
+    def written(self, write: Write, at: float, *, whole: bool) -> None:
         """Publish a frame that was written, or was not."""
         frame = _CLASSES["frame/tx"]()
         frame.data = write.data
         frame.command_id = write.command_id
         frame.why = write.why
         frame.written = whole
-        self._publishers["frame/tx"].put(frame, stamp_ns)
+        self._publishers["frame/tx"].put(frame, self._wall.ns(at))
 
     def command(self, record: CommandRecord, request: tuple[bytes, str] | None) -> None:
         """Publish one transition of a command; the first carries the request as it came."""
@@ -151,7 +149,7 @@ class Publications:
     def log(self, record: LogRecord) -> None:
         """Publish a notable event as foxglove.Log."""
         message: Any = messages.message_class("foxglove.Log")()
-        message.timestamp.seconds, message.timestamp.nanos = divmod(wall_ns(record.at), 1_000_000_000)
+        message.timestamp.seconds, message.timestamp.nanos = divmod(self._wall.ns(record.at), 1_000_000_000)
         message.level = _LEVELS[record.level]
         message.name = f"{self._car} {record.code}"
         message.message = record.words
@@ -159,7 +157,7 @@ class Publications:
 
     def _record(self, name: str, message: Any, at: float) -> None:
         """Publish what explains afterwards what happened; while the bus is away it waits."""
-        publisher, stamp_ns = self._publishers[name], wall_ns(at)
+        publisher, stamp_ns = self._publishers[name], self._wall.ns(at)
         if not self._kept and at > self._away_at + BACK_S:
             publisher.put(message, stamp_ns)
             return
@@ -228,7 +226,7 @@ class Publications:
 
     def _put_state(self, name: str, message: Any, now: float) -> None:
         self._told_at[name] = now
-        stamp_ns = wall_ns(now)
+        stamp_ns = self._wall.ns(now)
         self._rings[name].add(stamp_ns, self._publishers[name].put(message, stamp_ns))
 
     # ------------------------------------------------------------------ queries

@@ -21,7 +21,7 @@ def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
         with Bus.open(fleet.endpoint) as opened:
             out = Publications(opened, "fleet", "red", Controller("red", parse_platform("arduino")), "tcp://x")
             for number in range(3 * SLICE + 1):
-                out.event(ImuReading(b"", float(number), (number, 0, 0), (0, 0, 0)), number + 1, None, loaded=False)
+                out.event(ImuReading(b"", float(number), (number, 0, 0), (0, 0, 0)), None, loaded=False)
             pauses: queue.Queue[int] = queue.Queue()
 
             def answer(query: zenoh.Query) -> None:

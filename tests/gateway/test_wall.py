@@ -1,0 +1,73 @@
+"""Stamps of moments: their order is theirs, whatever kept the process from running meanwhile."""
+
+import itertools
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from gateway.wall import STEP_NS, TRIES, Wall
+
+EPOCH_NS = 1_795_000_000_000_000_000
+MS = 1_000_000
+
+
+class Clocks:
+    """A monotonic clock and a wall clock; each look takes as long as `takes` says next, in ns."""
+
+    def __init__(self, takes: Iterator[int]) -> None:
+        self.now = 5_000 * MS
+        self.ahead = EPOCH_NS
+        self._takes = takes
+
+    def monotonic_ns(self) -> int:
+        self.now += next(self._takes)
+        return self.now
+
+    def wall_ns(self) -> int:
+        self.now += next(self._takes)
+        return self.now + self.ahead
+
+
+def _wall(takes: Callable[[int], int] = lambda look: 50) -> tuple[Clocks, Wall]:
+    clocks = Clocks(map(takes, itertools.count()))
+    return clocks, Wall(clocks.monotonic_ns, clocks.wall_ns)
+
+
+def test_a_moment_has_its_wall_time() -> None:
+    clocks, wall = _wall()
+    assert wall.ns(clocks.now / 1e9) == pytest.approx(clocks.now + EPOCH_NS, abs=1_000)
+    assert wall.ns(4.0) == pytest.approx(4_000 * MS + EPOCH_NS, abs=1_000)
+
+
+@pytest.mark.parametrize("held_up", [0, 1, 2])
+def test_a_process_that_is_held_up_between_two_looks_gives_one_moment_one_stamp(held_up: int) -> None:
+    """At each look in turn, once in a while, for 0.3 s."""
+    clocks, wall = _wall(lambda look: 300 * MS if look % 99 == held_up + 33 else 50)
+    stamps = {wall.ns(4.0) for _ in range(300)}
+    assert len(stamps) == 1
+    assert stamps.pop() == pytest.approx(4_000 * MS + EPOCH_NS, abs=1_000)
+    assert clocks.now > 5_000 * MS + 3 * 300 * MS
+
+
+def test_a_process_that_is_always_held_up_is_not_wrong_by_more_than_that() -> None:
+    _, wall = _wall(lambda look: 20 * MS)
+    for _ in range(TRIES):
+        assert wall.ns(4.0) == pytest.approx(4_000 * MS + EPOCH_NS, abs=20 * MS)
+
+
+@pytest.mark.parametrize("step", [-3_600_000 * MS, -3 * MS, 3 * MS, 3_600_000 * MS])
+def test_a_wall_clock_that_is_set_is_followed_at_once(step: int) -> None:
+    clocks, wall = _wall()
+    before = wall.ns(4.0)
+    clocks.ahead += step
+    assert wall.ns(4.0) - before == pytest.approx(step, abs=1_000)
+
+
+def test_a_slewed_wall_clock_is_followed_in_steps() -> None:
+    clocks, wall = _wall()
+    stamps = []
+    for _ in range(1_000):  # 10 us at a time, 10 ms in all
+        clocks.ahead += MS // 100
+        stamps.append(wall.ns(4.0) - 4_000 * MS)
+        assert clocks.ahead - stamps[-1] <= STEP_NS + 1_000
+    assert 4 <= len(set(stamps)) <= 6
