@@ -1,18 +1,20 @@
 """Asking publishers again for what a recorder missed: when, and for how long back. What is new is tape.py's to say.
 
-Publishers hold ten seconds at their topic's rate, a hundred publications at least (`Topic.held`). They are asked after
-a hub was away, after a gap in their numbers, and by a recorder that goes on for one that was killed.
+Publishers hold ten seconds at their topic's rate, a hundred publications at least (`Topic.held`): of a state minutes,
+of an event hours. They are asked after a hub was away, after a gap in their numbers, and by a recorder that goes on for
+one that was killed.
 """
 
 import threading
 import time
+from collections import deque
 from collections.abc import Collection, Sequence
 from typing import Final
 
 import zenoh
 
+from fleet.recording.before import TAIL_S
 from schemas.bus import Bus
-from schemas.topics import HELD_S
 
 LOOK_S: Final = 0.2
 AFTER_START_S: Final = (1.0,)
@@ -20,8 +22,8 @@ AFTER_START_S: Final = (1.0,)
 AFTER_HUB_S: Final = (0.3, 1.0, 2.0, 4.0)
 """Others are back later than we are: clients try again after half a second at most, and may be held up."""
 AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
-BEFORE_S: Final = 2.0
-"""A link is gone for so long before it is noticed (Zenoh's lease)."""
+LOOKS: Final = round(2.0 / LOOK_S)
+"""A link is gone for two seconds before it is noticed (Zenoh's lease): in looks, since who stands still has none."""
 FEW: Final = 16
 """Of more keys than that everything is asked at once."""
 MOST: Final = 200_000
@@ -42,7 +44,7 @@ class Recall:
         self._thread = threading.Thread(target=self._run, name="recall")
         now = time.monotonic()
         self._due = [now + after for after in ((0.0,) if follows else ()) + AFTER_START_S]
-        self._from = now - (HELD_S if follows else 0.0)
+        self._from = now - (TAIL_S if follows else 0.0)
         self._every = True
         self._keys: set[str] = set()
 
@@ -67,19 +69,21 @@ class Recall:
         return found
 
     def _run(self) -> None:
-        hubs, seen = self._bus.hubs, time.monotonic()
+        hubs = self._bus.hubs
+        looks = deque([time.monotonic()], LOOKS)
+        whole_at = looks[0]
         while not self._closing.wait(LOOK_S):
             now, there = time.monotonic(), self._bus.hubs
             with self._lock:
                 gaps, self._gaps = self._gaps, set()
             if gaps:
-                self._plan(AFTER_GAP_S, now - BEFORE_S, gaps)
+                self._plan(AFTER_GAP_S, looks[0], gaps)
             if there and there != hubs:
-                self._plan(AFTER_HUB_S, seen - BEFORE_S, None)
+                self._plan(AFTER_HUB_S, whole_at, None)
+            hubs = there
             if there:
-                hubs, seen = there, now
-            else:
-                hubs = ()
+                whole_at = looks[0]
+            looks.append(now)
             if there and self._due and self._due[0] <= now:
                 self._due = [due for due in self._due if due > now]
                 self._ask_now()
@@ -88,7 +92,7 @@ class Recall:
         with self._lock:
             gaps = self._gaps
         if gaps or self._due:
-            self._plan((), time.monotonic() - BEFORE_S, gaps or None)
+            self._plan((), looks[0], gaps or None)
             self._ask_now()
 
     def _plan(self, after: Sequence[float], since: float, keys: set[str] | None) -> None:
@@ -101,7 +105,7 @@ class Recall:
             self._keys |= keys
 
     def _ask_now(self) -> None:
-        last_s = min(time.monotonic() - self._from, 2 * HELD_S)
+        last_s = time.monotonic() - self._from
         every = self._every or len(self._keys) > FEW
         for expression in self._all if every else sorted(self._keys):
             found = []

@@ -1,6 +1,7 @@
 """What tests/e2e/test_recorder_kills.py does, many times and with more cars; the recorder's memory."""
 
 import random
+import signal
 import time
 from functools import partial
 from pathlib import Path
@@ -9,12 +10,13 @@ import pytest
 
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
-from tests.support.lossless import hub_killed, recorder_killed
+from tests.support.lossless import all_there, fleet_back, hub_killed, recorder_killed
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, wait_for
-from tests.support.recording import Recording
+from tests.support.recording import Load, Recording, faults
 
 CARS = 20
+AWAY_S = 30.0
 MESSAGES = 10_000_000
 PUBLISHERS = 40
 AT_ONCE = 50
@@ -33,6 +35,30 @@ def test_the_hub_killed_twenty_times(tmp_path: Path) -> None:
     finally:
         fleet.close()
     print(f"\n{told.published} published over 20 kills of the hub, {told.recovered} had again; none lost, none twice")
+
+
+@pytest.mark.soak
+def test_what_publishers_hold_is_had_again_however_long_the_hub_was_away(tmp_path: Path) -> None:
+    """Of what comes twice a second a hundred seconds are held."""
+    fleet = Fleet(free_endpoint(), tmp_path)
+    try:
+        recording = Recording(fleet, tmp_path / "sessions")
+        with Load(fleet.endpoint, CARS, rate_hz=2.0) as load:
+            wait_for(lambda: load.count() > 4 * CARS, "a load")
+            recording.process.popen.send_signal(signal.SIGSTOP)  # it would start another
+            fleet.hub.kill()
+            fleet.hub.wait()
+            time.sleep(AWAY_S)
+            recording.process.popen.send_signal(signal.SIGCONT)
+            fleet_back(fleet, CARS)
+            load.rest()
+            all_there(load, [recording.session])
+            last = recording.end()
+        assert faults(load, [recording.session]) == ({}, {})
+        assert (last["drops"], last["missed"]) == ({}, {})
+    finally:
+        fleet.close()
+    print(f"\n{load.count()} published, the hub and the recorder away for {AWAY_S:g} s; none lost, none twice")
 
 
 @pytest.mark.soak

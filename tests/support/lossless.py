@@ -13,7 +13,7 @@ from fleet.recording.sessions.making import recover
 from fleet.recording.sessions.verify import verify
 from schemas.bus import BusError
 from tests.support.processes import Fleet, wait_for
-from tests.support.recording import Load, Recording, faults, kill_hub, numbers
+from tests.support.recording import RATE_HZ, Load, Recording, faults, kill_hub, numbers
 
 SECOND_S = 1.0
 LONGEST_S = 4.0
@@ -35,10 +35,12 @@ class Told:
     """Of each session that was cut off: how long before the kill it ends."""
 
 
-def hub_killed(fleet: Fleet, out: Path, *, cars: int, times: int, chance: random.Random) -> Told:
+def hub_killed(
+    fleet: Fleet, out: Path, *, cars: int, times: int, chance: random.Random, rate_hz: float = RATE_HZ
+) -> Told:
     """Kill the hub so often: nothing is lost, nothing is there twice, and nothing is said to be."""
     recording = Recording(fleet, out)
-    with Load(fleet.endpoint, cars) as load:
+    with Load(fleet.endpoint, cars, rate_hz) as load:
         wait_for(lambda: load.count() > 4 * cars, "a load")
         for _ in range(times):
             kill_hub(fleet, chance)

@@ -24,9 +24,13 @@ READING = b"$4WD,CSB33,PV8.2,GS214,LF0110,HW00,GM00#"
 
 
 class Load:
-    """Cars that track a line: from each, for every frame a reading and the frame, from threads of their own."""
+    """Cars that track a line: from each, for every frame a reading and the frame, from threads of their own.
 
-    def __init__(self, endpoint: str, cars: int) -> None:
+    What is slower than its topic (27 Hz) is held for longer than ten seconds.
+    """
+
+    def __init__(self, endpoint: str, cars: int, rate_hz: float = RATE_HZ) -> None:
+        self._rate_hz = rate_hz
         self.sent: dict[str, list[int]] = {}
         """By key: when each was published, ns since the epoch; the first has number 1."""
         self._over = threading.Event()
@@ -73,7 +77,7 @@ class Load:
                 for lines, frames in pairs:
                     self._put(lines, line)
                     self._put(frames, frame)
-                due += 1 / RATE_HZ
+                due += 1 / self._rate_hz
 
     def _publisher(self, bus: Bus, car: str, topic: str) -> Publisher:
         made = bus.publisher(keys.topic_key("fleet", car, topic), TOPICS[topic], car)
