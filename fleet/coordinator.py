@@ -20,7 +20,7 @@ from fleet.outcome import Outcome
 from fleet.policy.check import faults
 from fleet.policy.decide import Ask, Step, step
 from fleet.policy.decision import LEFT_ALONE, Decision
-from fleet.policy.memory import Memory, carried, restored, to_keep
+from fleet.policy.memory import Memory, carried, hub_back, restored, to_keep
 from fleet.policy.picture import CarPicture, Refused, topic_of
 from fleet.policy.plan import Plan
 from fleet.policy.reader import parse
@@ -101,7 +101,7 @@ class Coordinator:
         bus.queryable(keys.command_key(fleet, keys.COORDINATOR, PLAN_VERB), self._put)
         again_at = time.monotonic() + AGAIN_S
         look_again_at: float | None = time.monotonic() + LOOK_AGAIN_S
-        linked_at = time.monotonic()
+        hubs, linked_at = bus.hubs, time.monotonic()
         with ThreadPoolExecutor(max_workers=32) as pool:
             try:
                 self._listen(hearing, pool, wait_s=0.0)
@@ -113,11 +113,17 @@ class Coordinator:
                 now = time.monotonic()
                 self._memory = restored(self.plan, hearing.picture(()), keeper.load(), now, time.time())
                 while not ended():
-                    self._turn(hearing, pool, now)
-                    keeper.save(to_keep(self.plan, self._memory, now, time.time()))
+                    there = bus.hubs  # before it listens: who went with the last hub has been told then
                     self._listen(hearing, pool)
                     now = time.monotonic()
-                    linked_at = now if bus.connected else self._see_to_hub(linked_at, now)
+                    if not there:
+                        linked_at = self._see_to_hub(linked_at, now)
+                        continue
+                    if there != hubs:
+                        hubs, self._memory = there, hub_back(self._memory, now)
+                    linked_at = now
+                    self._turn(hearing, pool, now)
+                    keeper.save(to_keep(self.plan, self._memory, now, time.time()))
                     if look_again_at is not None and now >= look_again_at:
                         look_again_at = None
                         self._yield_to_the_first()

@@ -8,7 +8,7 @@ from fleet.policy.decision import Decision
 from fleet.policy.picture import NOBODY, Picture
 from fleet.policy.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
-from fleet.policy.steady import Settled, Steady
+from fleet.policy.steady import HYSTERESIS_S, Settled, Steady
 from gateway.protocol.values import Mode
 
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
@@ -84,6 +84,16 @@ class Memory:
     def roles(self) -> dict[str, str]:
         """The role of each car."""
         return {car: held.role for car, held in self.held.items()}
+
+
+HUB_BACK_S: Final = 5.0
+"""So long after a hub was away roles are kept for cars whose gateways are not back at it: they try again every half
+second, and may be held up."""
+
+
+def hub_back(memory: Memory, now: float) -> Memory:
+    """What counts when there is a hub again: without one nobody could be heard, and nobody was lost for that."""
+    return replace(memory, gone_since=dict.fromkeys(memory.held, now + HUB_BACK_S - HYSTERESIS_S))
 
 
 def carried(memory: Memory, before: Plan, after: Plan) -> Memory:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.policy.decide import step
-from fleet.policy.memory import Memory, carried, restored, to_keep
+from fleet.policy.memory import HUB_BACK_S, Memory, carried, hub_back, restored, to_keep
 from fleet.policy.picture import CarPicture, Picture, Refused
 from fleet.policy.reader import parse
 from tests.fleet.policy.cars import GONE, HERE, Run
@@ -182,6 +182,26 @@ rules:
     run.at(1.0)
     assert run.of("blue").mode == "obstacle_avoidance"
     assert run.of("blue").readings == ("red/sensor/range range_m=0.2 (1.0 s old)",)
+
+
+@pytest.mark.parametrize(("back_s", "kept"), [(0.3, True), (HUB_BACK_S - 0.2, True), (HUB_BACK_S + 0.2, False)])
+def test_after_a_hub_was_away_a_role_waits_for_the_car_that_is_back_last(back_s: float, kept: bool) -> None:
+    """Without one the coordinator decides nothing; a car that nobody could hear was not lost."""
+    run = Run(ONE, "blue", "green", "red")
+    run.until(1.0)
+    (scout,) = run.roles
+    here = dict(run.cars)
+    run.cars = dict.fromkeys(here, GONE)
+    run.at(1.1)
+    run.memory = hub_back(run.memory, 9.0)
+    for car in here.keys() - {scout}:
+        run.cars[car] = here[car]
+    run.now = 9.0
+    run.until(9.0 + back_s)
+    run.cars[scout] = here[scout]
+    run.until(20.0)
+    assert (run.roles == {scout: "scout"}) is kept
+    assert (len(run.asked) == 1) is kept
 
 
 def test_phases_follow_conditions_and_time_outs() -> None:
