@@ -22,7 +22,7 @@ SIZE: Final = "1920x1080"
 AT: Final = 0.75
 """Of the session's time: where the cursor is."""
 UP_WITHIN_S: Final = 30.0
-DRAWN_WITHIN_S: Final = 30.0
+DRAWN_WITHIN_S: Final = 120.0
 SETTLE_S: Final = 1.0
 """The viewer offers no sign that it has drawn everything: two pictures so far apart that are the same are one."""
 DRIVERS: Final = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
