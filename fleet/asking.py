@@ -23,17 +23,18 @@ class Over:
         self.words = words
 
 
-class Gone:
-    """The gateway of a car went."""
+class Token:
+    """The gateway of a car came onto the bus, or went."""
 
-    def __init__(self, car: str) -> None:
+    def __init__(self, car: str, *, alive: bool) -> None:
         self.car = car
+        self.alive = alive
 
 
 CLOSED: Final = Over("", "")
 
 Item = tuple[float, Any]
-"""When it came (monotonic s), and a Sample (an answer), a CommandEvent, Over, or Gone."""
+"""When it came (monotonic s), and a Sample (an answer), a CommandEvent, Over, or Token."""
 
 
 class Asking:
@@ -71,7 +72,7 @@ class Asking:
             now = time.monotonic()
             for progress in waiting:
                 if now >= progress.deadline and self._hubs() != self._hubs_then:
-                    progress.stays()
+                    progress.token(now, alive=True)  # it was the hub that went
                 if now >= progress.deadline and self.inbox.empty():  # we may have slept while the answer came
                     progress.give_up(now)
             until = min((each.deadline for each in waiting), default=now + ANSWER_S)
@@ -96,9 +97,9 @@ class Asking:
             key = keys.parse(item.key)
             if key is not None:
                 self._answer(self._of(key.car), item, at)
-        elif isinstance(item, Gone):
+        elif isinstance(item, Token):
             if item.car in self._progress:
-                self._progress[item.car].gone(at)
+                self._progress[item.car].token(at, alive=item.alive)
         else:
             self._of(item.car).event(item.phase, item.reason, item.words, item.worst_case_s, at)
 

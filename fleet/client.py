@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from typing import Any, Final, Self
 
 from fleet import history
-from fleet.asking import ANSWER_S, CLOSED, Asking, Gone, Item, Over
+from fleet.asking import ANSWER_S, CLOSED, Asking, Item, Over, Token
 from fleet.condition import Condition
 from fleet.lease import Lease
 from fleet.outcome import Outcome
@@ -254,11 +254,9 @@ class Fleet:
 
     def _gateway(self, token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
         """A car's gateway came or went; on a Zenoh thread."""
-        if not alive:
-            gone = Gone(token.rpartition("/")[2])
-            for inbox in list(self._inboxes.values()):
-                with suppress(queue.Full):
-                    inbox.put_nowait((time.monotonic(), gone))
+        for inbox in list(self._inboxes.values()):
+            with suppress(queue.Full):
+                inbox.put_nowait((time.monotonic(), Token(token.rpartition("/")[2], alive=alive)))
 
     def _event(self, sample: Sample) -> None:
         """A record of some command of somebody; on a Zenoh thread."""

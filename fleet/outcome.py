@@ -15,8 +15,8 @@ MARGIN_S: Final = 5.0
 """What is waited beyond the time in which the gateway said, or must say, what became of a command.
 
 A stop's worst case ends when the motors are off; its last frame follows 1.1 s later (protocol.md, "full")."""
-GONE_S: Final = 0.5
-"""How long a gateway that has gone from the bus may take to be there again, because it was the hub that went."""
+GONE_S: Final = 1.0
+"""How long a gateway that has gone from the bus may take to be there again: it tries twice a second."""
 PATIENCE_S: Final = 10.0  # gateway.control: the longest that a command waits there for a busy car
 
 
@@ -138,14 +138,12 @@ class Progress:
         if not self.heard:
             self._end(NO_ANSWER, "", words, at, ok=False)
 
-    def gone(self, at: float) -> None:
-        """Its gateway's token went: killed, or the hub was."""
-        if self._gone_at is None:
+    def token(self, at: float, *, alive: bool) -> None:
+        """Its gateway's token came back, or went: the gateway was killed, or its link or the hub went."""
+        if alive:
+            self._gone_at = None
+        elif self._gone_at is None:
             self._gone_at = at
-
-    def stays(self) -> None:
-        """It was not the gateway that went."""
-        self._gone_at = None
 
     def give_up(self, at: float) -> None:
         """The deadline is over."""

@@ -69,15 +69,16 @@ def test_giving_up_says_what_was_heard_last() -> None:
     assert progress.outcome.words == "not known what became of it after 15.0 s: last heard was 'queued', 14.0 s ago"
 
 
-def test_a_gateway_that_went_is_told_after_half_a_second_in_which_it_may_have_been_the_hub() -> None:
+def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0), ("event", "sent", 0.0)], 9.0)
-    progress.gone(102.0)
-    assert progress.deadline == 102.5
-    progress.stays()
+    progress.token(102.0, alive=False)
+    assert progress.deadline == 103.0
+    progress.token(102.4, alive=True)
     assert progress.deadline == 109.0
-    progress.gone(103.0)
-    progress.gone(103.4)
-    progress.give_up(103.5)
+    progress.token(103.0, alive=False)
+    progress.token(103.4, alive=False)
+    assert progress.deadline == 104.0
+    progress.give_up(104.0)
     assert progress.outcome is not None
     assert (progress.outcome.ok, progress.outcome.phase) == (False, "sent")
     assert progress.outcome.words.startswith("its gateway went away, so whether red moves is not known")
