@@ -1,6 +1,7 @@
-"""How many tests run at once, and how long an example of Hypothesis may take."""
+"""How many tests run at once, how long an example of Hypothesis may take, and what a Ctrl-C is."""
 
 import os
+import signal
 
 from hypothesis import HealthCheck, settings
 
@@ -13,6 +14,10 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("patient")
+
+# In the background of a script SIGINT comes ignored: so it would be in every process that a test starts, and ends by it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_xdist_auto_num_workers() -> int:
