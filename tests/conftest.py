@@ -15,7 +15,7 @@ settings.register_profile(
 )
 settings.load_profile("patient")
 
-# In the background of a script SIGINT comes ignored: so it would be in every process that a test starts, and ends by it.
+# In the background of a script SIGINT comes ignored, and is in every process that a test starts and would end by it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
