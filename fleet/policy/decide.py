@@ -10,7 +10,7 @@ from typing import Final
 from fleet.policy import explain
 from fleet.policy.decision import Decision, Kind
 from fleet.policy.explain import Override
-from fleet.policy.memory import Coloured, Held, Memory, Tried
+from fleet.policy.memory import HUB_BACK_S, Coloured, Held, Memory, Tried
 from fleet.policy.picture import CONTRADICTED, LOST, NOBODY, CarPicture, Picture
 from fleet.policy.plan import Effect, Plan, Rule
 from fleet.policy.rules import Cars, RuleState, follow_phase, follow_rules, targets
@@ -98,7 +98,8 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     decisions = [explain.of_phase(plan, phase, picture)] if phase.name else []
     for car in subjects:
         if car in barriers:
-            decisions.append(explain.alone(car, barriers[car], reserved.get(car)))
+            kept_s = HYSTERESIS_S if gone_since[car] <= now else HUB_BACK_S
+            decisions.append(explain.alone(car, barriers[car], reserved.get(car), kept_s))
         elif car in overrides:
             decisions.append(explain.ruled(car, overrides[car], staffing.roles.get(car)))
         elif car in held:

@@ -59,9 +59,9 @@ def _unseen(condition: Condition, picture: Picture) -> str:
     return blind(condition.expression, [(known, known.mode) for known in cars])
 
 
-def alone(car: str, barrier: Barrier, kept: str | None) -> Decision:
+def alone(car: str, barrier: Barrier, kept: str | None, kept_s: float) -> Decision:
     """A car that cannot, or may not, be asked for anything."""
-    why = f"{barrier.why}; its role {kept} is kept for {HYSTERESIS_S:g} s" if kept else barrier.why
+    why = f"{barrier.why}; its role {kept} is kept for {kept_s:g} s" if kept else barrier.why
     return Decision(car, Kind.ALONE, LEFT_ALONE, barrier.why, why, (), barrier.change, car=car, role=kept)
 
 

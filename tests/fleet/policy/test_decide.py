@@ -196,7 +196,8 @@ def test_after_a_hub_was_away_a_role_waits_for_the_car_that_is_back_last(back_s:
     run.memory = hub_back(run.memory, 9.0)
     for car in here.keys() - {scout}:
         run.cars[car] = here[car]
-    run.now = 9.0
+    run.at(9.0)
+    assert run.of(scout).why == f"{scout} is not on the bus; its role scout is kept for 5 s"
     run.until(9.0 + back_s)
     run.cars[scout] = here[scout]
     run.until(20.0)
