@@ -46,12 +46,7 @@ def hub_killed(
             kill_hub(fleet, chance)
         running = {key: len(sent) for key, sent in load.sent.items()}
         wait_for(lambda: all(len(load.sent[key]) > count for key, count in running.items()), "all are publishing")
-        fleet_back(fleet, cars)
-        load.rest()
-        all_there(load, [recording.session])
-        last = recording.end()
-    assert faults(load, [recording.session]) == ({}, {})
-    assert (last["drops"], last["missed"]) == ({}, {})
+        ends_whole(fleet, load, cars, recording, [recording.session])
     verdict = verify(Session.open(recording.session))
     assert verdict.whole, list(verdict.words())
     description = Session.open(recording.session).description
@@ -73,9 +68,15 @@ def fleet_back(fleet: Fleet, cars: int) -> None:
     time.sleep(2 * SECOND_S)  # the recorder asks for the last time some seconds after a hub is back
 
 
-def all_there(load: Load, sessions: list[Path]) -> None:
-    """Wait until the last that was published is on the disk: a recorder that is told to end waits only for a moment."""
+def ends_whole(fleet: Fleet, load: Load, cars: int, recording: Recording, sessions: list[Path]) -> None:
+    """End a load, and then its recording: nothing is lost, nothing is there twice, and nothing is said to be."""
+    fleet_back(fleet, cars)
+    load.rest()
+    # A recorder that is told to end waits only for a moment.
     wait_for(lambda: not faults(load, sessions)[0], "all that was published is recorded")
+    last = recording.end()
+    assert (last["drops"], last["missed"]) == ({}, {})
+    assert faults(load, sessions) == ({}, {})
 
 
 def recorder_killed(
@@ -96,11 +97,7 @@ def recorder_killed(
             recording = Recording(fleet, out)
             sessions.append(recording.session)
             recording_ns.append(time.time_ns())
-        fleet_back(fleet, cars)
-        load.rest()
-        all_there(load, sessions)
-        last = recording.end()
-    assert (last["drops"], last["missed"]) == ({}, {})
+        ends_whole(fleet, load, cars, recording, sessions)
     missing_s = []
     for number, (path, at_ns) in enumerate(zip(sessions[:-1], killed_ns, strict=True)):
         session = Session.open(path)
@@ -140,5 +137,4 @@ def recorder_killed(
         following = Session.open(sessions[number + 1]).description
         assert following is not None
         assert following.continues == path.name
-    assert faults(load, sessions) == ({}, {})
     return Told(load.count(), 0, tuple(missing_s))
