@@ -23,8 +23,6 @@ STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
 MODE00 = b"$4WD,MODE00#"
 
-"""Queued: another frame was in flight."""
-
 # What a car sent, and what of it are readings: protocol.md, "From the car: readings".
 LAST = b"$4WD,CSB33.00,PV7.25,GS7,LF0000,HW00,GM00#"
 RECORDED: list[tuple[bytes, dict[str, dict[str, Any]]]] = [

@@ -9,10 +9,8 @@ import pytest
 
 from fleet.outcome import NotCarriedOut, Outcome
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet, Process, wait_for
+from tests.support.processes import LONG_S, Fleet, Process, wait_for
 
-LONG_S = 60.0
-"""A drive that is still on when the next process has been started, and has asked for something."""
 CARS = {"red": "arduino", "green": "raspberry_pi", "blue": "raspberry_pi"}
 
 

@@ -14,9 +14,9 @@ import click
 import pytest
 
 from fleet import cli
-from tests.fleet.conftest import LONG_S, Cars, running
+from tests.fleet.conftest import Cars, running
 from tests.support.ports import free_endpoint
-from tests.support.processes import driving, wait_for
+from tests.support.processes import LONG_S, driving, wait_for
 
 FLEET = [sys.executable, "-m", "fleet.cli"]
 LONG = f"{LONG_S:g}s"

@@ -16,9 +16,9 @@ from fleet.verbs import led_request
 from schemas import keys, messages, topics
 from schemas.bus import BadEndpoint, Bus, NoFleet, reply
 from schemas.gen import fleet_v1_pb2 as pb
-from tests.fleet.conftest import LONG_S, Cars, asked
+from tests.fleet.conftest import Cars, asked
 from tests.support.ports import free_endpoint
-from tests.support.processes import driving, wait_for
+from tests.support.processes import LONG_S, driving, wait_for
 
 
 @pytest.fixture

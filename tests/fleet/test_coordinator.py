@@ -11,8 +11,8 @@ import pytest
 
 from fleet.client import Fleet
 from schemas import bus
-from tests.fleet.conftest import LONG_S, Cars, asked
-from tests.support.processes import Process, wait_for
+from tests.fleet.conftest import Cars, asked
+from tests.support.processes import LONG_S, Process, wait_for
 
 PLAN = """
 cars: {red: tracking, green: manual}

@@ -9,8 +9,8 @@ import pytest
 
 import fleet.examples
 from fleet import Fleet
-from tests.fleet.conftest import LONG_S, Cars, asked
-from tests.support.processes import driving, wait_for
+from tests.fleet.conftest import Cars, asked
+from tests.support.processes import LONG_S, driving, wait_for
 
 EXAMPLES = Path(fleet.examples.__file__).parent
 LINES = 30

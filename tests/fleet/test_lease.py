@@ -13,8 +13,8 @@ from fleet.client import Car
 from fleet.lease import Ours
 from fleet.outcome import Outcome
 from schemas.gen import fleet_v1_pb2 as pb
-from tests.fleet.conftest import LONG_S, Cars, asked
-from tests.support.processes import driving, wait_for
+from tests.fleet.conftest import Cars, asked
+from tests.support.processes import LONG_S, driving, wait_for
 
 # ---------------------------------------------------------------- whether it is ours
 

@@ -20,9 +20,11 @@ from schemas import bus, messages
 PATIENCE_S = 40.0
 """The machine may be busy with other tests; nothing here is waited for longer than it takes."""
 
-
 TAKEN = ("sent", "queued")
 """Of a command that is carried out; queued: another frame was in flight."""
+
+LONG_S = 60.0
+"""A drive that is still on when the next process has been started, and has asked for something."""
 
 
 def wait_for(so: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> Any:

@@ -1,5 +1,4 @@
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -8,9 +7,10 @@ import pytest
 import zenoh
 
 from schemas import keys
-from schemas.bus import Bus, Publisher, accepts, router_config
+from schemas.bus import Bus, Publisher, router_config
 from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint
+from tests.support.processes import Fleet
 
 
 def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = 30.0) -> Any:
@@ -45,19 +45,17 @@ def endpoint() -> Iterator[str]:
 
 
 @pytest.fixture
-def hub_apart() -> Iterator[str]:
+def hub_apart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A hub in a process of its own, for what is huge.
 
     The sessions of one process share two threads that receive: while the hub waits on one of them for room on the way
     to a recorder, and the other sleeps, that recorder does not receive, and after five seconds the hub gives it up.
     """
-    where = free_endpoint()
-    with subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", where]) as hub:
-        try:
-            wait_for(lambda: accepts(where), "the hub listens")
-            yield where
-        finally:
-            hub.kill()
+    fleet = Fleet(free_endpoint(), tmp_path_factory.mktemp("hub"))
+    try:
+        yield fleet.endpoint
+    finally:
+        fleet.close()
 
 
 @pytest.fixture
