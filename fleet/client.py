@@ -254,9 +254,10 @@ class Fleet:
 
     def _gateway(self, token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
         """A car's gateway came or went; on a Zenoh thread."""
+        item = time.monotonic(), Token(token.rpartition("/")[2], alive=alive)
         for inbox in list(self._inboxes.values()):
             with suppress(queue.Full):
-                inbox.put_nowait((time.monotonic(), Token(token.rpartition("/")[2], alive=alive)))
+                inbox.put_nowait(item)
 
     def _event(self, sample: Sample) -> None:
         """A record of some command of somebody; on a Zenoh thread."""

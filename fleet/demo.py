@@ -22,6 +22,7 @@ import click
 
 from fleet.client import Fleet
 from fleet.commands.common import sigterm_interrupts
+from fleet.readings import Reading
 from schemas import bus, ending, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -195,10 +196,15 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
         seen = outcome.ok and run.truly(car, "led", colour)
         run.check(f"{car} LED", f"asked {colour}, truly {run.truth[car].led}", ok=seen)
 
-    run.until(lambda: len(client.get("*/sensor/range")) == len(CARS))
-    readings = client.get("*/sensor/range")
+    readings: list[Reading] = []
+
+    def all_measured() -> bool:
+        readings[:] = client.get("*/sensor/range")
+        return len(readings) == len(CARS)
+
+    seen = run.until(all_measured)
     told = ", ".join(f"{reading.key} {reading.value.range_m:.2f} m" for reading in readings)
-    run.check("sensors by key", told, ok=len(readings) == len(CARS))
+    run.check("sensors by key", told, ok=seen)
 
     run.say("the coordinator assigns modes")
     plan = session / "plan.yaml"

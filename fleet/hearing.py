@@ -34,7 +34,7 @@ class Hearing:
     @property
     def unheard(self) -> frozenset[str]:
         """Those of them of which not all that could forbid a command is known."""
-        return frozenset(car for car in self.present if not self.readings.get(car, {}).keys() >= set(NEEDED))
+        return frozenset(car for car in self.present if not _all_known(self.readings.get(car, {})))
 
     def picture(self, busy: Iterable[str]) -> Picture:
         """What is known now; `busy`: the cars that something was asked of, with no outcome yet."""
@@ -88,7 +88,7 @@ class Hearing:
                 capabilities=before.capabilities if before.listed else frozenset(capabilities),
             )
             self.cars[car] = before
-        if not before.present or any(topic not in seen for topic in NEEDED):
+        if not before.present or not _all_known(seen):
             return
         link, mode, motion, safety = (seen[topic].fields for topic in NEEDED)
         hold, lease = safety.get("hold"), safety.get("lease")
@@ -107,6 +107,10 @@ class Hearing:
             estopped_by=estops[0].by if estops else None,
             driven_by=str(driver) or None,
         )
+
+
+def _all_known(seen: Mapping[str, Seen]) -> bool:
+    return all(topic in seen for topic in NEEDED)
 
 
 def listed_cars(file: FleetFile) -> Mapping[str, CarPicture]:

@@ -7,7 +7,9 @@ from typing import Final
 STEP_NS: Final = 2_000_000
 """Less between the two clocks is left alone: a slewed wall clock may gain 0.5 ms a second, and is followed in steps."""
 CLOSE_NS: Final = 100_000
+"""Three looks at clocks take less, unless the process does not run in between: then it looks again."""
 TRIES: Final = 10
+"""So often at most; of machines on which it never runs undisturbed the best counts."""
 
 
 class Wall:

@@ -98,7 +98,7 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     decisions = [explain.of_phase(plan, phase, picture)] if phase.name else []
     for car in subjects:
         if car in barriers:
-            kept_s = HYSTERESIS_S if gone_since[car] <= now else HUB_BACK_S
+            kept_s = HYSTERESIS_S if gone_since[car] <= now else HUB_BACK_S  # the latter by memory.hub_back
             decisions.append(explain.alone(car, barriers[car], reserved.get(car), kept_s))
         elif car in overrides:
             decisions.append(explain.ruled(car, overrides[car], staffing.roles.get(car)))

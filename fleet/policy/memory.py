@@ -13,8 +13,9 @@ from gateway.protocol.values import Mode
 
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Why a car has a role that it had before."""
-
-
+HUB_BACK_S: Final = 5.0
+"""So long after a hub was away roles are kept for cars whose gateways are not back at it: they try again every half
+second, and may be held up."""
 IN_PHASE: Final = "it was so before the coordinator was started again"
 
 
@@ -84,11 +85,6 @@ class Memory:
     def roles(self) -> dict[str, str]:
         """The role of each car."""
         return {car: held.role for car, held in self.held.items()}
-
-
-HUB_BACK_S: Final = 5.0
-"""So long after a hub was away roles are kept for cars whose gateways are not back at it: they try again every half
-second, and may be held up."""
 
 
 def hub_back(memory: Memory, now: float) -> Memory:
