@@ -8,9 +8,15 @@ one frame on its way.
 from collections.abc import Iterable
 
 from gateway.control import arbiter, recipes
-from gateway.control.evidence import Evidence
-from gateway.control.ledger import Pending
-from gateway.control.mode import Verdict
+from gateway.control.battery import Battery, Policy
+from gateway.control.believed import Believed
+from gateway.control.car_model import CarModel
+from gateway.control.car_monitor import CarMonitor
+from gateway.control.executor import Executor
+from gateway.control.ledger import Ledger, Pending
+from gateway.control.mode import ModeTruth, Verdict
+from gateway.control.outbox import Pacing
+from gateway.control.platform import PlatformTruth
 from gateway.control.records import (
     Act,
     Answer,
@@ -24,6 +30,7 @@ from gateway.control.records import (
     Level,
     Phase,
     Reason,
+    Record,
     Resume,
     Sender,
     SetMode,
@@ -31,23 +38,219 @@ from gateway.control.records import (
     TakeLease,
     What,
     Why,
+    Write,
 )
-from gateway.control.safety import LEASE_S, Estop
+from gateway.control.safety import LEASE_S, Estop, Hold, Kept, Safety
 from gateway.control.senders import PAUSE_S
+from gateway.control.stop import Running
+from gateway.control.trust import Basis, CarTrust
 from gateway.control.waiting import Held
 from gateway.protocol.encode import ColorLed, Frame, General, ModeOpen
+from gateway.protocol.profile import Profile
+from gateway.protocol.readings import Event
 from gateway.protocol.values import Mode, Motion
 
 
-class Controller(Evidence):
-    """One car's control: commands and those who give them. See the module's docstring for how it is driven."""
+class Controller:
+    """One car's control. See the module's docstring for how it is driven.
+
+    It holds small objects that share one `CarModel`: `CarMonitor` takes what is heard, `Executor` sends, `Ledger` keeps
+    the records. The controller itself takes commands.
+    """
+
+    def __init__(
+        self,
+        car: str,
+        profile: Profile,
+        *,
+        auto: bool = False,
+        kept: Kept | None = None,
+        battery_policy: Policy | None = None,
+        speed_max: float = 1.0,
+    ) -> None:
+        self.car = car
+        self.safety = Safety.restored(kept or Kept())
+        self._ledger = Ledger()
+        self.model = CarModel(car, profile, auto, self._ledger, battery_policy or Policy())
+        self._executor = Executor(self.model, self._ledger, self.safety)
+        self._monitor = CarMonitor(self.model, self._executor, self._ledger)
+        self._senders = self._executor.senders
+        self._waiting = self._executor.waiting
+        self._speed_max = speed_max
+        self.was_open = False
+        """The link was open at least once: the car may have been set going."""
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def profile(self) -> Profile:
+        """Return what the car is treated as."""
+        return self.model.profile
+
+    @property
+    def platform(self) -> PlatformTruth:
+        """Return what the car's bytes show of its platform."""
+        return self.model.platform
+
+    @property
+    def mode(self) -> ModeTruth:
+        """Return what is known of the car's mode."""
+        return self.model.mode
+
+    @property
+    def battery(self) -> Battery:
+        """Return what is known of the car's battery."""
+        return self.model.battery
+
+    @property
+    def pacing(self) -> Pacing:
+        """Return when the next frame may be written."""
+        return self.model.pacing
+
+    @property
+    def believed(self) -> Believed:
+        """Return what was written to the car, as a state."""
+        return self.model.believed
+
+    @property
+    def known(self) -> bool:
+        """Return True if the car reads what is sent as it is meant."""
+        return self.model.known
+
+    @property
+    def running(self) -> Running | None:
+        """Return the stop that goes on, if one does."""
+        return self._executor.running
+
+    @property
+    def motors(self) -> str:
+        """Return `off`, `on`, `stopping` or `unknown`."""
+        return self.model.motors
+
+    @property
+    def basis(self) -> Basis | None:
+        """Return what `off` rests on: `shown` or `sent`; None if the motors are not off."""
+        return self.model.basis
+
+    @property
+    def motion(self) -> Motion | None:
+        """Return the motion that was sent last; None if the state is unknown or the car moves by itself."""
+        return self.model.motion
+
+    @property
+    def at_rest(self) -> bool:
+        """Return True if the car stands in mode 0 after a stop, as shown or as sent."""
+        return self.model.at_rest
+
+    @property
+    def hears(self) -> bool:
+        """Return True if the car has shown on this link that a frame arrived."""
+        return self.model.evidence.obeyed_at is not None
+
+    @property
+    def is_heard(self) -> bool:
+        """Return False if the car is silent for longer than it ever is."""
+        return self.model.trust.state is not CarTrust.UNHEARD
+
+    @property
+    def lost_frames(self) -> int:
+        """Return how often the car's reports have shown that a frame was lost."""
+        return self._monitor.lost_frames
+
+    @property
+    def owner(self) -> str:
+        """Return who holds the motion; empty if nobody does."""
+        return self._waiting.held.sender.name if self._waiting.held else ""
+
+    def expires_in_s(self, now: float) -> float | None:
+        """Return how long the held motion lasts; None if none is held."""
+        return max(0.0, self._waiting.held.expires_at - now) if self._waiting.held else None
+
+    @property
+    def asked(self) -> Mode | None:
+        """Return the mode that the car is in or about to be brought to, as far as we asked; None if unknown."""
+        opening = self._waiting.opening
+        if opening is not None and isinstance(opening.command.what, SetMode):
+            return opening.command.what.mode
+        return self.mode.asked
+
+    @property
+    def hold(self) -> Hold | None:
+        """Return who stopped the car, if it is on hold."""
+        return self.safety.hold
+
+    @property
+    def has_records(self) -> bool:
+        """Return True if there are records to take."""
+        return self._ledger.waiting
+
+    def take_records(self) -> list[Record]:
+        """Return the records since the last call."""
+        return self._ledger.take()
+
+    # ------------------------------------------------------------------ link, frames, readings, time
+
+    def link_up(self, now: float) -> None:
+        """Bring the car to a known state: the link is open."""
+        self.was_open = True
+        self._monitor.link_up()
+        self._executor.link_up(now)
+
+    def link_down(self, reason: str, now: float) -> None:
+        """Fail all that waits: the link is gone, and the car may do anything."""
+        self._executor.link_down(reason, now, cause=Reason.LINK_DOWN)
+
+    def write_failed(self, reason: str, now: float) -> None:
+        """Take that the frame of `poll` did not go out whole: the caller closes the link and opens it again."""
+        self._executor.link_down(reason, now, cause=Reason.WRITE_FAILED)
+
+    def poll(self, now: float) -> Write | None:
+        """Return the frame to write now, if any."""
+        return self._executor.poll(now)
+
+    def wrote(self, write: Write, now: float) -> None:
+        """Take that the frame of `poll` was handed to the link."""
+        self._executor.wrote(write, now)
+
+    def next_at(self, now: float) -> float:
+        """Return when `poll` may have something to do if nothing happens before; inf if never."""
+        return self._executor.next_at(now)
+
+    def heard(self, event: Event, now: float) -> None:
+        """Take an event of the decoder as evidence."""
+        self._monitor.heard(event, now)
+
+    def tick(self, now: float) -> None:
+        """Weigh silence; called a few times a second."""
+        self._monitor.tick(now)
+
+    def stalled(self, gap_s: float, now: float) -> None:
+        """Take that the loop slept for `gap_s`."""
+        self._monitor.stalled(gap_s, now)
+
+    def shutdown(self, now: float) -> None:
+        """Stop the car and accept nothing else: the gateway ends."""
+        self._executor.shutdown(now)
+
+    @property
+    def finished(self) -> bool:
+        """Return True after `shutdown` if the stop is over, or the car did not show it in time."""
+        return self._executor.finished
+
+    @property
+    def not_stopped(self) -> str:
+        """Return why the gateway ends without a stop of the car; empty if it does not."""
+        return self._executor.not_stopped
+
+    def worst_stop_s(self, now: float) -> float:
+        """Return the longest that a stop asked now takes until the motors are off, if its frames arrive."""
+        return self._executor.worst_stop_s(now)
 
     # ------------------------------------------------------------------ commands
 
     def command(self, command: Command, now: float) -> Answer:
         """Take a command: refuse it with a reason, or begin to carry it out. What becomes of it is recorded."""
         pending, what = Pending(command, now), command.what
-        self._tries_left = 0
         if self._ledger.known(command) and not isinstance(what, Stop | EmergencyStop):
             words = f"a command with id {command.id} came already"
             if not command.streamed:  # not under its id: that is the record of the first
@@ -136,9 +339,9 @@ class Controller(Evidence):
         why = f": {begun[0].why}" if begun[0].why else ""
         words = f"e-stop {begun[0].id} by {begun[0].by} is in force in the fleet, as {shown_by} shows{why}"
         self._ledger.log(Level.ERROR, "estop_joined", words, now)
-        self._halt(words, now)
-        if self._link_open and not self._closing:
-            self._begin(self._full(now), Why.STOP, now)
+        self._executor.halt(words, now)
+        if self.model.link_open and not self._executor.closing:
+            self._executor.begin(self._executor.full(now), Why.STOP, now)
 
     # ------------------------------------------------------------------ one by one
 
@@ -153,17 +356,17 @@ class Controller(Evidence):
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not Kind.COORDINATOR:
             self.safety.held_by(sender.name, command.asked_ns)
-        self._halt(f"{command.verb} by {sender.name}", now, by=sender.name)
-        if not self._link_open or self._closing:
-            why = "its gateway is ending" if self._closing else self._link_reason
+        self._executor.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
+        if not self.model.link_open or self._executor.closing:
+            why = "its gateway is ending" if self._executor.closing else self.model.link_reason
             words = f"{self.car} cannot be reached: {why}; it is stopped first when its link is back"
             return self._reject(pending, Reason.LINK_DOWN, f"{words} ({latched})" if latched else words, now)
-        if self._unheard:
+        if not self.is_heard:
             silent = f"{self.car} was not heard for {self.mode.unheard_s(now):.0f} s: it may not get this stop"
             latched = f"{silent}; {latched}" if latched else silent
         worst = self.worst_stop_s(now)
         self._ledger.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
-        self._begin(self._full(now), Why.STOP, now, pending)
+        self._executor.begin(self._executor.full(now), Why.STOP, now, pending)
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
 
     def _has_let_go(self, command: Command, drive: Drive, now: float) -> bool:
@@ -196,9 +399,9 @@ class Controller(Evidence):
                 pass
             case SetMode(mode):  # until it is in force: sooner nobody can tell whether it is wanted
                 opening_s = 0.0 if mode is Mode.MANUAL else self.profile.block_s(ModeOpen(mode))
-                lasts_s = max(self._free_at(now) - now, 0.0) + opening_s
+                lasts_s = max(self._executor.free_at(now) - now, 0.0) + opening_s
             case _:  # what is asked on the way does not shorten it
-                lasts_s = self.expires_in_s(now) if self.owner == sender.name else 0.0
+                lasts_s = (self.expires_in_s(now) or 0.0) if self.owner == sender.name else 0.0
         self.safety.grant(sender, now + lasts_s)
         if before is None or before.holder == sender:
             return
@@ -209,7 +412,7 @@ class Controller(Evidence):
             and self._waiting.held.sender != sender
             and not isinstance(command.what, Drive | SetMode)
         ):
-            self._release(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+            self._executor.release(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
 
     def _take_lease(self, pending: Pending, now: float, *, release: bool) -> Answer:
         sender = pending.command.sender
@@ -218,12 +421,12 @@ class Controller(Evidence):
         if not self.safety.release(sender):
             return self._done(pending, f"{sender.name} had no lease of {self.car}", now)
         if self._waiting.held is not None and self._waiting.held.sender == sender:
-            self._release(Phase.COMPLETE, None, f"released by {sender.name}", now)
+            self._executor.release(Phase.COMPLETE, None, f"released by {sender.name}", now)
         return self._done(pending, f"{self.car} is free", now)
 
     def _too_busy(self, what: What, now: float) -> str:
         """Why a drive would be over before it could begin; empty if it would not."""
-        free_at = self._free_at(now)
+        free_at = self._executor.free_at(now)
         if not isinstance(what, Drive) or what.motion is Motion.STOP or now + what.duration_s > free_at:
             return ""
         return f"{self.car} is busy for {free_at - now:.1f} s more, longer than this drive's {what.duration_s:g} s"
@@ -238,10 +441,10 @@ class Controller(Evidence):
         if held is not None and held.motion is drive.motion and held.pending.sent:
             self._ledger.sent(pending, now, "the motion is held on")
             return Answer(Phase.SENT, words="the motion is held on")
-        running = self._running
+        running = self._executor.running
         if running is not None and running.recipe.rank == recipes.SOFT.rank:
             # The car is wanted to move again: the rest of a soft stop would only jerk it.
-            self._running = None
+            self._executor.running = None
             for other in running.commands:
                 self._ledger.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
         return self._queued(pending, now)
@@ -265,25 +468,25 @@ class Controller(Evidence):
         sender = pending.command.sender.name
         self._waiting.close_held(Phase.COMPLETE, None, f"released by {sender}", now)
         self._waiting.close_opening(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
-        if self._running is None and self.at_rest:
+        if self._executor.running is None and self.at_rest:
             return self._done(pending, f"{self.car} is at rest", now)
         worst = self.worst_stop_s(now)
         if not pending.command.streamed:
             self._ledger.record(pending, Phase.QUEUED, now, worst_case_s=worst)
-        self._begin(self._soft(now), Why.STOP, now, None if pending.command.streamed else pending)
+        self._executor.begin(self._executor.soft(now), Why.STOP, now, None if pending.command.streamed else pending)
         return Answer(Phase.QUEUED, worst_case_s=worst)
 
     def _close_mode(self, pending: Pending, now: float) -> Answer:
         self._waiting.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {pending.command.sender.name}", now)
         answer = self._queued(pending, now)
-        self._begin(self._full(now), Why.COMMAND, now, pending)
+        self._executor.begin(self._executor.full(now), Why.COMMAND, now, pending)
         return answer
 
     def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
         words = f"mode {mode} by {pending.command.sender.name}"
         self._waiting.close_opening(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._waiting.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        settled = self.known and self._running is None and self.mode.verdict is not Verdict.CONTRADICTED
+        settled = self.known and self._executor.running is None and self.mode.verdict is not Verdict.CONTRADICTED
         if settled and self.mode.asked is mode:
             return self._done(pending, f"{self.car} is in {mode} already ({self.mode.verdict})", now)
         self._waiting.opening = pending
@@ -315,10 +518,10 @@ class Controller(Evidence):
             car=self.car,
             profile=self.profile,
             now=now,
-            link_open=self._link_open,
-            link_reason=self._link_reason,
-            answering=not (self._gave_up or self._unheard),
-            closing=self._closing,
+            link_open=self.model.link_open,
+            link_reason=self.model.link_reason,
+            answering=self.is_heard,
+            closing=self._executor.closing,
             asked=self.asked,
             contradicted=self.mode.verdict is Verdict.CONTRADICTED,
             held_by=self.hold.by if self.hold else None,

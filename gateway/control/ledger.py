@@ -50,12 +50,13 @@ class Ledger:
         words: str = "",
         worst_case_s: float = 0.0,
         evidence: tuple[str, ...] = (),
+        basis: str = "",
     ) -> None:
         """Note one transition."""
         pending.sent = pending.sent or phase is Phase.SENT
         took = now - pending.asked_at
         self._records.append(
-            CommandRecord(pending.command, phase, now, reason, words, worst_case_s, took, evidence, pending.count)
+            CommandRecord(pending.command, phase, now, reason, words, worst_case_s, took, evidence, pending.count, basis)
         )
 
     def sent(self, pending: Pending, now: float, words: str = "") -> None:

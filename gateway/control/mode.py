@@ -12,7 +12,7 @@ from typing import Final
 from gateway.control.recipes import REPEAT_S
 from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Sensors
-from gateway.protocol.timing import FRAME_S, RATE_HZ
+from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S, RATE_HZ
 from gateway.protocol.values import Mode
 
 CONTRADICTING_FRAMES: Final = 3
@@ -152,9 +152,19 @@ class ModeTruth:
             words = f"no reading with the shape of {self.asked} for {own_s:.1f} s, the last has that of {shape}"
             self._conclude(Verdict.CONTRADICTED, words, now)
 
+    def fade(self, now: float) -> None:
+        """Take back a confirmation that is older than the silence that the asked mode allows."""
+        if self.verdict is not Verdict.CONFIRMED or self.asked is None:
+            return
+        limit = MANUAL_SILENCE_S if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
+        since_s = now - max(self._own_at, self._excused_at)
+        blocked_s = sum(block_s for at, block_s in self._blocks if at > now - since_s)
+        if self.inferred is None or since_s > limit + blocked_s + MODE_CLOSE_S:
+            self._conclude(Verdict.ASSUMED, f"no reading with the shape of {self.asked} for {since_s:.1f} s", now)
+
     def unheard_s(self, now: float) -> float:
-        """How long there was no reading, s, what blocks of ours can explain left out."""
-        return self._silence_s(self._heard_at, now)
+        """Return how long there was no reading, s, what blocks of ours can explain left out; never negative."""
+        return max(0.0, self._silence_s(self._heard_at, now))
 
     def silence_limit(self, *, fan: bool) -> float | None:
         """The longest silence that fits the asked mode, s; None where silence is normal, or nothing was asked."""

@@ -64,6 +64,11 @@ class Pacing:
             self._read_by = min(self._read_by, at + self._before_s)
 
     @property
+    def heard_at(self) -> float:
+        """When the last mode-0 reading came; -inf if none did."""
+        return self._heard_at
+
+    @property
     def written_at(self) -> float:
         """When the last frame was written; -inf if none was."""
         return self._written_at

@@ -11,9 +11,6 @@ REPEAT_S: Final = 1.1
 """A block that we know nothing of lasts up to 1.0 s; a frame sent 1.1 s after the last is alone in the buffer."""
 SILENCE_S: Final = 3.7
 """From the first frame of recovery to the one that is certain: longer than any block outside avoidance."""
-CONFIRM_S: Final = 4.5
-"""How long recovery waits for a mode-0 reading: avoidance blocks 4.3 s."""
-RETRIES: Final = 3
 
 
 class Gate(IntEnum):
@@ -42,8 +39,6 @@ class Recipe:
     name: str
     rank: int
     steps: tuple[Step, ...]
-    confirmed: bool = False
-    """Over only when a mode-0 reading has come after its last frame."""
 
     @property
     def length_s(self) -> float:
@@ -79,7 +74,6 @@ RECOVERY: Final = Recipe(
         Step(_MANUAL, after_s=SILENCE_S - 0.05),
         Step(_STOP, after_s=REPEAT_S),
     ),
-    confirmed=True,
 )
 
 # protocol.md, stopping, platform unknown
@@ -93,7 +87,6 @@ UNKNOWN: Final = Recipe(
         Step(_MANUAL, after_s=SILENCE_S - REPEAT_S - 0.06),
         Step(_STOP, after_s=REPEAT_S),
     ),
-    confirmed=True,
 )
 
 # The same where mode 0 is certain: there general stops stop every platform, behind whatever frame of ours is unread.
@@ -108,8 +101,7 @@ UNKNOWN_MANUAL: Final = Recipe(
         Step(_MANUAL, Gate.ALONE, after_s=REPEAT_S),
         Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S),
     ),
-    confirmed=True,
 )
 
-# protocol.md, stopping, "If none has come 4.5 s after it"
-RETRY: Final = Recipe("recovery_again", 3, (Step(_MANUAL), Step(_STOP, after_s=REPEAT_S)), confirmed=True)
+# Asks a car that reports in mode 0 to show that it obeys: its reports pause for the second that `MODE00` takes.
+PROBE: Final = Recipe("probe", 3, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))

@@ -32,6 +32,8 @@ class Reason(StrEnum):
     SUPERSEDED = "superseded"
     DUPLICATE = "duplicate"
     STALE = "stale"
+    NOT_SHOWN = "not_shown"
+    """A stop: the car could have shown it and did not."""
 
 
 class Phase(StrEnum):
@@ -170,11 +172,14 @@ class CommandRecord:
     took_s: float = 0.0
     evidence: tuple[str, ...] = ()
     count: int = 1
+    basis: str = ""
+    """`shown` or `sent`, in the last record of a stop."""
 
 
 class Level(StrEnum):
     """How much a notable event matters."""
 
+    DEBUG = "debug"
     INFO = "info"
     WARNING = "warning"
     ERROR = "error"

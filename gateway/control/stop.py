@@ -8,7 +8,8 @@ from gateway.control.ledger import Pending
 from gateway.control.outbox import Pacing
 from gateway.control.recipes import Gate, Recipe
 from gateway.control.records import Why
-from gateway.protocol.encode import Frame
+from gateway.control.stop_evidence import StopCase
+from gateway.protocol.encode import Frame, ModeClose
 from gateway.protocol.profile import Profile, StopStyle
 from gateway.protocol.timing import FRAME_S, MODE_TURN_S
 from gateway.protocol.values import Mode
@@ -17,6 +18,15 @@ WIRE_S: Final = 0.02  # protocol.md: 20 ms of wire for a frame of 19 bytes at 96
 RECOVERY_WORST_S: Final = 7.3  # protocol.md, "recovery": theory, never over 7.3 s outside avoidance
 _AVOIDING_S: Final = MODE_TURN_S[Mode.OBSTACLE_AVOIDANCE]
 """Of a car in an unknown state it is not known that it is not avoiding obstacles."""
+SHOW_S: Final = 10.0
+"""Time that a car has to show a stop, beyond the announced worst case, before a command counts as failed."""
+LONGEST_WORST_S: Final = 5.0
+"""Maximum of the worst case that counts for that: nobody waits longer than 15 s for an answer."""
+SHOWN_S: Final = 2.0
+"""Usual time from the last frame to the evidence."""
+RETRY_S: Final = (recipes.SILENCE_S, 5.0, 6.5, 8.0)
+"""Interval from `MODE00` to the next try, by tries. The silence makes the next frame certain: it is longer than any block
+outside avoidance. It grows to 8 s, so that a car is told within 10 s of the link being whole."""
 IN_TIME_S: Final = 0.2
 """A frame written so long before a block can end lies in the buffer when it does, whatever the link's own delay."""
 
@@ -57,88 +67,102 @@ class Situation:
 
 @dataclass(slots=True)
 class Running:
-    """A recipe under way, and the commands that are over with it. Times: s, monotonic."""
+    """A stop under way: the frames of its present try, and the commands that end with it. Times: s, monotonic.
+
+    A stop ends on evidence (see `stop_evidence`), so after its last frame it waits, and tries again.
+    """
 
     recipe: Recipe
     why: Why
     began_at: float
+    try_at: float
+    """When the present try began."""
     commands: list[Pending] = field(default_factory=list)
     index: int = 0
     first_at: float | None = None
+    """When the first frame of the stop was written."""
     last_at: float = float("-inf")
-    retries: int = 0
-    disobeyed: bool = False
-    """What was heard meanwhile shows that one of its frames was lost."""
+    closed_at: float = float("-inf")
+    """When its newest `MODE00` was written."""
+    tries: int = 1
     worst_at: float = float("-inf")
-    """When the motors are off at the latest, if no step is late."""
+    """When the motors are off at the latest, if no step is late and all frames arrive."""
+    patience_s: float = SHOW_S
+    """A command whose stop is not shown for so long has failed."""
     due: float = float("inf")
     """When the next step is due, as last asked."""
+    report_at: float = float("-inf")
+    """When the last report of mode 0 came that was sent after its newest `MODE00`."""
+    no_echo_at: float = float("-inf")
+    """The same, of one without an echo."""
+    probes: int = 0
+    overdue: bool = False
+    """Nothing showed it in time. The stop goes on."""
+    case: StopCase = StopCase.MANUAL
+    """What it rests on if it is not shown."""
 
     @property
     def frames_sent(self) -> bool:
-        """Its last frame is written."""
+        """Return True if the last frame of this try is written."""
         return self.index >= len(self.recipe.steps)
 
     @property
     def frame(self) -> Frame:
-        """The frame of the next step."""
+        """Return the frame of the next step."""
         return self.recipe.steps[self.index].frame
 
     def due_at(self, pacing: Pacing) -> float:
-        """When the next step is due."""
+        """Return when the next step is due."""
         step = self.recipe.steps[self.index]
-        due = self.began_at if self.first_at is None else self.last_at + step.after_s
+        due = self.try_at if self.index == 0 else self.last_at + step.after_s
         self.due = max(due, pacing.ready_at(step.gate))
         return self.due
 
     @property
     def obeyed_at(self) -> float:
-        """When the car has obeyed at the latest, if no reading says so earlier and none has to."""
+        """Return when the car has obeyed at the latest, if the frames arrived."""
         return max(self.last_at, self.worst_at)
 
+    @property
+    def next_try_at(self) -> float:
+        """Return when the stop is sent again if nothing shows it before."""
+        after = self.closed_at if self.closed_at > float("-inf") else self.last_at
+        return max(self.last_at + recipes.REPEAT_S, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
+
+    @property
+    def gives_up_at(self) -> float:
+        """Return when what nothing has shown counts as not shown."""
+        return self.began_at + self.patience_s
+
     def worst_s(self, now: float) -> float:
-        """How long it takes from now on, at worst."""
+        """Return how long it takes from now on, at worst, if the frames arrive."""
         worst_at = self.worst_at + (0.0 if self.frames_sent else max(0.0, now - self.due))
-        if self.recipe in (recipes.RECOVERY, recipes.RETRY) and self.frames_sent:
+        if self.recipe is recipes.RECOVERY and self.frames_sent:
             # Should all its frames have been read at the wrong place, in one string, it tries again.
-            worst_at = max(worst_at, self.last_at + recipes.CONFIRM_S + _AVOIDING_S)
+            worst_at = max(worst_at, self.next_try_at + _AVOIDING_S)
         return max(worst_at - now, 0.0) + WIRE_S
 
-    def wake_at(self, pacing: Pacing) -> float:
-        """When there is something to do: the next step, or the end of the patience."""
-        if not self.frames_sent:
-            return self.due_at(pacing)
-        return self.last_at + recipes.CONFIRM_S if self.recipe.confirmed else self.obeyed_at
-
     def over_at(self, pacing: Pacing, now: float) -> float:
-        """When it will be over, as far as that is known."""
+        """Return when it will be over, as far as that is known."""
         began = self.first_at if self.first_at is not None else max(now, self.due_at(pacing))
-        return (
-            began + self.recipe.length_s if self.recipe.confirmed else max(began + self.recipe.length_s, self.worst_at)
-        )
+        shown_s = 0.0 if self.case is StopCase.SOFT else SHOWN_S
+        return max(began + self.recipe.length_s, self.worst_at, now) + shown_s
 
     def stepped(self, now: float) -> bool:
-        """A step's frame was written; True if it was the first."""
+        """Note that a step's frame was written. Return True if it was the stop's first."""
         self.worst_at += max(0.0, now - self.due)  # a loop that slept
         first = self.first_at is None
         if first:
             self.first_at = now
         self.last_at = now
+        if isinstance(self.frame, ModeClose):
+            self.closed_at = now
         self.index += 1
         return first
 
-    def again(self, now: float) -> "Running":
-        """The short recovery that follows when no reading confirmed this one."""
-        return Running(
-            recipes.RETRY,
-            self.why,
-            now,
-            self.commands,
-            first_at=now,
-            last_at=now,
-            retries=self.retries + 1,
-            worst_at=now + _AVOIDING_S,
-        )
+    def again(self, recipe: Recipe, now: float) -> None:
+        """Begin the next try."""
+        self.recipe, self.index, self.try_at = recipe, 0, now
 
 
 def recovery(situation: Situation) -> Recipe:

@@ -1,0 +1,128 @@
+"""What the gateway believes of one car: platform, mode, battery, outputs, trust, and what shows a stop. No decisions.
+
+`Executor` changes it by what it writes, `CarMonitor` by what is heard.
+"""
+
+from dataclasses import dataclass, field, replace
+
+from gateway.control import recipes, stop
+from gateway.control.battery import Battery, Policy
+from gateway.control.believed import Believed
+from gateway.control.ledger import Ledger
+from gateway.control.mode import ModeTruth, Verdict
+from gateway.control.outbox import AWAKE_S, Pacing
+from gateway.control.platform import PlatformTruth
+from gateway.control.records import Level
+from gateway.control.stop_evidence import StopCase, StopEvidence
+from gateway.control.trust import Basis, CarTrust, TrustEvent, TrustState
+from gateway.protocol.profile import Profile, StopStyle
+from gateway.protocol.values import Mode, Motion
+
+KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
+"""In these states the last recovery is over and no write has failed since: the car reads what is sent as it is meant."""
+
+
+@dataclass(slots=True)
+class CarModel:
+    """The estimates of one car. Times: s, monotonic."""
+
+    name: str
+    profile: Profile
+    auto: bool
+    ledger: Ledger
+    battery_policy: Policy
+    platform: PlatformTruth = field(init=False)
+    mode: ModeTruth = field(init=False)
+    battery: Battery = field(init=False)
+    pacing: Pacing = field(init=False)
+    believed: Believed = field(init=False)
+    evidence: StopEvidence = field(default_factory=StopEvidence)
+    trust: TrustState = field(default_factory=TrustState)
+    rest: StopCase = StopCase.SOFT
+    """What the claim of rest rests on, if that is only `sent`."""
+    link_open: bool = False
+    link_reason: str = "not connected yet"
+
+    def __post_init__(self) -> None:
+        self.platform = PlatformTruth(self.profile, auto=self.auto)
+        self.mode = ModeTruth(self.profile)
+        self.battery = Battery(self.battery_policy)
+        self.pacing = Pacing(self.profile)
+        self.believed = Believed(self.profile)
+
+    def treat_as(self, profile: Profile) -> None:
+        """Use another platform's profile from now on."""
+        self.profile = self.mode.profile = self.pacing.profile = profile
+        self.believed = replace(self.believed, profile=profile)
+
+    def learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
+        """Change the trust in the car. This is the only place that does; the record has each change."""
+        if self.trust.take(event, now, evidence):
+            trust = self.trust
+            basis = f" ({trust.basis})" if trust.basis is not None else ""
+            words = f"{self.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"
+            self.ledger.log(Level.DEBUG, "trust", words, now)
+
+    @property
+    def known(self) -> bool:
+        """Return True if the car reads what is sent as it is meant."""
+        return self.trust.state in KNOWN
+
+    @property
+    def manual(self) -> bool:
+        """Return True if mode 0 is the last that was asked, and no reading contradicts it."""
+        return self.mode.asked is Mode.MANUAL and self.mode.verdict is not Verdict.CONTRADICTED
+
+    @property
+    def at_rest(self) -> bool:
+        """Return True if the car stands in mode 0 after a stop, as shown or as sent."""
+        return self.trust.state is CarTrust.STOPPED and self.manual
+
+    @property
+    def rest_is_sure(self) -> bool:
+        """Return True if the car has shown that it stands, or could not show it if it did."""
+        return self.at_rest and (self.trust.shown or self.rest is not StopCase.SOFT or not self.can_show)
+
+    @property
+    def can_show(self) -> bool:
+        """Return True if the platform is one that shows a stop."""
+        return self.for_stop_style is StopStyle.MODE_FRAME
+
+    @property
+    def for_stop_style(self) -> StopStyle:
+        """Return which kind of stop the car takes now."""
+        return StopStyle.UNKNOWN if self.platform.doubted else self.profile.stop_style
+
+    @property
+    def motors(self) -> str:
+        """Return `off`, `on`, `stopping` or `unknown`."""
+        believed_moving = self.trust.state in (CarTrust.DRIVING, CarTrust.IN_MODE, CarTrust.STOPPED)
+        if believed_moving and self.mode.verdict is Verdict.CONTRADICTED:
+            return "unknown"
+        return self.trust.motors
+
+    @property
+    def basis(self) -> Basis | None:
+        """Return what `off` rests on; None if the motors are not off."""
+        return self.trust.basis if self.motors == "off" else None
+
+    @property
+    def motion(self) -> Motion | None:
+        """Return the motion that was sent last; None if the state is unknown or the car moves by itself."""
+        return self.believed.motion if self.known and self.manual else None
+
+    def for_stop(self, now: float) -> stop.Situation:
+        """Return what the choice of a stop looks at."""
+        contradicted = self.mode.verdict is Verdict.CONTRADICTED
+        clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
+        return stop.Situation(
+            self.profile, self.known, self.mode.asked, contradicted, clear, blocked, self.platform.doubted
+        )
+
+    def is_awake(self, now: float) -> bool:
+        """Return True if the car reads a frame at once: no block of ours runs, nor one that we know nothing of."""
+        if now < self.pacing.block_until:
+            return False
+        if (self.known and self.manual) or now <= self.pacing.heard_at + AWAKE_S:
+            return True
+        return now >= self.pacing.written_at + recipes.SILENCE_S - 0.1

@@ -1,0 +1,146 @@
+"""What the gateway believes of the car's motion, as one state machine. Pure.
+
+Each transition names what happened; `TRANSITIONS` is total, so every state answers every event. The state follows from
+frames that were written and from what the car has shown, never from time alone.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+
+
+class CarTrust(StrEnum):
+    """What the gateway believes of the car."""
+
+    UNKNOWN = "unknown"
+    """The link is down: the car may do anything."""
+    RECOVERING = "recovering"
+    """The link is open, and the stop that brings the car to a known state goes on."""
+    STOPPING = "stopping"
+    """A stop of a car in a known state goes on."""
+    STOPPED = "stopped"
+    """The stop is over: the car has shown it, or can show nothing. See `Basis`."""
+    DRIVING = "driving"
+    """The gateway sent a motion."""
+    IN_MODE = "in_mode"
+    """The gateway opened a mode in which the car drives by itself."""
+    UNHEARD = "unheard"
+    """The car is silent for longer than it ever is, on an open link. The stop goes on."""
+    UNPROVEN = "unproven"
+    """The car is heard, and could have shown a stop, and did not within its time. The stop goes on."""
+
+
+class Basis(StrEnum):
+    """What the claim that the motors are off rests on."""
+
+    SHOWN = "shown"
+    """The car's own readings."""
+    SENT = "sent"
+    """Frames that were written, to a car that can show nothing of them."""
+
+
+class TrustEvent(StrEnum):
+    """What changes the gateway's belief."""
+
+    LINK_OPENED = "the link was opened"
+    LINK_LOST = "the link was lost"
+    STOP_BEGUN = "a stop began"
+    DOUBTED = "readings speak against what was believed"
+    STOP_SHOWN = "the car showed that it stopped"
+    STOP_SENT = "the stop was sent to a car that can show nothing"
+    NOT_SHOWN = "the car did not show its stop in time"
+    SILENT = "the car is silent for too long"
+    HEARD = "the car is heard again"
+    MOTION_SENT = "a motion was sent"
+    MODE_SENT = "a mode was opened"
+
+
+_T, _E = CarTrust, TrustEvent
+_ANY: Final = {
+    _E.LINK_OPENED: _T.RECOVERING,
+    _E.LINK_LOST: _T.UNKNOWN,
+    _E.STOP_BEGUN: _T.STOPPING,
+    _E.DOUBTED: _T.RECOVERING,
+    _E.STOP_SHOWN: _T.STOPPED,
+    _E.STOP_SENT: _T.STOPPED,
+    _E.NOT_SHOWN: _T.UNPROVEN,
+    _E.SILENT: _T.UNHEARD,
+    _E.MOTION_SENT: _T.DRIVING,
+    _E.MODE_SENT: _T.IN_MODE,
+}
+"""Where each event leads, whatever the state; the table below has the exceptions."""
+
+_SAME: Final = {
+    # Without a link nothing that was written or heard before counts.
+    _T.UNKNOWN: set(TrustEvent) - {_E.LINK_OPENED},
+    # A stop that begins meanwhile joins the recovery, or takes its place: the car's state is as unknown as before.
+    _T.RECOVERING: {_E.STOP_BEGUN, _E.HEARD},
+    _T.STOPPING: {_E.STOP_BEGUN, _E.HEARD},
+    _T.STOPPED: {_E.HEARD, _E.NOT_SHOWN},
+    _T.DRIVING: {_E.HEARD, _E.NOT_SHOWN, _E.STOP_SHOWN, _E.STOP_SENT},
+    _T.IN_MODE: {_E.HEARD, _E.NOT_SHOWN, _E.STOP_SHOWN, _E.STOP_SENT},
+    # Only a reading ends the silence, and only evidence the doubt.
+    _T.UNHEARD: {_E.STOP_BEGUN, _E.DOUBTED, _E.NOT_SHOWN, _E.SILENT},
+    _T.UNPROVEN: {_E.STOP_BEGUN, _E.DOUBTED, _E.NOT_SHOWN, _E.HEARD},
+}
+_OTHER: Final = {(_T.UNHEARD, _E.HEARD): _T.RECOVERING}
+
+TRANSITIONS: Final[dict[tuple[CarTrust, TrustEvent], CarTrust]] = {
+    (state, event): _OTHER.get((state, event), state if event in _SAME[state] else _ANY.get(event, state))
+    for state in CarTrust
+    for event in TrustEvent
+}
+"""Every state and event. A test walks all of it."""
+
+STOP_GOES_ON: Final = frozenset({_T.RECOVERING, _T.STOPPING, _T.UNHEARD, _T.UNPROVEN})
+"""In these states the gateway sends stops until one is shown."""
+
+_MOTORS: Final = {
+    _T.UNKNOWN: "unknown",
+    _T.RECOVERING: "unknown",
+    _T.STOPPING: "stopping",
+    _T.STOPPED: "off",
+    _T.DRIVING: "on",
+    _T.IN_MODE: "on",
+    _T.UNHEARD: "unknown",
+    _T.UNPROVEN: "unknown",
+}
+
+
+@dataclass(slots=True)
+class TrustState:
+    """The state in force, since when, and why. Times: s, monotonic."""
+
+    state: CarTrust = CarTrust.UNKNOWN
+    since: float = float("-inf")
+    evidence: str = "not connected yet"
+    basis: Basis | None = None
+    """Set in `STOPPED` only."""
+    shown_at: float | None = field(default=None)
+    """When the car showed its last stop."""
+
+    def take(self, event: TrustEvent, now: float, evidence: str = "") -> bool:
+        """Take an event. Return True if the state, or what it rests on, changed."""
+        before = self.state, self.basis
+        self.state = TRANSITIONS[self.state, event]
+        if event is TrustEvent.STOP_SHOWN and self.state is CarTrust.STOPPED:
+            self.basis, self.shown_at = Basis.SHOWN, now
+        elif event is TrustEvent.STOP_SENT and self.state is CarTrust.STOPPED:
+            self.basis = Basis.SENT
+        elif self.state is not CarTrust.STOPPED:
+            self.basis = None
+        changed = (self.state, self.basis) != before
+        if changed:
+            self.since = now
+            self.evidence = evidence or event
+        return changed
+
+    @property
+    def motors(self) -> str:
+        """Return `off`, `on`, `stopping` or `unknown`."""
+        return _MOTORS[self.state]
+
+    @property
+    def shown(self) -> bool:
+        """True if the car has shown that it stands, and nothing was sent since that could move it."""
+        return self.basis is Basis.SHOWN
