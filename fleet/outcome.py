@@ -44,8 +44,8 @@ class Outcome:
     """Of the gateway's closed set (`held, wrong_mode, link_down, ...`); empty if there is none."""
     words: str = ""
     """For a person: why, and what to do."""
-    worst_case_s: float = 0.0
-    """A stop's: the longest it could take until the motors are off, as announced."""
+    worst_case_s: float | None = None
+    """A stop's: the longest it could take until the motors are off, as announced. None if no stop was announced."""
     took_s: float = 0.0
     """From asking until this was known, here."""
 
@@ -115,7 +115,7 @@ class Progress:
         """Take the answer to the query; a record of the same command may have overtaken it."""
         self._worst_case_s = max(self._worst_case_s, worst_case_s)
         if self.outcome is not None:
-            self.outcome = replace(self.outcome, worst_case_s=self._worst_case_s)
+            self.outcome = replace(self.outcome, worst_case_s=self._worst_case_s or None)
         self._note(status, reason, words, at)
         # Nothing had to be stopped, so nothing will be complete: `sent` without a worst case is the last word.
         if status == SENT and self._until is Until.STOPPED and worst_case_s == 0:
@@ -176,4 +176,4 @@ class Progress:
     def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
         if self.outcome is None:
             took_s = at - self._asked_at
-            self.outcome = Outcome(self.car, ok, phase, reason, words, self._worst_case_s, took_s)
+            self.outcome = Outcome(self.car, ok, phase, reason, words, self._worst_case_s or None, took_s)

@@ -418,7 +418,7 @@ class Car:
             status=status,
             reason=answer.reason or "",
             words=answer.words,
-            worst_case_s=answer.worst_case_s,
+            worst_case_s=answer.worst_case_s or None,  # left out unless a stop was announced
         )
         with asked.query as query:
             if asked.as_json:

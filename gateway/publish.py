@@ -18,7 +18,7 @@ from gateway.control import battery
 from gateway.control.allowance import Allowance
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
-from gateway.control.records import CommandRecord, Level, LogRecord, Write
+from gateway.control.records import CommandRecord, Level, LogRecord, Phase, Write
 from gateway.history import BadRange, Ring
 from gateway.protocol.measured import measured, verdict_of
 from gateway.protocol.readings import Event
@@ -48,6 +48,8 @@ _CLASSES: Final[dict[str, Any]] = {
     if topic.message.startswith("fleet.v1.")
 }
 """A message is made anew each time: one that is cleared and filled again keeps what it held before in memory."""
+_ON_ARRIVAL: Final = frozenset({Phase.ASKED, Phase.QUEUED, Phase.REJECTED})
+"""Records made when a command arrives: nothing took any time yet."""
 _LEVELS: Final = {Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
 
 
@@ -137,9 +139,12 @@ class Publications:
         event.phase = record.phase
         event.reason = record.reason or ""
         event.words = record.words
-        event.age_s = command.age_s
-        event.worst_case_s = record.worst_case_s
-        event.took_s = record.took_s
+        if command.age_s is not None:
+            event.age_s = command.age_s
+        if record.worst_case_s > 0:  # only a stop announces one
+            event.worst_case_s = record.worst_case_s
+        if record.phase not in _ON_ARRIVAL:
+            event.took_s = record.took_s
         event.count = record.count
         event.evidence.extend(record.evidence)
         if request is not None:
@@ -278,7 +283,8 @@ def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> No
     message.reconnects = health.reconnects
     message.tx_airtime = health.airtime(now)
     message.since_s = now - health.since
-    message.last_rx_s = -1.0 if health.last_rx_at is None else now - health.last_rx_at
+    if health.last_rx_at is not None:
+        message.last_rx_s = max(0.0, now - health.last_rx_at)
 
 
 def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
@@ -287,7 +293,8 @@ def _fill_mode(message: pb.Mode, control: Controller, now: float) -> None:
     message.inferred = mode.inferred or "unknown"
     message.verdict = mode.verdict
     message.evidence = mode.evidence
-    message.evidence_age_s = 0.0 if mode.evidence_at is None else max(0.0, now - mode.evidence_at)
+    if mode.evidence_at is not None:
+        message.evidence_age_s = max(0.0, now - mode.evidence_at)
     message.candidates.extend(mode.candidates)
 
 
@@ -296,7 +303,8 @@ def _fill_motion(message: pb.Motion, control: Controller, now: float) -> None:
     message.source = "unknown" if control.motion is None else "commanded" if control.owner else "assumed"
     message.speed = control.profile.speed.fraction(control.believed.speed)
     message.owner = control.owner
-    message.expires_in_s = control.expires_in_s(now)
+    if control.owner:
+        message.expires_in_s = control.expires_in_s(now)
     message.fan = bool(control.believed.fan)
     if control.believed.servo_deg is not None:
         message.servo_deg = control.believed.servo_deg

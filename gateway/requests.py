@@ -157,14 +157,14 @@ def _encoding(request: Request) -> str:
     return PROTOBUF  # zero bytes are a message without fields
 
 
-def _age_s(message: Any, request: Request) -> float:
-    """Seconds since it was asked; a clock that is ahead of ours gives 0, not a bonus."""
+def _age_s(message: Any, request: Request) -> float | None:
+    """Return the seconds since it was asked, None if unknown; a clock that is ahead of ours gives 0, not a bonus."""
     if message.HasField("asked"):
         asked_ns = message.asked.seconds * 1_000_000_000 + message.asked.nanos
     elif request.sampled_ns is not None:
         asked_ns = request.sampled_ns
     else:
-        return 0.0
+        return None
     age_ns: int = request.now_ns - asked_ns
     return max(0.0, age_ns / 1e9)
 

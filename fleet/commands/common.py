@@ -134,7 +134,7 @@ def _words(outcome: Outcome) -> str:
         # Who asks here is a person, so that only another person keeps the car from them.
         return f"{outcome}{' (--take)' if outcome.reason == 'leased' else ''}"
     notes = [outcome.words] if outcome.words else []
-    if outcome.worst_case_s:
+    if outcome.worst_case_s is not None:
         notes.append(f"motors off within {outcome.worst_case_s:.2f} s at worst")
     more = f" ({'; '.join(notes)})" if notes else ""
     return f"{outcome.car}: {outcome.phase} after {outcome.took_s:.2f} s{more}"

@@ -125,7 +125,7 @@ def refuse(command: Command, situation: Situation) -> Refusal | None:
     what = command.what
     if isinstance(what, Stop | EmergencyStop):
         return None
-    if command.age_s > command.ttl_s:
+    if command.age_s is not None and command.age_s > command.ttl_s:
         return Reason.STALE, f"{command.age_s:.1f} s old on arrival, at most {command.ttl_s:g} s is allowed: ask again"
     unknown = _unknown(what, situation)
     if unknown is not None:

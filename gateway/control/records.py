@@ -137,7 +137,8 @@ class Command:
     verb: str
     sender: Sender
     what: What
-    age_s: float = 0.0
+    age_s: float | None = None
+    """Seconds from asking to arrival; None if the command does not say when it was asked, which counts as fresh."""
     ttl_s: float = 2.0
     take: bool = False
     """A person takes the car from an equal."""

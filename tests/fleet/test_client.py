@@ -52,6 +52,7 @@ def test_a_stop_supersedes_a_drive_and_is_waited_for_until_it_is_complete(client
     (outcome,) = client.stop(["blue"])
     drive.join()
     assert (outcome.ok, outcome.phase) == (True, "complete")
+    assert outcome.worst_case_s is not None
     assert outcome.worst_case_s > 0
     assert not driving(cars.sim, "blue")
     assert [(each.ok, each.phase) for each in ended] == [(False, "superseded")]  # type: ignore[attr-defined]  # Outcome

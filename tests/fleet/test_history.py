@@ -261,7 +261,7 @@ def test_a_table_of_every_type_has_the_same_columns_whatever_was_measured() -> N
     assert table(silent, topics.TOPICS["sensor/range"]).endswith(",red,9223372036854775808,,true\r\n")
     mode = [Reading("fleet/red/state/mode", NOW, pb.Mode(asked="manual", evidence='a "b", c', candidates=["x", "y"]))]
     row = next(csv.DictReader(io.StringIO(table(mode, topics.TOPICS["state/mode"]), newline="")))
-    assert (row["evidence"], row["candidates"], row["evidence_age_s"]) == ('a "b", c', '["x", "y"]', "0.0")
+    assert (row["evidence"], row["candidates"], row["evidence_age_s"]) == ('a "b", c', '["x", "y"]', "")
     safety = pb.Safety(motors="off")
     safety.hold.by = "ann"
     row = next(

@@ -175,7 +175,7 @@ class Wild:
             type(what).__name__,
             sender,
             what,
-            age_s=moments.choice([0.0, 0.0, 0.0, 0.1, 9.0]),
+            age_s=moments.choice([None, None, 0.0, 0.1, 9.0]),
             take=moments.random() < 0.1,
             streamed=isinstance(what, Drive) and moments.random() < 0.5,
         )

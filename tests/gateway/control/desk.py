@@ -71,7 +71,7 @@ class Desk:
         *,
         identity: str = "",
         streamed: bool = False,
-        age_s: float = 0.0,
+        age_s: float | None = None,
         pump: bool = True,
         take: bool = False,
     ) -> Answer:
