@@ -57,7 +57,7 @@ FRESH_S: Final = 0.25
 """Bytes that could not be looked at so soon are not looked at: what comes after them matters more."""
 FLOOD_OVER_S: Final = 10.0
 """A flood is told of again when it was over for so long."""
-_LEVELS: Final = {Level.INFO: logging.INFO, Level.WARNING: logging.WARNING, Level.ERROR: logging.ERROR}
+_LEVELS: Final = {Level.DEBUG: logging.DEBUG, Level.INFO: logging.INFO, Level.WARNING: logging.WARNING, Level.ERROR: logging.ERROR}
 
 log = logging.getLogger("gateway")
 
@@ -178,13 +178,12 @@ class Car:
             self._flush()
             self._out.bus_back(self._loop.time(), at_once=True)
             self._out.states(self._control, self._health, self._loop.time(), force=True)
-        return not self._control.unstopped
+        return not self._control.not_stopped
 
     def stop(self) -> None:
         """Begin to end: the car is stopped first. Told again, end without waiting for it."""
         if self._ending:
             log.error("%s: told twice to end: its stop may be incomplete", self._settings.car)
-            self._control.unstopped = True
             self._control.link_down("the gateway was told twice to end", self._loop.time())
         self._ending = True
         self._control.shutdown(self._loop.time())
@@ -314,7 +313,7 @@ class Car:
     @property
     def _shown(self) -> tuple[object, ...]:
         """What a reading, or silence, may change of the states."""
-        return self._control.mode.verdict, self._control.mode.inferred, self._control.motors
+        return self._control.mode.verdict, self._control.mode.inferred, self._control.motors, self._control.basis
 
     def _wake_if_due(self, now: float) -> None:
         """Wake the writer if it has something to do: for each reading, which seldom needs it, it would cost a third."""

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 from gateway import desk
 from gateway.candidates import Port
-from gateway.control.recipes import CONFIRM_S, UNKNOWN
+from gateway.control.recipes import ANSWER_S, UNKNOWN
 from gateway.heard import Tally
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
 from gateway.protocol.decode import Decoder
@@ -90,7 +90,7 @@ class Ear:
                 self.trouble = str(error)
                 return
         self.answered = False
-        await self.listen(CONFIRM_S, until_answered=True)
+        await self.listen(ANSWER_S, until_answered=True)
 
     def end(self) -> None:
         """Take in what was held back."""

@@ -50,7 +50,7 @@ _CLASSES: Final[dict[str, Any]] = {
 """A message is made anew each time: one that is cleared and filled again keeps what it held before in memory."""
 _ON_ARRIVAL: Final = frozenset({Phase.ASKED, Phase.QUEUED, Phase.REJECTED})
 """Records made when a command arrives: nothing took any time yet."""
-_LEVELS: Final = {Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
+_LEVELS: Final = {Level.DEBUG: 1, Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
 
 
 class Publications:
@@ -147,6 +147,7 @@ class Publications:
             event.took_s = record.took_s
         event.count = record.count
         event.evidence.extend(record.evidence)
+        event.basis = record.basis
         if request is not None:
             event.request, event.request_encoding = request
         self._record("event/command", event, record.at)
@@ -192,7 +193,7 @@ class Publications:
             "state/link": (health.state, health.reconnects, health.state == "lost" and health.reason),
             "state/mode": (mode.asked, mode.inferred, mode.verdict),
             "state/motion": (control.motion, control.owner, believed.fan, believed.servo_deg, believed.speed),
-            "state/safety": (safety.kept, lease and lease.holder, control.motors),
+            "state/safety": (safety.kept, lease and lease.holder, control.motors, control.basis, control.model.trust.state),
         }
         for name, told in changes.items():
             late = now - self._told_at.get(name, float("-inf")) >= STATE_EVERY_S
@@ -205,8 +206,8 @@ class Publications:
         match name:
             case "state/link":
                 _fill_link(message, health, self._url, now)
-                if control.disobeyed:
-                    message.rejects["not_obeyed"] = control.disobeyed
+                if control.lost_frames:
+                    message.rejects["not_obeyed"] = control.lost_frames
             case "state/mode":
                 _fill_mode(message, control, now)
             case "state/motion":
@@ -303,8 +304,9 @@ def _fill_motion(message: pb.Motion, control: Controller, now: float) -> None:
     message.source = "unknown" if control.motion is None else "commanded" if control.owner else "assumed"
     message.speed = control.profile.speed.fraction(control.believed.speed)
     message.owner = control.owner
-    if control.owner:
-        message.expires_in_s = control.expires_in_s(now)
+    expires_in_s = control.expires_in_s(now)
+    if expires_in_s is not None:
+        message.expires_in_s = expires_in_s
     message.fan = bool(control.believed.fan)
     if control.believed.servo_deg is not None:
         message.servo_deg = control.believed.servo_deg
@@ -325,6 +327,12 @@ def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
         message.lease.holder, message.lease.kind = lease.holder.name, lease.holder.kind
         message.lease.expires_in_s = lease.until - now
     message.motors = control.motors
+    message.motors_basis = control.basis or ""
+    trust = control.model.trust
+    message.trust = trust.state
+    message.trust_evidence = trust.evidence
+    if trust.shown_at is not None:
+        message.shown_age_s = max(0.0, now - trust.shown_at)
     message.worst_stop_s = control.worst_stop_s(now)
 
 

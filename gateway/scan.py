@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from gateway import desk
 from gateway.candidates import BleDevice, NoBluetooth, ble_devices, serial_ports
-from gateway.control.recipes import CONFIRM_S, UNKNOWN
+from gateway.control.recipes import ANSWER_S, UNKNOWN
 from gateway.ear import Ear, Verdict
 from gateway.link import parse_url
 from gateway.protocol.encode import encode
@@ -128,7 +128,7 @@ class _Scan:
         where = ", ".join(str(ear.url) for ear in asked)
         desk.note(f"sending {frames} within {UNKNOWN.length_s:g} s to {where}: a car there stops, and goes to mode 0")
         probing = asyncio.gather(*(ear.probe() for ear in asked))
-        await self._with_progress(_all(probing), "probing", UNKNOWN.length_s + CONFIRM_S)
+        await self._with_progress(_all(probing), "probing", UNKNOWN.length_s + ANSWER_S)
 
     async def _with_progress(self, work: Coroutine[Any, Any, None], what: str, seconds: float) -> None:
         """Tell a person at a terminal how long it may still take."""

@@ -10,7 +10,7 @@ from gateway.control.battery import Battery, Policy
 from gateway.control.believed import Believed
 from gateway.control.ledger import Ledger
 from gateway.control.mode import ModeTruth, Verdict
-from gateway.control.outbox import AWAKE_S, Pacing
+from gateway.control.outbox import AWAKE_S, FLIGHT_S, Pacing
 from gateway.control.platform import PlatformTruth
 from gateway.control.records import Level
 from gateway.control.stop_evidence import StopCase, StopEvidence
@@ -121,8 +121,11 @@ class CarModel:
 
     def is_awake(self, now: float) -> bool:
         """Return True if the car reads a frame at once: no block of ours runs, nor one that we know nothing of."""
-        if now < self.pacing.block_until:
+        pacing = self.pacing
+        if now <= pacing.heard_at + AWAKE_S and pacing.heard_at > pacing.written_at + FLIGHT_S:
+            return True
+        if now < pacing.block_until - FLIGHT_S:
             return False
-        if (self.known and self.manual) or now <= self.pacing.heard_at + AWAKE_S:
+        if self.known and self.manual:
             return True
         return now >= self.pacing.written_at + recipes.SILENCE_S - 0.1

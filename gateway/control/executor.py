@@ -14,7 +14,7 @@ from gateway.control.records import Fan, Level, Phase, Reason, SetMode, Why, Wri
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
 from gateway.control.stop import Running
-from gateway.control.stop_evidence import EVIDENCE, Finding, StopCase
+from gateway.control.stop_evidence import CLOSED_S, EVIDENCE, Finding, StopCase
 from gateway.control.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
 from gateway.control.waiting import Held, Waiting
 from gateway.protocol.encode import Frame, General, ModeClose, ModeOpen, encode
@@ -105,7 +105,7 @@ class Executor:
         running = self.running
         if running is not None:
             write = self._step(running, now)
-            if write is not None or self.running is running and not self._leaves_gap(running, now):
+            if write is not None or (self.running is not None and not self._leaves_gap(self.running, now)):
                 return write
         if not self.accepts:
             return self._toggle_fan(now)
@@ -399,7 +399,7 @@ class Executor:
         match finding:
             case Finding.SHOWN:
                 self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
-            case Finding.NO_ECHO:
+            case Finding.NO_ECHO if at > running.closed_at + CLOSED_S:
                 running.no_echo_at = at
             case Finding.LOST:
                 self._lost(running, now)

@@ -11,6 +11,8 @@ REPEAT_S: Final = 1.1
 """A block that we know nothing of lasts up to 1.0 s; a frame sent 1.1 s after the last is alone in the buffer."""
 SILENCE_S: Final = 3.7
 """From the first frame of recovery to the one that is certain: longer than any block outside avoidance."""
+ANSWER_S: Final = 4.5
+"""Maximum wait for a mode-0 reading after a stop: avoidance blocks for 4.3 s."""
 
 
 class Gate(IntEnum):

@@ -27,6 +27,9 @@ SHOWN_S: Final = 2.0
 RETRY_S: Final = (recipes.SILENCE_S, 5.0, 6.5, 8.0)
 """Interval from `MODE00` to the next try, by tries. The silence makes the next frame certain: it is longer than any block
 outside avoidance. It grows to 8 s, so that a car is told within 10 s of the link being whole."""
+REPORTED_S: Final = 3.3
+"""Minimum wait after the last frame: without an echo the car ranges for 1.0 s before it reads a frame, is blocked for
+1.0 s, and reports after 0.9 s more. A second ranging of 1.0 s may follow, but a try in it does no harm."""
 IN_TIME_S: Final = 0.2
 """A frame written so long before a block can end lies in the buffer when it does, whatever the link's own delay."""
 
@@ -127,7 +130,7 @@ class Running:
     def next_try_at(self) -> float:
         """Return when the stop is sent again if nothing shows it before."""
         after = self.closed_at if self.closed_at > float("-inf") else self.last_at
-        return max(self.last_at + recipes.REPEAT_S, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
+        return max(self.last_at + REPORTED_S, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
 
     @property
     def gives_up_at(self) -> float:

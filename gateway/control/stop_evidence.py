@@ -157,8 +157,6 @@ class StopEvidence:
     """When the first `MODE00` since then was written; None if another frame came first."""
     _plain: bool = False
     """No other frame was written before that `MODE00`."""
-    _last_close: float = float("inf")
-    """When the newest `MODE00` on this link was written; inf if none was."""
 
     # ------------------------------------------------------------------ frames
 
@@ -166,7 +164,6 @@ class StopEvidence:
         """Forget everything: the link is new."""
         self.obeyed_at = None
         self._last_at = float("-inf")
-        self._last_close = float("inf")
         self._window_s = CLOSED_S
         self.stalled()
         self.sent_motion()
@@ -191,7 +188,6 @@ class StopEvidence:
     def closed(self, now: float, *, awake: bool) -> None:
         """Note a `MODE00`; `awake`: no block of our own frames runs, so the pause that it makes is 1.0 s."""
         self._pending = now if awake else None
-        self._last_close = now
         if self._closed_at is None:
             self._closed_at = now
         else:
@@ -229,7 +225,7 @@ class StopEvidence:
             return self._obeyed(at)
         pending = self._pending
         if not event.range_cm:
-            return Finding.NO_ECHO if at > self._last_close + CLOSED_S else Finding.NOTHING
+            return Finding.NO_ECHO
         if pending is None:
             return Finding.REPORT
         if before is None:

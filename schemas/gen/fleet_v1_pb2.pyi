@@ -275,7 +275,7 @@ class Lease(_message.Message):
     def __init__(self, holder: _Optional[str] = ..., kind: _Optional[str] = ..., expires_in_s: _Optional[float] = ...) -> None: ...
 
 class Safety(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -286,6 +286,10 @@ class Safety(_message.Message):
     LEASE_FIELD_NUMBER: _ClassVar[int]
     MOTORS_FIELD_NUMBER: _ClassVar[int]
     WORST_STOP_S_FIELD_NUMBER: _ClassVar[int]
+    MOTORS_BASIS_FIELD_NUMBER: _ClassVar[int]
+    TRUST_FIELD_NUMBER: _ClassVar[int]
+    TRUST_EVIDENCE_FIELD_NUMBER: _ClassVar[int]
+    SHOWN_AGE_S_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -296,7 +300,11 @@ class Safety(_message.Message):
     lease: Lease
     motors: str
     worst_stop_s: float
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ...) -> None: ...
+    motors_basis: str
+    trust: str
+    trust_evidence: str
+    shown_age_s: float
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops")
@@ -373,7 +381,7 @@ class TxFrame(_message.Message):
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., data: _Optional[bytes] = ..., command_id: _Optional[str] = ..., why: _Optional[str] = ..., written: _Optional[bool] = ...) -> None: ...
 
 class CommandEvent(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "id", "verb", "sender", "kind", "phase", "reason", "words", "request", "request_encoding", "age_s", "worst_case_s", "took_s", "evidence", "count")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "id", "verb", "sender", "kind", "phase", "reason", "words", "request", "request_encoding", "age_s", "worst_case_s", "took_s", "evidence", "count", "basis")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -392,6 +400,7 @@ class CommandEvent(_message.Message):
     TOOK_S_FIELD_NUMBER: _ClassVar[int]
     EVIDENCE_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
+    BASIS_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -410,7 +419,8 @@ class CommandEvent(_message.Message):
     took_s: float
     evidence: _containers.RepeatedScalarFieldContainer[str]
     count: int
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., id: _Optional[str] = ..., verb: _Optional[str] = ..., sender: _Optional[str] = ..., kind: _Optional[str] = ..., phase: _Optional[str] = ..., reason: _Optional[str] = ..., words: _Optional[str] = ..., request: _Optional[bytes] = ..., request_encoding: _Optional[str] = ..., age_s: _Optional[float] = ..., worst_case_s: _Optional[float] = ..., took_s: _Optional[float] = ..., evidence: _Optional[_Iterable[str]] = ..., count: _Optional[int] = ...) -> None: ...
+    basis: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., id: _Optional[str] = ..., verb: _Optional[str] = ..., sender: _Optional[str] = ..., kind: _Optional[str] = ..., phase: _Optional[str] = ..., reason: _Optional[str] = ..., words: _Optional[str] = ..., request: _Optional[bytes] = ..., request_encoding: _Optional[str] = ..., age_s: _Optional[float] = ..., worst_case_s: _Optional[float] = ..., took_s: _Optional[float] = ..., evidence: _Optional[_Iterable[str]] = ..., count: _Optional[int] = ..., basis: _Optional[str] = ...) -> None: ...
 
 class Truth(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "x_m", "y_m", "heading_rad", "mode", "motor_left", "motor_right", "blocked", "fan", "led")
