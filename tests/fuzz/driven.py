@@ -132,7 +132,7 @@ def wedged(pair: Pair) -> bool:
 
 def pair_lost(pair: Pair) -> bool:
     """Whether control was told that the link is gone."""
-    return not pair.control._link_open
+    return not pair.control.model.link_open
 
 
 def run(seed: int, steps: int, *, stop_every: int = 12) -> Fuzzed:

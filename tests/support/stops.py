@@ -430,7 +430,7 @@ def state_of(pair: Pair) -> str:
         StopStyle.UNKNOWN: "unknown platform, ",
         StopStyle.RASPBERRY_PI: f"{Platform.RASPBERRY_PI}, ",
     }
-    running = control._running
+    running = control.running
     if not control.known:
         return f"{kind[style]}link just restored"
     if running is not None and running.recipe.rank > 1:

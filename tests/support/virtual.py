@@ -4,7 +4,7 @@ import random
 from collections.abc import Callable
 
 from gateway.control.controller import Controller
-from gateway.control.records import Answer, Command, CommandRecord, LogRecord, Phase, Sender, What
+from gateway.control.records import Answer, Command, CommandRecord, Level, LogRecord, Phase, Sender, What
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import parse_platform
 from gateway.sim.core.cars import build
@@ -131,5 +131,5 @@ class Pair:
         for record in self.control.take_records():
             if isinstance(record, CommandRecord):
                 self.records.append(record)
-            else:
+            elif record.level is not Level.DEBUG:
                 self.logs.append(record)

@@ -8,6 +8,7 @@ from gateway.control.records import (
     Command,
     CommandRecord,
     Kind,
+    Level,
     LogRecord,
     Phase,
     Reason,
@@ -124,7 +125,7 @@ class Desk:
         for record in self.control.take_records():
             if isinstance(record, CommandRecord):
                 self.records.append(record)
-            else:
+            elif record.level is not Level.DEBUG:
                 self.logs.append(record)
 
     @property
