@@ -146,7 +146,9 @@ class CarMonitor:
         )
         self._ledger.log(Level.WARNING, "unheard", words, now)
         self._executor.waiting.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
-        if self._executor.running is None:
+        if model.at_rest and self._executor.running is None:
+            self._executor.stop_again(now)
+        elif self._executor.running is None:
             self._executor.recover(now, words)
         model.learn(TrustEvent.SILENT, now, words)
 
@@ -156,6 +158,8 @@ class CarMonitor:
         self._ledger.log(Level.INFO, "answers_again", words, now)
         self._executor.waiting.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self.model.learn(TrustEvent.HEARD, now, words)
+        if self._executor.running is not None and self._executor.running.at_rest:
+            self._executor.recover(now, words)
 
     def stalled(self, gap_s: float, now: float) -> None:
         """Stop a car that is driven: the loop slept for `gap_s`."""

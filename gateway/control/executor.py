@@ -31,6 +31,9 @@ UNKNOWN_PROBES: Final = 2
 """Maximum probes of a car of an unknown platform: a Raspberry Pi shows nothing of them."""
 GAP_S: Final = 1.5
 """Minimum time to the next try of a stop in which other frames may go out."""
+CLEARING_RENEWALS: Final = 3
+"""After a stop that an arduino could not show, so many times `MODE00` is sent again. A general stop does nothing to a car
+that was sent half a named frame (protocol.md, hazards). No more than that, since it beeps."""
 _STOP: Final = General(Motion.STOP)
 
 
@@ -131,7 +134,7 @@ class Executor:
             return None
         held = waiting.held
         if held is not None and not held.pending.sent:
-            self._give_way()
+            self._give_way(now)
             return self._write(General(held.motion), Why.COMMAND, held, held.pending)
         if waiting.opening is not None and not (waiting.acts and model.at_rest) and self.running is None:
             return self._open_mode(waiting.opening, now)
@@ -142,9 +145,12 @@ class Executor:
             return self._write(General(model.believed.motion), Why.REPEAT, None, held.pending if held else None)
         return self._renew(now)
 
-    def _give_way(self) -> None:
+    def _give_way(self, now: float) -> None:
         """End the tries of a stop that the car does not show: somebody drives it all the same."""
-        self.running = None
+        running, self.running = self.running, None
+        words = f"{self.model.name} was driven before it showed that it stopped"
+        for pending in running.commands if running is not None else ():
+            self._ledger.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
 
     def _renew(self, now: float) -> Write | None:
         """Send the stop of a car at rest again if nothing has shown it: the frames may have been lost."""
@@ -155,7 +161,8 @@ class Executor:
         if model.rest is StopCase.FAN and self._left_mode:
             self.begin(self.full(now), Why.REPEAT, now)
             return self._step(self.running, now) if self.running is not None else None
-        return self._write(_STOP, Why.REPEAT, None, None)
+        clears = model.rest in (StopCase.NO_ECHO, StopCase.UNKNOWN_PLATFORM) and self._renewals <= CLEARING_RENEWALS
+        return self._write(ModeClose() if clears else _STOP, Why.REPEAT, None, None)
 
     def _schedule_renewal(self, now: float) -> None:
         self._renew_at = now + RENEW_S[min(self._renewals, len(RENEW_S) - 1)]
@@ -271,8 +278,17 @@ class Executor:
                     self._moves(TrustEvent.MOTION_SENT, now)
                 else:
                     model.evidence.sent_other()
+                if shown and frame != _STOP and model.trust.shown:
+                    self._doubt_rest(now)
         if model.profile.stop_style is StopStyle.RASPBERRY_PI and model.mode.asked is None:
             model.mode.ask(Mode.MANUAL, now=now, block_s=block_s)
+
+    def _doubt_rest(self, now: float) -> None:
+        """Rest on what was sent from now on: half of a named frame is read as a motion (protocol.md, hazards)."""
+        self.model.rest = StopCase.ACTED
+        words = EVIDENCE[StopCase.ACTED].words.format(car=self.model.name)
+        self.model.learn(TrustEvent.STOP_SENT, now, words)
+        self._schedule_renewal(now)
 
     def _moves(self, event: TrustEvent, now: float) -> None:
         self._renewals, self._renew_at = 0, float("inf")
@@ -330,7 +346,7 @@ class Executor:
         model.believed.repeat = False
         joining = [pending] if pending is not None else []
         running = self.running
-        if running is None or running.recipe.rank < recipe.rank:
+        if running is None or running.recipe.rank < recipe.rank or running.at_rest:
             self._start(recipe, why, now, [*(running.commands if running is not None else ()), *joining])
             return
         running.commands.extend(joining)
@@ -341,6 +357,12 @@ class Executor:
             running.again(self.full(now), now)
         if running.first_at is not None and pending is not None:
             self._ledger.sent(pending, now, f"joined the {running.recipe.name} stop under way")
+
+    def stop_again(self, now: float) -> None:
+        """Send general stops to a car that had shown that it stands, and is silent now."""
+        self._start(self.soft(now), Why.RECOVERY, now, [])
+        assert self.running is not None
+        self.running.at_rest = True
 
     def recover(self, now: float, words: str) -> None:
         """Bring the car to a known state, whatever runs. Commands that wait for a stop wait for this one."""
@@ -428,7 +450,8 @@ class Executor:
 
     def _try_again(self, running: Running, now: float) -> None:
         running.tries += 1
-        running.again(stop.recovery(self.model.for_stop(now)), now)
+        situation = self.model.for_stop(now)
+        running.again(stop.soft(situation) if running.at_rest else stop.recovery(situation), now)
         self.model.evidence.tried_again()
 
     def _await(self, running: Running, now: float) -> None:
@@ -447,6 +470,8 @@ class Executor:
     def _ends_as_sent(self, running: Running, now: float) -> StopCase | None:
         """Return why the stop ends without evidence; None if the car may still show it."""
         model = self.model
+        if running.at_rest:
+            return None
         reported = running.report_at > running.last_at
         over = now >= running.obeyed_at
         if not running.frames_sent or not (over or reported):

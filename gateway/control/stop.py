@@ -101,6 +101,9 @@ class Running:
     probes: int = 0
     overdue: bool = False
     """Nothing showed it in time. The stop goes on."""
+    at_rest: bool = False
+    """The car had shown that it stands before it fell silent. It is sent general stops only: unlike a named frame, one
+    that loses bytes on the way can set nothing going."""
     case: StopCase = StopCase.MANUAL
     """What it rests on if it is not shown."""
 

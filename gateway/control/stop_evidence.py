@@ -18,10 +18,12 @@ SETTLED_S: Final = 0.8
 such a mode can look like mode 0 (there is no checksum), but silence never comes before it."""
 CLOSED_S: Final = 0.95
 """A report sooner after `MODE00` was written than this was sent before the car obeyed: closing takes 1.0 s."""
-LEFT_S: Final = 3.3
-"""Maximum time from `MODE00` to the first mode-0 report if that frame alone closed the mode: 1.0 s of closing, 0.9 s to
-the report, 1.0 s of ranging without an echo. Half a `MODE00` that the general stop 1.1 s later completes also leads to
-mode 0, with the motors on; it blocks for 2.3 s and so reports after 3.4 s at the soonest."""
+LEFT_S: Final = 2.2
+"""Maximum time from `MODE00` to the first mode-0 report if that frame closed the mode: 1.0 s of closing, 0.9 s to the
+report, and 0.2 s of turn and wire. A `MODE00` that lost one of its digits opens mode 0 instead, with the motors on; that
+blocks for 2.3 s, so the report comes later."""
+RANGING_S: Final = 1.0
+"""A report without an echo comes so much later."""
 SHAPE_UNTIL_S: Final = 1.0
 """Readings of the mode that is left end within this time if `MODE00` ended it, before the general stop at 1.1 s."""
 OPENING_SILENCE_S: Final = 2.3
@@ -51,6 +53,7 @@ class StopCase(StrEnum):
     NO_ECHO = "no_echo"
     FAN = "fan"
     SOFT = "soft"
+    ACTED = "acted"
     RASPBERRY_PI = "raspberry_pi"
     UNKNOWN_PLATFORM = "unknown_platform"
 
@@ -69,8 +72,8 @@ class EvidenceRow:
 EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.LEFT_SHAPE: EvidenceRow(
         "full, out of tracking, light seeking or following",
-        "a mode-0 report that begins after `MODE00` and comes within 3.3 s, when `MODE00` was the first frame since the "
-        "mode was seen; else as in mode 0",
+        "a mode-0 report that begins after `MODE00` and comes within 2.2 s (3.2 s without an echo), when `MODE00` was "
+        "the first frame since the mode was seen; else as in mode 0",
         "the stop goes on",
     ),
     StopCase.LEFT_SILENT: EvidenceRow(
@@ -86,7 +89,7 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.NO_ECHO: EvidenceRow(
         "full or recovery, in mode 0 without an echo",
         "",
-        "`sent` after a report; a general stop every 8 s at most",
+        "`sent` after a report; three more `MODE00` within 15 s, then a general stop every 8 s at most",
         "{car} has no sonar echo, so its reports show no pause",
     ),
     StopCase.FAN: EvidenceRow(
@@ -101,6 +104,12 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
         "`sent`; a general stop every 8 s at most",
         "a general stop shows nothing; `fleet stop` shows it",
     ),
+    StopCase.ACTED: EvidenceRow(
+        "none: a light, servo, whistle or LED frame at a rest that was shown",
+        "",
+        "`sent`; a general stop every 8 s at most",
+        "a frame went out since {car} showed that it stands; a link that loses bytes may make a motion of it",
+    ),
     StopCase.RASPBERRY_PI: EvidenceRow(
         "any, Raspberry Pi",
         "",
@@ -110,7 +119,7 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.UNKNOWN_PLATFORM: EvidenceRow(
         "full or recovery, platform unknown",
         "as for the other platforms",
-        "`sent` if it reports on in mode 0, as a Raspberry Pi does; a general stop every 8 s at most",
+        "`sent` if it reports on in mode 0, as a Raspberry Pi does; then as without an echo",
         "{car} reports on in mode 0, as a Raspberry Pi car does, which shows nothing of a stop",
     ),
 }
@@ -221,7 +230,7 @@ class StopEvidence:
             self._before, self._pauses = None, 0
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
-        if self._left(at, quiet_s):
+        if self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S):
             return self._obeyed(at)
         pending = self._pending
         if not event.range_cm:
@@ -260,7 +269,7 @@ class StopEvidence:
             self._shape_at = at
             self._silent_mode = None
 
-    def _left(self, at: float, quiet_s: float) -> bool:
+    def _left(self, at: float, quiet_s: float, within_s: float) -> bool:
         """Return True if this report shows that `MODE00`, alone, closed the mode that the car was in."""
         closed_at = self._closed_at
         shape_at, silent = self._shape_at, self._silent_mode
@@ -269,7 +278,7 @@ class StopEvidence:
         if silent is not None and quiet_s < OPENING_SILENCE_S:
             return False  # an older report, on a slow link
         self._shape_at = self._silent_mode = None
-        if not self._plain or at > closed_at + LEFT_S:
+        if not self._plain or at > closed_at + within_s:
             return False
         if silent is not None:
             self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {silent}"

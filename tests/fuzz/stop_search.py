@@ -103,7 +103,7 @@ class Ending(StrEnum):
     MANUAL = "manual"
     SHUTDOWN = "shutdown"
     RECONNECT = "reconnect"
-    BATTERY = "nothing"
+    
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,6 +276,7 @@ class Episode:
         self._complete_since = 0.0
         self._verdict_since: float | None = None
         self._case = ""
+        self._ended_as_sent = False
         self._false_counted = False
         self.trace: list[str] = []
         self.tracing = False
@@ -379,6 +380,8 @@ class Episode:
             if not ended.not_stopped:
                 self.report.ends[f"shutdown {ended.basis}"] += 1
                 self._complete = ended.basis == "shown"
+                self._ended_as_sent = ended.basis == "sent"
+                self.report.sent["shutdown"] += self._ended_as_sent
                 self._complete_since = self.now
                 self._linked = False
                 return
@@ -397,8 +400,7 @@ class Episode:
     def _ask(self, what: What, *, stop: bool = False) -> None:
         self._number += 1
         identity = f"c{self._number}"
-        if not stop:
-            self._complete = False
+        self._complete = False
         if stop:
             self._ends[identity] = []
             self._asked_at[identity] = self.now
@@ -508,6 +510,8 @@ class Episode:
             else ""
         )
         self._note(f"record {identity} {record.phase} {record.basis} {record.words} {record.evidence}")
+        if identity not in self._ends and record.phase is Phase.SENT:
+            self._complete = False
         if identity in self._ends and last:
             self._ends[identity].append(last)
             self.report.ends[last] += 1
@@ -534,7 +538,9 @@ class Episode:
         if self._on_since is not None:
             if self._claim_since is not None and now - max(self._on_since, self._claim_since) > FALSE_S:
                 self._violate(f"(1) off, shown ({control.model.trust.evidence}), while the motors run")
-            if self._complete and now - max(self._on_since, self._complete_since) > FALSE_S:
+            # A claim that was true and is withdrawn is none: a frame that loses bytes on the way can start the motors.
+            claimed = self._complete and (shown or self._on_since <= self._complete_since)
+            if claimed and now - max(self._on_since, self._complete_since) > FALSE_S:
                 self._violate("(1) complete, while the motors run")
         self._judge_sent(driving=driving)
         self._judge_verdict(truth.mode)
@@ -574,6 +580,8 @@ class Episode:
             if self.car.truth.driving and self.car.alive:
                 if _is_wedged(self.car):
                     self.report.wedged = True
+                elif self._ended_as_sent:
+                    self.report.false_sent["shutdown"] += 1  # nothing showed it, and no gateway is left
                 else:
                     self._violate("(2) the motors run")
                 break
