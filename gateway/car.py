@@ -31,7 +31,7 @@ from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.neighbours import Neighbours
 from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import Profile
-from gateway.protocol.readings import Event, Rejected
+from gateway.protocol.readings import Echo, Event, Rejected
 from gateway.publish import RAW_PER_S, STALLED_S, Publications
 from gateway.store import Store
 from schemas import bus, ending, keys, messages, topics
@@ -282,7 +282,10 @@ class Car:
             self._health.rx_frames += 1
             if isinstance(event, Rejected):
                 self._health.rejected(event.cause)
-            elif self._attempts.proven(event.at, heard=True):
+                continue
+            if not isinstance(event, Echo):
+                self._health.heard(event.at)
+            if self._attempts.proven(event.at, heard=True):
                 self._tell_open()
 
     def _lost(self, reason: str) -> None:
@@ -508,6 +511,7 @@ class Car:
                 limit_s=mode.silence_limit(fan=bool(self._control.believed.fan)),
                 unheard_s=mode.unheard_s(now),
                 why_quiet=f"{mode.asked or 'an unknown mode'} is silent",
+                is_heard=self._control.is_heard,
             )
             if changed or self._shown != shown or now >= next_health:
                 self._out.states(self._control, self._health, now)

@@ -25,13 +25,13 @@ LATE_S: Final = 0.1
 """Report a drive as shortened if its frame goes out later than this; its duration counts from the request."""
 SHUTDOWN_S: Final = 13.0
 """Maximum time that a gateway that ends waits for its car to show the stop."""
-RENEW_S: Final = (2.2, 4.0, 8.0)
+RENEW_S: Final = (2.2, 4.0, 6.0)
 """Intervals at which a rest that nothing has shown is sent again, by how often it was. A lost stop is made up for."""
 UNKNOWN_PROBES: Final = 2
 """Maximum probes of a car of an unknown platform: a Raspberry Pi shows nothing of them."""
 GAP_S: Final = 1.5
 """Minimum time to the next try of a stop in which other frames may go out."""
-CLEARING_RENEWALS: Final = 3
+CLEARING_RENEWALS: Final = 4
 """After a stop that an arduino could not show, so many times `MODE00` is sent again. A general stop does nothing to a car
 that was sent half a named frame (protocol.md, hazards). No more than that, since it beeps."""
 _STOP: Final = General(Motion.STOP)
@@ -106,6 +106,9 @@ class Executor:
             return None
         self._expire(now)
         running = self.running
+        if running is not None and self.closing and now >= self._closing_until:
+            self._give_up(running, now)
+            return None
         if running is not None:
             write = self._step(running, now)
             if write is not None or (self.running is not None and not self._leaves_gap(self.running, now)):
@@ -159,9 +162,8 @@ class Executor:
             return None
         self._schedule_renewal(now)
         if model.rest is StopCase.FAN and self._left_mode:
-            self.begin(self.full(now), Why.REPEAT, now)
-            return self._step(self.running, now) if self.running is not None else None
-        clears = model.rest in (StopCase.NO_ECHO, StopCase.UNKNOWN_PLATFORM) and self._renewals <= CLEARING_RENEWALS
+            return self._begin_now(self.full(now), Why.REPEAT, now)
+        clears = model.rest in (StopCase.NO_ECHO, StopCase.UNKNOWN_PLATFORM) and self._renewals <= CLEARING_RENEWALS + 1
         return self._write(ModeClose() if clears else _STOP, Why.REPEAT, None, None)
 
     def _schedule_renewal(self, now: float) -> None:
@@ -216,7 +218,7 @@ class Executor:
 
     def _running_times(self, running: Running, now: float) -> list[float]:
         if not running.frames_sent:
-            return [running.due_at(self.model.pacing)]
+            return [min(running.due_at(self.model.pacing), self._closing_until)]
         times = [max(running.next_try_at, self.model.pacing.flight_until)]
         if running.obeyed_at > now:
             times.append(running.obeyed_at)
@@ -249,8 +251,7 @@ class Executor:
         """Open a mode, from a sure rest only: opening while driving leaves the motors as they were, blind."""
         assert isinstance(pending.command.what, SetMode)
         if not self.model.rest_is_sure:
-            self.begin(self.full(now), Why.STOP, now)
-            return self._step(self.running, now) if self.running is not None else None
+            return self._begin_now(self.full(now), Why.STOP, now)
         if now < self.model.pacing.open_at(now):
             return None
         return self._write(ModeOpen(pending.command.what.mode), Why.COMMAND, pending, pending)
@@ -326,6 +327,13 @@ class Executor:
         self.not_stopped = why
         self._ledger.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at it.", now)
 
+    def _give_up(self, running: Running, now: float) -> None:
+        """End without a stop that the car showed."""
+        self.running = None
+        self._end_unstopped("did not show that it stopped", now)
+        for pending in running.commands:
+            self._ledger.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=self.not_stopped)
+
     def halt(self, words: str, now: float, by: str = "") -> None:
         """Drop all queued commands. Ignore a continuous drive stream until its sender pauses."""
         self.waiting.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
@@ -363,6 +371,12 @@ class Executor:
         self._start(self.soft(now), Why.RECOVERY, now, [])
         assert self.running is not None
         self.running.at_rest = True
+
+    def _begin_now(self, recipe: Recipe, why: Why, now: float) -> Write | None:
+        """Begin a stop. Return its first frame, if that may be written now."""
+        self.begin(recipe, why, now)
+        assert self.running is not None
+        return self._step(self.running, now)
 
     def recover(self, now: float, words: str) -> None:
         """Bring the car to a known state, whatever runs. Commands that wait for a stop wait for this one."""
@@ -461,10 +475,7 @@ class Executor:
             self._finish(running, Basis.SENT, EVIDENCE[case].words.format(car=self.model.name), now, case)
             return
         self._fail_late(running, now)
-        if self.closing and now >= self._closing_until:
-            self.running = None
-            self._end_unstopped("did not show that it stopped", now)
-        elif now >= max(running.next_try_at, self.model.pacing.flight_until):
+        if now >= max(running.next_try_at, self.model.pacing.flight_until):
             self._try_again(running, now)
 
     def _ends_as_sent(self, running: Running, now: float) -> StopCase | None:
@@ -522,6 +533,7 @@ class Executor:
             self._ledger.log(Level.INFO, "recovered", f"{model.name} is stopped, mode manual ({how})", now)
         model.believed.motors_on = False
         if basis is Basis.SENT:
+            self._renewals = 0
             self._schedule_renewal(now)
         phase = Phase.COMPLETE if basis is Basis.SHOWN else Phase.SENT
         evidence = (words,) if basis is Basis.SHOWN else ()

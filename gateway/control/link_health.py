@@ -33,6 +33,9 @@ class LinkHealth:
     rejects: dict[str, int] = field(default_factory=dict)
     reconnects: int = 0
     last_rx_at: float | None = None
+    """When the last bytes came."""
+    last_reading_at: float | None = None
+    """When the last reading came: bytes that are none do not make a link online."""
     _up_at: float | None = None
     _writes: deque[tuple[float, int]] = field(default_factory=deque)
 
@@ -40,7 +43,7 @@ class LinkHealth:
         """The port is open."""
         self.reconnects += self._up_at is not None
         self._up_at = now
-        self.last_rx_at = None
+        self.last_rx_at = self.last_reading_at = None
         self._set(LinkState.STALE, "open, nothing heard yet", now)
 
     def down(self, reason: str, now: float) -> None:
@@ -51,6 +54,10 @@ class LinkHealth:
         """Bytes came."""
         self.rx_bytes += count
         self.last_rx_at = now
+
+    def heard(self, at: float) -> None:
+        """Take that a reading came."""
+        self.last_reading_at = at
 
     def rejected(self, cause: str, count: int = 1) -> None:
         """Bytes were no reading."""
@@ -69,23 +76,26 @@ class LinkHealth:
         sent = sum(count for at, count in self._writes if at >= now - AIRTIME_WINDOW_S)
         return min(1.0, sent / (BYTES_PER_S * AIRTIME_WINDOW_S))
 
-    def judge(self, *, now: float, limit_s: float | None, unheard_s: float, why_quiet: str) -> bool:
-        """Bring the state up to date; True on a change.
+    def judge(self, *, now: float, limit_s: float | None, unheard_s: float, why_quiet: str, is_heard: bool) -> bool:
+        """Bring the state up to date. Return True on a change.
 
         `limit_s`: the longest normal silence, None if any is. `unheard_s`: how long there was no reading, what our own
-        frames explain left out (see `ModeTruth`).
+        frames explain left out (see `ModeTruth`). `is_heard`: False once control counts the car as unheard.
         """
         if self.state is LinkState.LOST:
             return False
         before = self.state
         up_at = self._up_at if self._up_at is not None else now
-        silence_s = now - (self.last_rx_at if self.last_rx_at is not None else up_at)
-        if self.last_rx_at is not None and silence_s <= (limit_s if limit_s is not None else STALE_S):
+        heard = self.last_reading_at is not None
+        silence_s = max(0.0, now - (self.last_reading_at if self.last_reading_at is not None else up_at))
+        if is_heard and heard and silence_s <= (limit_s if limit_s is not None else STALE_S):
             self._set(LinkState.ONLINE, "heard", now)
+        elif not is_heard:
+            self._set(LinkState.STALE, f"not heard for {silence_s:.1f} s: whether it moves is not known", now)
         elif limit_s is None:
             self._set(LinkState.QUIET, why_quiet, now)
         elif min(silence_s, unheard_s) <= limit_s:
-            if self.last_rx_at is not None:
+            if heard:
                 self._set(LinkState.QUIET, "the car is busy", now)
         else:
             self._set(LinkState.STALE, f"nothing heard for {silence_s:.1f} s, expected every {limit_s:g} s", now)

@@ -24,9 +24,9 @@ LONGEST_WORST_S: Final = 5.0
 """Maximum of the worst case that counts for that: nobody waits longer than 15 s for an answer."""
 SHOWN_S: Final = 2.0
 """Usual time from the last frame to the evidence."""
-RETRY_S: Final = (recipes.SILENCE_S, 5.0, 6.5, 8.0)
+RETRY_S: Final = (recipes.SILENCE_S, 4.5, 5.5, 6.5)
 """Interval from `MODE00` to the next try, by tries. The silence makes the next frame certain: it is longer than any block
-outside avoidance. It grows to 8 s, so that a car is told within 10 s of the link being whole."""
+outside avoidance. It grows to 6.5 s: of two tries that begin after the link is whole again, one is certain within 15 s."""
 REPORTED_S: Final = 3.3
 """Minimum wait after the last frame: without an echo the car ranges for 1.0 s before it reads a frame, is blocked for
 1.0 s, and reports after 0.9 s more. A second ranging of 1.0 s may follow, but a try in it does no harm."""

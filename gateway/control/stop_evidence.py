@@ -89,31 +89,31 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.NO_ECHO: EvidenceRow(
         "full or recovery, in mode 0 without an echo",
         "",
-        "`sent` after a report; three more `MODE00` within 15 s, then a general stop every 8 s at most",
+        "`sent` after a report; four more `MODE00` within 18 s, then a general stop every 6 s",
         "{car} has no sonar echo, so its reports show no pause",
     ),
     StopCase.FAN: EvidenceRow(
         "full or recovery, the fan runs (not Raspberry Pi)",
         "",
-        "`sent`; the stop again every 8 s at most",
+        "`sent`; the stop again every 6 s",
         "{car} sends nothing while its fan runs",
     ),
     StopCase.SOFT: EvidenceRow(
         "soft (a drive's end, or its sender lost)",
         "",
-        "`sent`; a general stop every 8 s at most",
+        "`sent`; a general stop every 6 s",
         "a general stop shows nothing; `fleet stop` shows it",
     ),
     StopCase.ACTED: EvidenceRow(
         "none: a light, servo, whistle or LED frame at a rest that was shown",
         "",
-        "`sent`; a general stop every 8 s at most",
+        "`sent`; a general stop every 6 s",
         "a frame went out since {car} showed that it stands; a link that loses bytes may make a motion of it",
     ),
     StopCase.RASPBERRY_PI: EvidenceRow(
         "any, Raspberry Pi",
         "",
-        "`sent` after a report; a general stop every 8 s at most",
+        "`sent` after a report; a general stop every 6 s",
         "a Raspberry Pi car shows nothing of a stop",
     ),
     StopCase.UNKNOWN_PLATFORM: EvidenceRow(

@@ -578,7 +578,7 @@ class Episode:
         end = self.now + seconds
         while self.now < end:
             if self.car.truth.driving and self.car.alive:
-                if _is_wedged(self.car):
+                if _is_wedged(self.car) and self.control.basis == "sent":
                     self.report.wedged = True
                 elif self._ended_as_sent:
                     self.report.false_sent["shutdown"] += 1  # nothing showed it, and no gateway is left
@@ -598,8 +598,8 @@ class Episode:
 
 
 def _is_wedged(car: object) -> bool:
-    """Return True for the one string that no frame of protocol.md's recovery clears (test_stops.py)."""
-    return isinstance(car, ArduinoCar) and car._string.startswith("4WD")
+    """Return True if the car keeps half a named frame: it ignores general stops (protocol.md, hazards)."""
+    return isinstance(car, ArduinoCar) and "4WD" in car._string
 
 
 # ---------------------------------------------------------------------- many episodes
