@@ -28,6 +28,7 @@ from gateway.control.records import (
     Stop,
     What,
 )
+from gateway.control.trust import CarTrust
 from gateway.protocol.decode import Decoder
 from gateway.protocol.encode import ColorLed, General, Ptz
 from gateway.protocol.profile import parse_platform
@@ -119,6 +120,9 @@ class Plan:
     load_s: float
     ending: Ending
     faults: tuple[Fault, ...]
+    opening: bool = False
+    """The stop comes `load_s` after the frame that opens the mode, else so long after the mode is open."""
+    report_every_s: float = 0.9
     again_s: float = 0.0
     """A second stop so long after the first; 0: none."""
     drive_again_s: float = 0.0
@@ -152,8 +156,11 @@ def draw(seed: int) -> Plan:
         ],
         [12, 2, 2, 2, 1],
     )[0]
-    modes = [mode.value for mode in Mode if mode is not Mode.MANUAL] if (platform, told) in _WITH_MODES else []
+    has_modes = (platform, told) in _WITH_MODES
+    modes = [mode.value for mode in Mode if mode is not Mode.MANUAL] if has_modes else []
     load = moments.choice(["rest", "drive", "drive", "drive", "steer", "acts", *modes])
+    if has_modes and moments.random() < 0.15:
+        load = moments.choice(["light_seeking", "following", "tracking"])
     world = moments.choices(["echo", "no-echo", "flickering"], [6, 2, 1])[0]
     if load == "tracking" and moments.random() < 0.3:
         world = "black"
@@ -161,25 +168,49 @@ def draw(seed: int) -> Plan:
         world = moments.choice(["echo", "pen"])
     elif load == "following" and moments.random() < 0.5:
         world = "wall"
-    driven = load in ("drive", "steer")
-    endings = [Ending.STOP] * 6 + [Ending.ESTOP, Ending.MANUAL, Ending.SHUTDOWN, Ending.SHUTDOWN, Ending.RECONNECT]
-    if driven:
+    endings = [Ending.STOP] * 7 + [Ending.ESTOP, Ending.MANUAL, Ending.SHUTDOWN, Ending.SHUTDOWN, Ending.RECONNECT]
+    if load in ("drive", "steer"):
         endings += [Ending.EXPIRY, Ending.RELEASE, Ending.LOST_SENDER]
+    opening = load in modes and moments.random() < 0.25
     return Plan(
         seed,
         platform,
         told,
         world,
         load,
-        moments.uniform(0.2, 2.0) if load in ("rest", "drive", "steer", "acts") else moments.uniform(0.5, 9.0),
+        moments.uniform(0.1, 3.5) if opening else moments.uniform(0.5, 9.0) if load in modes else moments.uniform(0.2, 2.0),
         moments.choice(endings),
-        tuple(_fault(moments) for _ in range(moments.choices([1, 2, 3], [5, 3, 1])[0])),
+        _faults(moments),
+        opening=opening,
+        report_every_s=moments.choice([0.9, 0.9, moments.uniform(0.9, 1.0)]),
         again_s=moments.uniform(0.3, 6.0) if moments.random() < 0.15 else 0.0,
         drive_again_s=moments.uniform(4.0, 14.0) if moments.random() < 0.15 else 0.0,
     )
 
 
 _WITH_MODES = {("arduino", "arduino"), ("arduino", "stm32")}
+_FRAME_S = 12 / BYTES_PER_S
+"""`$4WD,MODE00#` on the wire."""
+
+
+def _faults(moments: random.Random) -> tuple[Fault, ...]:
+    """Return faults: half of the time one that hits the stop itself, else any."""
+    chance = moments.random()
+    if chance < 0.25:  # a gap around the stop
+        for_s = 0.1 * 60 ** moments.random()
+        return (Fault(Kind.DEAD, moments.choice(list(Way)), moments.uniform(-min(for_s, 1.0), 0.1), for_s),)
+    if chance < 0.45:  # the stop's first frame is cut, or lacks bytes
+        at_s = moments.uniform(0.0, _FRAME_S)
+        for_s = moments.choice([1 / BYTES_PER_S, 2 / BYTES_PER_S, 0.02 * 100 ** moments.random()])
+        cut = Fault(Kind.DEAD, moments.choice([Way.TO_CAR, Way.TO_CAR, Way.BOTH]), at_s, for_s)
+        return (cut, _fault(moments)) if moments.random() < 0.3 else (cut,)
+    if chance < 0.55:  # the car's frames are damaged, and the stop is lost
+        lossy = Fault(Kind.LOSSY, Way.TO_HOST, -0.5, moments.uniform(1.0, 9.0), share=moments.choice([0.02, 0.05, 0.1]))
+        return (lossy, Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(-0.3, 0.01), moments.uniform(0.1, 6.0)))
+    if chance < 0.6:  # old reports come late, and the stop is lost
+        slow = Fault(Kind.SLOW, Way.TO_HOST, -4.0, 30.0, delay_s=moments.uniform(0.5, 1.5))
+        return (slow, Fault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(0.05, 3.0)))
+    return tuple(_fault(moments) for _ in range(moments.choices([1, 2, 3], [5, 3, 1])[0]))
 
 
 def _fault(moments: random.Random) -> Fault:
@@ -255,6 +286,8 @@ class Episode:
         self.report = Report(plan)
         world = ALL_WORLDS[plan.world]()
         self.car = build(plan.platform, world, 0, random.Random(plan.seed), transport=Transport.SERIAL, name="red")
+        if isinstance(self.car, ArduinoCar):
+            self.car.report_every_s = plan.report_every_s
         self.control = Controller("red", parse_platform(plan.told))
         self.decoder = Decoder()
         self.now = 0.0
@@ -290,7 +323,7 @@ class Episode:
         self._connect()
         self._until(lambda: self.control.motors == "off", READY_S)
         self._run(self._moments.random())
-        self.zero = self.now + self._load_time()
+        self.zero = self.now + 60.0  # the load says when
         self._load()
         self._run_to(self.zero)
         self._end()
@@ -311,11 +344,10 @@ class Episode:
         self._judge_rest(3.0)
         return self.report
 
-    def _load_time(self) -> float:
-        return self.plan.load_s + (9.0 if self.plan.load in {mode.value for mode in Mode} else 0.0)
-
     def _load(self) -> None:
         plan, moments = self.plan, self._moments
+        if plan.load in ("rest", "drive", "steer", "acts"):
+            self.zero = self.now + plan.load_s
         match plan.load:
             case "rest":
                 pass
@@ -335,9 +367,11 @@ class Episode:
                     self._ask(what)
             case mode:
                 self._ask(SetMode(Mode(mode)))
-                if moments.random() < 0.6:  # else the stop comes also while the mode opens
-                    self._until(lambda: self.car.truth.mode is Mode(mode), 9.0, fails=False)
-                    self.zero = self.now + plan.load_s
+                if plan.opening:
+                    self._until(lambda: self.control.model.trust.state is CarTrust.IN_MODE, 12.0, fails=False)
+                else:
+                    self._until(lambda: self.car.truth.mode is Mode(mode), 15.0, fails=False)
+                self.zero = self.now + plan.load_s
 
     def _drive_s(self) -> float:
         if self.plan.ending is Ending.EXPIRY:

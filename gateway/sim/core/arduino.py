@@ -56,6 +56,8 @@ class ArduinoCar(Firmware):
     def __init__(self, body: Body, rng: Rng, *, options: frozenset[str] = frozenset(), now: float = 0.0) -> None:
         super().__init__(body, rng, options=options, now=now)
         self._joints = [90] * 6
+        self.report_every_s = REPORT_EVERY_S
+        """Loop time from one report to the next, without its ranging. About a second: cars differ."""
         self._forget()
 
     def _forget(self) -> None:
@@ -67,7 +69,7 @@ class ArduinoCar(Firmware):
         self._speed = START_SPEED
         self._colour_position = 0
         # Loop time until each thing that mode 0 sends; the options' frames lie between the reports so that none blocks.
-        self._due = {"report": REPORT_EVERY_S}
+        self._due = {"report": self.report_every_s}
         for offset, option in ((0.3, "arm"), (0.6, "imu")):
             if option in self._options:
                 self._due[option] = offset
@@ -209,7 +211,7 @@ class ArduinoCar(Firmware):
             self._due[what] -= self._now - since
         if self._now >= due:
             what = min(self._due, key=lambda name: self._due[name])
-            self._due[what] = REPORT_EVERY_S
+            self._due[what] = self.report_every_s
             yield from self._report(what)
 
     def _report(self, what: str) -> Program:

@@ -1,0 +1,106 @@
+"""Each rule of a stop, taken out: the search must find the fault that the rule is there for."""
+
+from collections.abc import Callable
+from typing import Any
+
+from gateway.control import stop_evidence
+from gateway.control.executor import Executor
+from gateway.control.mode import ModeTruth
+from gateway.control.stop import Running
+from gateway.control.stop_evidence import StopCase, StopEvidence
+from gateway.control.trust import Basis
+
+Patch = Callable[[object, str, Any], None]
+"""`pytest.MonkeyPatch.setattr`."""
+
+
+def _time_decides(patch: Patch) -> None:
+    def await_time(self: Executor, running: Running, now: float) -> None:
+        if now >= running.obeyed_at:
+            self._finish(running, Basis.SHOWN, "time", now)
+
+    patch(Executor, "_await", await_time)
+
+
+def _no_second_try(patch: Patch) -> None:
+    patch(Executor, "_try_again", lambda self, running, now: setattr(running, "last_at", now))
+    patch(Executor, "_may_probe", lambda self, running: False)
+
+
+def _one_pause(patch: Patch) -> None:
+    patch(stop_evidence, "PAUSES", 1)
+
+
+def _damaged_frames_count(patch: Patch) -> None:
+    patch(stop_evidence, "SETTLED_S", -1.0)
+    patch(StopEvidence, "noise", lambda self, at: None)
+
+
+def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:
+    patch(stop_evidence, "LEFT_S", 20.0)
+
+
+def _any_frame_before_it(patch: Patch) -> None:
+    original = StopEvidence._left
+
+    def left(self: StopEvidence, at: float, quiet_s: float, within_s: float) -> bool:
+        self._plain = self._plain or self._shape_at is not None or self._silent_mode is not None
+        return original(self, at, quiet_s, 20.0)
+
+    patch(StopEvidence, "_left", left)
+
+
+def _silent_mode_after_any_rest(patch: Patch) -> None:
+    original = StopEvidence.opened
+    patch(StopEvidence, "opened", lambda self, mode, *, silent, shown: original(self, mode, silent=silent, shown=True))
+    patch(stop_evidence, "OPENING_SILENCE_S", 0.0)
+
+
+def _no_renewal(patch: Patch) -> None:
+    patch(Executor, "_schedule_renewal", lambda self, now: setattr(self, "_renew_at", float("inf")))
+
+
+def _confirmations_stay(patch: Patch) -> None:
+    patch(ModeTruth, "fade", lambda self, now: None)
+
+
+def _shutdown_waits_for_time(patch: Patch) -> None:
+    patch(Executor, "finished", property(lambda self: self.closing and (self.running is None or self.running.frames_sent)))
+
+
+def _sent_without_a_report(patch: Patch) -> None:
+    def ends(self: Executor, running: Running, now: float) -> StopCase | None:
+        return StopCase.NO_ECHO if running.frames_sent and now >= running.obeyed_at else None
+
+    patch(Executor, "_ends_as_sent", ends)
+
+
+def _drives_leave_evidence(patch: Patch) -> None:
+    patch(StopEvidence, "sent_motion", lambda self: None)
+
+
+def _a_stop_that_is_driven_over_ends_without_a_word(patch: Patch) -> None:
+    patch(Executor, "_give_way", lambda self, now: setattr(self, "running", None))
+
+
+def _commands_wait_for_ever(patch: Patch) -> None:
+    patch(Executor, "_fail_late", lambda self, running, now: None)
+
+
+RULES: dict[str, Callable[[Patch], None]] = {
+    "evidence decides, not time": _time_decides,
+    "what is not shown is sent again": _no_second_try,
+    "one pause is not enough": _one_pause,
+    "damaged frames are no reports": _damaged_frames_count,
+    "a report after LEFT_S does not show that a mode was left": _any_report_shows_that_a_mode_was_left,
+    "nor one after more frames than MODE00": _any_frame_before_it,
+    "a silent mode is left only from a shown rest, after its silence": _silent_mode_after_any_rest,
+    "a rest that is only sent is renewed": _no_renewal,
+    "a confirmation fades": _confirmations_stay,
+    "a shutdown waits for evidence": _shutdown_waits_for_time,
+    "only a car that can show nothing ends as sent": _sent_without_a_report,
+    "a motion takes back what was shown": _drives_leave_evidence,
+    "a stop that is driven over has failed": _a_stop_that_is_driven_over_ends_without_a_word,
+    "a stop that is not shown fails in time": _commands_wait_for_ever,
+}
+"""What each rule says, and how it is taken out."""
