@@ -12,7 +12,7 @@ import logging
 import os
 import random
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -126,6 +126,7 @@ class Car:
         self._wake_at = now
         """Until when the writer sleeps, if nothing wakes it."""
         self._hub_gone = asyncio.Event()
+        self._values_asked, self._histories_asked = asyncio.Event(), asyncio.Event()
         self._ending = False
         self._stopped = asyncio.Event()
         self._began_at = self._alive_at = now
@@ -140,11 +141,12 @@ class Car:
         self._out.states(self._control, self._health, now)
         self._doors.attach(
             self._loop,
-            query=lambda asked: self._answer(self._out.answers(*asked)),
+            values=self._values_asked,
+            histories=self._histories_asked,
             command=self._query,
             streamed=self._streamed,
-            sender=self._sender,
-            car=self._neighbours.changed,
+            senders=self._senders,
+            cars=self._neighbours.changed,
         )
         work = (
             self._connect(),
@@ -153,6 +155,8 @@ class Car:
             self._keep_hub(),
             self._look_again(),
             self._neighbours.keep_united(self._unite),
+            self._answer(self._doors.values),
+            self._answer(self._doors.histories),
         )
         tasks = [asyncio.ensure_future(each) for each in work]
         stopped = asyncio.ensure_future(self._stopped.wait())
@@ -352,18 +356,24 @@ class Car:
 
     # ------------------------------------------------------------------ commands
 
-    def _answer(self, rest: Iterator[None]) -> None:
-        """Answer a query of readings, the car's own work in between."""
-        for _ in rest:
-            self._loop.call_later(PAUSE_S, self._answer, rest)
-            return
+    async def _answer(self, asked: bus.Backlog[tuple[str, zenoh.Query]]) -> None:
+        """Answer queries of readings, one at a time, the car's own work in between."""
+        while True:
+            family, query = await asked.next()
+            try:
+                for _ in self._out.answers(family, query):
+                    await asyncio.sleep(PAUSE_S)
+            except Exception:  # whatever was asked: the car's own work goes on
+                log.exception("a question could not be answered")
+            await asyncio.sleep(0)
 
-    def _query(self, query: zenoh.Query) -> None:
+    def _query(self, came: tuple[zenoh.Query, str]) -> None:
         """Take a command that came as a query; it is answered when control has had the chance to write."""
+        query, unread = came
         expression = str(query.key_expr)
         verb = expression.rpartition("/")[2]
-        encoding = str(query.encoding) if query.encoding is not None else ""
-        payload = query.payload.to_bytes() if query.payload is not None else None
+        encoding = str(query.encoding) if query.encoding is not None and not unread else ""
+        payload = query.payload.to_bytes() if query.payload is not None and not unread else None
         as_json = query.parameters.get("format") == "json" or not encoding.startswith(topics.PROTOBUF)
         if "*" in verb:
             with query:
@@ -372,7 +382,13 @@ class Car:
         longest_s = self._settings.longest_drive_s
         by_wildcard = "*" in expression
         request = requests.Request(
-            verb, payload, encoding, time.time_ns(), longest_drive_s=longest_s, by_wildcard=by_wildcard
+            verb,
+            payload,
+            encoding,
+            time.time_ns(),
+            longest_drive_s=longest_s,
+            by_wildcard=by_wildcard,
+            unread=unread,
         )
         before = self._control.safety.kept
         command, answer = self._command(request)
@@ -395,6 +411,7 @@ class Car:
                 sampled_ns=sample.time_ns,
                 longest_drive_s=self._settings.longest_drive_s,
                 by_wildcard="*" in sample.key,
+                unread=sample.unread,
             )
             self._command(request)
             self._wake.set()
@@ -469,10 +486,11 @@ class Car:
         log.log(_LEVELS[level], "%s: %s", self._settings.car, words)
         self._out.log(LogRecord(level, code, words, self._loop.time()))
 
-    def _sender(self, change: tuple[str, bool]) -> None:
-        """A sender's liveliness token appeared or went."""
-        name, alive = change
-        self._control.sender_alive(name, alive=alive, now=self._loop.time())
+    def _senders(self, changed: Mapping[str, bool]) -> None:
+        """Liveliness tokens of senders appeared or went."""
+        now = self._loop.time()
+        for name, alive in changed.items():
+            self._control.sender_alive(name, alive=alive, now=now)
         self._wake.set()
 
     def _unite(self, estops: Sequence[Estop], ended: Sequence[str], told_by: str) -> None:

@@ -6,7 +6,7 @@ to: with fifty cars that would be 2,500 states a second.
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from gateway.control.records import Command, EmergencyStop, Resume
@@ -21,6 +21,10 @@ AGAIN_S: Final = 0.5
 nobody else knows."""
 SELDOM_S: Final = 30.0
 """... and so seldom in the end."""
+CALM_S: Final = 1.0
+"""While gateways come on and on, all are asked ever more seldom, down to every `LONGEST_TOGETHER_S`; after so long
+without one that came, at once again."""
+LONGEST_TOGETHER_S: Final = 3.0
 
 log = logging.getLogger("gateway")
 
@@ -38,10 +42,9 @@ class Neighbours:
         self._passing_on: set[asyncio.Task[None]] = set()
         self._came = asyncio.Event()
 
-    def changed(self, change: tuple[str, bool]) -> None:
-        """A gateway of the fleet came or went."""
-        name, alive = change
-        if alive and name != self._car:
+    def changed(self, changes: Mapping[str, bool]) -> None:
+        """Gateways of the fleet came or went."""
+        if any(alive and name != self._car for name, alive in changes.items()):
             self.ask_soon()
 
     def ask_soon(self) -> None:
@@ -75,10 +78,16 @@ class Neighbours:
     async def keep_united(self, unite: Unite) -> None:
         """Fleet-wide e-stops, in force and ended, are taken over from whoever comes onto the bus; until cancelled."""
         key = keys.topic_key(self._fleet, "*", "state/safety")
-        again_s = AGAIN_S
+        again_s, together_s = AGAIN_S, TOGETHER_S
         while True:
-            await self._came.wait()
-            await asyncio.sleep(TOGETHER_S)
+            try:
+                async with asyncio.timeout(CALM_S):
+                    await self._came.wait()
+            except TimeoutError:
+                together_s = TOGETHER_S
+                await self._came.wait()
+            await asyncio.sleep(together_s)
+            together_s = min(2 * together_s, LONGEST_TOGETHER_S)
             self._came.clear()
             unanswered = False
             for answer in await asyncio.to_thread(lambda: list(self._bus.query(key))):

@@ -31,7 +31,7 @@ from gateway.control.records import (
 from gateway.protocol.encode import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from schemas import messages
-from schemas.topics import COMMANDS, PROTOBUF
+from schemas.topics import COMMANDS, PROTOBUF, STOPS
 
 LONGEST_DRIVE_S: Final = 10.0
 """A drive that holds longer is refused, unless `gateway run --longest-drive` allows it: who drives can say so again."""
@@ -41,8 +41,6 @@ LONGEST_WHY: Final = 200
 """Of an e-stop's reason, characters; the rest is cut off: nobody's e-stop fails over its words."""
 _DRIVE_TTL_S: Final = 0.5
 _TTL_S: Final = 2.0  # messages.md: greatest age at arrival, default 0.5 for drive, 2 for the rest
-_STOPS: Final = ("stop", "estop")
-"""The verbs that need no payload, and are obeyed whatever is in it."""
 _SAME_QUERY_NS: Final = 2_000_000_000
 """One query reaches every gateway within this time."""
 BY_WILDCARD: Final = ("stop", "estop", "resume")
@@ -63,6 +61,8 @@ class Request:
     longest_drive_s: float = LONGEST_DRIVE_S
     by_wildcard: bool = False
     """It was asked of several cars with one key expression."""
+    unread: str = ""
+    """Why its payload was not read, and is left out here."""
 
     @property
     def streamed(self) -> bool:
@@ -90,17 +90,25 @@ def parse(request: Request) -> Command:
     if request.by_wildcard and verb not in BY_WILDCARD:
         words = f"{verb} cannot be asked by wildcard: name one car (only {', '.join(BY_WILDCARD)} can)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
-    if request.payload is None and verb not in _STOPS:
+    if request.unread:
+        if verb not in STOPS:
+            raise BadRequest(Reason.BAD_VALUE, f"{verb}: {request.unread}", blank)
+        return _stopped_though(blank, request.unread, request)
+    if request.payload is None and verb not in STOPS:
         words = f"{verb} without a payload: give {COMMANDS[verb]} or its JSON (only stop and estop need none)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     try:
         return _filled(blank, request)
     except BadRequest as error:
-        if verb not in _STOPS:
+        if verb not in STOPS:
             raise
-        # Whatever is wrong with its words: somebody wants this car to stop.
-        what = Stop() if verb == "stop" else _readable_estop(request)
-        return replace(error.command, what=what, note=f"stopped, though: {error.words}")
+        return _stopped_though(error.command, error.words, request)
+
+
+def _stopped_though(command: Command, words: str, request: Request) -> Command:
+    """Whatever is wrong with its words: somebody wants this car to stop."""
+    what = Stop() if request.verb == "stop" else _readable_estop(request)
+    return replace(command, what=what, note=f"stopped, though: {words}")
 
 
 def _id(request: Request) -> str:

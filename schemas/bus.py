@@ -30,6 +30,9 @@ if TYPE_CHECKING:  # a gateway is on the bus before it has imported these
 
 T = TypeVar("T")
 
+_TURN: Final = 16
+"""Objects that are handed over in one iteration of a loop."""
+
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
 
@@ -51,6 +54,13 @@ _QOS: Final[dict[Qos, dict[str, Any]]] = {
 }
 
 
+LARGEST_PAYLOAD: Final = 1 << 16
+"""Bytes of a query's payload, or of a streamed command's: what is larger is refused, and its payload is not read.
+
+Reading 5 MB of JSON stalls a process for a second."""
+LONGEST_SELECTOR: Final = 4096
+"""Characters of a query's selector (key and parameters), and of its encoding."""
+BUSY: Final = "busy: too many questions wait here already; ask again later"
 _ANSWERS: Final = 1 << 16
 """Answers that wait for who asked: beyond them the link stands still, and what comes is dropped on the way."""
 
@@ -172,7 +182,7 @@ class Handover(Generic[T]):
     """Hands objects from Zenoh's threads to one asyncio loop, in order and bounded; what does not fit is counted.
 
     Left out is what comes while it is full or, with `newest`, what has waited longest. It may be made before there is
-    a loop: what comes waits until `attach`.
+    a loop: what comes waits until `attach`. In one iteration of the loop it hands over few, so that others get a turn.
     """
 
     def __init__(
@@ -198,10 +208,10 @@ class Handover(Generic[T]):
             self._take = take
         loop.call_soon(self._drain)
 
-    def __call__(self, item: T) -> bool:
-        """Called on a Zenoh thread; False if the item was left out."""
+    def __call__(self, item: T, *, reserve: int = 0) -> bool:
+        """Called on a Zenoh thread; False if the item was left out. `reserve`: how far it may go beyond the limit."""
         with self._lock:
-            if len(self._waiting) >= self._limit:
+            if len(self._waiting) >= self._limit + reserve:
                 self.dropped += 1
                 if not self._newest:
                     return False
@@ -217,14 +227,120 @@ class Handover(Generic[T]):
         return True
 
     def _drain(self) -> None:
-        with self._lock:
-            batch = list(self._waiting)
-            self._waiting.clear()
         assert self._loop is not None
         assert self._take is not None
+        with self._lock:
+            batch = [self._waiting.popleft() for _ in range(min(len(self._waiting), _TURN))]
+            left = bool(self._waiting)
         for item in batch:
             # One callback each: an item that raises takes no other with it.
             self._loop.call_soon(self._take, item)
+        if left:
+            self._loop.call_soon(self._drain)
+
+
+class Backlog(Generic[T]):
+    """Objects from Zenoh's threads that wait for one task of an asyncio loop, in order and bounded.
+
+    The task takes one when it is done with the last: what takes long is done one at a time. It may be made before there
+    is a loop.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._waiting: deque[T] = deque()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._came: asyncio.Event | None = None
+        self.dropped = 0
+        """How many found it full."""
+
+    def attach(self, loop: "asyncio.AbstractEventLoop", came: "asyncio.Event") -> None:
+        """Say whose task takes them; `came` is set when there are some. On the loop's thread."""
+        with self._lock:
+            self._loop, self._came = loop, came
+        came.set()
+
+    def __call__(self, item: T) -> bool:
+        """Called on a Zenoh thread; False if the item was left out."""
+        with self._lock:
+            if len(self._waiting) >= self._limit:
+                self.dropped += 1
+                return False
+            self._waiting.append(item)
+            loop, came = self._loop, self._came
+            if loop is None or came is None or len(self._waiting) > 1:
+                return True
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to take it
+            loop.call_soon_threadsafe(came.set)
+        return True
+
+    async def next(self) -> T:
+        """The one that has waited longest; only one task may wait for it."""
+        assert self._came is not None
+        while True:
+            with self._lock:
+                if self._waiting:
+                    return self._waiting.popleft()
+                self._came.clear()
+            await self._came.wait()
+
+
+class Latest(Generic[T]):
+    """Hands the latest value of each name from Zenoh's threads to one asyncio loop: changes of one name are merged.
+
+    The first is handed over at once, what comes within `APART_S` after it together. Of more names than `limit` in that
+    time the rest is left out, and counted.
+    """
+
+    APART_S: Final = 0.05
+
+    def __init__(self, limit: int = 16_384) -> None:
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._changed: dict[str, T] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._take: Callable[[dict[str, T]], object] | None = None
+        self._told_at = float("-inf")
+        self.dropped = 0
+
+    def attach(self, loop: "asyncio.AbstractEventLoop", take: "Callable[[dict[str, T]], object]") -> None:
+        """Say who takes what has changed, the latest of each name; on the loop's thread."""
+        with self._lock:
+            self._loop, self._take = loop, take
+        loop.call_soon(self._tell)
+
+    def __call__(self, name: str, value: T) -> bool:
+        """Called on a Zenoh thread; False if the change was left out."""
+        with self._lock:
+            first = not self._changed
+            if len(self._changed) >= self._limit and name not in self._changed:
+                self.dropped += 1
+                return False
+            self._changed.pop(name, None)  # in the order of the last changes
+            self._changed[name] = value
+            loop = self._loop
+        if first and loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to take it
+                loop.call_soon_threadsafe(self._schedule)
+        return True
+
+    def taken(self) -> dict[str, T]:
+        """What has changed since it was taken last, for who comes by itself."""
+        with self._lock:
+            changed, self._changed = self._changed, {}
+        return changed
+
+    def _schedule(self) -> None:
+        assert self._loop is not None
+        self._loop.call_at(self._told_at + self.APART_S, self._tell)
+
+    def _tell(self) -> None:
+        assert self._loop is not None
+        assert self._take is not None
+        self._told_at = self._loop.time()
+        if changed := self.taken():
+            self._take(changed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,6 +355,8 @@ class Sample:
     sequence: int
     """The publisher's number for the key, modulo 2^32; 0 if it gave none."""
     deleted: bool = False
+    unread: str = ""
+    """Why the payload was not read, and is left out: it is too large."""
 
     def message(self) -> "Message":
         """The payload as the message that the encoding names; raises messages.BadPayload or KeyError."""
@@ -262,18 +380,43 @@ def sequence_of(info: zenoh.SourceInfo) -> int:
     return (int(info.source_sn) + 1) & 0xFFFFFFFF
 
 
-def sample_of(sample: zenoh.Sample) -> Sample:
-    """Copy what is wanted out of a Zenoh sample."""
+def sample_of(sample: zenoh.Sample, largest: int | None = None) -> Sample:
+    """Copy what is wanted out of a Zenoh sample; `largest`: bytes of a payload that is read."""
     stamp = sample.timestamp
     info = sample.source_info
+    unread = "" if largest is None else _too_many_bytes(len(sample.payload), largest)
     return Sample(
         key=str(sample.key_expr),
-        payload=sample.payload.to_bytes(),
+        payload=b"" if unread else sample.payload.to_bytes(),
         encoding=str(sample.encoding),
         time_ns=stamp.get_time_as_ntp64().as_nanos() if stamp is not None else time.time_ns(),
         sequence=sequence_of(info) if info is not None else 0,
         deleted=sample.kind == zenoh.SampleKind.DELETE,
+        unread=unread,
     )
+
+
+def _too_many_bytes(size: int, largest: int) -> str:
+    if size <= largest:
+        return ""
+    return f"a payload of {size} bytes is too large: at most {largest} are read, so nothing of it was"
+
+
+def unread(query: zenoh.Query) -> str:
+    """Why nothing of a query is read: something in it is too large. Empty if nothing is."""
+    payload = query.payload
+    if payload is not None and (words := _too_many_bytes(len(payload), LARGEST_PAYLOAD)):
+        return words
+    longest = max(len(str(query.selector)), len(str(query.encoding)) if query.encoding is not None else 0)
+    if longest > LONGEST_SELECTOR:
+        return f"a key, parameters or an encoding of {longest} characters: at most {LONGEST_SELECTOR} are read"
+    return ""
+
+
+def refuse(query: zenoh.Query, words: str) -> None:
+    """Answer a query with an error, and end it."""
+    with query:
+        query.reply_err(words, encoding="text/plain")
 
 
 class Publisher:
@@ -371,9 +514,14 @@ class Bus:
         """Declare a publisher of `topic` under `key`; `source` becomes the messages' `car`."""
         return Publisher(self._session, key, topic, source, self.boot_id)
 
-    def subscribe(self, expression: str, callback: Callable[[Sample], object]) -> zenoh.Subscriber[None]:
-        """Call back for every publication, on a Zenoh thread: hand over and return."""
-        subscriber = self._session.declare_subscriber(expression, lambda sample: callback(sample_of(sample)))
+    def subscribe(
+        self, expression: str, callback: Callable[[Sample], object], *, largest: int | None = None
+    ) -> zenoh.Subscriber[None]:
+        """Call back for every publication, on a Zenoh thread: hand over and return.
+
+        A payload of more than `largest` bytes is not read (see `Sample.unread`).
+        """
+        subscriber = self._session.declare_subscriber(expression, lambda sample: callback(sample_of(sample, largest)))
         self._kept.append(subscriber)
         return subscriber
 
@@ -387,9 +535,27 @@ class Bus:
         self._kept.append(subscriber)
         return subscriber
 
-    def queryable(self, expression: str, callback: Callable[[zenoh.Query], object]) -> zenoh.Queryable[None]:
-        """Call back for every query, on a Zenoh thread: hand over and return."""
-        queryable = self._session.declare_queryable(expression, callback, complete=True)
+    def queryable(
+        self,
+        expression: str,
+        callback: Callable[[zenoh.Query], object],
+        *,
+        too_large: Callable[[zenoh.Query, str], object] | None = None,
+    ) -> zenoh.Queryable[None]:
+        """Call back for every query, on a Zenoh thread: hand over and return False if it found no room.
+
+        Such a query is answered as BUSY. One in which something is too large is refused and its payload is not read, or
+        handed to `too_large` with the words.
+        """
+
+        def take(query: zenoh.Query) -> None:
+            words = unread(query)
+            if words and too_large is None:
+                refuse(query, words)
+            elif (too_large(query, words) if words and too_large is not None else callback(query)) is False:
+                refuse(query, BUSY)
+
+        queryable = self._session.declare_queryable(expression, take, complete=True)
         self._kept.append(queryable)
         return queryable
 

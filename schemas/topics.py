@@ -279,6 +279,9 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Verb to the full name of its payload message."""
 
+STOPS: Final = ("stop", "estop")
+"""The verbs that need no payload, and are obeyed whatever is in it."""
+
 RESULT: Final = "fleet.v1.Result"
 
 

@@ -182,10 +182,15 @@ class Recorder:
                 where = f"to {message.session}"
         raise AnotherRecorder(f"fleet {self._fleet!r} is being recorded already, {where}: one recorder is enough")
 
-    def _ask(self, query: zenoh.Query) -> None:
+    def _ask(self, query: zenoh.Query) -> bool:
+        """On a Zenoh thread; False if too many wait."""
         with self._lock:
-            if len(self._questions) < QUESTIONS and not self.ended.is_set():
-                self._questions.append(query)
+            if self.ended.is_set():
+                return True  # nobody answers any more
+            if len(self._questions) >= QUESTIONS:
+                return False
+            self._questions.append(query)
+        return True
 
     # ------------------------------------------------------------------ the reader's thread
 

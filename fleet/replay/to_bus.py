@@ -27,6 +27,8 @@ LATE_S: Final = 0.25
 _LOOK_S: Final = 0.1
 _ALONE_S: Final = 0.5
 _TOLD: Final = 4
+_QUESTIONS: Final = 256
+"""Queries that may wait."""
 _SPARED: Final = frozenset(" /*$#?")
 
 
@@ -51,7 +53,7 @@ class Player:
     _alone_since_s: float | None = None
     _latest: dict[tuple[str, str], tuple[bytes, str]] = field(default_factory=dict)
     """By key, and of decisions by subject."""
-    _inbox: "queue.Queue[zenoh.Query]" = field(default_factory=lambda: queue.Queue(1024))
+    _inbox: "queue.Queue[zenoh.Query]" = field(default_factory=lambda: queue.Queue(_QUESTIONS))
 
     def begin(self, session: str, cars: Iterable[str]) -> None:
         """Be there, with these cars; raises NameTaken."""
@@ -156,12 +158,13 @@ class Player:
 
     # ------------------------------------------------------------------ queries
 
-    def _ask(self, query: zenoh.Query) -> None:
-        """On a Zenoh thread."""
+    def _ask(self, query: zenoh.Query) -> bool:
+        """On a Zenoh thread; False if too many wait."""
         try:
             self._inbox.put_nowait(query)
         except queue.Full:
-            query.drop()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type. Who asks is told that nobody answers
+            return False
+        return True
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:

@@ -21,6 +21,8 @@ PING_S: Final = 2.0
 _HEARD: Final = ("*/state/*", "*/sensor/battery", "*/event/log", f"{keys.RECORDER}/status", f"{keys.COORDINATOR}/plan")
 _WAITING: Final = 8192
 """Messages that may wait: some seconds of a hundred cars."""
+_QUESTIONS: Final = 64
+"""Queries that may wait."""
 SERVICES: Final = {"down": "fleet.v1.DownCommand", "reload": "fleet.v1.ReloadCommand"}
 """What it may be asked, and the payload's message."""
 
@@ -75,7 +77,7 @@ class Desk:
                 reply_value(query, self._key("status"), message.SerializeToString(), STATUS)
 
         samples: Handover[Sample] = Handover(loop, take, limit=_WAITING)
-        questions: Handover[zenoh.Query] = Handover(loop, answer)
+        questions: Handover[zenoh.Query] = Handover(loop, answer, limit=_QUESTIONS)
         work: set[asyncio.Task[None]] = set()
 
         def command(query: zenoh.Query) -> None:
@@ -83,7 +85,7 @@ class Desk:
             work.add(task)
             task.add_done_callback(work.discard)
 
-        commands: Handover[zenoh.Query] = Handover(loop, command)
+        commands: Handover[zenoh.Query] = Handover(loop, command, limit=_QUESTIONS)
         self.bus.queryable(self._key("status"), questions)
         self.bus.queryable(self._key("@cmd/*"), commands)
         self.bus.token(keys.car_token(self.fleet, keys.SUPERVISOR))

@@ -220,7 +220,10 @@ def test_bad_commands_are_answered_and_nothing_dies(fleet: Fleet, tcp_car: TcpCa
     fleet.ready()
     wait_for(lambda: tcp_car.received == [STOP, STOP, STOP], "recovery")
     quiet = len(tcp_car.received)
+    records: list[Any] = []
+    fleet.bus.subscribe("fleet/red/event/command", lambda sample: records.append(sample.message()))
     for verb, fields, reason in [
+        ("drive", {"motion": "forward", "sender": "x" * 5_000_000}, "bad_value"),
         ("drive", {}, "bad_value"),
         ("drive", {"motion": "forward", "duration_s": "NaN"}, "bad_value"),
         ("mode", {"mode": "tracking"}, "unsupported"),
@@ -235,14 +238,18 @@ def test_bad_commands_are_answered_and_nothing_dies(fleet: Fleet, tcp_car: TcpCa
         (answer,) = list(fleet.bus.query(selector, payload=b'{"motion": "forward"}', timeout_s=5.0))
         words = answer.words if isinstance(answer, bus.Failure) else json.loads(answer.payload)["words"]
         assert "name" in words
-    for data in (b"", b"{", b"\xff" * 100, b"[" * 100_000):
+    for data in (b"", b"{", b"\xff" * 100, b"[" * 60_000, b"[" * 5_000_000):
         for encoding in ("application/json", "application/protobuf", "application/protobuf;fleet.v1.DriveCommand"):
             assert len(list(fleet.bus.query("fleet/red/@cmd/drive", payload=data, encoding=encoding))) == 1
             fleet.bus.put_command("fleet/red/@cmd/drive", data, encoding)
-    answers = list(fleet.bus.query("fleet/*/@cmd/stop", timeout_s=5.0))
-    assert [json.loads(one.payload)["status"] in TAKEN for one in answers if isinstance(one, bus.Sample)] == [True]
+    answers = list(fleet.bus.query("fleet/*/@cmd/stop", payload=b"[" * 5_000_000, timeout_s=5.0))
+    (result,) = [json.loads(one.payload) for one in answers if isinstance(one, bus.Sample)]
+    assert result["status"] in TAKEN
+    assert result["words"].startswith("stopped, though: a payload of 5000000 bytes is too large")
     wait_for(lambda: len(tcp_car.received) == quiet + 3, "the stop, and nothing else")
     assert set(tcp_car.received) == {STOP}
+    wait_for(lambda: any(record.verb == "stop" for record in records), "the stop is recorded")
+    assert max(len(record.request) for record in records) == 60_000
     assert gateway.end() == 0
     assert "Traceback" not in gateway.stderr
 

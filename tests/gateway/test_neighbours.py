@@ -41,7 +41,7 @@ async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) ->
                 await asyncio.to_thread(lambda: list(opened.query(KEY, timeout_s=0.1)))
             neighbours, before = Neighbours(opened, "fleet", "red"), len(asked)
             keeping = asyncio.ensure_future(neighbours.keep_united(unite))
-            neighbours.changed(("blue", True))
+            neighbours.changed({"blue": True})
             await asyncio.to_thread(wait_for, lambda: len(asked) > before, "it is asked")
             awake.set()
             await asyncio.to_thread(wait_for, lambda: learned, "it is asked again")

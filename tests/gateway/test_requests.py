@@ -308,3 +308,11 @@ def test_deep_json_is_refused_in_no_time() -> None:
     began = time.monotonic()
     assert "not the JSON" in refused("drive", b"[" * 100_000).words
     assert time.monotonic() - began < 10
+
+
+def test_what_was_not_read_is_refused_and_a_stop_is_obeyed() -> None:
+    error = refused("drive", None, unread="it is too large")
+    assert (error.reason, error.words) == (Reason.BAD_VALUE, "drive: it is too large")
+    stop = ask("stop", None, unread="it is too large")
+    assert (stop.what, stop.note) == (Stop(), "stopped, though: it is too large")
+    assert ask("estop", None, unread="it is too large", by_wildcard=True).what == EmergencyStop()

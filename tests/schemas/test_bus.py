@@ -194,6 +194,51 @@ async def test_a_handover_keeps_order_is_bounded_and_counts_what_it_drops() -> N
     assert taken == [*range(10), 99]
 
 
+async def test_a_handover_lets_others_have_their_turn() -> None:
+    """Of two that are full, the second waited until the first was empty."""
+    taken: list[str] = []
+    loop = asyncio.get_running_loop()
+    many: bus.Handover[str] = bus.Handover(loop, taken.append, limit=1000)
+    one: bus.Handover[str] = bus.Handover(loop, taken.append)
+    thread = threading.Thread(target=lambda: [*(many("drive") for _ in range(1000)), one("stop")])
+    thread.start()
+    thread.join()
+    for _ in range(200):
+        await asyncio.sleep(0)
+    assert len(taken) == 1001
+    assert taken.index("stop") < 50
+
+
+async def test_a_backlog_is_taken_one_at_a_time_and_refuses_what_it_has_no_room_for() -> None:
+    backlog: bus.Backlog[int] = bus.Backlog(3)
+    assert [backlog(number) for number in range(2)] == [True, True], "before there is a loop"
+    backlog.attach(asyncio.get_running_loop(), asyncio.Event())
+    assert [backlog(number) for number in range(2, 5)] == [True, False, False]
+    assert [await backlog.next() for _ in range(3)] == [0, 1, 2]
+    assert backlog.dropped == 2
+    thread = threading.Timer(0.01, backlog, (7,))
+    thread.start()
+    assert await backlog.next() == 7
+    thread.join()
+
+
+async def test_the_latest_of_each_name_comes_once() -> None:
+    batches: list[dict[str, bool]] = []
+    latest: bus.Latest[bool] = bus.Latest(limit=3)
+    latest("early", True)
+    latest.attach(asyncio.get_running_loop(), batches.append)
+    await turns()
+    assert batches == [{"early": True}]
+    for number in range(100):
+        assert latest("ann", number % 2 == 0)
+    assert latest("bob", True)
+    assert latest("early", False)
+    assert not latest("eve", True), "there is no room for more names"
+    await asyncio.sleep(2 * latest.APART_S)
+    assert batches[1:] == [{"ann": False, "bob": True, "early": False}]
+    assert latest.dropped == 1
+
+
 async def test_a_handover_of_the_newest_leaves_out_what_waited_longest() -> None:
     taken: list[int] = []
     handover = bus.Handover(asyncio.get_running_loop(), taken.append, limit=10, newest=True)
