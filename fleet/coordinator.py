@@ -4,8 +4,9 @@ What it wants is decided in policy/, also that a car on hold is left alone; the 
 """
 
 import queue
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -26,7 +27,7 @@ from fleet.policy.plan import Plan
 from fleet.policy.reader import parse
 from fleet.verbs import led_request, mode_request
 from schemas import keys, messages, topics
-from schemas.bus import BusError, Publisher, Sample, ensure_hub, reply, reply_value
+from schemas.bus import BusError, Latest, Publisher, Sample, ensure_hub, reply, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos
 
@@ -41,6 +42,11 @@ _ANSWERS_S: Final = 1.0
 _TRIES: Final = 3
 """How often who has just begun asks: what a car did before counts, and its gateway may be held up for a moment."""
 _QUEUE: Final = 4096
+_QUESTIONS: Final = 64
+"""Queries that may wait in it."""
+_ASKERS: Final = 4
+_APIECE: Final = 8
+"""So many cars that came together are asked each for itself, of more all cars with one question."""
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
 
@@ -52,7 +58,7 @@ class _Answer:
     sample: Sample
 
 
-_Item = Sample | _Answer | tuple[str, bool] | zenoh.Query
+_Item = Sample | _Answer | zenoh.Query
 
 
 class AnotherCoordinator(Exception):
@@ -84,6 +90,13 @@ class Coordinator:
     _publishers: dict[str, Publisher] = field(default_factory=dict)
     _subscribed: set[str] = field(default_factory=set)
     _inbox: "queue.Queue[_Item]" = field(default_factory=lambda: queue.Queue(_QUEUE))
+    _questions: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(_QUESTIONS))
+    """How many queries find room."""
+    _tokens: Latest[bool] = field(default_factory=Latest)
+    """Whether each car's gateway is on the bus, where that has changed."""
+    _came: set[str] = field(default_factory=set)
+    """Cars whose gateways came and were not asked yet."""
+    _asked: "list[Future[None]]" = field(default_factory=list)
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Coordinate until `ended` says so; raises AnotherCoordinator. The cars keep their modes afterwards."""
@@ -95,10 +108,10 @@ class Coordinator:
         hearing = Hearing(self.listed)
         keeper = Keeper(fleet, bus.endpoint)
         self._subscribe(f"{fleet}/*/state/*")
-        bus.watch_tokens(keys.car_token(fleet, "*"), lambda key, alive: self._put((key, alive)))
+        bus.watch_tokens(keys.car_token(fleet, "*"), lambda key, alive: self._tokens(key.rpartition("/")[2], alive))
         self._follow(self.plan)
-        bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._put)
-        bus.queryable(keys.command_key(fleet, keys.COORDINATOR, PLAN_VERB), self._put)
+        bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._ask)
+        bus.queryable(keys.command_key(fleet, keys.COORDINATOR, PLAN_VERB), self._ask)
         again_at = time.monotonic() + AGAIN_S
         look_again_at: float | None = time.monotonic() + LOOK_AGAIN_S
         hubs, linked_at = bus.hubs, time.monotonic()
@@ -146,8 +159,10 @@ class Coordinator:
             outcome = future.result()[0]
             if not outcome.ok:
                 self.failed(f"{ask.car}: the colour of a rule: {outcome.reason or outcome.phase}: {outcome.words}")
+        hearing.forget(now, {*self.plan.named, *self._memory.held, *self._running})
         result = step(self.plan, hearing.picture(self._running), self._memory, now)
         before, self._memory = self._memory, result.memory
+        self._forget(before.said.keys() - result.memory.said.keys())
         since_s = time.time() - now
         for decision in (*result.changed, *result.reworded):
             self._publish("decision", _message(decision, since_s + decision.since))
@@ -162,6 +177,12 @@ class Coordinator:
                 self._running[ask.car] = (ask, future)
             else:
                 self._colouring.append((ask, future))
+
+    def _forget(self, subjects: Collection[str]) -> None:
+        """Nothing is decided of them any more."""
+        for subject in subjects:
+            self._published.pop(("decision", subject), None)
+            self._told.pop(subject, None)
 
     def _outcome(self, hearing: Hearing, car: str, ask: Ask, outcome: Outcome, now: float) -> None:
         assert ask.mode is not None
@@ -219,12 +240,23 @@ class Coordinator:
             self._subscribed.add(expression)
             self.client.bus.subscribe(expression, self._put)
 
-    def _put(self, item: _Item) -> None:
-        """On a Zenoh thread."""
+    def _put(self, item: _Item) -> bool:
+        """On a Zenoh thread; False if there is no room."""
         try:
             self._inbox.put_nowait(item)
         except queue.Full:
             self.dropped += 1
+            return False
+        return True
+
+    def _ask(self, query: zenoh.Query) -> bool:
+        """On a Zenoh thread; False if too many wait."""
+        if not self._questions.acquire(blocking=False):
+            return False
+        if self._put(query):
+            return True
+        self._questions.release()
+        return False
 
     def _ask_all(self, car: str = "*") -> None:
         """What the cars (or one of them) have said last: whoever begins needs not wait until they say it again."""
@@ -237,24 +269,36 @@ class Coordinator:
 
     def _listen(self, hearing: Hearing, pool: ThreadPoolExecutor, wait_s: float = TURN_S) -> None:
         """Take what came, waiting a turn's length for the first."""
-        while True:
+        for _ in range(_QUEUE):  # what comes meanwhile is for the next turn
             try:
                 item = self._inbox.get(timeout=wait_s) if wait_s else self._inbox.get_nowait()
             except queue.Empty:
+                self._look_at_tokens(hearing, pool)
                 return
+            self._look_at_tokens(hearing, pool)  # first: a gateway says how its car is when its token is there
             wait_s = 0.0
             now = time.monotonic()
             if isinstance(item, zenoh.Query):
+                self._questions.release()
                 self._answer(item, hearing)
-            elif isinstance(item, tuple):
-                car = item[0].rpartition("/")[2]
-                hearing.token(car, alive=item[1])
-                if item[1] and self._memory.began is not None:
-                    pool.submit(self._ask_all, car)
             elif isinstance(item, _Answer):
                 hearing.take(item.sample, now, time.time())
             else:
                 hearing.take(item, now, None)
+
+    def _look_at_tokens(self, hearing: Hearing, pool: ThreadPoolExecutor) -> None:
+        """Note who came and went, and ask who came how it is."""
+        now = time.monotonic()
+        for car, alive in self._tokens.taken().items():
+            hearing.token(car, now, alive=alive)
+            if alive and self._memory.began is not None:
+                self._came.add(car)
+            elif not alive:
+                self._came.discard(car)
+        self._asked = [each for each in self._asked if not each.done()]
+        if self._came and len(self._asked) < _ASKERS:
+            cars, self._came = sorted(self._came), set()
+            self._asked += [pool.submit(self._ask_all, car) for car in (cars if len(cars) <= _APIECE else ["*"])]
 
     def _answer(self, query: zenoh.Query, hearing: Hearing) -> None:
         with query:

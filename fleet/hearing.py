@@ -1,7 +1,8 @@
 """What the coordinator hears becomes a picture: tokens and messages in, values of policy/picture.py out. No Zenoh."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any, Final
 
 from fleet.config import FleetFile
@@ -13,6 +14,12 @@ from schemas.gen import fleet_v1_pb2 as pb
 NEEDED: Final = ("state/link", "state/mode", "state/motion", "state/safety")
 """Only when all that could forbid a command is known, a car counts as heard."""
 _HEALTH: Final = "state/health"
+FORGOTTEN_S: Final = 60.0
+"""A car is forgotten whose gateway has been away for so long, unless the fleet file or the plan names it."""
+MOST_GONE: Final = 256
+"""So many cars are remembered whose gateways are away; of more those that went first are forgotten at once."""
+MOST_UNHEARD: Final = 256
+"""So many names count as cars that are on the bus, have said nothing yet, and stand in no fleet file."""
 
 
 @dataclass(slots=True)
@@ -22,6 +29,10 @@ class Hearing:
     listed: Mapping[str, CarPicture] = field(default_factory=dict)
     cars: dict[str, CarPicture] = field(default_factory=dict)
     readings: dict[str, dict[str, Seen]] = field(default_factory=dict)
+    _gone_since: dict[str, float] = field(default_factory=dict)
+    """Cars without a gateway on the bus that no fleet file lists; who went first stands first."""
+    _met: set[str] = field(default_factory=set)
+    """Cars that have said all that could forbid a command, whatever has become of them."""
 
     def __post_init__(self) -> None:
         self.cars.update(self.listed)
@@ -38,14 +49,38 @@ class Hearing:
 
     def picture(self, busy: Iterable[str]) -> Picture:
         """What is known now; `busy`: the cars that something was asked of, with no outcome yet."""
-        cars = {**self.cars, **{car: replace(self.cars[car], busy=True) for car in busy if car in self.cars}}
-        return Picture(cars, {car: dict(seen) for car, seen in self.readings.items()})
+        # A name that no file lists is a car once it has said how it is: until then few count, and only while there.
+        cars = {car: known for car, known in self.cars.items() if known.listed or car in self._met}
+        unheard = (each for each in self.cars.items() if each[1].present and each[0] not in cars)
+        cars.update(list(islice(unheard, MOST_UNHEARD)))
+        cars.update({car: replace(cars[car], busy=True) for car in busy if car in cars})
+        return Picture(cars, {car: dict(seen) for car, seen in self.readings.items() if car in cars})
 
-    def token(self, car: str, *, alive: bool) -> None:
+    def token(self, car: str, now: float, *, alive: bool) -> None:
         """A gateway came or went: what was known of its car may no longer be so, a hold above all."""
+        if alive:
+            self._gone_since.pop(car, None)
+        elif car not in self.listed:
+            if car not in self._met:
+                self._forget(car)
+                return
+            self._gone_since.setdefault(car, now)
         self.cars[car] = replace(self.listed.get(car, CarPicture()), present=alive)
         for topic in (*NEEDED, _HEALTH):
             self.readings.get(car, {}).pop(topic, None)
+
+    def forget(self, now: float, needed: Container[str]) -> None:
+        """Forget the cars that have been away for long, but for the `needed`."""
+        for car, since in list(self._gone_since.items()):
+            if now - since < FORGOTTEN_S and len(self._gone_since) <= MOST_GONE:
+                return
+            if car not in needed:
+                self._forget(car)
+
+    def _forget(self, car: str) -> None:
+        self._met.discard(car)
+        for each in (self.cars, self.readings, self._gone_since):
+            each.pop(car, None)
 
     def refused(self, car: str, refusal: Refused | None) -> None:
         """A command was not carried out, or (None) one was."""
@@ -61,6 +96,8 @@ class Hearing:
             return  # not of this fleet's gateways: nothing to decide on
         if key is None:
             return
+        if key.car not in self.listed and not self.cars.get(key.car, CarPicture()).present:
+            self._gone_since.setdefault(key.car, now)
         at = now
         if wall_s is not None:
             at -= max(0.0, wall_s - value.stamp.seconds - value.stamp.nanos / 1e9)
@@ -90,6 +127,7 @@ class Hearing:
             self.cars[car] = before
         if not before.present or not _all_known(seen):
             return
+        self._met.add(car)
         link, mode, motion, safety = (seen[topic].fields for topic in NEEDED)
         hold, lease = safety.get("hold"), safety.get("lease")
         estops: Any = safety.get("estops") or ()

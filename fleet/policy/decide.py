@@ -117,7 +117,7 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
             held=held,
             tried=tried,
             coloured=coloured,
-            said={**memory.said, **{each.subject: each for each in decisions}},
+            said={each.subject: each for each in decisions},
         ),
         tuple(decisions),
         tuple(each for each in decisions if explain.new(each, memory.said)),

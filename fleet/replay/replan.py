@@ -86,7 +86,7 @@ class Replanning:
             new_ns = at_ns if new_ns is None else new_ns
             match item:
                 case Token():
-                    self._hearing.token(item.car, alive=item.alive)
+                    self._hearing.token(item.car, item.at_ns / 1e9, alive=item.alive)
                 case _NewPlan():
                     if self._memory is not None:
                         self._memory = carried(self._memory, self._plan, item.plan)
@@ -152,6 +152,7 @@ class Replanning:
         if self._memory is None or at_ns < self._looked_ns:
             return
         self._looked_ns = at_ns
+        self._hearing.forget(at_ns / 1e9, {*self._plan.named, *self._memory.held})
         result = step(self._plan, self._hearing.picture(self._busy), self._memory, at_ns / 1e9)
         self._memory = result.memory
         for each in result.changed:

@@ -1,0 +1,46 @@
+"""Ten thousand names in ten seconds at a real coordinator: it decides on few of them, and forgets all of them."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from fleet.hearing import FORGOTTEN_S, MOST_GONE
+from tests.support.ports import free_endpoint
+from tests.support.processes import PATIENCE_S, Fleet, wait_for
+
+FLOODER = Path(__file__).parents[1] / "support" / "flooder.py"
+SECONDS = 10.0
+PER_S = 1000.0
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("kind", ["names", "talkers"])
+def test_ten_thousand_names_in_ten_seconds(kind: str, tmp_path: Path) -> None:
+    fleet = Fleet(free_endpoint(), tmp_path)
+    try:
+        plan = tmp_path / "plan.yaml"
+        plan.write_text("roles: {scout: {mode: manual}}\n")
+        decided: list[str] = []
+        fleet.bus.subscribe("fleet/@coordinator/decision", lambda sample: decided.append(sample.message().subject))  # type: ignore[attr-defined]
+        coordinator = fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(plan))
+
+        def subjects() -> set[str]:
+            return {each.subject for each in fleet.get("fleet/@coordinator/decision") if not isinstance(each, str)}
+
+        wait_for(lambda: subjects() == {"role scout"}, "it decides")
+        before_mb = coordinator.rss_mb()
+        flood = fleet.start(str(FLOODER), kind, str(PER_S), str(SECONDS))
+        assert flood.wait() == 0, flood.stderr
+        ended = time.monotonic()
+        wait_for(lambda: len(subjects()) <= MOST_GONE + 1, "it is done with them")
+        print(f"\n{kind}: {flood.line()} names, {before_mb:.0f} MB before", end="")
+        wait_for(lambda: subjects() == {"role scout"}, "all are forgotten", FORGOTTEN_S + PATIENCE_S)
+        after_mb = coordinator.rss_mb()
+        print(f", {len(decided)} decisions, {after_mb:.0f} MB after, forgotten after {time.monotonic() - ended:.0f} s")
+        assert after_mb < before_mb + 30.0
+        assert len(decided) < 1000, "of names of which nothing was said a few were met alive"
+        assert coordinator.end() == 0
+        assert "Traceback" not in coordinator.stderr
+    finally:
+        fleet.close()
