@@ -1,5 +1,6 @@
 """One command on its way to some cars: what comes in from the bus, until it is known of each car what became of it."""
 
+import logging
 import queue
 import time
 from collections.abc import Callable
@@ -11,12 +12,15 @@ from schemas import keys, messages, topics
 from schemas.bus import Sample
 
 ANSWER_S: Final = 2.0
-"""How long a gateway may take to answer; it answers at once, whatever its car does."""
+"""How long a gateway takes to answer at most, whatever its car does, where the machine is not overloaded."""
 _QUEUE: Final = 4096  # answers and events of one command: a few for each of some hundred cars
 
 
+log = logging.getLogger("fleet")
+
+
 class Over:
-    """The query to a car, or to all, is over."""
+    """The query to a car, or to all, is over; without `words` nobody answered it in time."""
 
     def __init__(self, target: str, words: str) -> None:
         self.target = target
@@ -48,6 +52,8 @@ class Asking:
         self._hubs_then = hubs()
         self.inbox: queue.Queue[Item] = queue.Queue(_QUEUE)
         self._asked_at = time.monotonic()
+        self._late_at: float | None = self._asked_at + ANSWER_S
+        """When it is said who has not answered; None: it was."""
         self._open = 0
         self._progress: dict[str, Progress] = {}
         for car in present if named is None else named:
@@ -70,17 +76,31 @@ class Asking:
             if not waiting and not self._open:
                 return
             now = time.monotonic()
+            if self._late_at is not None and now >= self._late_at:
+                self._late_at = None
+                self._say_who_is_late(waiting)
             for progress in waiting:
                 if now >= progress.deadline and self._hubs() != self._hubs_then:
                     progress.token(now, alive=True)  # it was the hub that went
                 if now >= progress.deadline and self.inbox.empty():  # we may have slept while the answer came
                     progress.give_up(now)
             until = min((each.deadline for each in waiting), default=now + ANSWER_S)
+            until = until if self._late_at is None else min(until, self._late_at)
             try:
                 at, item = self.inbox.get(timeout=max(0.0, until - now))
             except queue.Empty:
                 continue
             self._take(item, at)
+
+    def concerns(self, car: str) -> bool:
+        """Whether it was asked of this car; on any thread."""
+        return car in self._progress
+
+    def _say_who_is_late(self, waiting: list[Progress]) -> None:
+        if late := sorted(progress.car for progress in waiting if not progress.heard):
+            log.warning(
+                "no answer yet from %s: still waiting, the machine or the gateway may be overloaded", ", ".join(late)
+            )
 
     def _take(self, item: Any, at: float) -> None:
         if item is CLOSED:
@@ -90,9 +110,12 @@ class Asking:
         elif isinstance(item, Over):
             self._open -= 1
             for progress in self._progress.values():
-                if item.target in ("*", progress.car):
-                    words = item.words.replace("*", progress.car, 1)
-                    progress.silent(words, at)
+                if item.target not in ("*", progress.car):
+                    continue
+                if item.words:
+                    progress.silent(item.words.replace("*", progress.car, 1), at)
+                else:
+                    progress.unanswered(at)
         elif isinstance(item, Sample):
             key = keys.parse(item.key)
             if key is not None:

@@ -19,10 +19,10 @@ from datetime import UTC, datetime
 from typing import Any, Final, Self
 
 from fleet import history
-from fleet.asking import ANSWER_S, CLOSED, Asking, Item, Over, Token
+from fleet.asking import ANSWER_S, CLOSED, Asking, Over, Token
 from fleet.condition import Condition
 from fleet.lease import Lease
-from fleet.outcome import Outcome
+from fleet.outcome import LATEST_ANSWER_S, Outcome
 from fleet.readings import Reading, Watch, reading_of
 from fleet.verbs import Request, Verbs, estop_request, resume_request, stop_request
 from fleet.waiting import Waiting
@@ -72,7 +72,7 @@ class Fleet:
         self.kind = kind
         token = keys.operator_token(self.name, self.sender)
         self.bus = Bus.open(endpoint, start_hub=start_hub)
-        self._inboxes: dict[str, queue.Queue[Item]] = {}
+        self._askings: dict[str, Asking] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
         self.dropped = 0
@@ -95,10 +95,11 @@ class Fleet:
         """Leave the bus; what is still waited for ends as not known, and every watch ends."""
         for watch in list(self._watches):
             watch.close()
-        for inbox in list(self._inboxes.values()):
-            inbox.put((time.monotonic(), CLOSED))
-        self._pool.shutdown(cancel_futures=True)
-        self.bus.close()
+        for asking in list(self._askings.values()):
+            asking.inbox.put((time.monotonic(), CLOSED))
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        self.bus.close()  # ends every query that is on its way
+        self._pool.shutdown()
 
     # ------------------------------------------------------------------ reading
 
@@ -209,7 +210,7 @@ class Fleet:
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._filled(request)
         asking = Asking(request, self.cars(), named, lambda: self.bus.hubs)
-        self._inboxes[command_id] = asking.inbox
+        self._askings[command_id] = asking
         try:
             payload = message.SerializeToString()
             futures = [self._pool.submit(self._query, target, asking, payload) for target in asking.targets]
@@ -218,7 +219,7 @@ class Fleet:
                 if future.done():
                     future.result()
         finally:
-            del self._inboxes[command_id]
+            del self._askings[command_id]
         return asking.outcomes()
 
     def _filled(self, request: Request) -> tuple[Any, str]:
@@ -240,24 +241,23 @@ class Fleet:
                 keys.command_key(self.name, target, verb),
                 payload=payload,
                 encoding=messages.encoding_of(topics.COMMANDS[verb]),
-                timeout_s=ANSWER_S,
+                timeout_s=LATEST_ANSWER_S,
             )
             for answer in answers:
                 if isinstance(answer, Sample):
                     asking.inbox.put((time.monotonic(), answer))
-                elif answer.words == "Timeout":
-                    words = f"{target} did not answer within {ANSWER_S:g} s: its gateway hangs"
                 else:
-                    words = answer.words
+                    words = "" if answer.words == "Timeout" else answer.words
         finally:
             asking.inbox.put((time.monotonic(), Over(target, words)))
 
     def _gateway(self, token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
         """A car's gateway came or went; on a Zenoh thread."""
-        item = time.monotonic(), Token(token.rpartition("/")[2], alive=alive)
-        for inbox in list(self._inboxes.values()):
-            with suppress(queue.Full):
-                inbox.put_nowait(item)
+        car = token.rpartition("/")[2]
+        for asking in list(self._askings.values()):
+            if asking.concerns(car):
+                with suppress(queue.Full):
+                    asking.inbox.put_nowait((time.monotonic(), Token(car, alive=alive)))
 
     def _event(self, sample: Sample) -> None:
         """A record of some command of somebody; on a Zenoh thread."""
@@ -266,11 +266,11 @@ class Fleet:
         except (messages.BadPayload, KeyError) as error:
             log.warning("%s: not a command event: %s", sample.key, error)
             return
-        inbox = self._inboxes.get(event.id)
-        if inbox is None:
+        asking = self._askings.get(event.id)
+        if asking is None:
             return
         try:
-            inbox.put_nowait((time.monotonic(), event))
+            asking.inbox.put_nowait((time.monotonic(), event))
         except queue.Full:
             self.dropped += 1
 

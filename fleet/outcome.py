@@ -17,6 +17,10 @@ MARGIN_S: Final = 5.0
 A stop's worst case ends when the motors are off; its last frame follows 1.1 s later (protocol.md, "full")."""
 GONE_S: Final = 1.0
 """How long a gateway that has gone from the bus may take to be there again: it tries twice a second."""
+LATEST_ANSWER_S: Final = 10.0
+"""How long an answer may take on an overloaded machine. A gateway that went is known from its token, long before."""
+LATE_S: Final = 2.0
+"""Of an answer that took longer, what is waited for is counted from when it came, not from when it was asked for."""
 PATIENCE_S: Final = 10.0  # gateway.control: the longest that a command waits there for a busy car
 
 
@@ -83,6 +87,7 @@ class Progress:
         self._lasts_s = lasts_s
         self._phase = NO_ANSWER
         self._heard_at = asked_at
+        self._counts_from = asked_at
         self._worst_case_s = 0.0
         self._queued = False
         self._sent_told = False
@@ -101,10 +106,12 @@ class Progress:
         """When to give up, on the clock of `asked_at`."""
         if self._gone_at is not None:
             return self._gone_at + GONE_S
+        if not self.heard:
+            return self._asked_at + LATEST_ANSWER_S + MARGIN_S
         if self._joined:
-            return self._asked_at + self._lasts_s
+            return self._counts_from + self._lasts_s
         wait_s = {Until.SENT: PATIENCE_S, Until.STOPPED: self._worst_case_s, Until.OVER: self._lasts_s}[self._until]
-        return self._asked_at + wait_s + MARGIN_S
+        return self._counts_from + wait_s + MARGIN_S
 
     @property
     def heard(self) -> bool:
@@ -138,6 +145,15 @@ class Progress:
         if not self.heard:
             self._end(NO_ANSWER, "", words, at, ok=False)
 
+    def unanswered(self, at: float) -> None:
+        """Its query was waited for in vain; a car of which something was heard is waited for as long as any other."""
+        there = (
+            f"is on the bus (slow or hanging), so whether {self.car} does it is not known"
+            if self._gone_at is None
+            else f"is not on the bus, so whether {self.car} moves is not known"
+        )
+        self.silent(f"no answer after {at - self._asked_at:.0f} s; its gateway {there}", at)
+
     def token(self, at: float, *, alive: bool) -> None:
         """Its gateway's token came back, or went: the gateway was killed, or its link or the hub went."""
         if alive:
@@ -164,6 +180,8 @@ class Progress:
         self._end(self._phase, "", words, at, ok=False)
 
     def _note(self, phase: str, reason: str, words: str, at: float) -> None:
+        if not self.heard and at - self._asked_at > LATE_S:
+            self._counts_from = at
         self._heard_at = at
         self._queued = self._queued or phase == QUEUED
         if self._phase not in (SENT, COMPLETE) or phase not in ("asked", QUEUED):

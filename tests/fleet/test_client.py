@@ -179,7 +179,13 @@ def _asked(query: zenoh.Query) -> str:
     return command.id
 
 
-def test_a_gateway_that_hangs_is_told_from_one_that_answers(cars: Cars, gateway: Bus) -> None:
+def test_a_gateway_that_hangs_is_told_from_one_that_answers_late(
+    cars: Cars, gateway: Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of 50 cars that stopped, six were said to hang: their answers took more than two seconds."""
+    monkeypatch.setattr("fleet.asking.ANSWER_S", 0.1)
+    monkeypatch.setattr("fleet.client.LATEST_ANSWER_S", 1.2)
+    caplog.set_level("WARNING", "fleet")
     events = gateway.publisher("odd/fine/event/command", topics.TOPICS["event/command"], "fine")
     held: list[zenoh.Query] = []
     asked = threading.Event()
@@ -188,6 +194,7 @@ def test_a_gateway_that_hangs_is_told_from_one_that_answers(cars: Cars, gateway:
     def answer(query: zenoh.Query) -> None:
         with query:
             ids.append(_asked(query))
+            wait_for(lambda: caplog.messages, "it is late")
             result = pb.Result(id=ids[0], car="fine", status="queued", worst_case_s=0.5)
             key = "odd/fine/@cmd/stop"
             reply(query, key, result.SerializeToString(), messages.encoding_of(topics.RESULT))
@@ -211,7 +218,12 @@ def test_a_gateway_that_hangs_is_told_from_one_that_answers(cars: Cars, gateway:
     worker.join()
     assert (fine.car, fine.ok, fine.phase, fine.worst_case_s) == ("fine", True, "complete", 0.5)
     assert (hung.car, hung.ok, hung.phase) == ("hung", False, "no_answer")
-    assert hung.words == "hung did not answer within 2 s: its gateway hangs"
+    assert hung.words == (
+        "no answer after 1 s; its gateway is on the bus (slow or hanging), so whether hung does it is not known"
+    )
+    assert caplog.messages == [
+        "no answer yet from fine, hung: still waiting, the machine or the gateway may be overloaded"
+    ]
 
 
 def test_a_command_of_which_nothing_more_is_heard_ends_with_what_was_heard_last(cars: Cars, gateway: Bus) -> None:
@@ -264,11 +276,12 @@ def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
     asked = threading.Event()
 
     def answer(query: zenoh.Query) -> None:
-        with query:
-            result = pb.Result(id=_asked(query), car="slow", status="queued", worst_case_s=600.0)
-            reply(query, "odd/slow/@cmd/stop", result.SerializeToString(), messages.encoding_of(topics.RESULT))
+        result = pb.Result(id=_asked(query), car="slow", status="queued", worst_case_s=600.0)
+        reply(query, "odd/slow/@cmd/stop", result.SerializeToString(), messages.encoding_of(topics.RESULT))
+        held.append(query)
         asked.set()
 
+    held: list[zenoh.Query] = []
     gateway.queryable("odd/slow/@cmd/*", answer)
     gateway.token(keys.car_token("odd", "slow"))
     client = Fleet(cars.endpoint, "odd", sender="ann")
@@ -277,7 +290,9 @@ def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
     waiting = threading.Thread(target=lambda: outcomes.extend(client.stop(["slow"])))
     waiting.start()
     assert asked.wait(20)
+    began = time.monotonic()
     client.close()
+    assert time.monotonic() - began < 5.0, "the query that hangs is not waited for"
     waiting.join(20)
     assert len(outcomes) == 1
 

@@ -61,6 +61,37 @@ def test_a_stop_is_waited_for_as_long_as_its_gateway_announced_and_a_margin() ->
     assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(100 + 7.3 + 5.0)
 
 
+def test_what_is_waited_for_after_a_late_answer_is_counted_from_it() -> None:
+    progress = Progress("red", Until.STOPPED, 100.0)
+    assert progress.deadline > 110.0, "the query is over before it"
+    progress.answered("queued", "", "", 0.5, 108.0)
+    assert progress.deadline == pytest.approx(108.0 + 0.5 + 5.0)
+
+
+@pytest.mark.parametrize(
+    ("alive", "words"),
+    [
+        (True, "its gateway is on the bus (slow or hanging), so whether red does it is not known"),
+        (False, "its gateway is not on the bus, so whether red moves is not known"),
+    ],
+)
+def test_no_answer_says_whether_there_is_a_gateway(alive: bool, words: str) -> None:
+    progress = Progress("red", Until.STOPPED, 100.0)
+    progress.token(109.5, alive=alive)
+    progress.unanswered(110.0)
+    assert progress.outcome is not None
+    assert (progress.outcome.phase, progress.outcome.words) == ("no_answer", f"no answer after 10 s; {words}")
+
+
+def test_a_car_whose_records_come_is_not_without_an_answer() -> None:
+    progress = told(Until.STOPPED, [("event", "asked", 0.0), ("event", "sent", 0.5)])
+    progress.unanswered(110.0)
+    assert progress.outcome is None
+    progress.event("complete", "", "", 0.0, 111.0)
+    assert progress.outcome is not None
+    assert progress.outcome.ok
+
+
 def test_giving_up_says_what_was_heard_last() -> None:
     progress = told(Until.SENT, [("answer", "queued", 0.0)])
     progress.give_up(115.0)
