@@ -221,6 +221,12 @@ def failure_table() -> str:
             "one gap in everything; nobody need do anything",
         ),
         (
+            "The bus is flooded: questions of the past, tokens, drives, payloads of megabytes",
+            "what it is told; a command does not wait for answers",
+            "a few milliseconds more (`make bench`, `floods`)",
+            "`busy` as an answer; over 64 KiB is refused unread (a stop is obeyed); `bus_drops` in `state/health`",
+        ),
+        (
             "The coordinator is killed",
             "keeps its mode",
             "until somebody changes it",

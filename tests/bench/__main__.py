@@ -15,6 +15,7 @@ BENCHMARKS = {
     "load": "load",
     "start": "starting",
     "stops": "stops",
+    "floods": "floods",
     "record": "recording",
     "replay": "replaying",
     "sessions": "sessions",

@@ -1,4 +1,4 @@
-"""Floor: a query is answered at once. Arguments: endpoint, key."""
+"""Floor: a query is answered at once. Arguments: endpoint, key, and what tokens are watched meanwhile."""
 
 import sys
 import threading
@@ -12,8 +12,9 @@ def answer(query: zenoh.Query) -> None:
         query.reply(key, b"here", express=True)
 
 
-endpoint, key = sys.argv[1:]
+endpoint, key, *watched = sys.argv[1:]
 with opened(endpoint) as session:
+    watches = [session.liveliness().declare_subscriber(each, lambda _: None, history=True) for each in watched]
     queryable = session.declare_queryable(key, answer)
     token = session.liveliness().declare_token(f"{key}/alive")
     threading.Event().wait()

@@ -1,0 +1,120 @@
+"""`stop` while the bus is flooded: from asking to its first frame on the tty, and what the gateway holds in memory.
+
+The floor is the same gateway without a flood. The goal of each is 50 ms more at most. What a bare process takes to
+answer under the same flood of tokens is told with it: Zenoh's own work for a token is most of what there is.
+"""
+
+import json
+import threading
+from pathlib import Path
+from time import sleep
+
+from tests.bench.measured import Measured
+from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, stage
+from tests.support.processes import PATIENCE_S, TAKEN, wait_for
+
+FLOODER = Path(__file__).parents[1] / "support" / "flooder.py"
+RATES = {"history": 330.0, "operators": 1200.0, "cars": 1200.0, "large": 20.0, "drives": 10_000.0}
+"""Of each flood, a second, as far as the machine goes."""
+TOKENS = ("operators", "cars")
+STOPS = 5
+WARM_S = 2.0
+RESTED_S = 2.5
+"""A stop is over, and another is not joined to it."""
+KEPT = 1500
+"""Values that a gateway keeps of each reading."""
+REPORT_S = 0.04
+LONGEST_FRAME = 26
+CLOSE = b"$4WD,MODE00#"
+CLOSING_S = 1.0
+"""How long a car is silent that closes a mode."""
+
+
+class _Car:
+    """The car's end of a tty: reports, and is silent for a second after `MODE00`."""
+
+    def __init__(self, port: Tty) -> None:
+        self._port = port
+        self.stops: list[float] = []
+        """When a stop's first frame came."""
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        silent_until = due = perf_counter()
+        came = b""
+        while not self._over.is_set():
+            came = came[-LONGEST_FRAME:] + self._port.read(max(0.0, due - perf_counter()))
+            now = perf_counter()
+            if CLOSE in came:
+                came = b""
+                self.stops.append(now)
+                silent_until = now + CLOSING_S
+            if now >= due:
+                due = now + REPORT_S
+                if now >= silent_until:
+                    self._port.write(READING)
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+
+
+def _drives(here: Stage, sender: str) -> bool:
+    """Ask for a drive; whether it is carried out."""
+    fields = {"motion": "forward", "duration_s": 10, "sender": sender, "kind": "person"}
+    drive = here.session.get("fleet/red/@cmd/drive", payload=json.dumps(fields), timeout=PATIENCE_S)
+    return any(reply.ok is not None and json.loads(reply.ok.payload.to_bytes())["status"] in TAKEN for reply in drive)
+
+
+def _stops(here: Stage, car: _Car) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Drive and stop; each stop's time from its question to the tty, ms, and that of a bare query before it."""
+    times, bare = [], []
+    for number in range(STOPS):
+        sleep(RESTED_S)
+        wait_for(lambda number=number: _drives(here, f"bench{number}"), "it drives: at rest nothing has to be stopped")
+        sleep(0.2)
+        began = perf_counter()
+        assert next(iter(here.session.get("bench/answer", timeout=PATIENCE_S))).ok is not None
+        bare.append((perf_counter() - began) * 1e3)
+        known, began = len(car.stops), perf_counter()
+        here.fleet.ask_all("stop", "red", sender=f"bench{number}", kind="person")
+        wait_for(lambda known=known: len(car.stops) > known, "a stop on the tty")
+        times.append((car.stops[known] - began) * 1e3)
+    return tuple(times), tuple(bare)
+
+
+def run() -> list[Measured]:
+    found = []
+    with stage() as here:
+        port = here.tty()
+        gateway = here.gateway(port)
+        alive = Arrival()
+        watch = here.session.liveliness().declare_subscriber("bench/answer/alive", alive.note, history=True)
+        here.bare("answer", "bench/answer", "fleet/*", "fleet/@operator/*")
+        alive.wait()
+        watch.undeclare()
+        with frames(port, READING, rate_hz=500.0):
+            wait_for(lambda: here.fleet.state("link").rx_frames > KEPT, "every ring is full")
+        car = _Car(port)
+        try:
+            sleep(WARM_S)
+            (floor, bare_floor), held = _stops(here, car), (gateway.rss_mb(),)
+            for kind, rate in RATES.items():
+                flooders = 3 if kind == "drives" else 1
+                seconds = WARM_S + STOPS * (RESTED_S + 1.0)
+                flood = [
+                    here.fleet.start(str(FLOODER), kind, str(rate / flooders), str(seconds)) for _ in range(flooders)
+                ]
+                sleep(WARM_S)
+                ours, bare = _stops(here, car)
+                found.append(Measured(f"stop under a flood of {kind}", ours, floor, "ms", 1.0, slack=50.0))
+                found.append(Measured(f"RSS under a flood of {kind}", (gateway.rss_mb(),), held, "MB", 1.0, slack=30.0))
+                if kind in TOKENS:
+                    found.append(Measured(f"a bare query under a flood of {kind}", bare, bare_floor, "ms", None))
+                for each in flood:
+                    each.wait()
+        finally:
+            car.close()
+    return found
