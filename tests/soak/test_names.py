@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from fleet.coordinator import AGAIN_S
 from fleet.hearing import FORGOTTEN_S, MOST_GONE
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, Fleet, wait_for
@@ -21,8 +22,11 @@ def test_ten_thousand_names_in_ten_seconds(kind: str, tmp_path: Path) -> None:
     try:
         plan = tmp_path / "plan.yaml"
         plan.write_text("roles: {scout: {mode: manual}}\n")
-        decided: list[str] = []
-        fleet.bus.subscribe("fleet/@coordinator/decision", lambda sample: decided.append(sample.message().subject))  # type: ignore[attr-defined]
+        decided: list[tuple[float, str]] = []
+        fleet.bus.subscribe(
+            "fleet/@coordinator/decision",
+            lambda sample: decided.append((time.monotonic(), sample.message().subject)),  # type: ignore[attr-defined]
+        )
         coordinator = fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(plan))
 
         def subjects() -> set[str]:
@@ -34,12 +38,18 @@ def test_ten_thousand_names_in_ten_seconds(kind: str, tmp_path: Path) -> None:
         assert flood.wait() == 0, flood.stderr
         ended = time.monotonic()
         wait_for(lambda: len(subjects()) <= MOST_GONE + 1, "it is done with them")
-        print(f"\n{kind}: {flood.line()} names, {before_mb:.0f} MB before", end="")
+        names = flood.line()
+        print(f"\n{kind}: {names} names, {before_mb:.0f} MB before", end="")
         wait_for(lambda: subjects() == {"role scout"}, "all are forgotten", FORGOTTEN_S + PATIENCE_S)
         after_mb = coordinator.rss_mb()
         print(f", {len(decided)} decisions, {after_mb:.0f} MB after, forgotten after {time.monotonic() - ended:.0f} s")
         assert after_mb < before_mb + 30.0
-        assert len(decided) < 1000, "of names of which nothing was said a few were met alive"
+        assert len(decided) < names, "only what was met alive is decided on"
+
+        def lately() -> set[str]:
+            return {subject for at, subject in decided if at > time.monotonic() - AGAIN_S - 1.0}
+
+        wait_for(lambda: lately() == {"role scout"}, "nothing is decided of names that are gone")
         assert coordinator.end() == 0
         assert "Traceback" not in coordinator.stderr
     finally:
