@@ -59,6 +59,8 @@ class Executor:
         self._closing_until = float("inf")
         self._renewals = 0
         self._renew_at = float("inf")
+        self._general_stop_follows = False
+        """The last renewal was a `MODE00`, which a Raspberry Pi ignores: a general stop follows, alone."""
         self._not_shown_logged = False
         self._left_mode = False
         """The last stop left a mode, in which a general stop is ignored."""
@@ -158,13 +160,24 @@ class Executor:
     def _renew(self, now: float) -> Write | None:
         """Send the stop of a car at rest again if nothing has shown it: the frames may have been lost."""
         model = self.model
-        if now < self._renew_at or not model.at_rest or model.trust.shown or self.running is not None:
+        if now < self._renewal_at or not model.at_rest or model.trust.shown or self.running is not None:
             return None
+        if self._general_stop_follows:
+            self._general_stop_follows = False
+            return self._write(_STOP, Why.REPEAT, None, None)
         self._schedule_renewal(now)
         if model.rest is StopCase.FAN and self._left_mode:
             return self._begin_now(self.full(now), Why.REPEAT, now)
         clears = model.rest in (StopCase.NO_ECHO, StopCase.UNKNOWN_PLATFORM) and self._renewals <= CLEARING_RENEWALS + 1
+        self._general_stop_follows = clears
         return self._write(ModeClose() if clears else _STOP, Why.REPEAT, None, None)
+
+    @property
+    def _renewal_at(self) -> float:
+        """Return when the next frame of a renewal is due."""
+        if self._general_stop_follows:
+            return self.model.pacing.written_at + recipes.REPEAT_S
+        return self._renew_at
 
     def _schedule_renewal(self, now: float) -> None:
         self._renew_at = now + RENEW_S[min(self._renewals, len(RENEW_S) - 1)]
@@ -240,7 +253,7 @@ class Executor:
         if model.believed.repeat:
             times.append(max(model.pacing.repeat_at, self.left_until))
         if model.at_rest and not model.trust.shown and self.running is None:
-            times.append(max(self._renew_at, self.ready_at))
+            times.append(max(self._renewal_at, self.ready_at))
         return times
 
     def _write(self, frame: Frame, why: Why, source: Running | Held | Pending | None, by: Pending | None) -> Write:
@@ -533,7 +546,7 @@ class Executor:
             self._ledger.log(Level.INFO, "recovered", f"{model.name} is stopped, mode manual ({how})", now)
         model.believed.motors_on = False
         if basis is Basis.SENT:
-            self._renewals = 0
+            self._renewals, self._general_stop_follows = 0, False
             self._schedule_renewal(now)
         phase = Phase.COMPLETE if basis is Basis.SHOWN else Phase.SENT
         evidence = (words,) if basis is Basis.SHOWN else ()
