@@ -112,6 +112,7 @@ class Executor:
             self._give_up(running, now)
             return None
         if running is not None:
+            self._fail_late(running, now)
             write = self._step(running, now)
             if write is not None or (self.running is not None and not self._leaves_gap(self.running, now)):
                 return write
@@ -230,16 +231,18 @@ class Executor:
         return max(now, min(times, default=float("inf")))
 
     def _running_times(self, running: Running, now: float) -> list[float]:
-        if not running.frames_sent:
-            return [min(running.due_at(self.model.pacing), self._closing_until)]
-        times = [max(running.next_try_at, self.model.pacing.flight_until)]
-        if running.obeyed_at > now:
-            times.append(running.obeyed_at)
+        times = [running.due_at(self.model.pacing)] if not running.frames_sent else self._waiting_times(running, now)
         times += [pending.asked_at + running.patience_s for pending in running.commands]
         if not running.overdue:
             times.append(running.gives_up_at)
         if self.closing:
             times.append(self._closing_until)
+        return times
+
+    def _waiting_times(self, running: Running, now: float) -> list[float]:
+        times = [max(running.next_try_at, self.model.pacing.flight_until)]
+        if running.obeyed_at > now:
+            times.append(running.obeyed_at)
         return times
 
     def _command_times(self, now: float) -> list[float]:
@@ -487,7 +490,6 @@ class Executor:
         if case is not None:
             self._finish(running, Basis.SENT, EVIDENCE[case].words.format(car=self.model.name), now, case)
             return
-        self._fail_late(running, now)
         if now >= max(running.next_try_at, self.model.pacing.flight_until):
             self._try_again(running, now)
 

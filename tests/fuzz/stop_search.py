@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
+from typing import Any
 
 from gateway.control.controller import Controller
 from gateway.control.mode import Verdict
@@ -144,8 +145,75 @@ class Report:
 
 
 def draw(seed: int) -> Plan:
-    """Return an episode."""
+    """Return an episode: every other one of a theme that is known to be hard, the others of anything."""
     moments = random.Random(f"episode {seed}")
+    return _any(seed, moments) if seed % 2 else THEMES[seed // 2 % len(THEMES)](seed, moments)
+
+
+def _theme(seed: int, load: str, load_s: float, faults: tuple[Fault, ...], **more: Any) -> Plan:
+    return Plan(seed, "arduino", "arduino", "echo", load, load_s, more.pop("ending", Ending.STOP), faults, **more)
+
+
+def _report_swallowed(seed: int, moments: random.Random) -> Plan:
+    """The link swallows the stop and the report after it, so that the reports pause as if it had been obeyed."""
+    gap = Fault(Kind.DEAD, Way.BOTH, moments.uniform(-0.2, 0.0), moments.uniform(0.5, 1.9))
+    return _theme(
+        seed, moments.choice(["drive", "steer"]), moments.uniform(0.5, 4.0), (gap,),
+        report_every_s=moments.uniform(0.93, 1.0), ending=moments.choice([Ending.STOP, Ending.STOP, Ending.SHUTDOWN]),
+    )  # fmt: skip
+
+
+def _digit_lost(seed: int, moments: random.Random) -> Plan:
+    """`MODE00` loses a digit: it opens mode 0, with the motors on. What follows is lost."""
+    lost = Fault(Kind.DEAD, Way.TO_CAR, moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S)
+    later = Fault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(1.0, 8.0))
+    load = moments.choice(["tracking", "light_seeking", "following", "obstacle_avoidance", "color_led"])
+    return _theme(seed, load, moments.uniform(0.5, 6.0), (lost, later), report_every_s=moments.uniform(0.9, 1.0))
+
+
+def _stop_while_opening(seed: int, moments: random.Random) -> Plan:
+    """Old reports come late while a silent mode opens, and the stop is lost."""
+    slow = Fault(Kind.SLOW, Way.TO_HOST, -4.0, 30.0, delay_s=moments.uniform(1.5, 4.0))
+    lost = Fault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
+    load_s = moments.uniform(0.05, 0.4)
+    return _theme(seed, "obstacle_avoidance", load_s, (slow, lost), opening=True)
+
+
+def _half_a_frame(seed: int, moments: random.Random) -> Plan:
+    """The first frame of the stop is cut, so what follows is read behind it; later tries are lost."""
+    cut = Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(1, 18) / BYTES_PER_S, 0.03)
+    later = Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(1.3, 1.9), moments.uniform(6.0, 15.0))
+    load = moments.choice(["steer", "steer", "tracking", "light_seeking", "acts"])
+    return _theme(seed, load, moments.uniform(0.5, 4.0), (cut, later) if moments.random() < 0.7 else (cut,))
+
+
+def _short_gap(seed: int, moments: random.Random) -> Plan:
+    """The fault that began this: 0.6 s of bytes swallowed around a stop, in any mode."""
+    gap = Fault(Kind.DEAD, moments.choice(list(Way)), moments.uniform(-0.5, 0.0), moments.uniform(0.3, 6.0))
+    load = moments.choice(["drive", *(mode.value for mode in Mode if mode is not Mode.MANUAL)])
+    ending = moments.choice([Ending.STOP, Ending.STOP, Ending.SHUTDOWN, Ending.MANUAL])
+    return _theme(seed, load, moments.uniform(0.5, 9.0), (gap,), ending=ending)
+
+
+def _damaged_reports(seed: int, moments: random.Random) -> Plan:
+    """The stop is lost, and the link drops digits of the car's frames, so that some look like reports of mode 0."""
+    lossy = Fault(Kind.LOSSY, Way.TO_HOST, -0.1, moments.uniform(3.0, 9.0), share=moments.choice([0.01, 0.02, 0.04]))
+    lost = Fault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(1.0, 8.0))
+    return _theme(seed, moments.choice(["light_seeking", "following"]), moments.uniform(0.5, 6.0), (lossy, lost))
+
+
+def _misread_and_lost(seed: int, moments: random.Random) -> Plan:
+    """A drive, then half a general frame and `MODE00` in one string, which opens a silent mode; later tries are lost."""
+    cut = Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(2, 18) / BYTES_PER_S, 0.03)
+    later = Fault(Kind.DEAD, Way.TO_CAR, 1.5, moments.uniform(9.0, 15.0))
+    again_s = moments.uniform(0.02, 0.2) if moments.random() < 0.5 else 0.0
+    return _theme(seed, "steer", moments.uniform(0.5, 4.0), (cut, later), again_s=again_s)
+
+
+THEMES = (_report_swallowed, _digit_lost, _stop_while_opening, _half_a_frame, _short_gap, _damaged_reports, _misread_and_lost)
+
+
+def _any(seed: int, moments: random.Random) -> Plan:
     platform, told = moments.choices(
         [
             ("arduino", "arduino"),
@@ -548,11 +616,21 @@ class Episode:
             self._complete = False
         if identity in self._ends and last:
             self._ends[identity].append(last)
+            if self.now - self._asked_at[identity] > ENDS_S:
+                self._violate(f"(4) {identity} ended after {self.now - self._asked_at[identity]:.0f} s")
             self.report.ends[last] += 1
+            if last == "sent" and self._shows:
+                self._violate(f"(4) {identity} ended as sent, and the car could have shown it")
             if last == "complete":
                 self._complete, self._complete_since = True, self.now
         if identity in self._ends and record.phase in (Phase.SUPERSEDED, Phase.EXPIRED):
             self._ends[identity].append(record.phase)
+
+    @property
+    def _shows(self) -> bool:
+        """Return True if the car can show a stop, and nothing hides that."""
+        plan = self.plan
+        return (plan.platform, plan.told) in _WITH_MODES and plan.world == "echo" and not self.car.truth.fan
 
     def _judge(self) -> None:
         """Hold the claims against the true motors."""
@@ -600,6 +678,8 @@ class Episode:
             return
         if mode.verdict is Verdict.CONFIRMED and mode.inferred is None:
             self._violate("(3) confirmed, inferred unknown")
+        if mode.verdict is Verdict.CONFIRMED and self.now - (mode.evidence_at or 0.0) > VERDICT_S:
+            self._violate("(3) confirmed by old evidence")
         if mode.verdict is not Verdict.CONFIRMED or mode.asked is true or not self.car.alive:
             self._verdict_since = None
         elif self._verdict_since is None:
