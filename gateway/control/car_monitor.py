@@ -13,8 +13,8 @@ from gateway.control.mode import MANUAL_SILENCE_S, Verdict
 from gateway.control.outbox import FLIGHT_S
 from gateway.control.platform import PlatformTruth
 from gateway.control.records import Level, Phase, Reason, SetMode, Why
-from gateway.control.stop_evidence import Finding
-from gateway.control.trust import Basis, CarTrust, TrustEvent
+from gateway.control.stop_evidence import Finding, StopCase
+from gateway.control.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
 from gateway.protocol.profile import StopStyle
 from gateway.protocol.readings import Event, Rejected, Sensors
 from gateway.protocol.values import Mode
@@ -52,7 +52,8 @@ class CarMonitor:
         for words in model.platform.heard(event):
             self._ledger.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
             # The last stop may have been of the wrong kind, unless the car has shown it.
-            if model.platform.doubted and model.trust.basis is Basis.SENT:
+            stopping = model.trust.state in STOP_GOES_ON or model.trust.basis is Basis.SENT
+            if model.platform.doubted and stopping and model.link_open:
                 self._executor.recover(now, words)
         if isinstance(event, Rejected):
             model.evidence.noise(event.at)
@@ -132,10 +133,12 @@ class CarMonitor:
     def _weigh_silence(self, now: float) -> None:
         model = self.model
         fan = bool(model.believed.fan)
-        if self._executor.running is None:
+        limit_s = model.mode.silence_limit(fan=fan)
+        # While a stop goes on, silence shows nothing of the mode; where it is expected it still excuses itself.
+        if self._executor.running is None or limit_s is None:
             model.mode.silent(now=now, fan=fan)
         model.mode.fade(now)
-        if model.trust.state is CarTrust.UNHEARD or model.mode.silence_limit(fan=fan) is None:
+        if model.trust.state is CarTrust.UNHEARD or limit_s is None:
             return
         silent_s = model.mode.unheard_s(now)
         if silent_s <= MANUAL_SILENCE_S:
@@ -146,9 +149,10 @@ class CarMonitor:
         )
         self._ledger.log(Level.WARNING, "unheard", words, now)
         self._executor.waiting.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
-        if model.at_rest and self._executor.running is None:
+        running = self._executor.running
+        if model.at_rest and running is None:
             self._executor.stop_again(now)
-        elif self._executor.running is None:
+        elif running is None or running.case is StopCase.SOFT:
             self._executor.recover(now, words)
         model.learn(TrustEvent.SILENT, now, words)
 

@@ -9,7 +9,7 @@ from gateway.control import recipes, stop
 from gateway.control.car_model import CarModel
 from gateway.control.ledger import Ledger, Pending
 from gateway.control.outbox import FLIGHT_S
-from gateway.control.recipes import Recipe
+from gateway.control.recipes import Gate, Recipe
 from gateway.control.records import Fan, Level, Phase, Reason, SetMode, Why, Write
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
@@ -100,7 +100,9 @@ class Executor:
     def accepts(self) -> bool:
         """Return True if the car may be sent what is no stop, as far as its state goes."""
         state = self.model.trust.state
-        return state in (CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE) or state is CarTrust.UNPROVEN
+        if state is CarTrust.STOPPING:
+            return self.running is None  # a drive took the place of a soft stop
+        return state in (CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE, CarTrust.UNPROVEN)
 
     def poll(self, now: float) -> Write | None:
         """Return the frame to write now, if any."""
@@ -166,10 +168,11 @@ class Executor:
         if self._general_stop_follows:
             self._general_stop_follows = False
             return self._write(_STOP, Why.REPEAT, None, None)
-        self._schedule_renewal(now)
         if model.rest is StopCase.FAN and self._left_mode:
+            self._schedule_renewal(now)
             return self._begin_now(self.full(now), Why.REPEAT, now)
-        clears = model.rest in (StopCase.NO_ECHO, StopCase.UNKNOWN_PLATFORM) and self._renewals <= CLEARING_RENEWALS + 1
+        clears = self._renewal_clears()
+        self._schedule_renewal(now)
         self._general_stop_follows = clears
         return self._write(ModeClose() if clears else _STOP, Why.REPEAT, None, None)
 
@@ -178,7 +181,12 @@ class Executor:
         """Return when the next frame of a renewal is due."""
         if self._general_stop_follows:
             return self.model.pacing.written_at + recipes.REPEAT_S
-        return self._renew_at
+        # In one string behind a servo or colour frame `MODE00` would open a mode: its digits are read out of that frame.
+        return max(self._renew_at, self.model.pacing.ready_at(Gate.ALONE)) if self._renewal_clears() else self._renew_at
+
+    def _renewal_clears(self) -> bool:
+        """Return True if the next renewal is a `MODE00`."""
+        return self.model.rest in (StopCase.NO_ECHO, StopCase.UNKNOWN_PLATFORM) and self._renewals <= CLEARING_RENEWALS
 
     def _schedule_renewal(self, now: float) -> None:
         self._renew_at = now + RENEW_S[min(self._renewals, len(RENEW_S) - 1)]
@@ -255,7 +263,7 @@ class Executor:
             times.append(max(model.pacing.open_at(now), self.left_until) if model.rest_is_sure else self.ready_at)
         if model.believed.repeat:
             times.append(max(model.pacing.repeat_at, self.left_until))
-        if model.at_rest and not model.trust.shown and self.running is None:
+        if model.at_rest and not model.trust.shown and self.running is None and waiting.opening is None:
             times.append(max(self._renewal_at, self.ready_at))
         return times
 
@@ -496,7 +504,7 @@ class Executor:
     def _ends_as_sent(self, running: Running, now: float) -> StopCase | None:
         """Return why the stop ends without evidence; None if the car may still show it."""
         model = self.model
-        if running.at_rest:
+        if running.at_rest or model.trust.state is CarTrust.UNHEARD:
             return None
         reported = running.report_at > running.last_at
         over = now >= running.obeyed_at
@@ -511,7 +519,7 @@ class Executor:
             return StopCase.FAN
         if running.no_echo_at > running.closed_at:
             return StopCase.NO_ECHO
-        if running.case is StopCase.UNKNOWN_PLATFORM and reported and running.probes:
+        if running.case is StopCase.UNKNOWN_PLATFORM and reported and running.probes >= UNKNOWN_PROBES:
             return StopCase.UNKNOWN_PLATFORM
         return None
 

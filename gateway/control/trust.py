@@ -80,7 +80,7 @@ _SAME: Final = {
     _T.DRIVING: {_E.HEARD, _E.NOT_SHOWN, _E.STOP_SHOWN, _E.STOP_SENT},
     _T.IN_MODE: {_E.HEARD, _E.NOT_SHOWN, _E.STOP_SHOWN, _E.STOP_SENT},
     # Only a reading ends the silence, and only evidence the doubt.
-    _T.UNHEARD: {_E.STOP_BEGUN, _E.DOUBTED, _E.NOT_SHOWN, _E.SILENT},
+    _T.UNHEARD: {_E.STOP_BEGUN, _E.STOP_SENT, _E.DOUBTED, _E.NOT_SHOWN, _E.SILENT},
     _T.UNPROVEN: {_E.STOP_BEGUN, _E.DOUBTED, _E.NOT_SHOWN, _E.HEARD},
 }
 _OTHER: Final = {(_T.UNHEARD, _E.HEARD): _T.RECOVERING}
