@@ -6,7 +6,6 @@ finds out; nothing is opened here but the file.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -21,7 +20,7 @@ from fleet.config_fields import (
     LimitsEntry,
 )
 from fleet.faults import Where, meant, shown
-from fleet.links import BadLink, Link, LinkKind, parse_link
+from fleet.links import BadLink, Link, LinkKind, parse_link, shared_ports
 from fleet.marked import Document, read_text
 from gateway.protocol.profile import AUTO, Platform, parse_platform, parse_told
 
@@ -220,12 +219,9 @@ def _one_port(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Where, st
                 links[name] = parse_link(given)
             except BadLink:
                 continue  # the link's own fault
-    told: set[str] = set()
-    for first, second in combinations(links, 2):
-        if second not in told and links[first].may_be(links[second]):
-            told.add(second)
-            words = f"{shown(cars[second]['link'])} may be the port of {first}: every car has a port of its own"
-            yield ("cars", second, "link"), words
+    for first, second in shared_ports(links):
+        words = f"{shown(cars[second]['link'])} may be the port of {first}: every car has a port of its own"
+        yield ("cars", second, "link"), words
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

@@ -1,6 +1,8 @@
 """Fleet files: layers resolved, faults across cars told, and links understood as gateways understand them."""
 
 import json
+import time
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 
 from fleet.config import CarSpec, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
 from fleet.config_fields import CRITICAL_V, EMPTY_V, FULL_V, LONGEST_DRIVE_S, LOW_V, BatteryAction, schema
-from fleet.links import BadLink, LinkKind, parse_link
+from fleet.links import BadLink, Link, LinkKind, parse_link, shared_ports
 from fleet.marked import BadFile
 from gateway import requests
 from gateway.control import battery
@@ -145,6 +147,38 @@ def test_a_port_behind_two_names(tmp_path: Path) -> None:
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
     (line,) = _faults(f"cars: {{a: {{link: {tmp_path}/tty}}, b: {{link: {tmp_path}/by-id}}}}")
     assert "may be the port of a" in line
+
+
+_PORTS = [parse_link(each) for each in ("/dev/a", "/dev/b", "tcp://a:1", "tcp://a:2", "ble://name=a", "sim")] + [
+    parse_link(f"serial://?{ids}")
+    for ids in (
+        "vid=1a86",
+        "pid=7523",
+        "serial=A",
+        "serial=B",
+        "vid=1a86&pid=7523",
+        "vid=1a86&serial=A",
+        "pid=7523&serial=B",
+    )
+]
+
+
+@given(st.lists(st.sampled_from(_PORTS), max_size=12))
+def test_shared_ports_are_those_that_a_comparison_of_each_pair_finds(links: list[Link]) -> None:
+    named = {f"car{number}": link for number, link in enumerate(links)}
+    first: dict[str, str] = {}
+    for (one, before), (other, after) in combinations(named.items(), 2):
+        if before.may_be(after):
+            first.setdefault(other, one)
+    assert set(shared_ports(named)) == {(one, other) for other, one in first.items()}
+
+
+@pytest.mark.parametrize("link", ["tcp://10.0.{}.{}:8888", "/dev/tty{}.{}", "serial://?vid=1a86&serial={}.{}"])
+def test_a_large_file_takes_time_for_each_car_and_not_for_each_pair(link: str) -> None:
+    lines = "".join(f"  c{n}: {{link: '{link.format(n >> 8, n & 255)}'}}\n" for n in range(4000))
+    began = time.process_time()
+    assert len(_fleet(f"cars:\n{lines}").cars) == 4000
+    assert time.process_time() - began < 4.0, "a comparison of each pair takes 9 to 60 s"
 
 
 def test_a_car_without_a_link_is_let_through_for_who_looks_for_it() -> None:
