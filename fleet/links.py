@@ -83,7 +83,7 @@ class Link:
 
     def may_be(self, other: "Link") -> bool:
         """Return True if both can be one port: one device behind two paths, or one USB device described twice."""
-        return self.port in other.descriptions() or other.port in self.descriptions()
+        return self.port in set(other.descriptions()) or other.port in set(self.descriptions())
 
 
 def shared_ports(links: Mapping[str, Link]) -> Iterator[tuple[str, str]]:

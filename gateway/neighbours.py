@@ -21,10 +21,8 @@ AGAIN_S: Final = 0.5
 nobody else knows."""
 SELDOM_S: Final = 30.0
 """... and so seldom in the end."""
-CALM_S: Final = 1.0
-"""While gateways come on and on, all are asked ever more seldom, down to every `LONGEST_TOGETHER_S`; after so long
-without one that came, at once again."""
-LONGEST_TOGETHER_S: Final = 3.0
+MANY: Final = 8
+"""Maximum gateways that are asked one by one. One query that all answer is cheaper for more of them."""
 
 log = logging.getLogger("gateway")
 
@@ -41,14 +39,26 @@ class Neighbours:
         self._car = car
         self._passing_on: set[asyncio.Task[None]] = set()
         self._came = asyncio.Event()
+        self._alive: set[str] = set()
+        self._due: set[str] = set()
+        """Gateways that came and have not answered since."""
 
-    def changed(self, changes: Mapping[str, bool]) -> None:
-        """Gateways of the fleet came or went."""
-        if any(alive and name != self._car for name, alive in changes.items()):
-            self.ask_soon()
+    def changed(self, change: tuple[str, bool]) -> None:
+        """A gateway of the fleet came or went."""
+        name, alive = change
+        if name == self._car:
+            return
+        if alive:
+            self._alive.add(name)
+            self._due.add(name)
+            self._came.set()
+        else:
+            self._alive.discard(name)
+            self._due.discard(name)
 
     def ask_soon(self) -> None:
-        """There may be fleet-wide e-stops that this gateway does not know."""
+        """Ask all: there may be fleet-wide e-stops that this gateway does not know."""
+        self._due |= self._alive
         self._came.set()
 
     def pass_on(self, command: Command, before: Kept, now: Kept) -> None:
@@ -77,8 +87,7 @@ class Neighbours:
 
     async def keep_united(self, unite: Unite) -> None:
         """Fleet-wide e-stops, in force and ended, are taken over from whoever comes onto the bus; until cancelled."""
-        key = keys.topic_key(self._fleet, "*", "state/safety")
-        again_s, together_s = AGAIN_S, TOGETHER_S
+        again_s, again = AGAIN_S, None
         while True:
             try:
                 async with asyncio.timeout(CALM_S):
@@ -89,20 +98,30 @@ class Neighbours:
             await asyncio.sleep(together_s)
             together_s = min(2 * together_s, LONGEST_TOGETHER_S)
             self._came.clear()
-            unanswered = False
-            for answer in await asyncio.to_thread(lambda: list(self._bus.query(key))):
-                if not isinstance(answer, bus.Sample):
-                    unanswered = True
-                    continue
+            for answer in await asyncio.to_thread(self._ask, sorted(self._due)):
                 try:
                     shown: Any = answer.message()
                 except (messages.BadPayload, KeyError) as error:
                     log.warning("%s: no state of a gateway of this fleet: %s", answer.key, error)
                     continue
                 unite([_estop(each) for each in shown.estops], shown.ended, shown.car)
-            if unanswered:
-                asyncio.get_running_loop().call_later(again_s, self.ask_soon)
-            again_s = min(2 * again_s, SELDOM_S) if unanswered else AGAIN_S
+                self._due.discard(shown.car)
+            if again is not None:
+                again.cancel()
+            if self._due:
+                again = asyncio.get_running_loop().call_later(again_s, self._came.set)
+            again_s = min(2 * again_s, SELDOM_S) if self._due else AGAIN_S
+
+    def _ask(self, names: Sequence[str]) -> list[bus.Sample]:
+        """Return the states of these gateways; on a thread.
+
+        If each gateway asked all others whenever one came, a hundred that start would have 300,000 answers to give.
+        """
+        asked = names if len(names) <= MANY else ("*",)
+        selectors = [keys.topic_key(self._fleet, name, "state/safety") for name in asked]
+        return [
+            answer for selector in selectors for answer in self._bus.query(selector) if isinstance(answer, bus.Sample)
+        ]
 
 
 def _estop(shown: pb.Estop) -> Estop:

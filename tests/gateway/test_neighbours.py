@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import zenoh
@@ -15,6 +16,7 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, Fleet, wait_for
 
 KEY = "fleet/blue/state/safety"
+SAFETY = encoding_of("fleet.v1.Safety")
 
 
 async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) -> None:
@@ -49,5 +51,44 @@ async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) ->
             keeping.cancel()
             await asyncio.gather(keeping, return_exceptions=True)
             asked.clear()
+    finally:
+        fleet.close()
+
+
+async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -> None:
+    """Else a hundred gateways that start one after the other have 300,000 answers to give."""
+    fleet = Fleet(free_endpoint(), tmp_path)
+    asked: dict[str, int] = {"blue": 0, "green": 0}
+    learned: list[str] = []
+
+    def answer(query: zenoh.Query, car: str) -> None:
+        asked[car] += 1
+        with query:
+            reply(query, f"fleet/{car}/state/safety", pb.Safety(car=car).SerializeToString(), SAFETY)
+
+    def learn(_: Sequence[Estop], __: Sequence[str], told_by: str) -> None:
+        learned.append(told_by)
+
+    try:
+        with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as cars, fleet.bus as opened:
+            loop = asyncio.get_running_loop()
+            for car in asked:
+                cars.queryable(f"fleet/{car}/state/safety", Handover(loop, partial(answer, car=car)))
+            while not all(asked.values()):  # until the hub knows of both
+                await asyncio.to_thread(lambda: list(opened.query("fleet/*/state/safety", timeout_s=0.1)))
+            neighbours = Neighbours(opened, "fleet", "red")
+            keeping = asyncio.ensure_future(neighbours.keep_united(learn))
+            for car in asked:
+                neighbours.changed((car, True))
+                await asyncio.to_thread(wait_for, lambda car=car: car in learned, f"{car} is asked")
+            assert learned == ["blue", "green"]
+            neighbours.ask_soon()
+            await asyncio.to_thread(wait_for, lambda: learned == ["blue", "green"] * 2, "all are asked")
+            neighbours.changed(("blue", False))
+            neighbours.ask_soon()
+            await asyncio.to_thread(wait_for, lambda: len(learned) == 5, "who is there is asked")
+            assert learned[4] == "green"
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
     finally:
         fleet.close()
