@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Final
 
 from fleet.supervise import wanted
@@ -27,8 +28,6 @@ from fleet.supervise.wanted import COORDINATOR, HUB, RECORDER, SELF, SIMULATOR, 
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
 
-STALL_S: Final = 1.0
-"""Who slept for so long has heard nobody meanwhile, and blames nobody."""
 SECOND_S: Final = 1.0
 HUB_UP_S: Final = 10.0
 HUB_GONE_S: Final = 0.3
@@ -37,6 +36,8 @@ RECORDER_FIRST_S: Final = 5.0
 """How long the cars wait for the recorder, so that it misses nothing."""
 STOP_ASKED_S: Final = 0.5
 END_S: Final = 5.0
+TRIES_S: Final = 30.0
+"""Time for which gateways that cannot stop their cars are replaced, if nobody is there to end it with Ctrl-C."""
 RECORDER_END_S: Final = 30.0
 """It writes what it has."""
 
@@ -69,23 +70,30 @@ class Supervisor:
         self._state = "starting"
         self._farewell = Farewell(self.crew, self.rows, lambda car, words: self._say("end", car, words))
         self._desk: Desk | None = None
-        self._began = self._turned_at = self._awake_since = self._unlinked_since = time.monotonic()
+        self._began = time.monotonic()
+        self._unlinked_since = self.crew.now
         self._linked_since: float | None = None
         self._gateways_from = 0.0
         self._end_asked = asyncio.Event()
+        self._tries_until = inf
         self._reloading = asyncio.Lock()
         self._sim_asked: deque[bool] = deque()
         """Whose questions to the simulator wait for an answer: True for a user's."""
         self._sim_links: dict[str, str] = {}
         self._shown: object = None
 
-    def end(self, why: str) -> None:
-        """Begin to end; asked again it says what is waited for."""
+    def end(self, why: str, tries_s: float = inf) -> None:
+        """Begin to end; asked again, say what is waited for, and try no longer to stop cars that cannot be stopped.
+
+        tries_s: for how long fresh gateways try that unless asked again.
+        """
         if self._end_asked.is_set():
             waiting = ", ".join(process.name for process in self.crew if process.ward.alive)
             self._say("end", SELF, f"{why}: is ending already, waits for {waiting or 'nothing'}")
+            self._farewell.hurry()
             return
         self._say("end", SELF, f"{why}: stopping every car, then closing the recording")
+        self._tries_until = self.crew.now + tries_s
         self._end_asked.set()
 
     def tell_simulator(self, line: str) -> None:
@@ -132,13 +140,13 @@ class Supervisor:
     async def _bus(self) -> Bus | None:
         """A session; the hub is started if there is none. None if it is to end before. Raises BusError."""
         self.crew.add(HUB, Kind.HUB, wanted.hub_command(self.endpoint))
-        deadline = time.monotonic() + HUB_UP_S
+        deadline = self.crew.now + HUB_UP_S
         while not self._end_asked.is_set():
             await self._turn()
             if await asyncio.to_thread(accepts, self.endpoint):
                 return await asyncio.to_thread(Bus.open, self.endpoint)
             hub = self.crew.get(HUB)
-            if time.monotonic() > deadline:
+            if self.crew.now > deadline:
                 words = hub.ward.words if hub is not None else ""
                 raise BusError(f"no hub came up at {self.endpoint}: {words or 'it does not listen'}")
             await asyncio.sleep(TURN_S)
@@ -170,7 +178,7 @@ class Supervisor:
     def _populate(self) -> None:
         if self._wish.record:
             self.crew.add(RECORDER, Kind.RECORDER, wanted.recorder_command(self._wish, self.endpoint))
-            self._gateways_from = time.monotonic() + RECORDER_FIRST_S
+            self._gateways_from = self.crew.now + RECORDER_FIRST_S
         if self._wish.simulated:
             command = wanted.simulator_command(self._wish, self.crew.directory, self.endpoint)
             self.crew.add(SIMULATOR, Kind.SIMULATOR, command)
@@ -252,10 +260,7 @@ class Supervisor:
     # ------------------------------------------------------------------ one turn
 
     async def _turn(self) -> None:
-        now = time.monotonic()
-        if now - self._turned_at > STALL_S:
-            self._awake_since = now
-        self._turned_at = now
+        now = self.crew.now
         linked = self._desk is not None and self._desk.bus.connected
         if linked and self._linked_since is None:
             self._linked_since = now
@@ -263,7 +268,7 @@ class Supervisor:
             self._linked_since, self._unlinked_since = None, now
         await self._see_to_hub(now, linked=linked)
         self._farewell.turn(now)
-        await self.crew.turn(now, self._listening_since, self._may_start)
+        await self.crew.turn(self._listening_since, self._may_start, self._may_move)
         shown = [(process.name, process.ward.state, process.ward.restarts) for process in self.crew]
         if self._desk is not None and shown != self._shown:
             self._shown = shown
@@ -271,13 +276,18 @@ class Supervisor:
 
     def _listening_since(self, process: Process) -> float | None:
         if process.kind is Kind.HUB:
-            return self._awake_since if self._desk is not None else None
-        return None if self._linked_since is None else max(self._linked_since, self._awake_since)
+            return 0.0 if self._desk is not None else None
+        return self._linked_since
+
+    def _may_move(self, process: Process) -> bool:
+        """Return True if a gateway's car may move: only a gateway that was heard can say that it does not."""
+        row = self.rows.get(process.name)
+        return process.kind is Kind.GATEWAY and (row is None or row.motors != "off")
 
     def _may_start(self, process: Process) -> bool:
         if process.kind is Kind.HUB or self._farewell.may_start(process.name):
             return True
-        waits = process.kind is Kind.GATEWAY and time.monotonic() < self._gateways_from
+        waits = process.kind is Kind.GATEWAY and self.crew.now < self._gateways_from
         return not waits and not self._end_asked.is_set()
 
     # ------------------------------------------------------------------ what is heard
@@ -300,10 +310,9 @@ class Supervisor:
             self._say("process", process.name, f"ended without stopping its car: {process.why or process.ward.words}")
 
     def _heard(self, car: str, topic: str, value: Any) -> None:
-        now = time.monotonic()
         row = self.rows.get(car)
         if car == RECORDER and self.crew.heard(RECORDER):
-            self._gateways_from = now
+            self._gateways_from = self.crew.now
         elif car == COORDINATOR:
             self._in_force(value)
         elif row is not None and topic == "state/health":
@@ -311,7 +320,7 @@ class Supervisor:
             if self.crew.heard(car, value.pid):
                 row.gone()
         elif row is not None:
-            if words := row.take(topic, value, now):
+            if words := row.take(topic, value, time.monotonic()):
                 self._say("car", car, words)
             if topic == "event/log":
                 self._say("log", car, row.event)
@@ -379,6 +388,9 @@ class Supervisor:
 
     async def _until_ended(self, processes: list[Process]) -> None:
         while self._farewell.going or any(process.ward.alive for process in processes):
+            if self.crew.now > self._tries_until:
+                self._tries_until = inf
+                self._farewell.hurry()
             await self._turn()
             await asyncio.sleep(TURN_S / 2)
 
@@ -386,12 +398,12 @@ class Supervisor:
 
     def status(self) -> pb.Supervision:
         """How things are."""
-        now = time.monotonic()
+        now = self.crew.now
         message = pb.Supervision(
             state=self._state,
             host=socket.gethostname(),
             pid=os.getpid(),
-            uptime_s=now - self._began,
+            uptime_s=time.monotonic() - self._began,
             fleet_file=self._source,
             directory=str(self.crew.directory),
             became=self._farewell.became,
@@ -405,7 +417,7 @@ class Supervisor:
         return message
 
     async def _down(self, sender: str) -> str:
-        self.end(f"fleet down by {sender}")
+        self.end(f"fleet down by {sender}", TRIES_S)
         return "stopping every car, then closing the recording"
 
     async def _reload(self, sender: str) -> str:

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import signal
 import stat
 import sys
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from fleet.policy.check import faults
 from fleet.policy.reader import parse as parse_plan
 from fleet.supervise.desk import AnotherSupervisor
 from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, listing, wanted
-from fleet.supervisor import Happening, Supervisor
+from fleet.supervisor import TRIES_S, Happening, Supervisor
 from schemas import ending, keys
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
@@ -135,8 +136,17 @@ async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool
         from fleet.supervise.table import Table
 
         table = Table(supervisor)
-    why = {"SIGINT": "Ctrl-C", "SIGHUP": "the terminal was closed"}
-    ending.calls_in(loop, lambda number: supervisor.end(why.get(number.name, "told to end")))
+
+    def end(number: signal.Signals) -> None:
+        match number:
+            case signal.SIGINT:
+                supervisor.end("Ctrl-C")
+            case signal.SIGTERM:
+                supervisor.end("told to end", TRIES_S)
+            case _:
+                supervisor.end("the terminal was closed", TRIES_S)
+
+    ending.calls_in(loop, end)
     if as_json and wish.simulated:
         await _pass_stdin(loop, supervisor.tell_simulator)
     if table is None:

@@ -17,6 +17,7 @@ class Row:
     mode: str = ""
     verdict: str = ""
     motion: str = ""
+    motors: str = ""
     hold: str = ""
     estop: str = ""
     lease: str = ""
@@ -25,6 +26,8 @@ class Row:
     """Frames from the car."""
     event: str = ""
     worst_stop_s: float | None = None
+    reached: bool = False
+    """Its link was open at some time, of any gateway."""
     _counted: tuple[float, int] | None = None
     _told: dict[str, str] = field(default_factory=dict)
 
@@ -33,6 +36,7 @@ class Row:
         match topic:
             case "state/link":
                 self.link, self.reason = value.state, value.reason
+                self.reached |= value.state in _OPEN
                 self._count(value.rx_frames, now)
                 return self._change("link", f"link {value.state}{f': {value.reason}' if value.reason else ''}")
             case "state/mode":
@@ -57,7 +61,7 @@ class Row:
     def gone(self) -> None:
         """Its gateway is away: nothing of it is known."""
         self.link, self.reason, self.rate_hz, self._counted = "", "", None, None
-        self.mode = self.verdict = self.motion = self.lease = ""
+        self.mode = self.verdict = self.motion = self.motors = self.lease = ""
         self._told.clear()
 
     def _safety(self, value: Any) -> str:
@@ -65,6 +69,7 @@ class Row:
         self.estop = " ".join(each.id for each in value.estops)
         self.lease = value.lease.holder if value.HasField("lease") else ""
         self.worst_stop_s = value.worst_stop_s
+        self.motors = value.motors
         if self.estop:
             return self._change("safety", f"e-stop {self.estop}")
         return self._change("safety", f"on hold by {self.hold}" if self.hold else "not on hold")
@@ -87,4 +92,5 @@ class Row:
         return {name: getattr(self, name) for name in (*names, "rate_hz", "event")}
 
 
+_OPEN: Final = frozenset({"online", "quiet", "stale"})
 _AT_FIRST: Final = frozenset({"not on hold", "battery ok", "motion stop", "motion unknown"})

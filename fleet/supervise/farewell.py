@@ -1,15 +1,15 @@
-"""The end of gateways, each of which stops its car: told to end, replaced once where one cannot, and what became of it.
+"""Ends gateways, each of which stops its car, and says what became of each car.
 
-Killing is crew.py's part, when is supervisor.py's.
+A gateway that cannot stop its car is replaced, again and again until the car is stopped or a person ends that. Killing
+is crew.py's part, when is supervisor.py's.
 """
 
-import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
 from fleet.supervise.cars import Row
 from fleet.supervise.crew import Crew, Process
-from fleet.supervise.restart import State, grace_s
+from fleet.supervise.restart import WRONG_USE, State, delay_s, grace_s
 
 NOT_STOPPED: Final = "not stopped"
 """How the words begin on a car that may be moving."""
@@ -24,8 +24,8 @@ LINK_S: Final = 8.0
 class Farewell:
     """Gateways that are to end.
 
-    One that is killed before its car is stopped, or had fallen before it was told, is started once more for that; and
-    one that has just been started may reach its car first.
+    A gateway that is killed before its car is stopped, or that fell before it was told to end, is replaced once in any
+    case. One that says that its car was not stopped is replaced until `hurry`, if the car was ever reached.
     `tell` hears what became of each car (its name, words).
     """
 
@@ -33,11 +33,12 @@ class Farewell:
         self._crew = crew
         self._rows = rows
         self._tell = tell
+        self._hurried = False
         self._going: dict[str, Process] = {}
         self._awaited: set[str] = set()
-        """Those that are told when they have reached their car."""
-        self._again: set[str] = set()
-        """Those of them that were started once more: a port, too, may need a moment after a gateway was killed."""
+        """Gateways that are told to end when they have reached their car."""
+        self._tries: dict[str, int] = {}
+        """Fresh gateways that were started to stop a car. A port, too, may need a moment after a gateway was killed."""
         self.became: dict[str, str] = {}
         """By car; without those that are taken out while the others stay."""
 
@@ -62,10 +63,21 @@ class Farewell:
             self._end(process)
         elif process.child is None:
             self._became(process, "nothing was sent to it: its gateway had not been started")
-        elif process.ward.state is State.GIVEN_UP:
+        elif process.ward.state is State.REFUSED:
             self._became(process, f"{NOT_STOPPED}: no gateway was running ({process.ward.words})")
         else:
-            self._once_more(process, process.ward.words or "no gateway was running")
+            self._replace(process, process.ward.words or "no gateway was running")
+
+    def hurry(self) -> None:
+        """Replace no gateway any more, but for the first time; those that try again stop their cars now or never."""
+        self._hurried = True
+        for name, process in list(self._going.items()):
+            if self._tries.get(name, 0) < 2:
+                continue
+            if process.ward.alive:
+                self._end(process)
+            else:
+                self._became(process, self.became.get(name, NOT_STOPPED))
 
     def recall(self, name: str) -> None:
         """This one is wanted again."""
@@ -74,24 +86,29 @@ class Farewell:
 
     def may_start(self, name: str) -> bool:
         """Whether it is to be started although it is to end."""
-        return name in self._again
+        return name in self._tries
 
     def _forget(self, name: str) -> None:
         self._going.pop(name, None)
         self._awaited.discard(name)
-        self._again.discard(name)
+        self._tries.pop(name, None)
 
     def ended(self, process: Process) -> None:
         """A gateway has ended."""
         if process.name not in self._going or process.code is None:
             return
+        words = f"{NOT_STOPPED}: {_why(process)}"
+        fell = process.code < 0 or process.ward.state is State.WAITING
         if process.code == 0:
             self._became(process, "stopped")
-        elif process.name in self._again or (process.code > 0 and process.ward.state is not State.WAITING):
-            killed = "its gateway was killed: the car may be moving"
-            self._became(process, f"{NOT_STOPPED}: {killed if process.code < 0 else _why(process)}")
+        elif process.name not in self._tries and fell:
+            self._replace(process, _why(process))
+        elif self._is_retried(process):
+            if not process.leaving:
+                self.became[process.name] = words
+            self._replace(process, words)
         else:
-            self._once_more(process, "its gateway was killed" if process.code < 0 else _why(process))
+            self._became(process, words)
 
     def turn(self, now: float) -> None:
         """Tell those to end that have reached their car now, or did not in time."""
@@ -103,12 +120,18 @@ class Farewell:
                     self._end(process)
                 case State.STARTING if overdue:
                     self._end(process)
-                case State.WAITING if overdue:
+                case State.WAITING if now - process.ward.due > START_S:
                     self._became(process, f"{NOT_STOPPED}: {process.ward.words}")
+
+    def _is_retried(self, process: Process) -> bool:
+        """Return True if another gateway may do what this one could not. A car that was off all the time stands."""
+        row = self._rows.get(process.name)
+        reached = row is not None and row.reached
+        return reached and not self._hurried and not process.leaving and process.code != WRONG_USE
 
     def _reached(self, process: Process) -> bool:
         row = self._rows.get(process.name)
-        if process.name in self._again:
+        if process.name in self._tries:
             return row is not None and row.link not in ("", "lost")
         return not self._undecided(process)
 
@@ -117,11 +140,13 @@ class Farewell:
         row = self._rows.get(process.name)
         return process.ward.state is State.STARTING or row is None or not row.link or row.reason == NOT_TRIED
 
-    def _once_more(self, process: Process, why: str) -> None:
-        self._tell(process.name, f"{why}: another is started to stop the car")
-        self._again.add(process.name)
+    def _replace(self, process: Process, why: str) -> None:
+        tried = self._tries[process.name] = self._tries.get(process.name, 0) + 1
+        until = "" if tried == 1 else "; Ctrl-C or fleet down, again, ends this"
+        self._tell(process.name, f"{why}: another gateway is started to stop the car{until}")
         self._awaited.add(process.name)
-        process.ward.wanted(time.monotonic())
+        process.urgent = True
+        process.ward.wanted(self._crew.now, 0.0 if tried == 1 else delay_s(tried, 0.5))
 
     def _end(self, process: Process) -> None:
         self._awaited.discard(process.name)
@@ -137,4 +162,6 @@ class Farewell:
 
 
 def _why(process: Process) -> str:
+    if process.code is not None and process.code < 0:
+        return "its gateway was killed: the car may be moving"
     return process.why.removeprefix(f"{process.name}: ") or f"its gateway ended with exit code {process.code}"

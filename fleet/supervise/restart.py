@@ -15,9 +15,13 @@ JITTER: Final = 0.2
 STEADY_S: Final = 10.0
 """Who ran for so long fell for a new reason: the delay begins anew."""
 WRONG_USE: Final = 2
-"""The exit code of a process that will never do what it was told: another start would change nothing."""
+"""Exit code of a process that refuses its arguments. Another start seldom changes that."""
+WRONG_USE_RETRY_S: Final = 60.0
+"""Interval of the retries then. Nothing is given up for good: a file or a device may be put right meanwhile."""
 RECIPE_S: Final = 4.9
 MARGIN_S: Final = 1.0
+HUNG: Final = "hung"
+"""How the words begin on a process that was killed for its silence."""
 UNKNOWN_STOP_S: Final = 9.1
 """design.md: the longest stop recipe, and a second more, to SIGKILL; with this as worst case the 15 s of systemd."""
 
@@ -30,7 +34,7 @@ class State(StrEnum):
     RUNNING = "running"
     ENDING = "ending"
     ENDED = "ended"
-    GIVEN_UP = "given_up"
+    REFUSED = "refused"
     ELSEWHERE = "elsewhere"
 
 
@@ -75,7 +79,7 @@ class Ward:
     heard_at: float = -inf
     restarts: int = 0
     words: str = ""
-    """Why it was started again, or is not."""
+    """Why it was started again, or is to be."""
     _falls: int = 0
     _kill_at: float = inf
     _killed: bool = False
@@ -91,23 +95,28 @@ class Ward:
         """Whether there is a process."""
         return self.state in (State.STARTING, State.RUNNING, State.ENDING)
 
-    def turn(self, now: float, listening_since: float | None) -> Act:
-        """What to do; `listening_since`: since when it could have been heard without a gap, None if it cannot be."""
-        match self.state:
-            case State.WAITING if now >= self.due:
-                return Act.START
-            case State.ENDING if now >= self._kill_at and not self._killed:
-                return self._kill("did not end in time and was killed")
-            case State.ENDING if self.patience.to_the_end and listening_since is not None and not self._killed:
-                silent = now - max(listening_since, self.since, self.heard_at)
-                if silent > self.patience.silence_s:
-                    return self._kill(f"hung: not heard for {silent:.1f} s")
-            case State.STARTING | State.RUNNING if listening_since is not None and not self._killed:
-                starting = self.state is State.STARTING
-                allowed = self.patience.start_s if starting else self.patience.silence_s
-                silent = now - max(listening_since, self.since if starting else self.heard_at)
-                if silent > allowed:
-                    return self._kill(f"hung: not heard for {silent:.1f} s")
+    def silent_s(self, now: float, listening_since: float | None) -> float:
+        """How long it could have been heard and was not; 0 while nothing is expected of it."""
+        if listening_since is None or self._killed or not self.alive:
+            return 0.0
+        if self.state is State.ENDING and not self.patience.to_the_end:
+            return 0.0
+        heard_at = self.heard_at if self.state is State.RUNNING else max(self.heard_at, self.since)
+        return max(0.0, now - max(listening_since, heard_at))
+
+    def turn(self, now: float, listening_since: float | None, leave_s: float = 0.0) -> Act:
+        """What to do; `listening_since`: since when it could have been heard without a gap, None if it cannot be.
+
+        leave_s: silence that is allowed even if the patience is less (hang.py).
+        """
+        if self.state in (State.WAITING, State.REFUSED) and now >= self.due:
+            return Act.START
+        if self.state is State.ENDING and now >= self._kill_at and not self._killed:
+            return self._kill("did not end in time and was killed")
+        silent = self.silent_s(now, listening_since)
+        allowed = self.patience.start_s if self.state is State.STARTING else self.patience.silence_s
+        if silent > max(allowed, leave_s):
+            return self._kill(f"{HUNG}: not heard for {silent:.1f} s")
         return Act.NOTHING
 
     def started(self, now: float) -> None:
@@ -138,7 +147,8 @@ class Ward:
             said = f": {why}" if why and code > 0 else ""
             self.words = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}{said}"
         if code == WRONG_USE:
-            self._set(State.GIVEN_UP, now)
+            self._set(State.REFUSED, now)
+            self.due = now + WRONG_USE_RETRY_S
             return
         self._falls = 1 if self.alive and now - self.since >= STEADY_S else self._falls + 1
         self._set(State.WAITING, now)
@@ -171,10 +181,10 @@ class Ward:
             self._set(State.ELSEWHERE, now)
         self.words = words
 
-    def wanted(self, now: float) -> None:
-        """Nobody else does it any more."""
+    def wanted(self, now: float, delay_s: float = 0.0) -> None:
+        """It is to be started after this delay: nobody else does it any more, or it did not do what it was to do."""
         self._set(State.WAITING, now)
-        self.due = now
+        self.due = now + delay_s
 
     def _kill(self, words: str) -> Act:
         self._killed = True

@@ -43,7 +43,8 @@ class Kind(StrEnum):
 
 
 PATIENCE: Final[Mapping[Kind, Patience]] = {
-    Kind.HUB: Patience(start_s=10.0, silence_s=4.0),  # linked again after half a second, a lease is 2 s
+    # A client is linked again after half a second, a lease is 2 s. A hub that stood for 6 s need not be replaced.
+    Kind.HUB: Patience(start_s=10.0, silence_s=8.0),
     Kind.SIMULATOR: Patience(start_s=20.0, silence_s=5.0),  # asked each second
     Kind.GATEWAY: Patience(start_s=20.0, silence_s=4.0, to_the_end=True),  # state/health comes each second
     Kind.COORDINATOR: Patience(start_s=20.0, silence_s=6.0),  # asked each second

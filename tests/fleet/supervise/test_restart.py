@@ -1,6 +1,7 @@
 """When a process is started, killed and started again: by tables, and for any order of what may happen."""
 
 from dataclasses import dataclass
+from math import inf
 
 import pytest
 from hypothesis import given
@@ -11,6 +12,7 @@ from fleet.supervise.restart import (
     JITTER,
     LONGEST_S,
     STEADY_S,
+    WRONG_USE_RETRY_S,
     Act,
     Patience,
     State,
@@ -71,13 +73,26 @@ def test_who_falls_at_once_again_and_again_waits_ever_longer_and_who_ran_steadil
     assert ward.words == "ended with exit code 1: no"
 
 
-def test_wrong_use_is_not_repeated() -> None:
+def test_a_process_that_refuses_its_arguments_is_retried_each_minute_and_at_once_after_a_reload() -> None:
     ward = running()
     ward.ended(2, "no such platform", 101.0, 0.5)
-    assert ward.state is State.GIVEN_UP
-    assert ward.turn(1e6, 0.0) is Act.NOTHING
-    ward.end(200.0, 5.0, again=True)
-    assert ward.turn(200.0, 0.0) is Act.START
+    assert ward.state is State.REFUSED
+    assert ward.words == "ended with exit code 2: no such platform"
+    assert ward.turn(101.0 + WRONG_USE_RETRY_S - 0.1, 0.0) is Act.NOTHING
+    assert ward.turn(101.0 + WRONG_USE_RETRY_S, 0.0) is Act.START
+    ward.end(120.0, 5.0, again=True)
+    assert ward.turn(120.0, 0.0) is Act.START
+
+
+@pytest.mark.parametrize(("leave_s", "act"), [(0.0, Act.KILL), (4.9, Act.KILL), (5.1, Act.NOTHING), (inf, Act.NOTHING)])
+def test_a_silent_process_may_be_left_longer_than_its_patience(leave_s: float, act: Act) -> None:
+    assert running(100.0).turn(105.0, 0.0, leave_s) is act
+
+
+def test_a_process_that_is_to_end_has_its_time_however_long_it_may_be_silent() -> None:
+    ward = running()
+    ward.end(110.0, 7.0)
+    assert ward.turn(117.0, 0.0, inf) is Act.KILL
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,77 @@
+"""Which processes may be started or killed now: by tables and on virtual time."""
+
+import itertools
+
+import pytest
+
+from fleet.supervise.admission import (
+    KILL_INTERVAL_S,
+    KILLS_AT_ONCE,
+    PLACE_S,
+    RESTART_INTERVAL_S,
+    RESTARTS_AT_ONCE,
+    Admission,
+    Budget,
+)
+
+
+@pytest.mark.parametrize(
+    ("starting_since", "admitted"),
+    [
+        ([], True),
+        ([99.0], True),
+        ([99.0, 99.5], False),
+        ([99.0, 100.0 - PLACE_S], True),  # one of them has had its time
+        ([0.0, 1.0, 2.0, 3.0], True),
+    ],
+)
+def test_the_next_is_admitted_when_one_before_it_is_heard_or_has_had_its_time(
+    starting_since: list[float], admitted: bool
+) -> None:
+    assert Admission(2).admit_start(100.0, starting_since, restart=False) is admitted
+
+
+def test_a_budget_allows_some_at_once_and_then_one_for_each_interval() -> None:
+    budget, taken = Budget(3, 2.0), []
+    for tenth in range(200):
+        if budget.has(tenth / 10):
+            budget.take()
+            taken.append(tenth / 10)
+    assert taken[:3] == [0.0, 0.1, 0.2]
+    assert len(taken) == 3 + 9
+    assert all(later - earlier >= 1.9 for earlier, later in itertools.pairwise(taken))
+
+
+def test_restarts_have_a_budget_for_the_whole_fleet_and_first_starts_have_none() -> None:
+    admission = Admission(100)
+    assert all(admission.admit_start(0.0, [], restart=False) for _ in range(1000))
+    assert sum(admission.admit_start(0.0, [], restart=True) for _ in range(1000)) == RESTARTS_AT_ONCE
+    later = 5 * RESTART_INTERVAL_S
+    assert sum(admission.admit_start(later, [], restart=True) for _ in range(1000)) == 5
+
+
+def test_kills_have_a_budget_for_the_whole_fleet() -> None:
+    admission, killed = Admission(2), 0
+    for tenth in range(round(10 * 4 * KILL_INTERVAL_S)):
+        if admission.may_kill(tenth / 10):
+            admission.killed()
+            killed += 1
+    assert killed == KILLS_AT_ONCE + 3
+
+
+@pytest.mark.parametrize("count", [1, 10, 100])
+@pytest.mark.parametrize("work_s", [0.3, 1.0])
+def test_a_fleet_starts_one_after_the_other_and_never_more_than_have_a_place(count: int, work_s: float) -> None:
+    """On virtual time: two processors are shared by those that start, and each needs `work_s` of one."""
+    admission, waiting, starting, now, most = Admission(3), count, list[list[float]](), 0.0, 0
+    while waiting or starting:
+        if waiting and admission.admit_start(now, [since for since, _ in starting], restart=False):
+            waiting -= 1
+            starting.append([now, work_s])
+        most = max(most, len(starting))
+        for each in starting:
+            each[1] -= 0.1 * min(1.0, 2 / len(starting))
+        starting = [each for each in starting if each[1] > 0]
+        now += 0.1
+    assert most <= 3
+    assert now < count * work_s + 1.0, "no processor waits for long"

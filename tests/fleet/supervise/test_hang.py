@@ -1,0 +1,127 @@
+"""What tells a process that hangs from a slow one, a machine that stands, and a hub on which nobody is heard."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from fleet.supervise import cpu_time
+from fleet.supervise.hang import (
+    LONGEST_TURN_S,
+    MANY_SILENT_S,
+    MOVING_SILENT_S,
+    SLOW_SILENT_S,
+    CpuTime,
+    Pulse,
+    Sign,
+    WatchClock,
+    are_many,
+    longest_silence_s,
+)
+from tests.support.processes import wait_for
+
+
+@pytest.mark.parametrize(
+    ("run_share", "wait_share", "ready", "sign"),
+    [
+        (0.0, 0.0, False, Sign.BLOCKED),  # a lock, SIGSTOP
+        (0.005, 0.0, False, Sign.SLOW),  # a gateway at rest
+        (0.0005, 0.9, False, Sign.SLOW),  # it gets no processor
+        (0.0, 0.0, True, Sign.SLOW),  # it waits for one, or for the disk, and was not counted yet
+        (0.5, 0.5, False, Sign.SLOW),  # it starts on a busy machine
+        (0.99, 0.01, False, Sign.SPINNING),
+    ],
+)
+def test_a_process_shows_by_its_cpu_time_what_its_silence_means(
+    run_share: float, wait_share: float, ready: bool, sign: Sign
+) -> None:
+    pulse = Pulse()
+    assert pulse.sign is Sign.UNKNOWN
+    for half in range(10):
+        now = 100.0 + half / 2
+        assert pulse.is_due(now)
+        pulse.look(now, CpuTime(7.0 + run_share * now, 3.0 + wait_share * now, ready))
+        assert not pulse.is_due(now + 0.4)
+        assert pulse.sign is (sign if half >= 2 else Sign.UNKNOWN)
+    pulse.clear()
+    assert pulse.sign is Sign.UNKNOWN
+
+
+def test_only_the_last_seconds_count_and_a_system_that_does_not_tell_shows_nothing() -> None:
+    pulse = Pulse()
+    for half in range(20):  # it worked, then it stands
+        pulse.look(half / 2, CpuTime(min(half, 8) / 2))
+    assert pulse.sign is Sign.BLOCKED
+    pulse.look(11.0, None)
+    assert pulse.sign is Sign.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("sign", "many", "may_move", "seconds"),
+    [
+        (Sign.BLOCKED, False, True, 0.0),  # it stops its car no more: another does
+        (Sign.SPINNING, False, True, 0.0),
+        (Sign.UNKNOWN, False, True, 0.0),
+        (Sign.BLOCKED, True, True, MANY_SILENT_S),
+        (Sign.UNKNOWN, True, False, MANY_SILENT_S),
+        (Sign.SLOW, False, False, SLOW_SILENT_S),
+        (Sign.SLOW, False, True, MOVING_SILENT_S),
+        (Sign.SLOW, True, True, MOVING_SILENT_S),
+    ],
+)
+def test_how_long_a_process_may_be_silent(sign: Sign, many: bool, may_move: bool, seconds: float) -> None:
+    assert longest_silence_s(sign, many=many, may_move=may_move) == seconds
+
+
+@pytest.mark.parametrize(
+    ("silent", "total", "many"),
+    [(0, 0, False), (1, 1, False), (1, 4, False), (2, 2, True), (2, 8, True), (2, 9, False), (24, 100, False)],
+)
+def test_when_many_are_silent(silent: int, total: int, many: bool) -> None:
+    assert are_many(silent, total) is many
+
+
+def test_the_watchers_clock_stands_while_the_watcher_does() -> None:
+    clock, now = WatchClock(100.0), 100.0
+    for _ in range(10):
+        now += 0.1
+        assert clock.look(now) == pytest.approx(now)
+    began = clock.look(now)
+    now += 6.0
+    assert clock.look(now) == pytest.approx(began + LONGEST_TURN_S)
+    assert clock.look(now + 0.1) == pytest.approx(began + LONGEST_TURN_S + 0.1)
+
+
+def test_a_process_is_seen_to_be_blocked_to_spin_and_to_have_gone(tmp_path: Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        begun = wait_for(lambda: cpu_time.read(process.pid), "there is a process")
+        wait_for(lambda: (read := cpu_time.read(process.pid)) and read.run_s > begun.run_s + 0.05, "it runs")
+        process.send_signal(signal.SIGSTOP)
+        wait_for(lambda: _state(process.pid) == "T", "it stands")
+        stood = cpu_time.read(process.pid)
+        time.sleep(0.1)
+        assert cpu_time.read(process.pid) == stood
+        assert stood is not None
+        assert not stood.ready
+    finally:
+        process.kill()
+        process.wait()
+    assert cpu_time.read(process.pid) is None
+
+
+def test_without_proc_ps_tells_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cpu_time, "_PROC", tmp_path)
+    read = cpu_time.read(os.getpid())
+    assert read is not None
+    assert read.run_s == pytest.approx(time.process_time(), abs=1.5), "Linux tells whole seconds"
+    assert cpu_time.read(2**22 + 1) is None
+
+
+def _state(pid: int) -> str:
+    listed = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False)
+    return listed.stdout[:1]
