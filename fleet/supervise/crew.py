@@ -189,7 +189,8 @@ class Crew:
             self._tell(process.name, process.ward.words)
             return
         process.ward.started(now)
-        again = f" again ({process.ward.words})" if process.ward.restarts else ""
+        why = f" ({process.ward.words})" if process.ward.words else ""
+        again = f" again{why}" if process.ward.restarts else ""
         self._tell(process.name, f"started{again}, process {process.child.pid}")
 
     def _ended(self, process: Process, code: int) -> None:

@@ -142,8 +142,8 @@ class Farewell:
 
     def _replace(self, process: Process, why: str) -> None:
         tried = self._tries[process.name] = self._tries.get(process.name, 0) + 1
-        until = "" if tried == 1 else "; Ctrl-C or fleet down, again, ends this"
-        self._tell(process.name, f"{why}: another gateway is started to stop the car{until}")
+        until = "" if tried == 1 else " until Ctrl-C is pressed or fleet down is called again"
+        self._tell(process.name, f"{why}. A fresh gateway tries to stop the car{until}.")
         self._awaited.add(process.name)
         process.urgent = True
         process.ward.wanted(self._crew.now, 0.0 if tried == 1 else delay_s(tried, 0.5))

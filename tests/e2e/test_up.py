@@ -247,13 +247,51 @@ def test_the_end_stops_cars_whose_gateways_hang_or_were_killed_and_says_which_it
         for car in ("green", "red"):
             wait_for(lambda car=car: not driving(sims[car][0], car), f"{car} is stopped")
             assert time.monotonic() - began < IN_ITS_PLACE_S + STARTS_S
+        for _ in range(2):
+            tried = started.until("end", "blue", "A fresh gateway tries to stop the car")
+        assert tried["words"].endswith(" until Ctrl-C is pressed or fleet down is called again.")
+        started.process.popen.send_signal(signal.SIGINT)
         assert started.process.wait() == 1
-        said = {
-            each["name"]: each["words"] for each in map(json.loads, started.process.lines()) if each["what"] == "end"
-        }
+        ended = [*started.heard, *map(json.loads, started.process.lines())]
+        said = {each["name"]: each["words"] for each in ended if each["what"] == "end"}
         assert (said["red"], said["green"]) == ("stopped", "stopped")
-        assert said["blue"].startswith("not stopped: ending without a stop, blue cannot be reached (")
+        assert said["blue"].startswith("not stopped: ")
         assert said["@supervisor"] == "not stopped: blue: look whether they drive"
+
+
+def test_a_car_that_cannot_be_reached_at_the_end_is_told_by_fresh_gateways_until_it_is_stopped(
+    fleet: Fleet, tmp_path: Path
+) -> None:
+    sim, (link,) = fleet.simulate("red:arduino:tcp")
+    with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--no-record") as started:
+        started.ready("red")
+        assert started.ask("mode", "red", mode="obstacle_avoidance")["status"] in TAKEN
+        wait_for(lambda: driving(sim), "red avoids obstacles")
+        sim.say({"car": "red", "fault": "link_drop"})
+        started.process.popen.send_signal(signal.SIGINT)
+        for _ in range(2):
+            tried = started.until("end", "red", "A fresh gateway tries to stop the car")
+            assert tried["words"].startswith("not stopped: ")
+        sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
+        started.until("end", "red", "stopped")
+        assert not driving(sim)
+        assert started.process.wait() == 0
+
+
+def test_fleet_down_names_the_car_that_was_not_stopped_and_fails(fleet: Fleet, tmp_path: Path) -> None:
+    sim, (link,) = fleet.simulate("red:arduino:tcp")
+    with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--no-record") as started:
+        started.ready("red")
+        sim.say({"car": "red", "fault": "link_drop"})
+        wait_for(lambda: started.get("red/state/link").state == "lost", "its link is gone")
+        first = threading.Thread(target=lambda: started.fleet("down"))
+        first.start()
+        started.until("end", "red", "A fresh gateway tries to stop the car")
+        second = started.fleet("down")
+        first.join()
+        assert second.returncode == 1
+        assert second.stderr.startswith("red: not stopped: ")
+        assert started.process.wait() == 1
 
 
 @pytest.mark.parametrize("until", ["@hub", "red", "green"])
