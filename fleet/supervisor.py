@@ -139,7 +139,7 @@ class Supervisor:
 
     async def _bus(self) -> Bus | None:
         """A session; the hub is started if there is none. None if it is to end before. Raises BusError."""
-        self.crew.add(HUB, Kind.HUB, wanted.hub_command(self.endpoint))
+        self.crew.add(HUB, Kind.HUB, wanted.hub_command(self._wish, self.endpoint))
         deadline = self.crew.now + HUB_UP_S
         while not self._end_asked.is_set():
             await self._turn()
@@ -159,7 +159,9 @@ class Supervisor:
         if linked:
             self.crew.heard(HUB)
         gone = self._desk is not None and not linked and now - self._unlinked_since >= HUB_GONE_S
-        if hub.ward.state is State.WAITING and now >= hub.ward.due and await asyncio.to_thread(accepts, self.endpoint):
+        due = hub.ward.state is State.WAITING and now >= hub.ward.due
+        refused = hub.ward.state is State.REFUSED  # on a network that is not to be opened: the router there is back
+        if (refused and linked) or (due and await asyncio.to_thread(accepts, self.endpoint)):
             hub.ward.elsewhere(now, f"somebody else's listens at {self.endpoint}")
         elif hub.ward.state is State.ELSEWHERE and gone and not await asyncio.to_thread(accepts, self.endpoint):
             hub.ward.wanted(now)

@@ -37,7 +37,7 @@ DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
 
 _ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
-_LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})
+_LOOPBACK: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 _HISTORY_S: Final = 2.0
 """The longest that a watch waits for what is there already: for a token that goes in this very moment.
 
@@ -74,7 +74,7 @@ class NoFleet(BusError):
 
 
 class BadEndpoint(BusError):
-    """An endpoint that Zenoh cannot take."""
+    """An endpoint that Zenoh cannot take, or at which no hub may listen."""
 
 
 def resolve_endpoint(argument: str | None = None) -> str:
@@ -92,6 +92,24 @@ def _host_and_port(endpoint: str) -> tuple[str, int]:
             f"port 1 to 65535, for example {DEFAULT_ENDPOINT}"
         )
     return match["host"], int(match["port"])
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Return True if no other machine can reach the endpoint; raises BadEndpoint."""
+    host, _ = _host_and_port(endpoint)
+    return _LOOPBACK.fullmatch(host) is not None
+
+
+def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
+    """Raise BadEndpoint if a hub would be open to a network without a word from the user.
+
+    A hub knows no passwords and no certificates: whoever reaches it drives the cars.
+    """
+    if not insecure_lan and not is_loopback(endpoint):
+        raise BadEndpoint(
+            f"a hub at {endpoint} would let everyone on that network drive the cars: "
+            f"use {DEFAULT_ENDPOINT}, start a Zenoh router of your own there, or accept it with --insecure-lan"
+        )
 
 
 _COMMON: Final[dict[str, Any]] = {
@@ -139,9 +157,11 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     """
     if accepts(endpoint):
         return
-    host, _ = _host_and_port(endpoint)
-    if host not in _LOOPBACK:
-        raise NoFleet(f"nothing listens at {endpoint}: start a Zenoh router there, or name another with --connect")
+    if not is_loopback(endpoint):
+        raise NoFleet(
+            f"nothing listens at {endpoint}, and a hub is started on loopback only: start a Zenoh router there "
+            "(or fleet up --insecure-lan), or name another endpoint with --connect"
+        )
     import subprocess
 
     command = [sys.executable, "-m", "schemas.hub", "--endpoint", endpoint]

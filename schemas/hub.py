@@ -13,7 +13,7 @@ from typing import Final
 import zenoh
 
 from schemas import ending
-from schemas.bus import DEFAULT_ENDPOINT, BusError, router_config
+from schemas.bus import DEFAULT_ENDPOINT, BusError, check_listening, router_config
 
 IDLE_S: Final = 10.0
 """How long a hub outlives its last link."""
@@ -33,11 +33,19 @@ def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
 
 
 def main() -> int:
-    """Run a hub; 0 when it ended by itself or was told to, 1 if it could not listen."""
+    """Run a hub; 0 when it ended by itself or was told to, 1 if it could not listen, 2 for wrong use."""
     parser = argparse.ArgumentParser(prog="python -m schemas.hub", description=__doc__)
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
     parser.add_argument("--idle-s", type=float, default=IDLE_S, help="end after so long without a link (default 10)")
+    parser.add_argument(
+        "--insecure-lan", action="store_true", help="listen on a network, where everyone may drive the cars"
+    )
     arguments = parser.parse_args()
+    try:
+        check_listening(arguments.endpoint, insecure_lan=arguments.insecure_lan)
+    except BusError as error:
+        sys.stderr.write(f"hub: {error}\n")
+        return 2
     stop = threading.Event()
     ending.calls(stop.set)
     try:

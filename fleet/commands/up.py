@@ -23,6 +23,7 @@ from fleet.supervise.desk import AnotherSupervisor
 from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, listing, wanted
 from fleet.supervisor import TRIES_S, Happening, Supervisor
 from schemas import ending, keys
+from schemas.bus import accepts, check_listening, resolve_endpoint
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
 _Tell = Callable[[Happening], None]
@@ -58,6 +59,7 @@ Without FILE and --sim it takes ./fleet.yaml. With --sim and --json, lines on st
     help="The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or loopback port 7447).",
 )
 @click.option("--fleet", help="Name of the fleet (default: the file's, or fleet).")
+@click.option("--insecure-lan", is_flag=True, help="Open the bus to a network: everyone there can drive the cars.")
 def up(
     file: Path | None,
     simulated: int | None,
@@ -69,6 +71,7 @@ def up(
     as_json: bool,
     connect: str | None,
     fleet: str | None,
+    insecure_lan: bool,
 ) -> None:
     """Start all that a fleet needs, show its cars, start again what dies; Ctrl-C stops every car, then ends."""
     if file is None and simulated is None:
@@ -77,7 +80,7 @@ def up(
                 "there is no fleet.yaml here: name a file, make one with fleet init, or give --sim 3"
             )
         file = DEFAULT_FILE
-    asked = Asked(simulated or 0, plan, world, record, out, connect, fleet)
+    asked = Asked(simulated or 0, plan, world, record, out, connect, fleet, insecure_lan)
     with explained():
         if fleet is not None:
             keys.check_name(fleet, "fleet name")
@@ -86,6 +89,9 @@ def up(
             click.echo(f"fleet: {doubt}", err=True)
         if not wish.cars:
             raise click.UsageError(f"{file} has no car with a link: fleet bind finds links, --sim {3} simulates cars")
+        endpoint = resolve_endpoint(wish.endpoint)
+        if not accepts(endpoint):  # the hub will be ours
+            check_listening(endpoint, insecure_lan=insecure_lan)
         try:
             stopped = asyncio.run(_serve(wish, file, asked, as_json=as_json))
         except AnotherSupervisor as error:

@@ -90,6 +90,8 @@ class Wanted:
     world: Path | None = None
     listed: Mapping[str, Listed] = field(default_factory=dict)
     """Every car, as the fleet file says; those that are only simulated, as their platform is."""
+    insecure_lan: bool = False
+    """A hub may listen where others than this machine reach it."""
     doubts: tuple[str, ...] = ()
     """What is hardly meant so, a line each."""
 
@@ -110,6 +112,7 @@ class Asked:
     out: Path | None = None
     connect: str | None = None
     fleet: str | None = None
+    insecure_lan: bool = False
 
 
 def wanted(file: FleetFile | None, asked: Asked) -> Wanted:
@@ -132,6 +135,7 @@ def wanted(file: FleetFile | None, asked: Asked) -> Wanted:
         recordings=asked.out or (file.recordings if file else None) or RECORDINGS,
         file=file.path if file else None,
         world=asked.world or (file.world if file else None),
+        insecure_lan=asked.insecure_lan,
         listed={name: _listed(specs.get(name), car.platform) for name, car in cars.items()},
     )
 
@@ -196,9 +200,10 @@ def module(name: str, *arguments: str) -> tuple[str, ...]:
     return (sys.executable, "-m", name, *arguments)
 
 
-def hub_command(endpoint: str) -> tuple[str, ...]:
+def hub_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
     """The hub."""
-    return module("schemas.hub", "--endpoint", endpoint)
+    open_to_lan = ("--insecure-lan",) if wish.insecure_lan else ()
+    return module("schemas.hub", "--endpoint", endpoint, *open_to_lan)
 
 
 def gateway_command(wish: Wanted, car: WantedCar, link: str, endpoint: str) -> tuple[str, ...]:

@@ -485,6 +485,7 @@ def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(tmp_path: Path) -
         (("--sim", "1", "--plan", "none.yaml"), "the plan none.yaml cannot be read"),
         (("--sim", "1", "--fleet", "Über"), "fleet name"),
         (("--sim", "1", "--connect", "here"), "endpoint 'here' is not allowed"),
+        (("--sim", "1", "--connect", f"tcp/0.0.0.0:{free_port()}"), "accept it with --insecure-lan"),
     ],
 )
 def test_wrong_use_starts_nothing(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:

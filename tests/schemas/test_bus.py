@@ -125,6 +125,29 @@ def test_a_hub_is_started_once_and_ends_by_itself() -> None:
     assert idle.wait(processes.PATIENCE_S) == 0
 
 
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [("127.0.0.1", True), ("127.1.2.3", True), ("localhost", True), ("[::1]", True)]
+    + [(host, False) for host in ("0.0.0.0", "192.168.1.5", "[::]", "127.0.0.1.example.org", "laptop.local")],
+)
+def test_a_hub_listens_on_a_network_only_if_a_user_says_so(host: str, loopback: bool) -> None:
+    where = f"tcp/{host}:7447"
+    assert bus.is_loopback(where) is loopback
+    bus.check_listening(where, insecure_lan=True)
+    if loopback:
+        bus.check_listening(where, insecure_lan=False)
+    else:
+        with pytest.raises(bus.BadEndpoint, match="would let everyone on that network drive the cars"):
+            bus.check_listening(where, insecure_lan=False)
+
+
+def test_a_hub_on_a_network_is_wrong_use() -> None:
+    command = [sys.executable, "-m", "schemas.hub", "--endpoint", "tcp/0.0.0.0:7447"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=processes.PATIENCE_S, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("hub: a hub at tcp/0.0.0.0:7447 would let everyone")
+
+
 def test_a_killed_hub_comes_back_and_everything_with_it() -> None:
     where = free_endpoint()
     with bus.Bus.open(where, start_hub=True) as car, bus.Bus.open(where) as watcher:
