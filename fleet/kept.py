@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.policy.memory import Kept
-from fleet.supervise.process import state_directory
+from schemas.state_dir import directory_of
 
 
 class Keeper:
@@ -21,7 +21,7 @@ class Keeper:
         self._last = Kept()
         self.path: Path | None = None
         with contextlib.suppress(RuntimeError):  # a user without a home
-            self.path = state_directory() / f"{fleet}.@coordinator.json"
+            self.path = directory_of(endpoint) / f"{fleet}.@coordinator.json"
 
     def load(self) -> Kept:
         """What the last one left; nothing, if it cannot be read or was of another bus."""

@@ -107,7 +107,7 @@ class Supervisor:
 
     async def run(self) -> bool:
         """Supervise until `end`. Raises AnotherSupervisor, BusError, and OSError if there is no place for the logs."""
-        self.crew.directory = await asyncio.to_thread(new_run, self._wish.fleet, time.time())
+        self.crew.directory = await asyncio.to_thread(new_run, self._wish.fleet, self.endpoint, time.time())
         try:
             bus = await self._bus()
             if bus is None:

@@ -69,7 +69,9 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         "--connect", metavar="ENDPOINT", help="the bus, tcp/HOST:PORT (default FLEET_ENDPOINT, or loopback)"
     )
     run.add_argument(
-        "--state-dir", metavar="DIR", help="where e-stops and holds are kept (default: FLEET_STATE_DIR, or the user's)"
+        "--state-dir",
+        metavar="DIR",
+        help="where e-stops and holds of each bus are kept (default: FLEET_STATE_DIR, or the user's)",
     )
     run.add_argument(
         "--longest-drive", metavar="S", type=float, default=10.0, help="longest duration_s of a drive (default 10 s)"
@@ -126,10 +128,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
             from gateway.car import Settings, serve
             from gateway.control.battery import Action, Policy
-            from gateway.store import default_directory
+            from schemas.state_dir import directory_of
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
-            state_dir = Path(arguments.state_dir) if arguments.state_dir else default_directory()
+            state_dir = directory_of(opened.endpoint, Path(arguments.state_dir) if arguments.state_dir else None)
             settings = Settings(
                 car,
                 url,

@@ -2,24 +2,10 @@
 
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
 from gateway.control.safety import Estop, Hold, Kept
-
-STATE_VARIABLE = "FLEET_STATE_DIR"
-
-
-def default_directory() -> Path:
-    """FLEET_STATE_DIR, else the user's state directory as the platform has it."""
-    if chosen := os.environ.get(STATE_VARIABLE):
-        return Path(chosen)
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Application Support" / "zenoh-car-fleet"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "zenoh-car-fleet"
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "zenoh-car-fleet"
 
 
 class Store:

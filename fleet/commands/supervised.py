@@ -15,7 +15,7 @@ from fleet.supervise.desk import STATUS, ask_service, ask_status
 from fleet.supervise.farewell import NOT_STOPPED
 from fleet.supervise.process import entry, runs
 from schemas import keys, messages
-from schemas.bus import Bus, BusError
+from schemas.bus import Bus, BusError, resolve_endpoint
 
 DOWN_S: Final = 120.0
 """The longest stop of a car, and a recorder that writes what it has."""
@@ -143,7 +143,7 @@ def _directory(connect: str | None, fleet: str) -> Path:
                     return Path(each.directory)
     except BusError:
         pass  # nothing is up: the logs are files
-    place = runs(fleet)
+    place = runs(fleet, resolve_endpoint(connect))
     newest = sorted(each for each in place.iterdir() if each.is_dir()) if place.is_dir() else []
     if not newest:
         raise click.ClickException(f"fleet {fleet} has never been up here: there is nothing in {place}")

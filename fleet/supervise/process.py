@@ -9,11 +9,12 @@ import hashlib
 import os
 import re
 import signal
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
+
+from schemas.state_dir import directory_of
 
 LOG_BYTES: Final = 1_000_000
 """Of one log file; there are at most two for each process."""
@@ -23,7 +24,6 @@ RUNS: Final = 10
 IN_USE_S: Final = 3600.0
 """A run that was touched within this time may go on: it is not removed."""
 _LOGGED: Final = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (?P<level>[A-Z]+) (?P<words>.*)")
-STATE_VARIABLE: Final = "FLEET_STATE_DIR"
 
 
 class Log:
@@ -60,25 +60,14 @@ def entry(line: str) -> dict[str, str]:
     return {"time": stamp, "name": name, "line": words} if bar else {"time": "", "name": "", "line": when}
 
 
-def state_directory() -> Path:
-    """What outlives a process lies there: FLEET_STATE_DIR, else the user's state directory of the platform."""
-    if chosen := os.environ.get(STATE_VARIABLE):
-        return Path(chosen)
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Application Support" / "zenoh-car-fleet"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "zenoh-car-fleet"
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "zenoh-car-fleet"
-
-
-def runs(fleet: str) -> Path:
+def runs(fleet: str, endpoint: str) -> Path:
     """Where the runs of a fleet are kept."""
-    return state_directory() / "runs" / fleet
+    return directory_of(endpoint) / "runs" / fleet
 
 
-def new_run(fleet: str, now: float) -> Path:
+def new_run(fleet: str, endpoint: str, now: float) -> Path:
     """A directory for one run; the oldest that are over are removed. Raises OSError."""
-    place = runs(fleet)
+    place = runs(fleet, endpoint)
     path = place / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime(now))}-{os.getpid()}"
     path.mkdir(parents=True)
     for old in sorted((each for each in place.iterdir() if each.is_dir()), reverse=True)[RUNS:]:

@@ -307,7 +307,7 @@ def test_told_to_end_while_it_starts_it_ends_at_once_and_in_order(tmp_path: Path
 def test_no_path_of_a_killed_simulator_is_left_to_lead_to_somebody_elses_car(tmp_path: Path) -> None:
     with Up(tmp_path, free_endpoint(), "--sim", "1", "--no-record") as started:
         started.ready("red")
-        (run,) = (tmp_path / "state" / "runs" / "fleet").iterdir()
+        (run,) = (tmp_path / "state" / "buses").glob("*/runs/fleet/*")
         assert [each.name for each in run.glob("*.tty")] == ["red.tty"]
         started.kill(started.running("@simulator"))
         started.process.end(signal.SIGINT)
@@ -444,7 +444,7 @@ def test_reload_on_a_full_disk_changes_nothing(tmp_path: Path) -> None:
     file = _job(tmp_path)
     with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
         wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
-        (run,) = (tmp_path / "state" / "runs" / "fleet").iterdir()
+        (run,) = (tmp_path / "state" / "buses").glob("*/runs/fleet/*")
         run.rename(run.with_name("away"))
         text = file.read_text()
         file.write_text(text + "  eve: {link: tcp://127.0.0.1:9}\n")

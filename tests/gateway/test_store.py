@@ -1,7 +1,6 @@
 """What survives a restart: written whole, read back, and a file that cannot be read counts as a hold."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.safety import Estop, Hold, Kept
-from gateway.store import Store, default_directory
+from gateway.store import Store
 
 NOW = 1_800_000_000_000_000_000
 
@@ -97,20 +96,3 @@ def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: by
 
 
 SAVED = json.dumps({"hold": {"by": "mia", "since_ns": NOW}}).encode()
-
-
-def test_the_directory_is_the_variables_or_the_platforms(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path / "chosen"))
-    assert default_directory() == tmp_path / "chosen"
-    monkeypatch.delenv("FLEET_STATE_DIR")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setenv("XDG_STATE_HOME", "")
-    assert default_directory() == tmp_path / ".local" / "state" / "zenoh-car-fleet"
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    assert default_directory() == tmp_path / "state" / "zenoh-car-fleet"
-    monkeypatch.setattr(sys, "platform", "darwin")
-    assert default_directory() == tmp_path / "Library" / "Application Support" / "zenoh-car-fleet"
-    monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "local"))
-    assert default_directory() == tmp_path / "local" / "zenoh-car-fleet"

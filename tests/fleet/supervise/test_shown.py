@@ -13,6 +13,7 @@ from fleet.supervise.restart import State
 from fleet.supervise.table import Table
 from fleet.supervise.wanted import Kind, Wanted
 from fleet.supervisor import Supervisor
+from schemas.bus import DEFAULT_ENDPOINT
 from schemas.gen import fleet_v1_pb2 as pb
 
 
@@ -86,7 +87,7 @@ def test_a_log_that_cannot_be_written_says_so_and_hurts_nobody(tmp_path: Path) -
 
 def test_the_oldest_runs_are_removed_unless_they_may_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
-    place = runs("lab")
+    place = runs("lab", DEFAULT_ENDPOINT)
     for number in range(RUNS + 5):
         old = place / f"20200101-0000{number:02}-1"
         old.mkdir(parents=True)
@@ -95,7 +96,7 @@ def test_the_oldest_runs_are_removed_unless_they_may_go_on(tmp_path: Path, monke
     touched = place / "20190101-000000-1"
     touched.mkdir()
     os.utime(touched, (1_700_000_000, 1_700_000_000))
-    made = new_run("lab", 1_700_000_100.0)
+    made = new_run("lab", DEFAULT_ENDPOINT, 1_700_000_100.0)
     left = sorted(each.name for each in place.iterdir())
     assert made.name in left
     assert touched.name in left

@@ -1,0 +1,41 @@
+"""The directory of what outlives a process: e-stops, holds, runs and their logs, what a coordinator leaves."""
+
+import hashlib
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Final
+
+from schemas.bus import DEFAULT_ENDPOINT
+
+STATE_VARIABLE: Final = "FLEET_STATE_DIR"
+_LOCALHOST: Final = re.compile(r"(?<=/)localhost(?=:)")
+_NO_NAME: Final = re.compile(r"[^a-z0-9.]+")
+_NAME_LENGTH: Final = 64
+_HASH_LENGTH: Final = 8
+
+
+def default_directory() -> Path:
+    """Return FLEET_STATE_DIR, else the user's state directory as the platform has it."""
+    if chosen := os.environ.get(STATE_VARIABLE):
+        return Path(chosen)
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Application Support" / "zenoh-car-fleet"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "zenoh-car-fleet"
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "zenoh-car-fleet"
+
+
+def directory_of(endpoint: str, directory: Path | None = None) -> Path:
+    """Return the place of one bus in a state directory: two fleets of one name at two hubs share nothing.
+
+    The default endpoint has the directory itself, as every endpoint had before: an e-stop survives the upgrade.
+    """
+    directory = default_directory() if directory is None else directory
+    endpoint = _LOCALHOST.sub("127.0.0.1", endpoint.lower())
+    if endpoint == DEFAULT_ENDPOINT:
+        return directory
+    # The hash tells apart what the readable part does not, such as [::1] and a host named 1.
+    readable = _NO_NAME.sub("-", endpoint)[:_NAME_LENGTH]
+    return directory / "buses" / f"{readable}-{hashlib.sha256(endpoint.encode()).hexdigest()[:_HASH_LENGTH]}"
