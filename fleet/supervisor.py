@@ -17,7 +17,7 @@ from math import inf
 from typing import Any, Final
 
 from fleet.supervise import wanted
-from fleet.supervise.cars import Row
+from fleet.supervise.cars import Row, left_from_before
 from fleet.supervise.crew import TURN_S, Crew, Process
 from fleet.supervise.desk import Desk, Refused
 from fleet.supervise.farewell import Farewell
@@ -27,6 +27,7 @@ from fleet.supervise.restart import State, grace_s
 from fleet.supervise.wanted import COORDINATOR, HUB, RECORDER, SELF, SIMULATOR, Kind, Wanted, WantedCar
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.keys import DEFAULT_FLEET
 
 SECOND_S: Final = 1.0
 HUB_UP_S: Final = 10.0
@@ -44,7 +45,7 @@ RECORDER_END_S: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Happening:
-    """Something that is worth a line. what: `process`, `car`, `log`, `decision`, `simulator` or `end`."""
+    """Something that is worth a line. what: `process`, `car`, `hold`, `log`, `decision`, ..."""
 
     what: str
     name: str
@@ -71,6 +72,7 @@ class Supervisor:
         self._farewell = Farewell(self.crew, self.rows, lambda car, words: self._say("end", car, words))
         self._desk: Desk | None = None
         self._began = time.monotonic()
+        self._began_wall_s = time.time()
         self._unlinked_since = self.crew.now
         self._linked_since: float | None = None
         self._gateways_from = 0.0
@@ -294,6 +296,12 @@ class Supervisor:
 
     # ------------------------------------------------------------------ what is heard
 
+    @property
+    def _options(self) -> str:
+        """What a command for this fleet needs besides the car."""
+        name = "" if self._wish.fleet == DEFAULT_FLEET else f" --fleet {self._wish.fleet}"
+        return name if self.endpoint == resolve_endpoint() else f"{name} --connect {self.endpoint}"
+
     def _ended(self, process: Process, told: bool) -> None:  # noqa: FBT001 - the crew calls it so
         if process.kind is Kind.SIMULATOR:
             self._sim_asked.clear()
@@ -322,6 +330,10 @@ class Supervisor:
             if self.crew.heard(car, value.pid):
                 row.gone()
         elif row is not None:
+            if topic == "state/safety" and not row.welcomed:
+                row.welcomed = True
+                if words := left_from_before(car, value, self._began_wall_s, self._options):
+                    self._say("hold", car, words)
             if words := row.take(topic, value, time.monotonic()):
                 self._say("car", car, words)
             if topic == "event/log":

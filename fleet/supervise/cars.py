@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import UTC
 from typing import Any, Final
 
 RATE_OVER_S: Final = 2.0
@@ -26,6 +27,8 @@ class Row:
     """Frames from the car."""
     event: str = ""
     worst_stop_s: float | None = None
+    welcomed: bool = False
+    """Its state of safety was heard, of any gateway."""
     reached: bool = False
     """Its link was open at some time, of any gateway."""
     _counted: tuple[float, int] | None = None
@@ -90,6 +93,32 @@ class Row:
         """For a script."""
         names = ("car", "link", "reason", "mode", "verdict", "motion", "hold", "estop", "lease", "battery")
         return {name: getattr(self, name) for name in (*names, "rate_hz", "event")}
+
+
+def left_from_before(car: str, safety: Any, began_s: float, options: str = "") -> str:
+    """Return words for a hold and e-stops that are older than `began_s` (s since the epoch); empty if there are none.
+
+    safety: a fleet.v1.Safety. options: what `fleet resume` needs to find this fleet.
+    """
+    estops = [each for each in safety.estops if each.stamp.ToDatetime(UTC).timestamp() < began_s]
+    held = safety.HasField("hold") and safety.hold.since.ToDatetime(UTC).timestamp() < began_s
+    resume = f"fleet resume {car}{options}"
+    words = []
+    if estops:
+        first = estops[0]
+        why = f" ({first.why})" if first.why else ""
+        more = f" and {len(estops) - 1} more" if len(estops) > 1 else ""
+        words.append(f"e-stopped by {first.by}{why} since {_date(first.stamp)}{more}: {car} only accepts stops")
+    if held:
+        words.append(f"on hold by {safety.hold.by} since {_date(safety.hold.since)}: no plan moves {car}")
+    if not words:
+        return ""
+    ends = " and then ".join([f"{resume} --estops"] * bool(estops) + [resume] * held)
+    return f"{'; '.join(words)}. To end that: {ends}"
+
+
+def _date(stamp: Any) -> str:
+    return f"{stamp.ToDatetime(UTC):%Y-%m-%d %H:%M} UTC"
 
 
 _OPEN: Final = frozenset({"online", "quiet", "stale"})

@@ -45,7 +45,7 @@ class Table:
 
     def tell(self, happening: "Happening") -> None:
         """A line above the table; what a car shows in its row is no line."""
-        if happening.what in ("process", "end"):
+        if happening.what in ("process", "hold", "end"):
             line = Text(f"{datetime.now(UTC):%H:%M:%S} {happening.name}: {happening.words}")
             self._safely(lambda: self._console.print(line))
 

@@ -143,6 +143,19 @@ def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
         assert "is in a known state" in started.fleet("logs", "red").stdout
 
 
+def test_a_hold_of_an_earlier_run_is_told_at_the_start_with_how_to_end_it(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with Up(tmp_path, endpoint, "--sim", "1", "--no-record") as started:
+        started.ready("red")
+        assert started.ask("stop", "red", sender="mia", kind="person")["status"] in TAKEN
+        assert started.fleet("down").returncode == 0
+    with Up(tmp_path, endpoint, "--sim", "1", "--no-record") as started:
+        said = started.until("hold", "red", "on hold by mia since ")
+        assert said["words"].endswith(" no plan moves red. To end that: fleet resume red")
+        assert started.fleet("resume", "red").returncode == 0
+        assert not started.get("red/state/safety").HasField("hold")
+
+
 def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(tmp_path / "state"), "TERM": "xterm"}

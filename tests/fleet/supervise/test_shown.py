@@ -5,9 +5,10 @@ import os
 from pathlib import Path
 
 import pytest
+from google.protobuf.timestamp_pb2 import Timestamp
 from rich.console import Console
 
-from fleet.supervise.cars import Row
+from fleet.supervise.cars import Row, left_from_before
 from fleet.supervise.process import RUNS, Log, new_run, runs
 from fleet.supervise.restart import State
 from fleet.supervise.table import Table
@@ -38,6 +39,47 @@ def test_a_row_shows_hold_and_e_stop() -> None:
     assert row.take("state/safety", held, 2.0) == "e-stop e1"
     assert (row.hold, row.estop, row.worst_stop_s) == ("ann", "e1", 1.8)
     assert row.take("state/safety", pb.Safety(), 3.0) == "not on hold"
+
+
+YESTERDAY, TODAY = 1_799_900_000, 1_800_000_000
+
+
+def _since(seconds: int) -> Timestamp:
+    return Timestamp(seconds=seconds)
+
+
+MIAS = pb.Hold(by="mia", since=_since(YESTERDAY))
+BOBS = pb.Estop(id="e1", by="bob", why="smoke", stamp=_since(YESTERDAY + 60))
+
+
+@pytest.mark.parametrize(
+    ("safety", "words"),
+    [
+        (pb.Safety(), ""),
+        (pb.Safety(hold=pb.Hold(by="mia", since=_since(TODAY + 1))), ""),  # of this run: it is shown when it begins
+        (
+            pb.Safety(hold=MIAS),
+            "on hold by mia since 2027-01-14 04:13 UTC: no plan moves red. To end that: fleet resume red --fleet lab",
+        ),
+        (
+            pb.Safety(hold=MIAS, estops=[BOBS]),
+            (
+                "e-stopped by bob (smoke) since 2027-01-14 04:14 UTC: red only accepts stops; "
+                "on hold by mia since 2027-01-14 04:13 UTC: no plan moves red. "
+                "To end that: fleet resume red --fleet lab --estops and then fleet resume red --fleet lab"
+            ),
+        ),
+        (
+            pb.Safety(estops=[BOBS, BOBS]),
+            (
+                "e-stopped by bob (smoke) since 2027-01-14 04:14 UTC and 1 more: red only accepts stops. "
+                "To end that: fleet resume red --fleet lab --estops"
+            ),
+        ),
+    ],
+)
+def test_what_keeps_a_car_still_from_an_earlier_day_is_told_with_how_to_end_it(safety: pb.Safety, words: str) -> None:
+    assert left_from_before("red", safety, TODAY, " --fleet lab") == words
 
 
 def test_the_rate_is_what_came_over_some_seconds() -> None:
