@@ -37,7 +37,8 @@ examples:
   fleet up --sim 8
 
 Without FILE and --sim it takes ./fleet.yaml. With --sim and --json, lines on stdin go to the simulator (gateway sim
---help). Exit codes: 0 every car was stopped, 1 one was not or nothing came up, 2 wrong use."""
+--help). If a car cannot be stopped at the end, fresh gateways try again until the next Ctrl-C.
+Exit codes: 0 every car was stopped, 1 one was not or nothing came up, 2 wrong use."""
 )
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--sim", "simulated", type=click.IntRange(1, MOST_SIMULATED), metavar="N",

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,6 +24,7 @@ class Up:
         self.endpoint = endpoint
         self.environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(directory / "state")}
         self.out = directory / "sessions"
+        self.began = time.perf_counter()
         words = ["-m", "fleet.cli", "up", *arguments, "--out", str(self.out), "--json"]
         self.process = Process(words, directory / "up.log", self.environment)
         self.heard: list[dict[str, Any]] = []

@@ -1,0 +1,95 @@
+"""A hundred simulated cars on this machine: nobody restarts a gateway because the machine is busy or stood still."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from schemas.bus import Sample
+from tests.support.ports import free_endpoint
+from tests.support.processes import PATIENCE_S
+from tests.support.up import Up
+
+CARS = 100
+QUIET_S, BUSY_S = 60.0, 120.0
+"""Until all cars are at rest: on two processors, and beside a process that takes one of them."""
+STANDS_S = 6.0
+SETTLED_S = 15.0
+"""A gateway that was to be killed would have been."""
+
+
+@contextmanager
+def burning() -> Iterator[None]:
+    """A process that takes a processor."""
+    process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def hundred(directory: Path, seconds: float) -> Iterator[Up]:
+    """A fleet that came to rest within this time, without one restart."""
+    with Up(directory, free_endpoint(), "--sim", str(CARS), "--no-record") as up:
+        wait_until_at_rest(up, 3 * seconds)
+        took = time.perf_counter() - up.began
+        print(f"\n{CARS} cars at rest after {took:.1f} s, load {os.getloadavg()[0]:.1f}, restarts: {restarts(up)}")
+        assert restarts(up) == {}
+        assert took < seconds
+        yield up
+
+
+def at_rest(up: Up) -> int:
+    """Cars that are known to stand."""
+    answers = list(up.bus.query("fleet/*/state/safety", timeout_s=5.0))
+    return sum(isinstance(each, Sample) and each.message().motors == "off" for each in answers)  # type: ignore[attr-defined]
+
+
+def wait_until_at_rest(up: Up, seconds: float) -> None:
+    """Look once a second: to answer costs a hundred gateways what they need to start."""
+    deadline = time.monotonic() + seconds
+    while (count := at_rest(up)) < CARS:
+        assert time.monotonic() < deadline, f"{count} cars are at rest"
+        time.sleep(1.0)
+
+
+def restarts(up: Up) -> dict[str, str]:
+    """Processes that were started again, and why."""
+    return {each.name: each.words for each in up.processes() if each.restarts}
+
+
+def stand(pids: list[int]) -> None:
+    """Stop these processes for a while: the first of them first, and the last to go on."""
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        time.sleep(STANDS_S)
+    finally:
+        for pid in reversed(pids):
+            os.kill(pid, signal.SIGCONT)
+
+
+@pytest.mark.soak
+def test_a_hundred_cars_come_to_rest_beside_a_process_that_takes_a_processor(tmp_path: Path) -> None:
+    with burning(), hundred(tmp_path, BUSY_S):
+        pass
+
+
+@pytest.mark.soak
+def test_a_hundred_cars_come_to_rest_and_none_is_restarted_when_the_hub_or_the_machine_stands(tmp_path: Path) -> None:
+    with hundred(tmp_path, QUIET_S) as up:
+        for what, pids in (("hub", [up.hub()]), ("machine", [up.process.pid, *up.left()])):
+            stand(pids)
+            time.sleep(SETTLED_S)
+            wait_until_at_rest(up, PATIENCE_S)
+            print(f"{what} stood for {STANDS_S:g} s, restarts: {restarts(up)}")
+            assert restarts(up) == {}
+        assert up.fleet("down").returncode == 0
