@@ -6,7 +6,8 @@ to: with fifty cars that would be 2,500 states a second.
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import random
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from gateway.control.records import Command, EmergencyStop, Resume
@@ -23,6 +24,13 @@ SELDOM_S: Final = 30.0
 """... and so seldom in the end."""
 MANY: Final = 8
 """Maximum gateways that are asked one by one. One query that all answer is cheaper for more of them."""
+SPREAD_S: Final = 0.05
+"""Time, for each of many gateways, over which their queries are spread.
+
+When a hub comes back every gateway asks all others. A hundred that ask in one instant are not answered in time, and ask
+again: the answers kept two processors busy for a minute.
+"""
+MANY_TIMEOUT_S: Final = 4.0
 
 log = logging.getLogger("gateway")
 
@@ -89,14 +97,10 @@ class Neighbours:
         """Fleet-wide e-stops, in force and ended, are taken over from whoever comes onto the bus; until cancelled."""
         again_s, again = AGAIN_S, None
         while True:
-            try:
-                async with asyncio.timeout(CALM_S):
-                    await self._came.wait()
-            except TimeoutError:
-                together_s = TOGETHER_S
-                await self._came.wait()
-            await asyncio.sleep(together_s)
-            together_s = min(2 * together_s, LONGEST_TOGETHER_S)
+            await self._came.wait()
+            await asyncio.sleep(TOGETHER_S)
+            if len(self._due) > MANY:
+                await asyncio.sleep(len(self._due) * SPREAD_S * random.random())  # noqa: S311 - jitter, no secret
             self._came.clear()
             for answer in await asyncio.to_thread(self._ask, sorted(self._due)):
                 try:
