@@ -69,7 +69,7 @@ class Supervisor:
         self._read = read
         self._tell = tell
         self._state = "starting"
-        self._farewell = Farewell(self.crew, self.rows, lambda car, words: self._say("end", car, words))
+        self._farewell = Farewell(self.crew, self.rows, lambda car, words: self._say("end", car, words), self._exists)
         self._desk: Desk | None = None
         self._began = time.monotonic()
         self._began_wall_s = time.time()
@@ -287,6 +287,13 @@ class Supervisor:
         """Return True if a gateway's car may move: only a gateway that was heard can say that it does not."""
         row = self.rows.get(process.name)
         return process.kind is Kind.GATEWAY and (row is None or row.motors != "off")
+
+    def _exists(self, car: str) -> bool:
+        """Return True unless the car is simulated and its simulator has ended."""
+        simulator = self.crew.get(SIMULATOR)
+        wish = self._wish.cars.get(car)
+        simulated = wish is not None and wish.link == wanted.SIMULATED
+        return not simulated or (simulator is not None and simulator.ward.alive)
 
     def _may_start(self, process: Process) -> bool:
         if process.kind is Kind.HUB or self._farewell.may_start(process.name):

@@ -26,13 +26,21 @@ class Farewell:
 
     A gateway that is killed before its car is stopped, or that fell before it was told to end, is replaced once in any
     case. One that says that its car was not stopped is replaced until `hurry`, if the car was ever reached.
-    `tell` hears what became of each car (its name, words).
+    `tell` hears what became of each car (its name, words). `exists` says whether there is such a car: a simulated car
+    goes with its simulator.
     """
 
-    def __init__(self, crew: Crew, rows: Mapping[str, Row], tell: Callable[[str, str], None]) -> None:
+    def __init__(
+        self,
+        crew: Crew,
+        rows: Mapping[str, Row],
+        tell: Callable[[str, str], None],
+        exists: Callable[[str], bool] = lambda _: True,
+    ) -> None:
         self._crew = crew
         self._rows = rows
         self._tell = tell
+        self._exists = exists
         self._hurried = False
         self._going: dict[str, Process] = {}
         self._awaited: set[str] = set()
@@ -126,7 +134,7 @@ class Farewell:
     def _is_retried(self, process: Process) -> bool:
         """Return True if another gateway may do what this one could not. A car that was off all the time stands."""
         row = self._rows.get(process.name)
-        reached = row is not None and row.reached
+        reached = row is not None and row.reached and self._exists(process.name)
         return reached and not self._hurried and not process.leaving and process.code != WRONG_USE
 
     def _reached(self, process: Process) -> bool:
