@@ -7,7 +7,7 @@ to: with fifty cars that would be 2,500 states a second.
 import asyncio
 import logging
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from gateway.control.records import Command, EmergencyStop, Resume
@@ -22,13 +22,18 @@ AGAIN_S: Final = 0.5
 nobody else knows."""
 SELDOM_S: Final = 30.0
 """... and so seldom in the end."""
+CALM_S: Final = 1.0
+"""While gateways come on and on, they are asked ever more seldom, down to every `LONGEST_TOGETHER_S`; after so long
+without one that came, at once again."""
+LONGEST_TOGETHER_S: Final = 3.0
 MANY: Final = 8
 """Maximum gateways that are asked one by one. One query that all answer is cheaper for more of them."""
-SPREAD_S: Final = 0.05
-"""Time, for each of many gateways, over which their queries are spread.
+ANSWERS_PER_S: Final = 400.0
+"""Maximum answers per second, all gateways together, when they come back at once.
 
-When a hub comes back every gateway asks all others. A hundred that ask in one instant are not answered in time, and ask
-again: the answers kept two processors busy for a minute.
+When a hub comes back every gateway asks all others: a hundred are 10,000 answers. If they ask in one instant, answers
+come too late and are asked for again, which keeps two processors busy for more than a minute. An e-stop that is asked
+for meanwhile does not wait for this: its gateway passes it on at once.
 """
 MANY_TIMEOUT_S: Final = 4.0
 
@@ -51,18 +56,18 @@ class Neighbours:
         self._due: set[str] = set()
         """Gateways that came and have not answered since."""
 
-    def changed(self, change: tuple[str, bool]) -> None:
-        """A gateway of the fleet came or went."""
-        name, alive = change
-        if name == self._car:
-            return
-        if alive:
-            self._alive.add(name)
-            self._due.add(name)
-            self._came.set()
-        else:
-            self._alive.discard(name)
-            self._due.discard(name)
+    def changed(self, changes: Mapping[str, bool]) -> None:
+        """Take that gateways of the fleet came or went."""
+        for name, alive in changes.items():
+            if name == self._car:
+                continue
+            if alive:
+                self._alive.add(name)
+                self._due.add(name)
+                self._came.set()
+            else:
+                self._alive.discard(name)
+                self._due.discard(name)
 
     def ask_soon(self) -> None:
         """Ask all: there may be fleet-wide e-stops that this gateway does not know."""
@@ -96,11 +101,19 @@ class Neighbours:
     async def keep_united(self, unite: Unite) -> None:
         """Fleet-wide e-stops, in force and ended, are taken over from whoever comes onto the bus; until cancelled."""
         again_s, again = AGAIN_S, None
+        together_s, first = TOGETHER_S, True
         while True:
-            await self._came.wait()
-            await asyncio.sleep(TOGETHER_S)
-            if len(self._due) > MANY:
-                await asyncio.sleep(len(self._due) * SPREAD_S * random.random())  # noqa: S311 - jitter, no secret
+            try:
+                async with asyncio.timeout(CALM_S):
+                    await self._came.wait()
+            except TimeoutError:
+                together_s = TOGETHER_S
+                await self._came.wait()
+            await asyncio.sleep(together_s)
+            together_s = min(2 * together_s, LONGEST_TOGETHER_S)
+            if len(self._due) > MANY and not first:
+                await asyncio.sleep(len(self._due) ** 2 / ANSWERS_PER_S * random.random())  # noqa: S311 - jitter, no secret
+            first = False
             self._came.clear()
             for answer in await asyncio.to_thread(self._ask, sorted(self._due)):
                 try:
