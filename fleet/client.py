@@ -30,6 +30,7 @@ from schemas import keys, messages, topics
 from schemas.bus import Bus, Failure, Sample, canon
 from schemas.topics import Qos
 
+_EVENT: Final = topics.TOPICS["event/command"].message
 _FOREVER_S: Final = 3600.0
 """One look of a wait without a time-out."""
 _SHORTEST_S: Final = 0.1
@@ -262,8 +263,8 @@ class Fleet:
     def _event(self, sample: Sample) -> None:
         """A record of some command of somebody; on a Zenoh thread."""
         try:
-            event: Any = sample.message()
-        except (messages.BadPayload, KeyError) as error:
+            event: Any = messages.parse(_EVENT, sample.payload, sample.encoding)
+        except messages.BadPayload as error:
             log.warning("%s: not a command event: %s", sample.key, error)
             return
         asking = self._askings.get(event.id)

@@ -3,12 +3,15 @@
 What it wants is decided in policy/, also that a car on hold is left alone; the gateway sees to that once more.
 """
 
+import contextlib
 import queue
 import threading
 import time
+import traceback
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 import zenoh
@@ -47,6 +50,11 @@ _QUESTIONS: Final = 64
 _ASKERS: Final = 4
 _APIECE: Final = 8
 """So many cars that came together are asked each for itself, of more all cars with one question."""
+INTERNAL_ERROR: Final = "internal_error"
+"""Code of the event about an exception that nobody foresaw. The coordinator goes on."""
+_LONGEST_ERROR: Final = 500
+"""Maximum characters of such an exception's own words: they may quote what came over the bus."""
+_ERROR: Final = 4  # foxglove.Log.Level
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
 
@@ -88,6 +96,8 @@ class Coordinator:
     _published: dict[tuple[str, str], tuple[Publisher, Any]] = field(default_factory=dict)
     """The last of each topic, and of each subject in it: what a query is answered with."""
     _publishers: dict[str, Publisher] = field(default_factory=dict)
+    _unforeseen_at: dict[str, float] = field(default_factory=dict)
+    """When each unforeseen exception was logged last, by its words."""
     _subscribed: set[str] = field(default_factory=set)
     _inbox: "queue.Queue[_Item]" = field(default_factory=lambda: queue.Queue(_QUEUE))
     _questions: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(_QUESTIONS))
@@ -135,7 +145,10 @@ class Coordinator:
                     if there != hubs:
                         hubs, self._memory = there, hub_back(self._memory, now)
                     linked_at = now
-                    self._turn(hearing, pool, now)
+                    try:
+                        self._turn(hearing, pool, now)
+                    except Exception as error:  # noqa: BLE001 - what it decides on came over the bus
+                        self._unforeseen("deciding", error)
                     keeper.save(to_keep(self.plan, self._memory, now, time.time()))
                     if look_again_at is not None and now >= look_again_at:
                         look_again_at = None
@@ -277,14 +290,20 @@ class Coordinator:
                 return
             self._look_at_tokens(hearing, pool)  # first: a gateway says how its car is when its token is there
             wait_s = 0.0
-            now = time.monotonic()
-            if isinstance(item, zenoh.Query):
-                self._questions.release()
-                self._answer(item, hearing)
-            elif isinstance(item, _Answer):
-                hearing.take(item.sample, now, time.time())
-            else:
-                hearing.take(item, now, None)
+            try:
+                self._take_item(item, hearing)
+            except Exception as error:  # noqa: BLE001 - nothing that comes over the bus may end a coordinator
+                self._unforeseen("handling what came over the bus", error)
+
+    def _take_item(self, item: _Item, hearing: Hearing) -> None:
+        now = time.monotonic()
+        if isinstance(item, zenoh.Query):
+            self._questions.release()
+            self._answer(item, hearing)
+        elif isinstance(item, _Answer):
+            hearing.take(item.sample, now, time.time())
+        else:
+            hearing.take(item, now, None)
 
     def _look_at_tokens(self, hearing: Hearing, pool: ThreadPoolExecutor) -> None:
         """Note who came and went, and ask who came how it is."""
@@ -302,12 +321,45 @@ class Coordinator:
 
     def _answer(self, query: zenoh.Query, hearing: Hearing) -> None:
         with query:
-            if str(query.key_expr).endswith(f"/@cmd/{PLAN_VERB}"):
-                self._replace(query, hearing)
-                return
-            for publisher, message in self._published.values():
-                if query.key_expr.intersects(publisher.key):
-                    reply_value(query, publisher.key, message.SerializeToString(), publisher.topic)
+            try:
+                self._reply(query, hearing)
+            except Exception as error:  # noqa: BLE001 - whoever asks gets an answer, and the coordinator goes on
+                words = self._unforeseen(f"answering {query.key_expr}", error)
+                query.reply_err(words, encoding="text/plain")
+
+    def _reply(self, query: zenoh.Query, hearing: Hearing) -> None:
+        if str(query.key_expr).endswith(f"/@cmd/{PLAN_VERB}"):
+            self._replace(query, hearing)
+            return
+        for publisher, message in self._published.values():
+            if query.key_expr.intersects(publisher.key):
+                reply_value(query, publisher.key, message.SerializeToString(), publisher.topic)
+
+    def _unforeseen(self, during: str, error: Exception) -> str:
+        """Log an exception that nobody foresaw, as an event and on stderr; return the words.
+
+        The same words are logged once in AGAIN_S: a fault in each turn would fill the disk.
+        """
+        frames = traceback.extract_tb(error.__traceback__)
+        where = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+        words = f"{INTERNAL_ERROR} while {during}: {type(error).__name__}{where}: {str(error)[:_LONGEST_ERROR]}"
+        now = time.monotonic()
+        self._unforeseen_at = {each: at for each, at in self._unforeseen_at.items() if now - at < AGAIN_S}
+        if words not in self._unforeseen_at:
+            self._unforeseen_at[words] = now
+            self._log(words)
+        return words
+
+    def _log(self, words: str) -> None:
+        """Publish an error as foxglove.Log, and tell whoever started the coordinator."""
+        now_ns = time.time_ns()
+        message: Any = messages.message_class("foxglove.Log")(
+            level=_ERROR, name=f"{keys.COORDINATOR} {INTERNAL_ERROR}", message=words
+        )
+        message.timestamp.seconds, message.timestamp.nanos = divmod(now_ns, 1_000_000_000)
+        self._publisher("log").put(message, now_ns)
+        with contextlib.suppress(Exception):  # what `failed` does is what may have failed
+            self.failed(words)
 
     # ------------------------------------------------------------------ there is only one; and the hub
 
@@ -337,12 +389,16 @@ class Coordinator:
         return now
 
     def _publish(self, name: str, message: Any) -> None:
+        publisher = self._publisher(name)
+        self._published[name, getattr(message, "subject", "")] = (publisher, message)
+        publisher.put(message, time.time_ns())
+
+    def _publisher(self, name: str) -> Publisher:
         topic = topics.TOPICS[f"{keys.COORDINATOR}/{name}"]
         if name not in self._publishers:
             key = f"{self.client.name}/{topic.name}"
             self._publishers[name] = self.client.bus.publisher(key, topic, keys.COORDINATOR)
-        self._published[name, getattr(message, "subject", "")] = (self._publishers[name], message)
-        self._publishers[name].put(message, time.time_ns())
+        return self._publishers[name]
 
 
 def _text(query: zenoh.Query) -> str:

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from fleet.config import FleetFile
 from fleet.policy.picture import CarPicture, Picture, Refused, Seen
-from schemas import keys, messages
+from schemas import keys, messages, topics
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -58,6 +58,10 @@ class Hearing:
 
     def token(self, car: str, now: float, *, alive: bool) -> None:
         """A gateway came or went: what was known of its car may no longer be so, a hold above all."""
+        try:
+            keys.check_name(car)
+        except keys.BadKey:
+            return  # no gateway of ours: nothing could be asked of it
         if alive:
             self._gone_since.pop(car, None)
         elif car not in self.listed:
@@ -90,12 +94,13 @@ class Hearing:
     def take(self, sample: Sample, now: float, wall_s: float | None) -> None:
         """A message of a car. `wall_s`: the wall clock, for an answer, which may be old; None: it came as published."""
         key = keys.parse(sample.key)
-        try:
-            value: Any = sample.message()
-        except (messages.BadPayload, KeyError):
-            return  # not of this fleet's gateways: nothing to decide on
-        if key is None:
+        topic = None if key is None else topics.TOPICS.get(key.topic)
+        if key is None or topic is None:
             return
+        try:
+            value: Any = messages.parse(topic.message, sample.payload, sample.encoding)
+        except messages.BadPayload:
+            return  # not of this fleet's gateways: nothing to decide on
         if key.car not in self.listed and not self.cars.get(key.car, CarPicture()).present:
             self._gone_since.setdefault(key.car, now)
         at = now

@@ -222,6 +222,7 @@ SERVICE_TOPICS: Final = (
         Qos.STATE,
         entity="coordinator/decision",
     ),
+    Topic("@coordinator/log", "foxglove.Log", "notable events of the coordinator", Qos.STATE, entity="coordinator/log"),
     Topic(
         "@recorder/status",
         "fleet.v1.Recording",

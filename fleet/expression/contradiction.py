@@ -63,9 +63,9 @@ def _simple(side: Node) -> bool:
 def _all_of(several: Iterable[list[_Way]]) -> list[_Way]:
     found: list[_Way] = [()]
     for ways in several:
-        found = [one + other for one in found for other in ways]
-        if len(found) > _WAYS:
+        if len(found) * len(ways) > _WAYS:
             raise _TooManyError
+        found = [one + other for one in found for other in ways]
     return found
 
 

@@ -51,6 +51,7 @@ def outside(expression: Expression, names: Mapping[str, type], of: str = "") -> 
             allowed, told = f"{name} >= {least} and {name} <= {most}", f"{least:g} .. {most:g}"
         else:
             continue
-        if contradictory(parse(f"({expression}) and ({allowed})", names)):
+        # Joined as trees: as one text they could be longer, or deeper, than a condition may be.
+        if contradictory(expression & parse(allowed, names)):
             return f"{expression} is never so: {name} is {told}"
     return ""

@@ -144,6 +144,10 @@ class Expression:
         """Both."""
         return Expression(joined(Every, (self.root, other.root)))
 
+    def __invert__(self) -> "Expression":
+        """Not."""
+        return Expression(self.root.inner if isinstance(self.root, Not) else Not(self.root))
+
     @property
     def names(self) -> tuple[str, ...]:
         """The names it uses, each once, as they come."""

@@ -4,19 +4,23 @@ What a part can never do by itself is check.py's.
 """
 
 from collections.abc import Iterator
-from functools import cache
+from functools import lru_cache
+from typing import Final
 
-from fleet.expression import contradictory
-from fleet.expression import parse as parse_expression
-from fleet.policy.picture import NAMES
+from fleet.expression import Expression, contradictory
+from fleet.expression.tree import Compare, Kind, Literal, Name, Op
 from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Plan, Rule
 from fleet.policy.steady import HYSTERESIS_S
 from gateway.protocol.values import Mode
 
+_REMEMBERED: Final = 4096
+"""Maximum pairs of conditions whose contradiction is cached: the rules of a large plan, each against each."""
 
-@cache
-def _contradictory(text: str) -> bool:
-    return contradictory(parse_expression(text, NAMES))
+
+@lru_cache(_REMEMBERED)
+def _contradictory(both: Expression) -> bool:
+    # Conditions are joined as trees. As one text two could be longer, or deeper, than a condition may be.
+    return contradictory(both)
 
 
 def implies(one: Condition, other: Condition) -> bool:
@@ -26,13 +30,13 @@ def implies(one: Condition, other: Condition) -> bool:
     same = one.of is other.of and one.car == other.car and (one.of is not Of.ALL or one.role == other.role)
     if not same and not (one.of is Of.CAR and other.of is Of.ANY and other.role is None):
         return False
-    return _contradictory(f"({one.expression}) and not ({other.expression})")
+    return _contradictory(one.expression & ~other.expression)
 
 
 def _together(one: Condition, other: Condition) -> bool:
     """Whether both may be so at once."""
     same = one.car == other.car if one.of is Of.CAR and other.of is Of.CAR else one.of is Of.ALL and other.of is Of.ALL
-    return not same or not _contradictory(f"({one.expression}) and ({other.expression})")
+    return not same or not _contradictory(one.expression & other.expression)
 
 
 def fights(plan: Plan) -> Iterator[tuple[Rule, str, bool]]:
@@ -69,9 +73,14 @@ def _with_itself(plan: Plan, rule: Rule) -> Iterator[tuple[Rule, str, bool]]:
         own = effect.who in (THAT, ALL) or (rule.when.car is not None and effect.who == rule.when.car)
         if not own or mode is None or rule.until is not None or "mode.asked" not in rule.when.expression.names:
             continue
-        if _contradictory(f"({rule.when.expression}) and mode.asked == '{mode}'"):
+        if _contradictory(rule.when.expression & _asked_for(mode)):
             words = f"it undoes itself again and again: in mode {mode}, {rule.when.expression} is not so"
             yield rule, f"{words}; give it until", True
+
+
+def _asked_for(mode: Mode) -> Expression:
+    """Return the condition that a car was asked for this mode."""
+    return Expression(Compare(Name("mode.asked", Kind.WORD), Op.EQ, Literal(str(mode))))
 
 
 def _unlike(effect: Effect, other: Effect) -> str:

@@ -188,7 +188,7 @@ FLEET_LANES: Final = (
 FLEET_CURVES: Final = (("Distance (m)", DISTANCE), ("Battery (V)", BATTERY))
 FLEET_TEXTS: Final = (
     ("Decisions and why", (), ("@coordinator/decision", ASSIGNMENT, "@recorder/mark")),
-    ("Commands and log", (COMMANDS, "event/log"), ()),
+    ("Commands and log", (COMMANDS, "event/log"), ("@coordinator/log",)),
 )
 """(name, topics of every car, topics of services)."""
 

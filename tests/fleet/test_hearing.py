@@ -1,5 +1,7 @@
 """What the coordinator has heard of the cars, what it must still ask for, and what it forgets."""
 
+import pytest
+
 from fleet.hearing import FORGOTTEN_S, MOST_GONE, NEEDED, Hearing
 from fleet.policy.decide import step
 from fleet.policy.memory import Memory
@@ -87,3 +89,22 @@ def test_ten_thousand_names_in_ten_seconds_are_decided_on_a_few_times_and_forgot
     assert hearing.cars.keys() == hearing.readings.keys() == {"red"}
     assert memory.said.keys() == {"red", "role scout"}
     assert memory.gone_since.keys() <= {"red"}
+
+
+@pytest.mark.parametrize("topic", NEEDED)
+@pytest.mark.parametrize("sent", ["fleet.v1.Battery", "fleet.v1.Result", "foxglove.Log", "fleet.v1.Nothing"])
+def test_another_message_than_the_topics_is_ignored(topic: str, sent: str) -> None:
+    hearing = Hearing()
+    hearing.token("red", 100.0, alive=True)
+    hearing.take(Sample(f"fleet/red/{topic}", b"", messages.encoding_of(sent), 0, 1), 100.0, None)
+    for each in NEEDED:
+        hearing.take(said(each), 100.0, None)
+    hearing.take(Sample(f"fleet/red/{topic}", b"", messages.encoding_of(sent), 0, 1), 101.0, None)
+    assert set(hearing.readings["red"]) == set(NEEDED)
+    assert hearing.unheard == set()
+
+
+def test_a_token_that_names_no_car_is_ignored() -> None:
+    hearing = Hearing()
+    hearing.token("RED!", 100.0, alive=True)
+    assert hearing.present == set()

@@ -169,6 +169,7 @@ def make(path: Path, seconds: int = 20, writer: type[Writer] = Writer) -> Counte
         made.put("fleet/@supervisor/status", pb.Supervision(state="running", processes=[supervised]), second)
         made.put("fleet/@sim/world", world(second), second)
     made.put("fleet/@recorder/mark", log("@recorder", 9.0, 2, "here it gets interesting"), 9.0)
+    made.put("fleet/@coordinator/log", log("@coordinator internal_error", 9.5, 4, "internal_error while deciding"), 9.5)
     made.close()
     return made.counts
 

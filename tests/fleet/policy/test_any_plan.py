@@ -1,0 +1,176 @@
+"""Any text as a plan: it is put in force or refused with the declared error, whatever it says. No other exception."""
+
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.expression.reader import DEPTH, LENGTH
+from fleet.marked import BadFile
+from fleet.policy.check import faults
+from fleet.policy.decide import step
+from fleet.policy.memory import Memory
+from fleet.policy.picture import NAMES, CarPicture, Picture
+from fleet.policy.plan import Plan
+from fleet.policy.reader import parse
+from gateway.protocol.profile import parse_platform
+from gateway.protocol.values import Mode
+from tests.fleet.policy.cars import HERE, seen
+
+FLEET = {
+    car: CarPicture(platform=platform, capabilities=frozenset(map(str, parse_platform(platform).modes)), listed=True)
+    for car, platform in (("red", "arduino"), ("pi", "raspberry_pi"))
+}
+LOW = "battery.voltage_v < 7"
+PLACES = (
+    "roles: {{scout: {{mode: tracking, needs: {0}}}}}",
+    "roles: {{scout: {{mode: tracking}}}}\nrules: [{{when: {{any: {0}}}, then: {{who: that, mode: manual}}}}]",
+    "roles: {{scout: {{mode: tracking}}}}\nphases: {{a: {{until: {{all: {0}}}, next: b}}, b: {{}}}}",
+)
+"""Plans with room for a condition: of a role, a rule, a phase."""
+
+
+def put_in_force(text: str) -> Plan | None:
+    """Do with a text what a coordinator does with a plan; return the plan, None if it was refused."""
+    try:
+        plan = parse(text)
+    except BadFile:
+        return None
+    for cars in (None, FLEET):
+        str(faults(plan, cars, ["red"]).refusal())
+    picture = Picture({"red": HERE, "pi": HERE}, {"red": seen(0.0, battery={"voltage_v": 6.0})})
+    memory = Memory()
+    for now in (0.0, 2.0, 90_000.0):
+        memory = step(plan, picture, memory, now).memory
+    return plan
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("length", [949, 950, 975, LENGTH - 1, LENGTH])
+def test_a_condition_as_long_as_is_allowed_is_put_in_force(place: str, length: int) -> None:
+    filler = " or mode.asked == 'manual'"
+    count = (length - len(LOW)) // len(filler)
+    condition = LOW + " " * (length - len(LOW) - count * len(filler)) + filler * count
+    assert len(condition) == length
+    assert put_in_force(place.format(json.dumps(condition))) is not None
+    assert put_in_force(place.format(json.dumps(f"{condition}   "[: LENGTH + 1]))) is None or length < LENGTH
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_condition_as_deep_as_is_allowed_is_put_in_force(place: str) -> None:
+    for depth, allowed in ((DEPTH - 1, True), (DEPTH, True), (DEPTH + 1, False)):
+        for begin, end in (("(", ")"), ("not (", ")"), ("(link.state != 'lost' and ", ")")):
+            condition = begin * depth + LOW + end * depth
+            assert (put_in_force(place.format(json.dumps(condition))) is not None) is allowed, (depth, begin)
+
+
+NUMBERS = st.one_of(
+    st.floats().map(repr),
+    st.integers().map(str),
+    st.integers(1, 400).map(lambda digits: "9" * digits),
+    st.sampled_from(["1e308", "1e309", "-1e-400", "0x10", "1_000", "007", ".5", "5.", "+3", "1e", "0" * 900]),
+)
+WORDS = st.one_of(
+    st.sampled_from(["and", "or", "not", "(", ")", "true", "false", "'", '"', "''", *"=!<>&|-"]),
+    st.sampled_from(["<", "<=", ">", ">=", "==", "!="]),
+    st.sampled_from(sorted(NAMES)),
+    st.text(max_size=6),
+    st.text(max_size=6).map(lambda text: f"'{text}'"),
+    NUMBERS,
+)
+COMPARISONS = st.one_of(
+    st.tuples(
+        st.sampled_from(sorted(name for name, kind in NAMES.items() if kind is float)),
+        st.sampled_from(["<", "<=", ">", ">=", "==", "!="]),
+        NUMBERS,
+    ).map(" ".join),
+    st.tuples(
+        st.sampled_from(sorted(name for name, kind in NAMES.items() if kind is str)),
+        st.sampled_from([" == ", " != "]),
+        st.text(max_size=8).map(lambda text: f"'{text}'"),
+    ).map("".join),
+    st.sampled_from(sorted(name for name, kind in NAMES.items() if kind is bool)),
+    st.sampled_from(["true", "false"]),
+)
+SENSIBLE = st.recursive(
+    COMPARISONS,
+    lambda inner: st.one_of(
+        st.tuples(inner, st.sampled_from([" and ", " or ", ") == (", ") != ("]), inner).map(
+            lambda x: f"({''.join(x)})"
+        ),
+        inner.map(lambda text: f"not ({text})"),
+        st.tuples(inner, st.sampled_from([" and ", " or "]), st.integers(2, 40)).map(
+            lambda x: x[1].join([x[0]] * x[2])[:LENGTH]
+        ),
+    ),
+    max_leaves=12,
+)
+CONDITIONS = st.one_of(st.lists(WORDS, max_size=20).map(" ".join), SENSIBLE, st.text())
+"""Conditions that mean something, that nearly do, and that do not."""
+FIELDS = (
+    *("roles", "cars", "rules", "phases", "idle", "mode", "needs", "count", "priority", "capabilities", "platforms"),
+    *("fallback", "on_call", "name", "when", "then", "until", "during", "who", "role", "led", "phase", "any", "all"),
+    *("car", "is", "for_s", "timeout_s", "next", "on_timeout", "a", "b", "red", "x"),
+)
+VALUES = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(),
+        st.floats(),
+        CONDITIONS,
+        st.sampled_from([*Mode, "red", "pi", "scout", "that", "others", "all", "any", "a", "b"]),
+    ),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.sampled_from(FIELDS), inner, max_size=4)),
+    max_leaves=10,
+)
+WHOLE = st.fixed_dictionaries(
+    {"roles": st.one_of(st.just({"scout": {"mode": "tracking"}}), VALUES)},
+    optional={
+        "cars": st.one_of(st.just({"red": "scout", "pi": "manual"}), VALUES),
+        "rules": VALUES,
+        "phases": VALUES,
+        "idle": VALUES,
+    },
+).map(json.dumps)
+SIGNS = (
+    *("\n- ", "\nroles: ", "cars: ", "rules: ", "phases: ", "when: ", "then: ", "who: ", "mode: ", "scout: ", "red"),
+    *(
+        "{",
+        "}",
+        "[",
+        "]",
+        ", ",
+        "? ",
+        "! ",
+        "--- ",
+        "...\n",
+        "# ",
+        "'",
+        '"',
+        ">\n ",
+        "|\n ",
+        "=",
+        "<<: *a",
+        "&a ",
+        "*a ",
+    ),
+    *("!!int ", "!!python/object:os.system ", "!!binary ", "%YAML 1.1\n", "%YAML 99999999999\n", "%TAG ! x\n"),
+    *("\x00", "\ud800", "\\ud800", "\t", "\ufeff", "\u2028", "\x85", "~", "null", ".inf", ".nan", "0o17", "2001-01-01"),
+)
+ODDITIES = st.lists(st.one_of(st.sampled_from(SIGNS), st.text(max_size=4)), max_size=24).map("".join)
+
+
+@settings(max_examples=300)
+@given(
+    st.one_of(
+        st.tuples(st.sampled_from(PLACES), CONDITIONS).map(lambda pair: pair[0].format(json.dumps(pair[1]))),
+        WHOLE,
+        ODDITIES,
+        st.tuples(st.sampled_from(PLACES), ODDITIES).map(lambda pair: pair[0].format(pair[1])),
+        st.text(),
+    )
+)
+def test_any_text_is_put_in_force_or_refused_with_the_declared_error(text: str) -> None:
+    put_in_force(text)
