@@ -87,18 +87,21 @@ class FleetFile:
         return tuple(self.unlinked)
 
 
-def read_fleet(path: Path | str, *, unbound: bool = False) -> FleetFile:
-    """The fleet in a file, every car resolved; raises BadFile. `unbound`: cars without a link are let through."""
+def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) -> FleetFile:
+    """The fleet in a file, every car resolved; raises BadFile. `unbound`: cars without a link are let through.
+
+    `moved`: it is a copy (a session's), so the plan and the world that it names need not be beside it.
+    """
     path = Path(path)
-    return parse_fleet(read_text(path), path, unbound=unbound)
+    return parse_fleet(read_text(path), path, unbound=unbound, moved=moved)
 
 
-def parse_fleet(text: str, path: Path, *, unbound: bool = False) -> FleetFile:
+def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = False) -> FleetFile:
     """The fleet in a text, as if it stood in this file; raises BadFile."""
     document = Document(text, str(path))
     file = document.take(FileEntry)
     tree = _mapping(document.tree)
-    for where, words in _contradictions(tree, path, unbound=unbound):
+    for where, words in _contradictions(tree, path, unbound=unbound, moved=moved):
         document.complain(where, words)
     document.end()
     assert file is not None  # else the document had ended
@@ -159,7 +162,7 @@ def _beside(path: Path, given: str | None) -> Path | None:
 # What no field shows by itself. These look at the text as it is, so that they tell of it along with the fields' faults.
 
 
-def _contradictions(tree: Mapping[str, Any], path: Path, *, unbound: bool) -> Iterator[tuple[Where, str]]:
+def _contradictions(tree: Mapping[str, Any], path: Path, *, unbound: bool, moved: bool) -> Iterator[tuple[Where, str]]:
     cars = {name: _mapping(car) for name, car in _mapping(tree.get("cars")).items()}
     types = _mapping(tree.get("types"))
     for name, car in cars.items():
@@ -172,7 +175,7 @@ def _contradictions(tree: Mapping[str, Any], path: Path, *, unbound: bool) -> It
             yield ("cars", name, "link"), words
         yield from _car_contradictions(tree, name, car)
     yield from _one_port(cars)
-    for entry in ("plan", "world"):
+    for entry in () if moved else ("plan", "world"):
         given = tree.get(entry)
         if isinstance(given, str) and given and given.isprintable():
             there = _beside(path, given)

@@ -6,6 +6,7 @@ put into words is `faults`' part; what a fleet file or a plan means is not decid
 
 import json
 import math
+import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,10 +72,26 @@ def read_marked(text: str, source: str, model: type[_Model]) -> _Model:
     return found
 
 
+def odd_kind(path: Path) -> str:
+    """Return what a path is (`directory`, `FIFO`, ...) that is no regular file; empty if it is one. Raises OSError.
+
+    Call it before opening: a FIFO is waited for, and opening a serial port resets the car on it.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISREG(mode):
+        return ""
+    kinds = {stat.S_IFDIR: "directory", stat.S_IFIFO: "FIFO", stat.S_IFSOCK: "socket"}
+    return kinds.get(stat.S_IFMT(mode), "device")
+
+
 def read_text(path: Path, source: str | None = None) -> str:
     """The text of a file; raises BadFile for one that cannot be read, is too large, or is not UTF-8."""
     source = str(path) if source is None else source
     try:
+        if kind := odd_kind(path):
+            raise BadFile(
+                source, [Problem(1, 1, "", f"is a {kind}, not a file: save the text as a file, and give that")]
+            )
         with path.open("rb") as file:
             data = file.read(LARGEST_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path

@@ -17,6 +17,7 @@ import click
 from fleet.commands.common import explained
 from fleet.config import parse_fleet, read_fleet
 from fleet.hearing import listed_cars
+from fleet.marked import BadFile, read_text
 from fleet.policy.check import faults
 from fleet.policy.reader import parse as parse_plan
 from fleet.supervise.desk import AnotherSupervisor
@@ -109,11 +110,9 @@ def read(file: Path | None, asked: Asked) -> Wanted:
         if path is None:
             continue
         try:
-            text = path.read_text(encoding="utf-8-sig")
-        except UnicodeDecodeError:
-            raise ValueError(f"{what} {path} is not a text in UTF-8") from None
-        except OSError as error:
-            raise ValueError(f"{what} {path} cannot be read: {error.strerror}") from None
+            text = read_text(path)
+        except BadFile as error:
+            raise ValueError(f"{what}: {error}") from None
         if path is wish.plan:
             wish = _with_plan(wish, text)
     return wish

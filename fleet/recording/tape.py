@@ -523,7 +523,7 @@ class Tape:
             try:
                 shutil.copyfile(source, self.path / name)
             except OSError as error:  # no reason to record nothing
-                self.uncopied.append(f"{source} could not be copied into {self.path}: {error.strerror}")
+                self.uncopied.append(f"{source} could not be copied into {self.path}: {error.strerror or error}")
         if self.uncopied:
             self.description.error = "; ".join(self.uncopied)
             self.description.write(self.path)

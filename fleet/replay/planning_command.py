@@ -57,15 +57,20 @@ def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance:
     from fleet.hearing import listed_cars
     from fleet.marked import read_text
     from fleet.policy.reader import parse
+    from fleet.recording.directory import FLEET_FILE
     from fleet.recording.session import NoSession, Session
 
     with explained():
         plan = None if path is None else parse(read_text(path), str(path))
         try:
             found = Session.open(session)
-            if fleet_file is None and found.path.is_dir() and (found.path / "fleet.yaml").is_file():
-                fleet_file = found.path / "fleet.yaml"
-            listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file))
+            own = found.path / FLEET_FILE
+            listed: Mapping[str, CarPicture] = {}
+            if fleet_file is not None:
+                listed = listed_cars(read_fleet(fleet_file, unbound=True))
+            elif found.path.is_dir() and own.is_file():
+                # The session keeps the plan as plan.yaml, whatever name it has in the copied fleet file.
+                listed = listed_cars(read_fleet(own, unbound=True, moved=True))
             compared = _Compared(found, plan, listed, round(tolerance * 1e9))
             compared.go()
         except NoSession as error:

@@ -169,6 +169,8 @@ def _world(words: str, cars: list[str]) -> World:
     from gateway.sim.worldfile import read_world
 
     try:
+        if Path(words).exists() and not Path(words).is_file():  # a FIFO would be waited for
+            raise BadSpec(f"world {words}: is a directory, FIFO or device, not a file: save the text as a file")
         with Path(words).open("rb") as file:
             data = file.read(LARGEST_BYTES + 1)
         text = data.decode("utf-8-sig", errors="strict" if len(data) <= LARGEST_BYTES else "replace")

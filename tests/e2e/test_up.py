@@ -495,7 +495,7 @@ def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(tmp_path: Path) -
         ((), "there is no fleet.yaml here: name a file"),
         (("--sim", "0"), "0 is not in the range 1<=x<=200"),
         (("none.yaml",), "none.yaml"),
-        (("--sim", "1", "--plan", "none.yaml"), "the plan none.yaml cannot be read"),
+        (("--sim", "1", "--plan", "none.yaml"), "the plan: none.yaml:1:1: cannot be read"),
         (("--sim", "1", "--fleet", "Über"), "fleet name"),
         (("--sim", "1", "--connect", "here"), "endpoint 'here' is not allowed"),
         (("--sim", "1", "--connect", f"tcp/0.0.0.0:{free_port()}"), "accept it with --insecure-lan"),

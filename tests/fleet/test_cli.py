@@ -1,6 +1,7 @@
 """The `fleet` command: exit codes, what is said of a mistake, what Ctrl-C does; real processes where it matters."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -8,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import click
@@ -123,6 +125,22 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     assert said.err.startswith("fleet: ")
     assert said.err.count("\n") == 1
     assert said.out == ""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["check", "plan check", "coordinate --plan", "up", "up --sim 1 --plan", "up --sim 1 --world"],
+)
+def test_a_fifo_as_a_file_is_refused_and_not_waited_for(
+    arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    monkeypatch.setattr(sys, "argv", ["fleet", *arguments.split(" "), str(tmp_path / "fifo")])
+    monkeypatch.setenv("FLEET_ENDPOINT", free_endpoint())
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert f"{tmp_path / 'fifo'}:1:1: is a FIFO, not a file" in capsys.readouterr().err
 
 
 OF_FILES = ("init", "check", "bind", "schema", "plan", "sessions", "replay", "replan", "redecode")

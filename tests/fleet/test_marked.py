@@ -1,5 +1,6 @@
 """Files that people write: every fault at once, each at its line and column; and what would harm a reader refused."""
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -119,7 +120,9 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
         read_text(path)
     with pytest.raises(BadFile, match="cannot be read: No such file"):
         read_text(tmp_path / "other.yaml")
-    with pytest.raises(BadFile, match="cannot be read: Is a directory"):
-        read_text(tmp_path)
+    os.mkfifo(tmp_path / "fifo")
+    for odd, kind in ((tmp_path, "directory"), (tmp_path / "fifo", "FIFO"), (Path(os.devnull), "device")):
+        with pytest.raises(BadFile, match=rf"{odd.name}:1:1: is a {kind}, not a file: save the text as a file"):
+            read_text(odd)
     path.write_bytes("\ufeffmode: fast\nwheels: {}".encode())
     assert read_marked(read_text(path), "f", Wagon).mode == "fast"

@@ -218,3 +218,21 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     assert run("replan", without, "--plan", tmp_path / "nowhere.yaml").exit_code == 2
     assert run("replan", tmp_path / "nowhere").exit_code == 1
     assert run("replan", without, "--tolerance", "0").exit_code == 2
+
+
+def test_a_sessions_fleet_file_may_name_its_plan_otherwise(tmp_path: Path) -> None:
+    """The session keeps the plan as plan.yaml, and a car without a link was simulated then."""
+    made = Made(tmp_path / "0001.mcap", Writer)
+    for at in range(3):
+        made.put("fleet/@coordinator/decision", pb.Decision(subject="red", decided="left alone", kind="alone"), at + 1)
+    made.close()
+    (tmp_path / "plan.yaml").write_text("cars: {red: manual}", encoding="utf-8")
+    text = "plan: p2.yaml\nworld: w2.yaml\ncars: {red: {platform: arduino}}\n"
+    (tmp_path / "fleet.yaml").write_text(text, encoding="utf-8")
+    result = run("replan", tmp_path)
+    assert "decisions from" in result.output, result.output
+    other = tmp_path / "other.yaml"
+    other.write_text(text, encoding="utf-8")
+    named = run("replan", tmp_path, "--fleet-file", other)
+    assert named.exit_code == 2
+    assert "plan: 'p2.yaml': there is no such file beside this one" in named.output
