@@ -10,6 +10,8 @@ from typing import Final
 
 import click
 
+from schemas import startup, streams
+
 COMMANDS: Final = {
     "up": ("fleet.commands.up:up", "Start a fleet from its file, or simulated cars, and keep it running."),
     "down": ("fleet.commands.supervised:down", "End a fleet that is up: every car is stopped first."),
@@ -67,6 +69,7 @@ class _Lazy(click.Group):
             return None
         module, _, name = COMMANDS[cmd_name][0].partition(":")
         command: click.Command = getattr(importlib.import_module(module), name)
+        startup.interruptible()
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's signature
@@ -91,6 +94,7 @@ def cli() -> None:
 
 def main() -> None:
     """Entry point."""
+    streams.complete()
     try:
         code = cli.main(prog_name="fleet", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -104,8 +108,8 @@ def main() -> None:
         several = "\n" in error.message  # the faults of a file, one a line
         sys.stderr.write(f"{error.message}\n" if several else f"fleet: {_one_line(error)}\n")
         code = error.exit_code
-    except click.Abort:
-        code = 130
+    except (click.Abort, KeyboardInterrupt):
+        code = startup.INTERRUPTED
     except OSError as error:  # what the commands raise of their own, they explain: this is the output's
         code = _no_output(error)
     try:

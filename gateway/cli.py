@@ -9,7 +9,7 @@ import os
 import sys
 from typing import Final
 
-from gateway import streams
+from schemas import startup, streams
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 
 COMMANDS: Final = {
@@ -40,10 +40,23 @@ def main() -> None:
     others = {name: commands.add_parser(name, help=words) for name, (_, words) in COMMANDS.items()}
     called = sys.argv[1] if sys.argv[1:] else ""
     if called not in COMMANDS:
-        sys.exit(_run(parser.parse_args()))
+        sys.exit(_run(_parsed(parser)))
     command = importlib.import_module(COMMANDS[called][0])
     command.add_arguments(others[called])
-    sys.exit(command.run(parser.parse_args()))
+    sys.exit(command.run(_parsed(parser)))
+
+
+def _parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Parse the command line; after a help that could not be written, say so and exit with 1."""
+    try:
+        return parser.parse_args()
+    except SystemExit:
+        try:
+            sys.stdout.flush()
+        except OSError as error:
+            streams.silence(sys.stdout)
+            sys.exit(_failed(f"the output cannot be written: {error.strerror}", 1))
+        raise
 
 
 def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -150,8 +163,8 @@ def _run(arguments: argparse.Namespace) -> int:
         return _failed(str(error), 2)
     except (AlreadyServed, LinkError, BusError) as error:
         return _failed(str(error), 1)
-    except KeyboardInterrupt:  # before the loop has taken the signals over: no link was open yet
-        return 130
+    except KeyboardInterrupt:  # a second one, after the car was stopped
+        return startup.INTERRUPTED
     return 0 if stopped else 1
 
 

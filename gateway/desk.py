@@ -8,19 +8,16 @@ import sys
 from collections.abc import Callable, Coroutine, Iterable
 from typing import IO, Any, Final
 
-from gateway import streams
 from gateway.capture import BadCapture
 from gateway.link import BadUrl, LinkError, LinkUrl
 from gateway.link.url import TcpUrl
 from gateway.protocol.profile import Profile, parse_platform
+from schemas import startup, streams
 
 LINK_HELP: Final = "/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04"
 PLATFORM_HELP: Final = "arduino, stm32, raspberry_pi; +arm, +imu (default unknown)"
 _ODD: Final = re.compile(r"[^ -\[\]-~]")
 _COLOURS: Final = {"red": "31", "yellow": "33", "cyan": "36", "dim": "2"}
-
-
-INTERRUPTED: Final = 130
 
 
 class WrongUse(Exception):
@@ -40,6 +37,7 @@ def describe(parser: argparse.ArgumentParser, description: str, epilog: str) -> 
 def explained(name: str, run: Callable[[], None]) -> int:
     """Run a command; what a user can cause becomes one line and an exit code: 2 wrong use, 1 a failure, 130 Ctrl-C."""
     try:
+        startup.interruptible()
         run()
         sys.stdout.flush()
     except (WrongUse, BadUrl, BadCapture) as error:
@@ -47,7 +45,7 @@ def explained(name: str, run: Callable[[], None]) -> int:
     except (Failed, LinkError) as error:
         return _told(f"{name}: {error}", 1)
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return startup.INTERRUPTED
     except OSError as error:  # the commands explain what they open; this is the output's
         streams.silence(sys.stdout)
         quiet = isinstance(error, BrokenPipeError)  # whoever closed a pipe has seen enough

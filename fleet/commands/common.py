@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from typing import Any, Final, Never
+from typing import Any, Never
 
 import click
 
@@ -16,7 +16,6 @@ from fleet.verbs import LONGEST_DRIVE_S, Request
 from schemas import ending, keys
 from schemas.bus import BadEndpoint, BusError
 
-INTERRUPTED: Final = 130
 _Function = Callable[..., Any]
 
 from_option = click.option(

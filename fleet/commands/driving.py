@@ -6,7 +6,6 @@ import click
 
 from fleet.client import Fleet
 from fleet.commands.common import (
-    INTERRUPTED,
     Cars,
     Seconds,
     carry_out,
@@ -21,6 +20,7 @@ from fleet.commands.common import (
 from fleet.outcome import Outcome
 from fleet.verbs import drive_request, estop_request, mode_request, resume_request, stop_request
 from gateway.protocol.values import Mode, Motion
+from schemas import startup
 
 
 @click.command(
@@ -49,7 +49,7 @@ def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, 
             outcomes = client.ask(replace(drive_request(motion, duration_s), take=take), cars)
         except KeyboardInterrupt:
             say(client.ask(drive_request("stop"), cars), as_json=as_json)
-            raise SystemExit(INTERRUPTED) from None
+            raise SystemExit(startup.INTERRUPTED) from None
     end_with(outcomes, as_json=as_json)
 
 

@@ -10,11 +10,11 @@ from typing import IO, Any, Final
 import click
 
 from fleet.client import default_sender
-from fleet.commands.common import INTERRUPTED, bus_options, json_option, sigterm_interrupts
+from fleet.commands.common import bus_options, json_option, sigterm_interrupts
 from fleet.supervise.desk import STATUS, ask_service, ask_status
 from fleet.supervise.farewell import NOT_STOPPED
 from fleet.supervise.process import entry, runs
-from schemas import keys, messages
+from schemas import keys, messages, startup
 from schemas.bus import Bus, BusError, resolve_endpoint
 
 DOWN_S: Final = 120.0
@@ -131,7 +131,7 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: b
             for line in _lines(path, follow=follow):
                 click.echo(json.dumps(entry(line)) + "\n" if as_json else line, nl=False)
         except KeyboardInterrupt:
-            raise SystemExit(INTERRUPTED) from None
+            raise SystemExit(startup.INTERRUPTED) from None
 
 
 def _directory(connect: str | None, fleet: str) -> Path:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from fleet.commands.common import INTERRUPTED, Cars, from_option
+from fleet.commands.common import Cars, from_option
 from fleet.replay.to_bus_command import refuse_without, to_bus_options
 from fleet.replay.to_bus_command import to_bus as play_to_bus
+from schemas import startup
 
 if TYPE_CHECKING:
     from fleet.recording.session import Session
@@ -171,7 +172,7 @@ def _view(rrd: Path) -> int:
         try:
             code = viewer.wait() or 0
         except KeyboardInterrupt:
-            return INTERRUPTED
+            return startup.INTERRUPTED
         if code:
             click.echo(f"fleet: Rerun's viewer ended with {code}: {viewer.last_words}", err=True)
         return 1 if code else 0

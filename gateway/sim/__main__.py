@@ -3,8 +3,8 @@
 import argparse
 import sys
 
-from gateway import streams
 from gateway.sim.command import add_arguments, run
+from schemas import streams
 
 if __name__ == "__main__":
     streams.complete()

@@ -8,13 +8,13 @@ import sys
 import threading
 from typing import Final
 
-from gateway import streams
 from gateway.sim.changes import change_of
 from gateway.sim.core.played import Played
 from gateway.sim.faults import fault_of, press_of
 from gateway.sim.links import LinkError
 from gateway.sim.shell import Simulation
 from gateway.sim.spec import BadSpec
+from schemas import streams
 
 LINE_LIMIT: Final = 65536
 

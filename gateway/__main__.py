@@ -1,0 +1,15 @@
+"""The `gateway` command as a script and as `python -m gateway`: a Ctrl-C while it is imported is no traceback."""
+
+from schemas import startup
+
+
+def main() -> None:
+    """Entry point of the script."""
+    startup.begin()
+    from gateway.cli import main as run
+
+    run()
+
+
+if __name__ == "__main__":
+    main()
