@@ -24,7 +24,7 @@ from fleet.outcome import Outcome
 from fleet.policy.check import faults
 from fleet.policy.decide import Ask, Step, step
 from fleet.policy.decision import LEFT_ALONE, Decision
-from fleet.policy.memory import Memory, carried, hub_back, restored, to_keep
+from fleet.policy.memory import Memory, carried, hub_back, restarted, restored, to_keep
 from fleet.policy.picture import CarPicture, Refused, topic_of
 from fleet.policy.plan import Plan
 from fleet.policy.reader import parse
@@ -57,6 +57,8 @@ _LONGEST_ERROR: Final = 500
 _ERROR: Final = 4  # foxglove.Log.Level
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
+RESTART_VERB: Final = "restart"
+"""`<fleet>/@coordinator/@cmd/restart` begins the plan in force anew, with its first phase."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,8 @@ class Coordinator:
     decided: Callable[[Decision], None]
     failed: Callable[[str], None]
     listed: Mapping[str, CarPicture] = field(default_factory=dict)
+    run_name: str = ""
+    """Of the `fleet up` that it belongs to: with a new one the plan begins anew."""
     dropped: int = 0
     """Samples that found the queue full."""
     _memory: Memory = field(default_factory=Memory)
@@ -116,12 +120,13 @@ class Coordinator:
             raise AnotherCoordinator(self._named(self._others()))
         bus.token(token)
         hearing = Hearing(self.listed)
-        keeper = Keeper(fleet, bus.endpoint)
+        keeper = Keeper(fleet, bus.endpoint, self.run_name)
         self._subscribe(f"{fleet}/*/state/*")
         bus.watch_tokens(keys.car_token(fleet, "*"), lambda key, alive: self._tokens(key.rpartition("/")[2], alive))
         self._follow(self.plan)
         bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._ask)
-        bus.queryable(keys.command_key(fleet, keys.COORDINATOR, PLAN_VERB), self._ask)
+        for verb in (PLAN_VERB, RESTART_VERB):
+            bus.queryable(keys.command_key(fleet, keys.COORDINATOR, verb), self._ask)
         again_at = time.monotonic() + AGAIN_S
         look_again_at: float | None = time.monotonic() + LOOK_AGAIN_S
         hubs, linked_at = bus.hubs, time.monotonic()
@@ -233,6 +238,9 @@ class Coordinator:
                 self._take(plan)
                 for each in found.warnings:
                     self.failed(f"the new plan: {each}")
+        self._result(query, result)
+
+    def _result(self, query: zenoh.Query, result: pb.Result) -> None:
         if query.parameters.get("format") == "json":
             reply(query, str(query.key_expr), messages.to_json(result).encode(), messages.JSON)
         else:
@@ -330,6 +338,10 @@ class Coordinator:
     def _reply(self, query: zenoh.Query, hearing: Hearing) -> None:
         if str(query.key_expr).endswith(f"/@cmd/{PLAN_VERB}"):
             self._replace(query, hearing)
+            return
+        if str(query.key_expr).endswith(f"/@cmd/{RESTART_VERB}"):
+            self._memory = restarted(self._memory)
+            self._result(query, pb.Result(status="sent", words=f"plan {self.plan.version} begins anew"))
             return
         for publisher, message in self._published.values():
             if query.key_expr.intersects(publisher.key):

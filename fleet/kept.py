@@ -14,26 +14,33 @@ from schemas.state_dir import directory_of
 
 
 class Keeper:
-    """The file of one fleet at one endpoint."""
+    """The file of one fleet at one endpoint. `run`: the `fleet up` that it belongs to; empty: none."""
 
-    def __init__(self, fleet: str, endpoint: str) -> None:
+    def __init__(self, fleet: str, endpoint: str, run: str) -> None:
         self._endpoint = endpoint
+        self._run = run
         self._last = Kept()
         self.path: Path | None = None
         with contextlib.suppress(RuntimeError):  # a user without a home
             self.path = directory_of(endpoint) / f"{fleet}.@coordinator.json"
 
     def load(self) -> Kept:
-        """What the last one left; nothing, if it cannot be read or was of another bus."""
+        """What the last one left; nothing, if it cannot be read or was of another bus.
+
+        Phase and rules count within one `fleet up`: with a new one the plan begins anew, and only the roles are kept.
+        """
         if self.path is None:
             return Kept()
         try:
             content: Any = json.loads(self.path.read_text(encoding="utf-8"))
             if content["endpoint"] != self._endpoint:
                 return Kept()
+            roles = {str(car): str(role) for car, role in content["roles"].items()}
+            if content.get("run", "") != self._run:
+                return Kept(roles=roles)
             return Kept(
                 str(content["version"]),
-                {str(car): str(role) for car, role in content["roles"].items()},
+                roles,
                 str(content["phase"]),
                 float(content["phase_since_s"]),
                 {int(index): str(that) for index, that in content["rules"].items()},
@@ -48,6 +55,7 @@ class Keeper:
         self._last = kept
         content = {
             "endpoint": self._endpoint,
+            "run": self._run,
             "version": kept.version,
             "roles": dict(kept.roles),
             "phase": kept.phase,

@@ -38,11 +38,14 @@ a plan:
 @click.option(
     "--fleet-file", type=click.Path(path_type=Path, dir_okay=False), help="The fleet file: what its cars may do."
 )
+@click.option(
+    "--run", default="", metavar="NAME", help="Phase and rules outlive the coordinator within one run (of fleet up)."
+)
 @click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
 @json_option
 @bus_options
 def coordinate(
-    path: Path, fleet_file: Path | None, connect: str | None, fleet: str, *, with_parent: bool, as_json: bool
+    path: Path, fleet_file: Path | None, run: str, connect: str | None, fleet: str, *, with_parent: bool, as_json: bool
 ) -> None:
     """Keep a plan true, until Ctrl-C; cars on hold are left alone. One line per decision."""
     parent = os.getppid() if with_parent else None
@@ -62,7 +65,7 @@ def coordinate(
 
     with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True) as client:
         try:
-            Coordinator(client, plan, decided, lambda words: click.echo(f"fleet: {words}", err=True), listed).run(
+            Coordinator(client, plan, decided, lambda words: click.echo(f"fleet: {words}", err=True), listed, run).run(
                 lambda: stop.is_set() or parent not in (None, os.getppid())
             )
         except AnotherCoordinator as error:

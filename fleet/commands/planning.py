@@ -4,13 +4,17 @@ import json
 import time
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import click
 
+from fleet.asking import ANSWER_S
 from fleet.client import Fleet
 from fleet.commands.common import explained, json_option, with_client
+from fleet.coordinator import RESTART_VERB
 from fleet.readings import Reading
-from schemas import keys
+from schemas import keys, messages, topics
+from schemas.bus import Failure
 
 
 @click.command(
@@ -51,7 +55,7 @@ def _told(reading: Reading) -> str:
     return "\n".join(lines)
 
 
-@click.group(epilog="\b\nexample:\n  fleet plan check deploy/plan.yaml --fleet-file fleet.yaml")
+@click.group(epilog="\b\nexamples:\n  fleet plan check deploy/plan.yaml --fleet-file fleet.yaml\n  fleet plan restart")
 def plan() -> None:
     """Plans: what the coordinator keeps true."""
 
@@ -96,3 +100,24 @@ def check(file: Path, fleet_file: Path | None, *, as_json: bool) -> None:
     if not as_json:
         what = f"{len(read.roles)} roles, {len(read.rules)} rules, {len(read.phases)} phases"
         click.echo(f"{file}: {what}: nothing that can never work")
+
+
+@plan.command(
+    epilog="""\b
+example:
+  fleet plan restart"""
+)
+@json_option
+@with_client
+def restart(client: Fleet, *, as_json: bool) -> None:
+    """Begin the plan in force anew: its first phase, no rule in force. Cars keep the roles that they still fit."""
+    key = keys.command_key(client.name, keys.COORDINATOR, RESTART_VERB)
+    for answer in client.bus.query(key, timeout_s=ANSWER_S):
+        if isinstance(answer, Failure):
+            raise click.ClickException(answer.words)
+        result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)
+        click.echo(json.dumps({"status": result.status, "words": result.words}) if as_json else result.words)
+        return
+    raise click.ClickException(
+        f"no coordinator answers in fleet {client.name}: start one (fleet up, fleet coordinate --plan FILE)"
+    )

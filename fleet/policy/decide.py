@@ -69,9 +69,9 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     cars = Cars(subjects, frozenset(free), frozenset({*free, *lately}), has)
     phase = memory.phase
     if not phase.name:  # it begins before the rules are looked at: some count only in it
-        phase = follow_phase(plan, picture, cars, phase, {}, now)
+        phase = follow_phase(plan, picture, cars, phase, {}, now, ready=False)
     rules = follow_rules(plan, picture, cars, phase.name, memory.rules, now)
-    phase = follow_phase(plan, picture, cars, phase, rules, now)
+    phase = follow_phase(plan, picture, cars, phase, rules, now, ready=_ready(picture, found, memory))
     needs = follow_needs(plan, picture, subjects, memory.needs, now)
     told = memory.said if phase.name == memory.phase.name else {}  # what would change a decision depends on the phase
     memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
@@ -139,6 +139,29 @@ def _unheard(known: CarPicture) -> bool:
     return known.present and not known.mode
 
 
+def _recovers(known: CarPicture) -> bool:
+    return known.motors == _UNKNOWN and known.verdict != CONTRADICTED
+
+
+def _ready(picture: Picture, found: Mapping[str, tuple[Barrier, bool] | None], memory: Memory) -> bool:
+    """Return True if every car that could be asked is known and in the mode that was decided last.
+
+    A car that a person has, that is lost or that is not there is not waited for, unless no car is there yet.
+    """
+    for car, barrier in found.items():
+        known = picture.cars.get(car, NOBODY)
+        if barrier is not None:
+            if _unheard(known) or (not barrier[1] and known.present and known.link != LOST and _recovers(known)):
+                return False
+            continue
+        decision = memory.said.get(car)
+        if decision is None or decision.kind is Kind.ALONE:  # it can be asked since this step
+            return False
+        if decision.mode is not None and (known.mode != decision.mode or known.verdict == CONTRADICTED or known.busy):
+            return False
+    return any(picture.cars.get(car, NOBODY).present for car in found)
+
+
 def _barrier(car: str, known: CarPicture) -> tuple[Barrier, bool] | None:
     """Why the car is left alone, and whether that is a person's word, for which its role is not kept."""
     if not known.present:
@@ -155,7 +178,7 @@ def _barrier(car: str, known: CarPicture) -> tuple[Barrier, bool] | None:
         return Barrier(f"{car} is driven by {known.driven_by}", "the end of that drive"), False
     if known.link == LOST:
         return Barrier(f"the link of {car} is lost", "its return"), False
-    if known.motors == _UNKNOWN and known.verdict != CONTRADICTED:
+    if _recovers(known):
         return Barrier(f"{car} is not in a known state yet", "the end of its recovery: a reading from it"), False
     return None
 

@@ -114,6 +114,11 @@ def carried(memory: Memory, before: Plan, after: Plan) -> Memory:
     )
 
 
+def restarted(memory: Memory) -> Memory:
+    """Return what still counts when the plan begins anew: who has which role, but no phase and no rule in force."""
+    return replace(memory, phase=PhaseState(), rules={}, coloured=frozenset())
+
+
 def restored(plan: Plan, picture: Picture, kept: Kept, now: float, wall_s: float) -> Memory:
     """What a coordinator that begins takes over from the one before, as far as the cars are still as it left them.
 

@@ -9,6 +9,8 @@ from fleet.policy.picture import Picture
 from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Phase, Plan, Rule
 from fleet.policy.steady import HYSTERESIS_S, Steady, follow
 
+SETTLES_WITHIN_S: Final = 15.0
+"""Maximum wait for a phase's cars before its time-out counts. Recovery and opening take 4.9 + 3.5 s (protocol.md)."""
 _WHOLE: Final = ""
 """Under this name stands a condition over all cars."""
 _NONE: Final[Mapping[str, Steady]] = MappingProxyType({})
@@ -39,6 +41,10 @@ class PhaseState:
     why: str = ""
     """What began it."""
     used: tuple[str, ...] = ()
+    settled: bool = False
+    """Its cars were in their modes once, or were waited for long enough."""
+    waited_s: float = 0.0
+    """How long they took; its time-out counts from then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,9 +153,19 @@ def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: 
 
 
 def follow_phase(
-    plan: Plan, picture: Picture, cars: Cars, before: PhaseState, rules: Mapping[int, RuleState], now: float
+    plan: Plan,
+    picture: Picture,
+    cars: Cars,
+    before: PhaseState,
+    rules: Mapping[int, RuleState],
+    now: float,
+    *,
+    ready: bool,
 ) -> PhaseState:
-    """The phase now; none is shorter than HYSTERESIS_S, so that two do not alternate."""
+    """The phase now; none is shorter than HYSTERESIS_S, so that two do not alternate.
+
+    `ready`: every car is known and in its mode. The phase's time-out does not count before.
+    """
     phase = plan.phases.get(before.name)
     if phase is None:
         return PhaseState(plan.first, now, why="the plan begins with it" if plan.first else "")
@@ -163,6 +179,9 @@ def follow_phase(
                     continue
                 assert effect.phase is not None
                 return PhaseState(effect.phase, now, why=f"{rule.name}: {rule.when.text}", used=state.used)
+    if not before.settled and lasted_s > 0:
+        settled = ready or lasted_s >= SETTLES_WITHIN_S
+        before = replace(before, settled=settled, waited_s=before.waited_s if settled else lasted_s)
     return _by_itself(phase, picture, cars, before, lasted_s, now)
 
 
@@ -174,6 +193,7 @@ def _by_itself(
     if phase.until is not None and phase.next is not None and true and lasted_s >= HYSTERESIS_S:
         used = _used(phase.until, picture, cars, true[0] or None, now)
         return PhaseState(phase.next, now, why=f"{phase.name} ends with {phase.until.text}", used=used)
-    if phase.timeout_s is not None and phase.on_timeout is not None and lasted_s >= max(phase.timeout_s, HYSTERESIS_S):
+    timed_s = lasted_s - before.waited_s
+    if phase.timeout_s is not None and phase.on_timeout is not None and timed_s >= max(phase.timeout_s, HYSTERESIS_S):
         return PhaseState(phase.on_timeout, now, why=f"{phase.name} lasts at most {phase.timeout_s:g} s")
     return replace(before, until=until)

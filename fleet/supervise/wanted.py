@@ -234,6 +234,6 @@ def recorder_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
 
 
 def coordinator_command(wish: Wanted, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
-    """The coordinator, with copies of the plan and of what is said of the cars."""
-    where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
+    """The coordinator, with copies of the plan and of what is said of the cars, both in the directory of this run."""
+    where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent", "--run", plan.parent.name)
     return module("fleet.cli", "coordinate", "--plan", str(plan), "--fleet-file", str(listed), "--json", *where)

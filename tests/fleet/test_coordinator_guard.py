@@ -8,17 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 from fleet import Fleet
+from fleet.cli import cli
 from fleet.coordinator import INTERNAL_ERROR, SENDER, Coordinator
 from fleet.policy.decision import Decision
 from fleet.policy.reader import parse
 from schemas import keys, messages
 from schemas.bus import Failure, Sample
+from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, wait_for
 from tests.support.processes import Fleet as Processes
 
+PHASES = "roles: {rest: {mode: manual}}\nphases: {work: {timeout_s: 1.5, next: done}, done: {}}"
 PLAN = "roles: {rest: {mode: manual, count: all}}"
 KEY = "fleet/@coordinator/@cmd/plan"
 
@@ -97,3 +101,28 @@ def test_what_is_no_message_of_its_topic_is_survived(started: Started) -> None:
     assert started.ask(b"\xff\xfe").reason == "bad_value"
     started.goes_on("roles: {further: {mode: manual, count: all}}")
     assert not [words for words in started.said if INTERNAL_ERROR in words]
+
+
+def test_a_finished_plan_begins_anew_when_it_is_restarted(started: Started) -> None:
+    def until(phase: str) -> None:
+        while (decision := started.decided.get(timeout=PATIENCE_S)).subject != "phase" or decision.decided != phase:
+            pass
+
+    bus = started.processes.bus
+    bus.token(keys.car_token("fleet", "red"))
+    topic = {name: TOPICS[f"state/{name}"] for name in ("link", "mode", "motion", "safety")}
+    said = {
+        "link": {"state": "online"},
+        "mode": {"asked": "manual", "verdict": "confirmed"},
+        "safety": {"motors": "off"},
+    }
+    for name, each in topic.items():
+        message: Any = messages.message_class(each.message)(**said.get(name, {}))
+        bus.put_command(f"fleet/red/state/{name}", message.SerializeToString(), messages.encoding_of(each.message))
+    assert started.ask(PHASES.encode()).status == "sent"
+    until("work")
+    until("done")
+    done = CliRunner().invoke(cli, ["plan", "restart", "--connect", started.processes.endpoint])
+    assert (done.exit_code, done.output.strip()) == (0, f"plan {parse(PHASES).version} begins anew")
+    until("work")
+    until("done")

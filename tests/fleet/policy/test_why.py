@@ -130,6 +130,7 @@ def _out(case: str) -> Run:
         run.change(car, held_by="ann")
     run.at(0.0)
     assert any(each.kind == Kind.VACANT for each in run.last.changed)
+    run.at(0.1)  # cars on hold are not waited for: the phase's time-out counts from its start
     run.change("red", held_by=None)
     run.at(10.0)
     return run
