@@ -76,14 +76,14 @@ class Battery:
 
     policy: Policy = field(default_factory=Policy)
     level: BatteryLevel | None = None
-    """None until a voltage was measured."""
+    """None until a voltage was measured; then OK until readings have shown another level for HOLD_S."""
     voltage_v: float | None = None
     """As measured last."""
     heard_at: float = float("-inf")
     _loaded_at: float = float("-inf")
     _other: BatteryLevel | None = None
     _since: float = 0.0
-    """Which other level the readings show, and since when."""
+    """Which other level the readings show, in the same direction since when."""
 
     def heard(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
         """Take a measured voltage in; `loaded`: motors may be on. True if the level has changed."""
@@ -94,8 +94,8 @@ class Battery:
         low_v, high_v = rest_v(voltage_v, loaded=self.loaded)
         worse, better = self.policy.level(high_v), self.policy.level(low_v - HYSTERESIS_V)
         if self.level is None:
-            self.level = worse
-            return self.level is not BatteryLevel.OK
+            # Motors may have run until now, and a single reading may be damaged: the first one decides nothing.
+            self.level = BatteryLevel.OK
         shown = self.level
         if _RANK[worse] > _RANK[shown]:
             shown = worse  # even if all of a load's sag is added
@@ -103,11 +103,14 @@ class Battery:
             shown = better
         if shown is self.level:
             self._other = None
-        elif self._other is not shown:
+        elif self._other is None or (_RANK[self._other] > _RANK[self.level]) is not (_RANK[shown] > _RANK[self.level]):
             self._other, self._since = shown, now
-        elif now - self._since >= HOLD_S:
-            self.level, self._other = shown, None
-            return True
+        else:
+            # Readings on both sides of `critical` are at least `low`: the level nearer to the present one has held.
+            self._other = min(self._other, shown, key=lambda each: abs(_RANK[each] - _RANK[self.level or each]))
+            if now - self._since >= HOLD_S:
+                self.level, self._other = self._other, None
+                return True
         return False
 
     @property

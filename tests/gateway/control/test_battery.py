@@ -63,11 +63,13 @@ def test_nothing_measured_is_no_level_and_refuses_nothing() -> None:
     ("voltage_v", "expected", "action", "refuses"),
     [(8.0, "ok", None, False), (6.9, "low", Action.WARN, False), (6.5, "critical", Action.REFUSE, True)],
 )
-def test_the_first_reading_says_where_it_stands(
+def test_the_first_readings_say_where_it_stands_when_they_have_held(
     voltage_v: float, expected: str, action: Action | None, refuses: bool
 ) -> None:
     battery = Battery()
-    assert battery.heard(voltage_v, loaded=False, now=0.0) is (expected != "ok")
+    assert not hear(battery, *[voltage_v] * 5)
+    assert (battery.level, battery.action, battery.refusal) == ("ok", None, "")
+    assert bool(hear(battery, voltage_v)) is (expected != "ok")
     assert (battery.level, battery.action, bool(battery.refusal)) == (expected, action, refuses)
 
 
@@ -113,13 +115,42 @@ def test_noise_around_a_threshold_does_not_flap(seed: int) -> None:
     assert len(changes) <= 2
 
 
+@given(st.integers(0, 2**32), st.sampled_from([7.6, 7.25, 6.85, 6.4]), st.booleans())
+def test_the_level_does_not_flap_from_the_first_reading_on(seed: int, rest_v: float, from_a_drive: bool) -> None:
+    """A gateway that starts while motors run, stops them (their sag recovers), and gets a damaged reading now and then.
+
+    At first it does not know of the motors; what it is told then goes one way, and where the voltage at rest is.
+    """
+    moments = random.Random(seed)
+    battery, levels = Battery(), ["ok"]
+    stops_at = moments.uniform(0, 12) if from_a_drive else 0.0
+    now = 0.0
+    while now < 60.0:
+        sag_v = 0.35 if now < stops_at else 0.35 * max(0.0, 1 - (now - stops_at) / 4) if from_a_drive else 0.0
+        voltage_v = rest_v - sag_v + moments.uniform(-0.04, 0.04)
+        if moments.random() < 0.1:
+            voltage_v = moments.choice([0.0, 12.0])
+        battery.heard(voltage_v, loaded=now < stops_at, now=now)
+        assert battery.level is not None
+        if battery.level != levels[-1]:
+            levels.append(str(battery.level))
+        now += moments.uniform(0.04, 1.2)
+    assert levels in (["ok"], ["ok", "low"], ["ok", "critical"], ["ok", "low", "critical"])
+
+
+def test_readings_on_both_sides_of_critical_are_low_at_least() -> None:
+    battery = Battery()
+    assert hear(battery, *[6.58, 6.62] * 4) == [5.0]
+    assert battery.level is BatteryLevel.LOW
+
+
 def test_a_policy_may_stop_or_only_warn() -> None:
     assert Policy(critical=Action.STOP).action(BatteryLevel.CRITICAL) is Action.STOP
     warns = Battery(Policy(critical=Action.WARN))
-    warns.heard(6.0, loaded=False, now=0.0)
+    hear(warns, *[6.0] * 6)
     assert (warns.action, warns.refusal) == (Action.WARN, "")
     refuses = Battery(Policy(low=Action.REFUSE))
-    refuses.heard(6.9, loaded=False, now=0.0)
+    hear(refuses, *[6.9] * 6)
     assert refuses.refusal.startswith("battery low: 6.90 V, charge 25% +- 15%: charge it")
 
 
