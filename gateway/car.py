@@ -545,10 +545,8 @@ class Car:
         self._control.stalled(gap_s, now)
 
     def _publish_health(self, now: float, lag_s: float) -> None:
-        evidence = self._control.platform.evidence
-        self._out.health(
-            now, loop_lag_s=lag_s, bus_drops=self._doors.dropped + self._out.dropped, platform_evidence=evidence
-        )
+        drops = self._doors.dropped + self._out.dropped
+        self._out.health(now, loop_lag_s=lag_s, bus_drops=drops, platform=self._control.platform)
 
     async def _keep_hub(self) -> None:
         """Bring a hub back that is gone for half a second; jitter keeps a hundred gateways from trying at once."""

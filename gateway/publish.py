@@ -8,7 +8,7 @@ import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ from gateway.control import battery
 from gateway.control.allowance import Allowance
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
+from gateway.control.platform import PlatformTruth
 from gateway.control.records import CommandRecord, Level, LogRecord, Phase, Write
 from gateway.history import BadRange, Ring
 from gateway.protocol.measured import measured, verdict_of
@@ -216,15 +217,16 @@ class Publications:
                 _fill_safety(message, control, now)
         self._put_state(name, message, now)
 
-    def health(self, now: float, *, loop_lag_s: float, bus_drops: int, platform_evidence: Iterable[str]) -> None:
-        """Publish what the gateway's process does."""
+    def health(self, now: float, *, loop_lag_s: float, bus_drops: int, platform: PlatformTruth) -> None:
+        """Publish what the gateway's process does, and what the car is treated as."""
         message = _CLASSES["state/health"]()
         self._process.fill(message, now)
         message.host = socket.gethostname()
         message.link = self._url
         message.version = VERSION
         message.platform = self.profile.name
-        message.platform_evidence.extend(platform_evidence)
+        message.platform_evidence.extend(platform.evidence)
+        message.platform_contradictions.extend(platform.contradictions)
         message.capabilities.extend(sorted(self.profile.capabilities))
         message.loop_lag_s = loop_lag_s
         message.bus_drops = bus_drops

@@ -16,7 +16,9 @@ from fleet.condition import Condition, topics_under
 from fleet.readings import Reading
 from schemas import keys, topics
 
-_COLUMNS: Final = ("car", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
+_COLUMNS: Final = ("car", "platform", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
+_UNHEARD_S: Final = 3.0
+"""Silence of a car whose motors are unknown that makes it unheard, whatever its link is called (gateway: stale)."""
 _TOLD: Final = 5
 
 
@@ -24,7 +26,7 @@ _TOLD: Final = 5
 @json_option
 @with_client
 def list_cars(client: Fleet, *, as_json: bool) -> None:
-    """The cars on the bus: link, mode and how sure that is, motion, who drives it and who stopped it, battery."""
+    """The cars on the bus: platform, link, mode and how sure that is, motion, who drives or stopped it, battery."""
     cars = client.cars()
     said: dict[str, dict[str, Reading]] = {car: {} for car in cars}
     for reading in client.get("*/*/*"):  # one query: a gateway that hangs is waited for once
@@ -33,7 +35,7 @@ def list_cars(client: Fleet, *, as_json: bool) -> None:
             said.setdefault(key.car, {})[key.topic] = reading
     if not said:
         raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
-    rows = [_row(car, values) for car, values in sorted(said.items())]
+    rows = [row_of(car, values) for car, values in sorted(said.items())]
     for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
         session = token.rpartition("/")[2]
         click.echo(f"fleet: {client.name} is a replay of {session}: ages are those of the recording", err=True)
@@ -42,18 +44,28 @@ def list_cars(client: Fleet, *, as_json: bool) -> None:
         for row in rows:
             click.echo(json.dumps(row))
         return
-    show_table(_COLUMNS, [{name: _shown(name, row) for name in _COLUMNS} for row in rows])
+    show_table(_COLUMNS, [{name: shown(name, row) for name in _COLUMNS} for row in rows])
+    for row in rows:
+        for words in row["platform_contradictions"]:
+            click.echo(f"fleet: {row['car']} may be no {row['platform']} car: {words}", err=True)
 
 
-def _row(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
+def row_of(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
+    """Return what `fleet list` shows of a car, by its latest readings: the fields of its JSON object."""
     values = {topic: reading.value for topic, reading in readings.items()}
     measured = readings.get("sensor/battery")
     link, mode, motion = (values.get(f"state/{name}") for name in ("link", "mode", "motion"))
     safety, battery = values.get("state/safety"), values.get("sensor/battery")
+    health = values.get("state/health")
+    last_rx_s = link.last_rx_s if link and link.HasField("last_rx_s") else None
     return {
         "car": car,
         "link": link.state if link else "no answer",
         "reason": link.reason if link else "",
+        "unheard": link is not None and _unheard(link.state, last_rx_s, safety.motors if safety else ""),
+        "last_rx_s": None if last_rx_s is None else round(last_rx_s, 3),
+        "platform": health.platform if health else None,
+        "platform_contradictions": list(health.platform_contradictions) if health else [],
         "mode": mode.asked if mode else None,
         "verdict": mode.verdict if mode else None,
         "motion": motion.motion if motion else None,
@@ -69,7 +81,15 @@ def _row(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
     }
 
 
-def _shown(name: str, row: Mapping[str, Any]) -> str:
+def _unheard(link: str, last_rx_s: float | None, motors: str) -> bool:
+    """Return True if the link is open and the car should be heard, but is not."""
+    if link == "lost":
+        return False
+    return link == "stale" or last_rx_s is None or (motors == "unknown" and last_rx_s > _UNHEARD_S)
+
+
+def shown(name: str, row: Mapping[str, Any]) -> str:
+    """Return a cell of the table."""
     if name == "battery":
         if row["battery_v"] is None:
             return "-"
@@ -79,6 +99,11 @@ def _shown(name: str, row: Mapping[str, Any]) -> str:
         return f"e-stop {' '.join(row['estops'])}"
     if name == "driver" and row["driver"]:
         return f"{row['driver']} ({row['driver_kind']})"
+    if name == "platform" and row["platform_contradictions"]:
+        return f"{row['platform']} (contradicted)"
+    if name == "link" and row["unheard"]:
+        silence = "never heard" if row["last_rx_s"] is None else f"not heard for {row['last_rx_s']:.0f} s"
+        return f"{row['link']} ({silence})"
     old = " (stale)" if name in ("link", "mode", "motion") and f"state/{name}" in row["stale"] else ""
     return f"{row[name]}{old}" if row[name] else "-"
 

@@ -307,7 +307,7 @@ class Safety(_message.Message):
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops", "platform_contradictions")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -324,6 +324,7 @@ class Health(_message.Message):
     CPU_FIELD_NUMBER: _ClassVar[int]
     RSS_MB_FIELD_NUMBER: _ClassVar[int]
     BUS_DROPS_FIELD_NUMBER: _ClassVar[int]
+    PLATFORM_CONTRADICTIONS_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -340,7 +341,8 @@ class Health(_message.Message):
     cpu: float
     rss_mb: float
     bus_drops: int
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., host: _Optional[str] = ..., link: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., platform: _Optional[str] = ..., platform_evidence: _Optional[_Iterable[str]] = ..., capabilities: _Optional[_Iterable[str]] = ..., uptime_s: _Optional[float] = ..., loop_lag_s: _Optional[float] = ..., cpu: _Optional[float] = ..., rss_mb: _Optional[float] = ..., bus_drops: _Optional[int] = ...) -> None: ...
+    platform_contradictions: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., host: _Optional[str] = ..., link: _Optional[str] = ..., pid: _Optional[int] = ..., version: _Optional[str] = ..., platform: _Optional[str] = ..., platform_evidence: _Optional[_Iterable[str]] = ..., capabilities: _Optional[_Iterable[str]] = ..., uptime_s: _Optional[float] = ..., loop_lag_s: _Optional[float] = ..., cpu: _Optional[float] = ..., rss_mb: _Optional[float] = ..., bus_drops: _Optional[int] = ..., platform_contradictions: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class RxFrame(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "data", "verdict", "published")

@@ -213,9 +213,10 @@ def test_list_says_how_each_car_is(cars: Cars) -> None:
     assert [(row["battery_v"] is None, row["battery_level"]) for row in rows] == [(True, None)] * 2 + [(False, "ok")]
     done = run(cars.endpoint, "list")
     table = [line.split() for line in done.stdout.splitlines()]
-    assert table[0] == ["CAR", "LINK", "MODE", "VERDICT", "MOTION", "DRIVER", "HOLD", "BATTERY"]
+    assert table[0] == ["CAR", "PLATFORM", "LINK", "MODE", "VERDICT", "MOTION", "DRIVER", "HOLD", "BATTERY"]
     assert [row[0] for row in table[1:]] == ["blue", "green", "red"]
-    assert [row[7:] for row in table[1:3]] == [["-"]] * 2
+    assert [row[1] for row in table[1:]] == ["raspberry_pi", "raspberry_pi", "arduino"]
+    assert [row[8:] for row in table[1:3]] == [["-"]] * 2
     assert table[3][-2:] == ["V", "ok"]
 
 

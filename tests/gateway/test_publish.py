@@ -10,14 +10,16 @@ import zenoh
 
 from gateway.control.controller import Controller
 from gateway.control.link_health import LinkHealth
+from gateway.control.platform import PlatformTruth
 from gateway.control.records import Command, CommandRecord, Drive, Find, Phase, Reason, SetMode, Stop
+from gateway.protocol.decode import Decoder
 from gateway.protocol.profile import parse_platform
 from gateway.protocol.readings import ImuReading
 from gateway.protocol.values import Mode, Motion
 from gateway.publish import SLICE, Publications
 from schemas import keys, messages
 from schemas.bus import Bus, Sample
-from tests.gateway.control.desk import PERSON, SCRIPT, Desk
+from tests.gateway.control.desk import PERSON, READING, SCRIPT, Desk
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, Fleet, wait_for
 
@@ -73,6 +75,12 @@ class Published:
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
         return self._before
 
+    def told_health(self, platform: PlatformTruth) -> dict[str, Any]:
+        """Publish the health; return its fields, as JSON has them."""
+        self._out.health(self.desk.now, loop_lag_s=0.0, bus_drops=0, platform=platform)
+        self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
+        return self._before["state/health"]
+
     def record(self, record: CommandRecord) -> dict[str, Any]:
         """Publish a command's record; return its fields, as JSON has them."""
         self._out.command(record, None)
@@ -91,6 +99,17 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Published]:
             yield Published(fleet, opened)
     finally:
         fleet.close()
+
+
+def test_what_speaks_against_the_platform_is_published(published: Published) -> None:
+    told = PlatformTruth(parse_platform("raspberry_pi"))
+    assert published.told_health(told)["platform_contradictions"] == []
+    for _ in range(3):
+        for event in Decoder().feed(READING, 0.0):
+            told.heard(event)
+    words = list(told.contradictions)
+    assert words
+    assert published.told_health(told)["platform_contradictions"] == words
 
 
 def test_states_leave_out_what_does_not_apply(published: Published) -> None:

@@ -1,0 +1,43 @@
+"""What `fleet list` shows of a car that is not heard, or whose bytes are not those of its platform."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+
+from fleet.commands.reading import row_of, shown
+from fleet.readings import Reading
+from schemas.gen import fleet_v1_pb2 as pb
+
+
+def row(**messages: Any) -> dict[str, Any]:
+    now = datetime.now(UTC)
+    readings = {f"state/{name}": Reading(f"fleet/red/state/{name}", now, value) for name, value in messages.items()}
+    return row_of("red", readings)
+
+
+@pytest.mark.parametrize(
+    ("link", "motors", "unheard", "cell"),
+    [
+        (pb.Link(state="online", last_rx_s=0.04), "off", False, "online"),
+        (pb.Link(state="quiet", last_rx_s=40), "on", False, "quiet"),
+        (pb.Link(state="lost", last_rx_s=40), "unknown", False, "lost"),
+        (pb.Link(state="stale", last_rx_s=12.2), "off", True, "stale (not heard for 12 s)"),
+        (pb.Link(state="stale"), "unknown", True, "stale (never heard)"),
+        (pb.Link(state="online", last_rx_s=24), "unknown", True, "online (not heard for 24 s)"),
+        (pb.Link(state="online", last_rx_s=1), "unknown", False, "online"),
+    ],
+)
+def test_an_unheard_car_is_shown_as_one(link: pb.Link, motors: str, unheard: bool, cell: str) -> None:
+    told = row(link=link, safety=pb.Safety(motors=motors))
+    assert (told["unheard"], shown("link", told)) == (unheard, cell)
+    assert told["last_rx_s"] == (round(link.last_rx_s, 3) if link.HasField("last_rx_s") else None)
+
+
+def test_a_contradicted_platform_is_shown() -> None:
+    words = "a voltage of 7.91 V, which no raspberry_pi car sends"
+    told = row(health=pb.Health(platform="raspberry_pi", platform_contradictions=[words]))
+    assert (told["platform"], told["platform_contradictions"]) == ("raspberry_pi", [words])
+    assert shown("platform", told) == "raspberry_pi (contradicted)"
+    assert shown("platform", row(health=pb.Health(platform="arduino"))) == "arduino"
+    assert shown("platform", row()) == "-", "an older gateway, or none that answers"
