@@ -5,6 +5,7 @@ A subcommand is imported when it is called, so that `fleet --help` takes no long
 
 import importlib
 import os
+import re
 import sys
 from typing import Final
 
@@ -56,6 +57,10 @@ COMMANDS: Final = {
     "demo": ("fleet.demo:demo", "Three simulated cars do a job, recorded and checked."),
 }
 """Subcommand: where it lives, and its line in `fleet --help`."""
+
+
+_PACKAGES: Final = {"rerun": "rerun-sdk", "rerun_cli": "rerun-sdk", "yaml": "pyyaml", "zenoh": "eclipse-zenoh"}
+"""Packages by the modules they bring, where the names differ."""
 
 
 class _Lazy(click.Group):
@@ -110,6 +115,9 @@ def main() -> None:
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = startup.INTERRUPTED
+    except ModuleNotFoundError as error:
+        sys.stderr.write(f"fleet: {_missing(error)}\n")
+        code = 1
     except OSError as error:  # what the commands raise of their own, they explain: this is the output's
         code = _no_output(error)
     try:
@@ -117,6 +125,22 @@ def main() -> None:
     except OSError as error:
         code = _no_output(error)
     sys.exit(code)
+
+
+def _missing(error: ModuleNotFoundError) -> str:
+    """Return what is not installed, and what to type; raises the error again if it is a module of ours."""
+    module = (error.name or "").partition(".")[0]
+    if module in ("", "fleet", "gateway", "schemas"):
+        raise error
+    from importlib import metadata
+
+    package = _PACKAGES.get(module, module)
+    try:
+        wanted = [each.partition(";")[0].strip() for each in metadata.requires("zenoh-car-fleet") or ()]
+    except metadata.PackageNotFoundError:  # a clone that was never installed
+        wanted = []
+    exact = next((each for each in wanted if re.match(rf"{re.escape(package)}(?![\w.-])", each)), package)
+    return f"{package} is not installed, and this command needs it: pip install '{exact}'"
 
 
 def _no_output(error: OSError) -> int:
