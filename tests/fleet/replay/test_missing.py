@@ -19,11 +19,6 @@ WITHOUT = "import sys; sys.modules[sys.argv.pop(1)] = None; from fleet.cli impor
         ("rerun", "replay SESSION --save OUT", "rerun-sdk is not installed, and this command needs it: pip install 'r"),
         ("rerun", "view --save OUT", "rerun-sdk is not installed, and this command needs it: pip install 'rerun-sdk=="),
         ("pyarrow", "replay SESSION --save OUT", "pyarrow is not installed, and this command needs it: pip install 'p"),
-        (
-            "pyarrow",
-            "sessions export SESSION --parquet --out OUT",
-            "Parquet needs pyarrow, which is not installed: pip",
-        ),
     ],
 )
 def test_a_missing_package_is_told_in_a_line(module: str, arguments: str, told: str, tmp_path: Path) -> None:
