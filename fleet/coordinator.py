@@ -152,6 +152,8 @@ class Coordinator:
                     linked_at = now
                     try:
                         self._turn(hearing, pool, now)
+                    except OSError:  # its own output is gone: whoever started it has ended
+                        raise
                     except Exception as error:  # noqa: BLE001 - what it decides on came over the bus
                         self._unforeseen("deciding", error)
                     keeper.save(to_keep(self.plan, self._memory, now, time.time()))
@@ -300,6 +302,8 @@ class Coordinator:
             wait_s = 0.0
             try:
                 self._take_item(item, hearing)
+            except OSError:  # its own output is gone: whoever started it has ended
+                raise
             except Exception as error:  # noqa: BLE001 - nothing that comes over the bus may end a coordinator
                 self._unforeseen("handling what came over the bus", error)
 
@@ -331,6 +335,8 @@ class Coordinator:
         with query:
             try:
                 self._reply(query, hearing)
+            except OSError:
+                raise
             except Exception as error:  # noqa: BLE001 - whoever asks gets an answer, and the coordinator goes on
                 words = self._unforeseen(f"answering {query.key_expr}", error)
                 query.reply_err(words, encoding="text/plain")

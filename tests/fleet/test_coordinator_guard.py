@@ -39,7 +39,7 @@ class Started:
     def failed(self, words: str) -> None:
         self.said.append(words)
         if self.broken:
-            raise BrokenPipeError("nobody reads it")
+            raise RuntimeError("nobody foresaw it")
 
     def ask(self, payload: bytes) -> Any:
         """Ask for another plan; return the result, or the error's words."""
@@ -76,10 +76,10 @@ def test_what_nobody_foresaw_is_answered_logged_and_survived(started: Started) -
     logged: list[Sample] = []
     started.processes.bus.subscribe("fleet/@coordinator/log", logged.append)
     started.broken = True
-    words = started.ask(b"cars: {purple: manual}")  # its warning meets the broken pipe
+    words = started.ask(b"cars: {purple: manual}")  # its warning meets what is broken
     started.broken = False
     assert isinstance(words, str)
-    assert words.startswith(f"{INTERNAL_ERROR} while answering {KEY}: BrokenPipeError at test_coordinator_guard.py:")
+    assert words.startswith(f"{INTERNAL_ERROR} while answering {KEY}: RuntimeError at test_coordinator_guard.py:")
     (event,) = wait_for(lambda: [each.message() for each in logged], "the event")
     assert (event.name, event.message, event.level) == (f"@coordinator {INTERNAL_ERROR}", words, 4)  # type: ignore[attr-defined]
     assert words in started.said
