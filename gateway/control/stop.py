@@ -25,11 +25,11 @@ LONGEST_WORST_S: Final = 5.0
 SHOWN_S: Final = 2.0
 """Usual time from the last frame to the evidence."""
 RETRY_S: Final = (recipes.SILENCE_S, 4.5, 5.5, 6.5)
-"""Interval from `MODE00` to the next try, by tries. The silence makes the next frame certain: it is longer than any block
-outside avoidance. It grows to 6.5 s: of two tries that begin after the link is whole again, one is certain within 15 s."""
-REPORTED_S: Final = 3.3
-"""Minimum wait after the last frame: without an echo the car ranges for 1.0 s before it reads a frame, is blocked for
-1.0 s, and reports after 0.9 s more. A second ranging of 1.0 s may follow, but a try in it does no harm."""
+"""Interval from `MODE00` to the next try, by tries. Silence makes the next frame certain: it is longer than any block
+outside avoidance. It grows to 6.5 s: of two tries on a link that is whole again, one is certain within 15 s."""
+REPORTED_S: Final = 4.1
+"""Minimum wait after the last frame of a try. Without an echo the car ranges for 1.0 s before it reads the frame, is
+blocked for 1.0 s, reports after 0.9 s, and ranges for 1.0 s more before that."""
 IN_TIME_S: Final = 0.2
 """A frame written so long before a block can end lies in the buffer when it does, whatever the link's own delay."""
 
