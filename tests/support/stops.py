@@ -12,6 +12,7 @@ from itertools import product
 
 from gateway.control.mode import Verdict
 from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, SetMode, Stop
+from gateway.control.trust import CarTrust
 from gateway.protocol.encode import ColorLed, General, ModeOpen, Ptz, encode
 from gateway.protocol.profile import Platform, StopStyle
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
@@ -24,6 +25,8 @@ from tests.support.virtual import Pair
 LONGEST_S = 4.0
 """Outside obstacle avoidance and links just restored no stop takes longer."""
 AVOIDING_S = 4.3
+ENDS_S = 16.0
+"""So long after it was asked, every stop has its last record (gateway/control/stop.py)."""
 RATIO = 1.5
 """The announced worst case is at most so many times the worst seen."""
 AVOIDANCE = Mode.OBSTACLE_AVOIDANCE
@@ -414,11 +417,17 @@ class Seen:
     settled_s: float
     """And back in mode 0, where nothing but a command of ours turns them on."""
     complete_s: float
-    """What the final record says."""
+    """What the final record says, as shown or as sent; inf if the stop has none."""
+    shown_s: float
+    """When the car had shown that it stands; inf if it did not."""
     motors: str
     """What control says of them in the end."""
+    basis: str
+    """On what that rests."""
     phase: str
-    """How the stop's life ended."""
+    """How the stop's life ended, the basis of that, and the words."""
+    phase_basis: str
+    words: str
 
 
 def state_of(pair: Pair) -> str:
@@ -431,6 +440,8 @@ def state_of(pair: Pair) -> str:
         StopStyle.RASPBERRY_PI: f"{Platform.RASPBERRY_PI}, ",
     }
     running = control.running
+    if control.model.trust.state in (CarTrust.UNHEARD, CarTrust.UNPROVEN):
+        return f"{kind[style]}{control.model.trust.state}"
     if not control.known:
         return f"{kind[style]}link just restored"
     if running is not None and running.recipe.rank > 1:
@@ -464,8 +475,10 @@ def play(case: Case, seed: int) -> Seen:
         pair.run(0.001)
         settled_at = pair.now
     pair.run(end - pair.now)
+    while pair.last_of("the-stop") is None and pair.now < asked_at + ENDS_S:
+        pair.run(0.5)
     off_at = pair.off_for_good_at()
-    last = [record for record in pair.records if record.command.id == "the-stop"][-1]
+    last, shown = pair.last_of("the-stop"), pair.shown_since(asked_at)
     return Seen(
         str(case),
         seed,
@@ -473,9 +486,13 @@ def play(case: Case, seed: int) -> Seen:
         answer.worst_case_s,
         max(0.0, off_at - asked_at),
         max(off_at, settled_at) - asked_at if settled_at > asked_at else max(0.0, off_at - asked_at),
-        last.took_s if last.phase is Phase.COMPLETE else float("inf"),
+        last.at - asked_at if last is not None and last.phase is not Phase.FAILED else float("inf"),
+        shown - asked_at if shown is not None else float("inf"),
         pair.control.motors,
-        last.phase,
+        pair.control.basis or "",
+        last.phase if last is not None else "",
+        last.basis if last is not None else "",
+        last.words if last is not None else "",
     )
 
 
@@ -497,6 +514,11 @@ class Row:
     """Of the longest announced to the worst seen."""
     worst_motors_s: float
     """The worst until the motors were off: 0 where a mode is opened, in which they never come on."""
+    shown: int
+    """Stops that the car has shown."""
+    shown_p50_s: float
+    """When these were shown."""
+    shown_worst_s: float
     worst_case: str
     """Where the worst was seen."""
 
@@ -513,6 +535,7 @@ def _row(state: str, stops: list[Seen]) -> Row:
     stops = sorted(stops, key=lambda one: one.settled_s)
     worst = stops[-1]
     announced = max(one.announced_s for one in stops)
+    shown = sorted(one.shown_s for one in stops if one.shown_s < float("inf"))
     return Row(
         state,
         len(stops),
@@ -522,6 +545,9 @@ def _row(state: str, stops: list[Seen]) -> Row:
         announced,
         announced / worst.settled_s if worst.settled_s else float("inf"),
         max(one.motors_off_s for one in stops),
+        len(shown),
+        shown[len(shown) // 2] if shown else float("inf"),
+        shown[-1] if shown else float("inf"),
         f"{worst.case} {worst.seed}",
     )
 

@@ -12,8 +12,10 @@ from gateway.sim.core.firmware import Firmware
 from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.core.world import World
 
-STEP_S = 0.01
-"""How long the loop may sleep between two looks: a gateway's loop is woken by bytes and by its own deadlines."""
+TICK_S = 0.05
+"""How often control weighs silence. All else wakes the loop when it is due: bytes, deadlines, what the car does."""
+SHORTEST_S = 1e-6
+"""Time passes in steps that are no shorter than this."""
 
 
 class Pair:
@@ -40,11 +42,16 @@ class Pair:
         self.sent: list[tuple[float, bytes]] = []
         self.records: list[CommandRecord] = []
         self.logs: list[LogRecord] = []
+        self.shown_at: list[float] = []
+        """When control learned from the car that it stands."""
         self.number = 0
         self.cut: int | None = None
         """How many bytes of the next write get through before the link breaks; None: all, and it holds."""
         self.deaf_until = 0.0
         """Until when what the car sends is lost on the way."""
+        self._next_tick = 0.0
+        self._awake = 0
+        """How often the loop turned without sleeping."""
         self.run(start_s, linked=False)
 
     def connect(self) -> None:
@@ -78,20 +85,15 @@ class Pair:
         """Let time pass."""
         end = self.now + seconds
         while self.now < end - 1e-9:
-            wake = min(self.now + STEP_S, end)
-            if linked:
-                wake = min(wake, max(self.now + 1e-6, self.control.next_at(self.now)))
-            self.now = wake
-            self._receive(linked=linked)
-            if linked:
-                self._pump()
+            self._turn(end, linked=linked)
 
     def until(self, condition: Callable[[], bool], seconds: float) -> float:
         """Let time pass until a condition holds; returns how long it took, fails if it takes longer."""
         began = self.now
+        end = began + seconds
         while not condition():
-            assert self.now - began < seconds, f"not within {seconds} s: {self.sent[-6:]}"
-            self.run(STEP_S)
+            assert self.now < end - 1e-9, f"not within {seconds} s: {self.sent[-6:]}"
+            self._turn(end, linked=True)
         return self.now - began
 
     def off_for_good_at(self) -> float:
@@ -104,6 +106,32 @@ class Pair:
         """The life of one command."""
         return [record.phase for record in self.records if record.command.id == identity]
 
+    def last_of(self, identity: str) -> CommandRecord | None:
+        """The record that ends a stop, as shown, as sent or as failed; None while it goes on."""
+        ends = (Phase.COMPLETE, Phase.FAILED, Phase.REJECTED, Phase.SUPERSEDED, Phase.EXPIRED)
+        for record in self.records:
+            if record.command.id == identity and (record.phase in ends or (record.phase is Phase.SENT and record.basis)):
+                return record
+        return None
+
+    def shown_since(self, since: float) -> float | None:
+        """When the car first showed after `since` that it stands; None if it did not."""
+        return next((at for at in self.shown_at if at > since), None)
+
+    def _turn(self, end: float, *, linked: bool) -> None:
+        """Go to whatever happens next, at `end` at the latest."""
+        wake = min(end, self.car.next_event())
+        if linked:
+            deadline = self.decoder.deadline()
+            silence = float("inf") if deadline is None else deadline
+            wake = min(wake, self._next_tick, silence, self.control.next_at(self.now))
+        self._awake = self._awake + 1 if wake < self.now + SHORTEST_S else 0
+        assert self._awake < 100, "a loop that never sleeps"
+        self.now = min(end, max(self.now + SHORTEST_S, wake))
+        self._receive(linked=linked)
+        if linked:
+            self._pump()
+
     def _receive(self, *, linked: bool) -> None:
         for at, data in self.car.advance(self.now):
             if linked and at >= self.deaf_until:
@@ -112,6 +140,12 @@ class Pair:
         if linked:
             for event in self.decoder.tick(self.now):
                 self.control.heard(event, self.now)
+            self.tick()
+
+    def tick(self) -> None:
+        """Let control weigh silence, if it is time."""
+        if self.now >= self._next_tick:
+            self._next_tick = self.now + TICK_S
             self.control.tick(self.now)
 
     def _pump(self) -> None:
@@ -128,6 +162,9 @@ class Pair:
         self._take()
 
     def _take(self) -> None:
+        shown_at = self.control.model.trust.shown_at
+        if shown_at is not None and shown_at not in self.shown_at[-1:]:
+            self.shown_at.append(shown_at)
         for record in self.control.take_records():
             if isinstance(record, CommandRecord):
                 self.records.append(record)

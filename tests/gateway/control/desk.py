@@ -1,4 +1,4 @@
-"""A controller without a car, on virtual time: the test says what is heard, and sees what would be written."""
+"""A controller at a desk, on virtual time: it hears what a car that obeys would send, and what the test says."""
 
 from collections.abc import Callable
 
@@ -18,11 +18,23 @@ from gateway.control.records import (
 )
 from gateway.control.safety import Kept
 from gateway.protocol.decode import Decoder
-from gateway.protocol.profile import parse_platform
+from gateway.protocol.encode import Frame, General, ModeClose, ModeOpen
+from gateway.protocol.profile import Platform, parse_platform
+from gateway.protocol.timing import FRAME_S
+from gateway.protocol.values import Mode
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
 PI_READING = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
+RUNNING = {
+    Mode.TRACKING: TRACKING,
+    Mode.LIGHT_SEEKING: b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM11#",
+    Mode.FOLLOWING: b"$4WD,CSB120,PV8.3,GS000,LF0000,HW10,GM00#",
+}
+REPORT_S = 1.0
+RUNNING_S = 0.1
+TICK_S = 0.2
+"""Interval of reports in mode 0, and of readings in a mode that reports."""
 
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
@@ -34,6 +46,46 @@ SCRIPT = Sender("script", Kind.SCRIPT)
 COORDINATOR = Sender("plan", Kind.COORDINATOR)
 
 
+class ObedientCar:
+    """When a car that obeys every frame sends its readings: none while it is blocked, or in a silent mode."""
+
+    def __init__(self, platform: str, now: float) -> None:
+        self._profile = parse_platform(platform.replace("unknown", "arduino"))
+        self._pi = self._profile.kind is Platform.RASPBERRY_PI
+        self._mode = Mode.MANUAL
+        self._fan = False
+        self.report_at = now + REPORT_S
+
+    def wrote(self, frame: Frame, now: float) -> None:
+        """Obey a frame."""
+        block_s = self._profile.block_s(frame)
+        if self._pi:
+            return
+        match frame:
+            case ModeOpen(mode):
+                self._mode = mode
+                self.report_at = now + block_s + RUNNING_S
+            case ModeClose() if self._mode is not Mode.MANUAL:
+                self._mode = Mode.MANUAL
+                self.report_at = now + block_s + 0.9 * REPORT_S
+            case _ if block_s > FRAME_S:
+                self.report_at += block_s
+            case _:
+                pass
+        if isinstance(frame, General) and frame.fan:
+            self._fan = not self._fan
+
+    def report(self, now: float) -> bytes:
+        """Return what it sends now, and go on; empty if it sends nothing."""
+        running = RUNNING.get(self._mode, b"")
+        self.report_at = now + (RUNNING_S if running else REPORT_S)
+        if self._mode is not Mode.MANUAL:
+            return running
+        if self._pi:
+            return PI_READING
+        return b"" if self._fan else READING
+
+
 class Desk:
     """Drives a controller exactly as its loop does: it is woken by what it says, and by what happens."""
 
@@ -41,27 +93,33 @@ class Desk:
         self.now = 100.0
         self.control = Controller("red", parse_platform(platform), kept=kept)
         self.reading = PI_READING if platform.startswith("raspberry_pi") else READING
+        self.car = ObedientCar(platform, self.now)
         self.sent: list[tuple[float, bytes, Why]] = []
         self.records: list[CommandRecord] = []
         self.logs: list[LogRecord] = []
         self.number = 0
+        self._next_tick = self.now
 
     def ready(self) -> "Desk":
-        """Connect, recover, and forget what was written until then."""
+        """Connect, recover, and forget what was written until then: the car has shown that it stands."""
         self.control.link_up(self.now)
         self.pump()
-        self.run(5.0, reports=False)
-        self.hear()
-        assert self.control.known
-        self.run(1.0)
+        self.until(lambda: self.control.known, 12.0)
+        assert self.control.motors == "off"
+        self.run(1.5)
         self.sent.clear()
         self.take()
         self.logs.clear()
+        self.records.clear()
         return self
 
     def hear(self, frame: bytes = b"") -> None:
-        """The car sends a frame; if none is given, a mode-0 reading."""
-        for event in Decoder().feed(frame or self.reading, self.now):
+        """The car sends a frame now; if none is given, a mode-0 reading."""
+        self.car.report_at = self.now + REPORT_S
+        self._hear(frame or self.reading)
+
+    def _hear(self, frame: bytes) -> None:
+        for event in Decoder().feed(frame, self.now):
             self.control.heard(event, self.now)
         self.pump()
 
@@ -94,16 +152,18 @@ class Desk:
         return answer
 
     def run(self, seconds: float, *, reports: bool = True) -> None:
-        """Let time pass; with reports a mode-0 reading comes every second, but for the one while `MODE00` blocks."""
+        """Let time pass; without reports nothing that the car sends is heard."""
         end = self.now + seconds
-        report_at = self.now + 1.0 if reports else float("inf")
-        while self.now < end:
-            wake = min(end, report_at, max(self.now + 1e-9, self.control.next_at(self.now)))
-            self.now = wake
-            if wake >= report_at:
-                report_at = wake + 1.0
-                if not any(data == MODE00 and at > wake - 1.0 for at, data, _ in self.sent[-3:]):
-                    self.hear()
+        while self.now < end - 1e-9:
+            wake = min(self.car.report_at, self._next_tick, self.control.next_at(self.now))
+            self.now = min(end, max(self.now + 1e-9, wake))
+            if self.now >= self.car.report_at:
+                frame = self.car.report(self.now)
+                if reports and frame:
+                    self._hear(frame)
+            if self.now >= self._next_tick:
+                self._next_tick = self.now + TICK_S
+                self.control.tick(self.now)
             self.pump()
 
     def until(self, so: Callable[[], bool], seconds: float = 30.0) -> None:
@@ -118,6 +178,7 @@ class Desk:
         while (write := self.control.poll(self.now)) is not None:
             self.sent.append((self.now, write.data, write.why))
             self.control.wrote(write, self.now)
+            self.car.wrote(write.frame, self.now)
         self.take()
 
     def take(self) -> None:

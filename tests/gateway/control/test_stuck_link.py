@@ -35,7 +35,8 @@ class Wire:
     def receive(self, *, linked: bool) -> None:
         self._receive(linked=linked and not self.stuck)
         if self.stuck:
-            self._pair.control.tick(self._pair.now)
+            self._pair.decoder.tick(self._pair.now)
+            self._pair.tick()
 
     def free(self) -> None:
         self.stuck = False
@@ -131,8 +132,13 @@ def slow(pair: Pair, delay_s: float) -> None:
         del up[: len(due)]
         return due
 
+    def next_event() -> float:
+        return min(own_event(), *(each[0] for each in (*down[:1], *up[:1])), float("inf"))
+
+    own_event = pair.car.next_event
     pair.car.feed = lambda data, now: down.append((now + delay_s, data))  # type: ignore[method-assign]
     pair.car.advance = delayed  # type: ignore[method-assign]
+    pair.car.next_event = next_event  # type: ignore[method-assign]
 
 
 def deaf(pair: Pair) -> list[bytes]:

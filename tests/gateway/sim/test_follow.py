@@ -13,13 +13,15 @@ from gateway.protocol.values import Mode
 from gateway.sim.core.things import Lamp, Thing
 from gateway.sim.core.world import RADIUS_M, World
 from gateway.sim.worldfile import WorldSpec, read_world
-from tests.support.virtual import STEP_S, Pair
+from tests.support.virtual import Pair
 
 ROW = ("red", "green", "blue")
 WORLD = (Path(__file__).parents[3] / "deploy" / "world.follow.yaml").read_text()
 NEAR_M = 0.45
 """Beyond 0.42 m between their middles a follower's infrared has lost the one before it."""
 LOOK_S = 0.1
+STEP_S = 0.01
+"""The cars of one world move together in steps of this."""
 
 
 def spec() -> WorldSpec:
