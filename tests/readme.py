@@ -5,9 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+from gateway.control.evidence import STALL_S
 from google.protobuf.descriptor import FieldDescriptor
 
-from gateway.control.evidence import STALL_S
 from gateway.control.recipes import REPEAT_S
 from gateway.control.senders import PAUSE_S, SENDER_GONE_S
 from gateway.requests import LONGEST_DRIVE_S

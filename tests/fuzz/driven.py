@@ -8,7 +8,7 @@ from gateway.protocol.values import Mode
 from gateway.sim.core.arduino import ArduinoCar
 from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
 from tests.fuzz.controller import PLATFORMS, SENDERS, anything
-from tests.support.stops import WORLDS, Seen, state_of
+from tests.support.stops import WORLDS, state_of
 from tests.support.virtual import Pair
 
 LIFE = 60
@@ -105,8 +105,8 @@ class Driven:
         self.asked += 1
         self.pair.ask(what, sender=self.moments.choice(SENDERS), identity=f"f{self.asked}")
 
-    def stop(self) -> Seen | None:
-        """A stop now: off for good within what is announced. None if the link is down, which it says."""
+    def stop(self) -> str | None:
+        """Stop now, and return the state before: off for good within what is announced. None if the link is down."""
         pair, moments = self.pair, self.moments
         pair.cut = None
         if not self.linked:
@@ -121,8 +121,22 @@ class Driven:
             return None
         off_s = max(0.0, pair.off_for_good_at() - asked_at)
         assert off_s <= answer.worst_case_s, f"{state}: off after {off_s:.3f} s, announced {answer.worst_case_s:.3f} s"
-        last = pair.phases(identity)[-1]
-        return Seen("fuzz", self.asked, state, answer.worst_case_s, off_s, off_s, 0.0, pair.control.motors, last)
+        last = pair.last_of(identity)
+        if last is not None and last.phase is not Phase.FAILED:
+            assert last.at - asked_at >= off_s, f"{state}: {last.phase} before it was off"
+        self._judge_claims(asked_at)
+        return state
+
+
+    def _judge_claims(self, since: float) -> None:
+        """Require that what the car showed since then was so: no motor ran, or ran on."""
+        pair = self.pair
+        for at in pair.shown_at:
+            if at <= since:
+                continue
+            log = list(pair.car.motor_log)
+            before = [(left, right) for time, left, right in log if time <= at]
+            assert before[-1] == (0, 0), f"shown at {at:.3f}, while the motors ran: {log[-4:]}"
 
 
 def wedged(pair: Pair) -> bool:
@@ -143,10 +157,10 @@ def run(seed: int, steps: int, *, stop_every: int = 12) -> Fuzzed:
         try:
             driven.step()
             if driven.moments.random() < 1 / stop_every:
-                seen = driven.stop()
-                if seen is not None:
+                state = driven.stop()
+                if state is not None:
                     done.stops += 1
-                    states.add(seen.state)
+                    states.add(state)
                 driven.pair.ask(Resume(), sender=sender)
         except Exception as error:
             name = driven.pair.control.profile.name

@@ -105,7 +105,7 @@ class Ending(StrEnum):
     MANUAL = "manual"
     SHUTDOWN = "shutdown"
     RECONNECT = "reconnect"
-    
+
 
 
 @dataclass(frozen=True, slots=True)
@@ -705,7 +705,7 @@ class Episode:
                 self._violate(f"(4) {identity} ended as {ends}")
 
     def _violate(self, words: str) -> None:
-        short = words.split(" (")[0] if words.startswith("(1)") else words
+        short = words.split(" (", maxsplit=1)[0] if words.startswith("(1)") else words
         if not any(each.startswith(short) for each in self.report.violations):
             self.report.violations.append(words)
             self._note(f"VIOLATION {words}")

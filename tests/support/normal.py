@@ -7,6 +7,7 @@ from gateway.control.link_health import LinkHealth, LinkState
 from gateway.control.mode import Verdict
 from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, Reason, SetMode, Stop, What
 from gateway.protocol.encode import ColorLed, General, Ptz
+from gateway.protocol.readings import Event, Sensors
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.sim.core.raspberry_pi import Transport
 from tests.support.truth import WORLDS
@@ -17,7 +18,15 @@ LOOK_S = 0.2
 SETTLED_S = 2.5
 """What is written sooner after a mode was left may be lost in the block of closing it: no alarm is false then."""
 ALARMS = frozenset(
-    {"mode_contradicted", "platform_contradicted", "unheard", "no_answer", "answers_again", "not_stopped"}
+    {
+        "mode_contradicted",
+        "platform_contradicted",
+        "unheard",
+        "not_shown",
+        "not_obeyed",
+        "answers_again",
+        "not_stopped",
+    }
 )
 EXPECTED = frozenset({Reason.SUPERSEDED, Reason.EXPIRED, Reason.QUEUE_FULL, Reason.UNSUPPORTED, Reason.WRONG_MODE})
 """What may become of a command without anything being wrong."""
@@ -44,15 +53,14 @@ class Run:
         self.health = LinkHealth()
         self.alarms: list[str] = []
         self.commands = 0
-        advance = self.pair.car.advance
+        heard = self.pair.control.heard
 
-        def counted(now: float) -> list[tuple[float, bytes]]:
-            pieces = advance(now)
-            for at, data in pieces:
-                self.health.received(len(data), at)
-            return pieces
+        def counted(event: Event, now: float) -> None:
+            if isinstance(event, Sensors):
+                self.health.heard(event.at)
+            heard(event, now)
 
-        self.pair.car.advance = counted  # type: ignore[method-assign]  # the wire has no other handle
+        self.pair.control.heard = counted  # type: ignore[method-assign]  # as car.py does
         self.health.up(self.pair.now)
         self.pair.ready()
         self.pair.logs.clear()
@@ -72,6 +80,7 @@ class Run:
             limit_s=mode.silence_limit(fan=bool(pair.control.believed.fan)),
             unheard_s=mode.unheard_s(pair.now),
             why_quiet="silent",
+            is_heard=pair.control.is_heard,
         )
         if self.health.state in (LinkState.STALE, LinkState.LOST):
             self._alarm(f"link {self.health.state}: {self.health.reason}")

@@ -22,6 +22,8 @@ def _box(metres: float) -> tuple[Segment, ...]:
     return ((-h, -h, h, -h), (h, -h, h, h), (h, h, -h, h), (-h, h, -h, -h))
 
 
+RENEWED_S = 26.0
+"""The renewals with `MODE00` of a rest that nothing has shown are over."""
 WORLDS: dict[str, Callable[[], World]] = {"room": World.room, "no-echo": World.open_field, "near-walls": near_walls}
 
 
@@ -31,7 +33,10 @@ def frame_of(mode: Mode) -> bytes:
 
 
 def car_in(mode: Mode, world: str, *, seed: int, platform: str = "arduino") -> Pair:
-    """A car that was brought to a mode, has been there for a while, and of which nothing else is to be expected."""
+    """A car that was brought to a mode, has been there for a while, and of which nothing else is to be expected.
+
+    A rest that nothing has shown is renewed with `MODE00` at first, which would end another mode.
+    """
     moments = random.Random(seed)
     pair = Pair(platform, seed=seed, world=WORLDS[world](), start_s=1.0 + moments.random()).ready()
     if mode is not Mode.MANUAL:
@@ -39,6 +44,8 @@ def car_in(mode: Mode, world: str, *, seed: int, platform: str = "arduino") -> P
         pair.ask(SetMode(mode))
         pair.until(lambda: pair.car.truth.mode is mode, 8.0)
         pair.run(4.0)
+    elif pair.control.basis != "shown":
+        pair.run(RENEWED_S)
     pair.run(2.0 * moments.random())
     return pair
 

@@ -26,6 +26,8 @@ from gateway.protocol.values import Mode
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
 PI_READING = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
+SHOWN_STOP = [MODE00, STOP, MODE00, STOP]
+"""What a stop of a driven car writes: the second `MODE00` asks for the second pause that shows it."""
 RUNNING = {
     Mode.TRACKING: TRACKING,
     Mode.LIGHT_SEEKING: b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM11#",
@@ -54,6 +56,7 @@ class ObedientCar:
         self._pi = self._profile.kind is Platform.RASPBERRY_PI
         self._mode = Mode.MANUAL
         self._fan = False
+        self.reading = PI_READING if self._pi else READING
         self.report_at = now + REPORT_S
 
     def wrote(self, frame: Frame, now: float) -> None:
@@ -81,9 +84,7 @@ class ObedientCar:
         self.report_at = now + (RUNNING_S if running else REPORT_S)
         if self._mode is not Mode.MANUAL:
             return running
-        if self._pi:
-            return PI_READING
-        return b"" if self._fan else READING
+        return b"" if self._fan else self.reading
 
 
 class Desk:
@@ -92,7 +93,6 @@ class Desk:
     def __init__(self, platform: str = "arduino", *, kept: Kept | None = None) -> None:
         self.now = 100.0
         self.control = Controller("red", parse_platform(platform), kept=kept)
-        self.reading = PI_READING if platform.startswith("raspberry_pi") else READING
         self.car = ObedientCar(platform, self.now)
         self.sent: list[tuple[float, bytes, Why]] = []
         self.records: list[CommandRecord] = []
@@ -116,7 +116,7 @@ class Desk:
     def hear(self, frame: bytes = b"") -> None:
         """The car sends a frame now; if none is given, a mode-0 reading."""
         self.car.report_at = self.now + REPORT_S
-        self._hear(frame or self.reading)
+        self._hear(frame or self.car.reading)
 
     def _hear(self, frame: bytes) -> None:
         for event in Decoder().feed(frame, self.now):

@@ -20,7 +20,7 @@ from gateway.control.records import (
 from gateway.control.safety import Estop, Kept
 from gateway.protocol.encode import ColorLed
 from gateway.protocol.values import Mode, Motion, SpeedStep
-from tests.gateway.control.desk import COORDINATOR, MODE00, PERSON, RUN, SCRIPT, STOP, TRACKING, Desk
+from tests.gateway.control.desk import COORDINATOR, MODE00, PERSON, RUN, SCRIPT, SHOWN_STOP, STOP, TRACKING, Desk
 
 SENT, QUEUED, REJECTED, SUPERSEDED = Phase.SENT, Phase.QUEUED, Phase.REJECTED, Phase.SUPERSEDED
 FORWARD = Drive(Motion.FORWARD, 5.0)
@@ -42,7 +42,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Desk) -> None:
     assert "latched as e1" in answer.words
     assert answer.worst_case_s > 0
     desk.run(600.0)
-    assert desk.frames == [RUN, MODE00, STOP]
+    assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.life("e1") == [Phase.ASKED, QUEUED, SENT, Phase.COMPLETE]
     for what in (FORWARD, SetMode(Mode.MANUAL), Act(ColorLed(1, 2, 3)), TakeLease(), Drive(Motion.STOP)):
         refused = desk.ask(what, PERSON)
@@ -89,7 +89,7 @@ def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Desk) -> None
     estop = Estop("e1", "mia", "smoke", 7, fleet_wide=True)
     desk.control.unite([estop], [], "blue", desk.now)
     desk.run(3.0)
-    assert desk.frames == [RUN, MODE00, STOP]
+    assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert desk.logs[0].code == "estop_joined"
     assert "as blue shows: smoke" in desk.logs[0].words
@@ -225,7 +225,7 @@ def test_a_stick_that_is_leaned_on_after_anothers_stop_does_not_drive_on(desk: D
         refused = desk.ask(stick, SCRIPT, streamed=True)
         assert (refused.reason, "let go" in refused.words) == (Reason.HELD, True)
         desk.run(0.1)
-    assert desk.frames == [RUN, MODE00, STOP]
+    assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.control.hold is not None, "what was refused ends no hold"
     rejected = [record for record in desk.records if record.phase is REJECTED]
     assert len(rejected) == 1, "one record for the whole stream"
@@ -243,7 +243,7 @@ def test_a_stick_that_a_lease_kept_out_does_not_drive_when_it_lapses_after_a_sto
     for _ in range(50):
         assert desk.ask(stick, SCRIPT, streamed=True).status is REJECTED
         desk.run(0.1)
-    assert desk.frames == [RUN, MODE00, STOP]
+    assert desk.frames == [RUN, *SHOWN_STOP]
 
 
 def test_a_stream_that_says_stop_is_heard_again_at_once(desk: Desk) -> None:
@@ -302,7 +302,7 @@ def test_a_drive_that_is_refused_and_a_stick_that_is_let_go_end_no_hold(desk: De
 
 
 def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Desk) -> None:
-    for _ in range(4):
+    for _ in range(3):
         desk.run(0.3, reports=False)
         desk.hear(TRACKING)
     assert (desk.control.motors, desk.control.motion) == ("unknown", None)

@@ -3,8 +3,8 @@
 import random
 
 import pytest
-
 from gateway.control.execution import LISTEN_S
+
 from gateway.control.mode import Verdict
 from gateway.control.records import (
     Act,

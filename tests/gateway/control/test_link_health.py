@@ -6,9 +6,14 @@ from gateway.control.link_health import LinkHealth, LinkState
 
 
 def judged(
-    health: LinkHealth, now: float, *, limit_s: float | None = 3.0, unheard_s: float = float("inf")
+    health: LinkHealth,
+    now: float,
+    *,
+    limit_s: float | None = 3.0,
+    unheard_s: float = float("inf"),
+    is_heard: bool = True,
 ) -> LinkState:
-    health.judge(now=now, limit_s=limit_s, unheard_s=unheard_s, why_quiet="color_led is silent")
+    health.judge(now=now, limit_s=limit_s, unheard_s=unheard_s, why_quiet="color_led is silent", is_heard=is_heard)
     return health.state
 
 
@@ -20,7 +25,9 @@ def test_from_lost_to_online_to_stale_and_back(start: float) -> None:
     assert (judged(health, start + 12), health.reason) == (LinkState.STALE, "open, nothing heard yet")
     judged(health, start + 14)
     assert health.reason == "nothing heard for 4.0 s, expected every 3 s"
-    health.received(10, start + 15)
+    health.received(10, start + 14)
+    assert judged(health, start + 14) is LinkState.STALE, "bytes that are no reading"
+    health.heard(start + 15)
     assert (judged(health, start + 15), health.since) == (LinkState.ONLINE, start + 15)
     assert judged(health, start + 18) is LinkState.ONLINE
     assert judged(health, start + 18.1) is LinkState.STALE
@@ -28,7 +35,7 @@ def test_from_lost_to_online_to_stale_and_back(start: float) -> None:
     assert health.reason == "the car is busy"
     assert judged(health, start + 30, limit_s=None) is LinkState.QUIET
     assert health.reason == "color_led is silent"
-    health.received(1, start + 31)
+    health.heard(start + 31)
     assert judged(health, start + 31) is LinkState.ONLINE
     health.down("unplugged", start + 32)
     assert (judged(health, start + 99), health.reason, health.since) == (LinkState.LOST, "unplugged", start + 32)
@@ -45,7 +52,7 @@ def test_in_a_silent_mode_what_is_heard_counts_and_silence_is_quiet() -> None:
     health = LinkHealth()
     health.up(1.0)
     assert judged(health, 2.0, limit_s=None) is LinkState.QUIET
-    health.received(1, 3.0)
+    health.heard(3.0)
     assert judged(health, 5.0, limit_s=None) is LinkState.ONLINE
     assert judged(health, 6.1, limit_s=None) is LinkState.QUIET
 
@@ -53,12 +60,31 @@ def test_in_a_silent_mode_what_is_heard_counts_and_silence_is_quiet() -> None:
 def test_a_new_connection_is_not_online_by_what_the_old_one_heard() -> None:
     health = LinkHealth()
     health.up(1.0)
-    health.received(1, 2.0)
+    health.heard(2.0)
     assert judged(health, 2.0) is LinkState.ONLINE
     health.down("gone", 3.0)
     health.up(3.5)
     assert judged(health, 3.6) is LinkState.STALE
     assert health.reconnects == 1
+
+
+@pytest.mark.parametrize("limit_s", [3.0, None])
+def test_a_link_is_not_online_while_the_car_counts_as_unheard(limit_s: float | None) -> None:
+    health = LinkHealth()
+    health.up(1.0)
+    health.heard(2.0)
+    assert judged(health, 2.5, limit_s=limit_s, is_heard=False) is LinkState.STALE
+    assert health.reason == "not heard for 0.5 s: whether it moves is not known"
+    assert judged(health, 2.6, limit_s=limit_s) is LinkState.ONLINE
+
+
+def test_no_time_is_negative() -> None:
+    """A reading may be taken later than the clock that judges it."""
+    health = LinkHealth()
+    health.up(1.0)
+    health.heard(7.0)
+    judged(health, 2.0, is_heard=False)
+    assert health.reason.startswith("not heard for 0.0 s")
 
 
 def test_counters() -> None:
@@ -79,6 +105,6 @@ def test_counters() -> None:
 def test_a_change_is_told_once() -> None:
     health = LinkHealth()
     health.up(1.0)
-    health.received(1, 2.0)
-    assert health.judge(now=2.0, limit_s=3.0, unheard_s=0.0, why_quiet="")
-    assert not health.judge(now=2.5, limit_s=3.0, unheard_s=0.0, why_quiet="")
+    health.heard(2.0)
+    assert health.judge(now=2.0, limit_s=3.0, unheard_s=0.0, why_quiet="", is_heard=True)
+    assert not health.judge(now=2.5, limit_s=3.0, unheard_s=0.0, why_quiet="", is_heard=True)
