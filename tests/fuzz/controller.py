@@ -32,7 +32,7 @@ from gateway.control.records import (
     Write,
 )
 from gateway.control.safety import Estop
-from gateway.control.trust import Basis
+from gateway.control.trust import Basis, CarTrust
 from gateway.protocol.decode import Decoder
 from gateway.protocol.encode import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
 from gateway.protocol.profile import Platform, parse_platform
@@ -268,7 +268,8 @@ class Wild:
             assert not self.control.safety.estops
             assert self.control.hold is None
             assert not self.ending
-            assert self.control.known
+            # A car that is heard but shows no stop may be driven by whoever sees it; a car of unknown state may not.
+            assert self.control.known or self.control.model.trust.state is CarTrust.UNPROVEN
 
     def _check_once(self, frame: Frame, why: Why) -> None:
         """What acts once is written once for each command that was accepted, and never repeated."""

@@ -26,8 +26,6 @@ from gateway.protocol.values import Mode
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
 PI_READING = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
-SHOWN_STOP = [MODE00, STOP, MODE00, STOP]
-"""What a stop of a driven car writes: the second `MODE00` asks for the second pause that shows it."""
 RUNNING = {
     Mode.TRACKING: TRACKING,
     Mode.LIGHT_SEEKING: b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM11#",
@@ -42,6 +40,8 @@ STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
 BACK = b"$2,0,0,0,0,0,0,0,0#"
 MODE00 = b"$4WD,MODE00#"
+SHOWN_STOP = [MODE00, STOP, MODE00, STOP]
+"""What a stop of a driven car writes: the second `MODE00` asks for the second pause that shows it."""
 
 PERSON = Sender("mia", Kind.PERSON)
 SCRIPT = Sender("script", Kind.SCRIPT)
