@@ -11,9 +11,11 @@ from itertools import pairwise
 import pytest
 
 from gateway.control.records import Act, Answer, Drive, Fan, Phase, Reason, SetMode, Stop
+from gateway.control.stop_evidence import EVIDENCE, StopCase
+from gateway.control.trust import Basis
 from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz, parse_sent
 from gateway.protocol.values import Light, Mode, Motion
-from gateway.sim.core.raspberry_pi import Transport
+from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
 from tests.gateway.sim.hazards import HAZARDS, Hazard
 from tests.gateway.sim.strangers import virtual
 from tests.support.virtual import Pair
@@ -71,14 +73,23 @@ def blocked(pair: Pair, by: Act | Fan) -> None:
     pair.until(lambda: pair.car.truth.blocked, 3.0)
 
 
-def stops(pair: Pair) -> Answer:
-    """Ask for a stop: the motors are off for good within what the answer announces."""
+def stops(pair: Pair, *, sent: StopCase | None = None) -> Answer:
+    """Ask for a stop: the motors are off for good within what the answer announces. `sent`: why nothing shows it."""
     asked_at = pair.now
     answer = pair.ask(Stop(), verb="stop", identity="the-stop")
     pair.run(SETTLED_S)
     assert pair.off_for_good_at() - asked_at <= answer.worst_case_s
-    assert pair.phases("the-stop")[-1] is Phase.COMPLETE
-    assert pair.control.motors == "off"
+    pi = isinstance(pair.car, RaspberryPiCar)
+    case = StopCase.RASPBERRY_PI if pi else sent
+    last = pair.last_of("the-stop")
+    assert last is not None
+    if case is None:
+        assert (last.phase, last.basis) == (Phase.COMPLETE, Basis.SHOWN)
+    else:
+        words = EVIDENCE[case].words.format(car="red")
+        assert (last.phase, last.basis, last.words) == (Phase.SENT, Basis.SENT, words)
+    assert (pair.control.motors, pair.control.basis) == ("off", last.basis)
+    pair.records.clear()
     return answer
 
 
@@ -98,7 +109,8 @@ def refused(pair: Pair, what: Act | SetMode) -> None:
     sent = len(pair.sent)
     assert pair.ask(what).reason is Reason.UNSUPPORTED
     pair.run(2.0)
-    assert all(parse_sent(data) == General(Motion.FORWARD) for _, data in pair.sent[sent:]), "only the repetition"
+    repeated = General(Motion.FORWARD if pair.car.truth.driving else Motion.STOP)
+    assert all(parse_sent(data) == repeated for _, data in pair.sent[sent:]), "only the repetition"
 
 
 PTZ = Act(Ptz(90))
@@ -130,7 +142,7 @@ def no_echo(pair: Pair) -> None:
     pair.until(lambda: pair.car.truth.blocked, 3.0)
     pair.ask(Drive(Motion.FORWARD, 5.0))
     pair.run(0.06)
-    stops(pair)
+    stops(pair, sent=StopCase.NO_ECHO)
 
 
 @ours("stop, then MODE00, both while blocked")
@@ -245,11 +257,11 @@ def half_while_blocked(pair: Pair) -> None:
 
 @ours("the fan on: obeys motion, but sends no readings until it is off again")
 def fan(pair: Pair) -> None:
-    """A stop needs no reading to be complete, and toggles nothing."""
+    """A stop needs no reading to end, says that it is only sent, and toggles nothing."""
     pair.ask(Fan())
     pair.until(lambda: pair.car.truth.fan, 3.0)
     driving(pair)
-    stops(pair)
+    stops(pair, sent=StopCase.FAN)
     assert pair.car.truth.fan
     assert sum(frame.fan for frame in general(pair)) == 1
 
