@@ -22,6 +22,7 @@ from gateway.protocol.encode import Frame, General, ModeClose, ModeOpen
 from gateway.protocol.profile import Platform, parse_platform
 from gateway.protocol.timing import FRAME_S
 from gateway.protocol.values import Mode
+from tests.support.virtual import SHORTEST_S
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
 PI_READING = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
@@ -99,6 +100,7 @@ class Desk:
         self.logs: list[LogRecord] = []
         self.number = 0
         self._next_tick = self.now
+        self._awake = 0
 
     def ready(self) -> "Desk":
         """Connect, recover, and forget what was written until then: the car has shown that it stands."""
@@ -156,6 +158,8 @@ class Desk:
         end = self.now + seconds
         while self.now < end - 1e-9:
             wake = min(self.car.report_at, self._next_tick, self.control.next_at(self.now))
+            self._awake = self._awake + 1 if wake < self.now + SHORTEST_S else 0
+            assert self._awake < 100, "a loop that never sleeps"
             self.now = min(end, max(self.now + 1e-9, wake))
             if self.now >= self.car.report_at:
                 frame = self.car.report(self.now)
