@@ -27,6 +27,8 @@ LONGEST_S = 4.0
 AVOIDING_S = 4.3
 ENDS_S = 16.0
 """So long after it was asked, every stop has its last record (gateway/control/stop.py)."""
+OPENS_S = 14.0
+"""So long after it was asked, a mode opens: the stop before it is over within 10 s, or the mode is given up."""
 RATIO = 1.5
 """The announced worst case is at most so many times the worst seen."""
 AVOIDANCE = Mode.OBSTACLE_AVOIDANCE
@@ -167,7 +169,7 @@ def opening(mode: Mode) -> Load:
         if moments.random() < 0.2:
             pair.run(4.0 * moments.random())
             return
-        pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), 9.0)
+        pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), OPENS_S)
         pair.run(3.6 * moments.random())
 
     return load
@@ -178,7 +180,7 @@ def last_moment(mode: Mode) -> Load:
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(SetMode(mode))
-        pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), 9.0)
+        pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), OPENS_S)
         pair.run(pair.control.pacing.block_from - pair.now - 0.2 + 0.25 * moments.random())
 
     return load
@@ -187,7 +189,7 @@ def last_moment(mode: Mode) -> Load:
 def inside(mode: Mode) -> Load:
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(SetMode(mode))
-        pair.until(lambda: pair.car.truth.mode is mode, 9.0)
+        pair.until(lambda: pair.car.truth.mode is mode, OPENS_S)
         pair.run(5.0 + 6.0 * moments.random())
 
     return load

@@ -19,7 +19,7 @@ from gateway.protocol.profile import Platform, StopStyle, parse_platform
 from gateway.protocol.values import Mode, Motion
 from gateway.sim.core.raspberry_pi import Transport
 from gateway.sim.core.world import World
-from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, RESTORED, Case, Seen, inside, play
+from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Case, Seen, inside, play
 from tests.support.virtual import Pair
 
 MOMENTS = 6
@@ -128,7 +128,7 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
         pair.ask(Drive(Motion.FORWARD, 10.0))
         pair.run(2 * moments.random())
         pair.ask(SetMode(Mode.COLOR_LED), identity="mode")
-        pair.until(lambda pair=pair: Phase.SENT in pair.phases("mode"), 9.0)
+        pair.until(lambda pair=pair: Phase.SENT in pair.phases("mode"), OPENS_S)
         assert pair.sent[-1][1] == b"$4WD,MODE41#"
         opened_at = pair.sent[-1][0]
         pair.until(lambda pair=pair: pair.car.truth.mode is Mode.COLOR_LED, 0.06)  # the car was awake: read at once
