@@ -127,7 +127,6 @@ class Driven:
         self._judge_claims(asked_at)
         return state
 
-
     def _judge_claims(self, since: float) -> None:
         """Require that what the car showed since then was so: no motor ran, or ran on."""
         pair = self.pair

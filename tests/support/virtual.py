@@ -109,7 +109,9 @@ class Pair:
     def last_of(self, identity: str) -> CommandRecord | None:
         """The record that ends a stop, as shown, as sent or as failed; None while it goes on."""
         begun = (Phase.ASKED, Phase.QUEUED, Phase.SENT)
-        ends = [each for each in self.records if each.command.id == identity and (each.phase not in begun or each.basis)]
+        ends = [
+            each for each in self.records if each.command.id == identity and (each.phase not in begun or each.basis)
+        ]
         return ends[0] if ends else None
 
     def shown_since(self, since: float) -> float | None:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
-from gateway.control.executor import RENEW_S, SHUTDOWN_S
 
+from gateway.control.executor import RENEW_S, SHUTDOWN_S
 from gateway.control.mode import Verdict
 from gateway.control.records import (
     Act,
@@ -192,7 +192,7 @@ def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Desk
     assert [data for _, data, _ in renewed] == [STOP] * len(renewed)
     assert {why for _, _, why in renewed} == {Why.REPEAT}
     times = [0.0, *(at for at, _, _ in renewed)]
-    gaps = [round(later - earlier, 1) for earlier, later in zip(times, times[1:], strict=False)]
+    gaps = [round(later - earlier, 1) for earlier, later in pairwise(times)]
     assert gaps[:3] == list(RENEW_S)
     assert set(gaps[2:]) == {RENEW_S[-1]}
 

@@ -384,6 +384,4 @@ def test_every_row_is_played() -> None:
     assert {row[0] for row in ROWS} | {StopCase.SOFT, StopCase.ACTED} == set(EVIDENCE) == set(StopCase)
 
 
-
-
 assert NORMAL_MAX_S < PAUSE_MIN_S

@@ -2,6 +2,7 @@
 
 import random
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 
@@ -192,7 +193,7 @@ def test_a_deaf_car_is_told_for_ever_with_pauses_that_grow_to_ten_seconds_at_mos
     pair.run(300.0)
     assert pair.control.model.trust.state is CarTrust.UNPROVEN
     times = [at for at, _ in pair.sent]
-    assert max(later - earlier for earlier, later in zip(times, times[1:], strict=False)) < 10.0
+    assert max(later - earlier for earlier, later in pairwise(times)) < 10.0
     assert pair.now - times[-1] < 10.0
     codes = [log.code for log in pair.logs]
     assert codes.count("not_obeyed") == codes.count("not_shown") == 1, "said once"

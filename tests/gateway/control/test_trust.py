@@ -47,7 +47,12 @@ def test_a_transition(state: CarTrust, event: TrustEvent) -> None:
         assert after is CarTrust.STOPPED
     if after in (CarTrust.DRIVING, CarTrust.IN_MODE) and state is not after:
         assert event in (TrustEvent.MOTION_SENT, TrustEvent.MODE_SENT), "the car only moves if we send something"
-    if state in STOP_GOES_ON and event in (TrustEvent.SILENT, TrustEvent.NOT_SHOWN, TrustEvent.DOUBTED, TrustEvent.HEARD):
+    if state in STOP_GOES_ON and event in (
+        TrustEvent.SILENT,
+        TrustEvent.NOT_SHOWN,
+        TrustEvent.DOUBTED,
+        TrustEvent.HEARD,
+    ):
         assert after in STOP_GOES_ON, "no doubt ends a stop"
 
 
