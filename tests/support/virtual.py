@@ -109,10 +109,8 @@ class Pair:
     def last_of(self, identity: str) -> CommandRecord | None:
         """The record that ends a stop, as shown, as sent or as failed; None while it goes on."""
         begun = (Phase.ASKED, Phase.QUEUED, Phase.SENT)
-        ends = [
-            each for each in self.records if each.command.id == identity and (each.phase not in begun or each.basis)
-        ]
-        return ends[0] if ends else None
+        life = (record for record in self.records if record.command.id == identity)
+        return next((record for record in life if record.phase not in begun or record.basis), None)
 
     def shown_since(self, since: float) -> float | None:
         """When the car first showed after `since` that it stands; None if it did not."""

@@ -124,7 +124,7 @@ def test_a_mode_frame_that_is_lost(row: Row, world: str) -> None:
 
 
 def told_again(pair: Pair, world: str) -> None:
-    """Silence does not contradict a stop that goes on: the car is told again, and nothing is claimed until it shows it."""
+    """Silence contradicts no stop that goes on: the car is told again, and until then nothing is claimed."""
     true, end = pair.car.truth.mode, pair.now + LONG_S
     while pair.car.truth.mode is true and pair.now < end:
         assert pair.control.mode.verdict is not Verdict.CONFIRMED
