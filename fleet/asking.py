@@ -124,7 +124,7 @@ class Asking:
             if item.car in self._progress:
                 self._progress[item.car].token(at, alive=item.alive)
         else:
-            self._of(item.car).event(item.phase, item.reason, item.words, item.worst_case_s, at)
+            self._of(item.car).event(item.phase, item.reason, item.words, item.worst_case_s, at, item.basis)
 
     def _answer(self, progress: Progress, item: Sample, at: float) -> None:
         """One car's answer; what nobody can read costs no other car its outcome."""

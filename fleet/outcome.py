@@ -14,7 +14,8 @@ _ENDED: Final = frozenset({"superseded", "expired", "failed", "rejected"})
 MARGIN_S: Final = 5.0
 """What is waited beyond the time in which the gateway said, or must say, what became of a command.
 
-A stop's worst case ends when the motors are off; its last frame follows 1.1 s later (protocol.md, "full")."""
+A stop's worst case ends when the motors are off; the car shows it later, see `SHOW_S`."""
+SHOW_S: Final = 10.0  # gateway.control.stop: time that a car has to show a stop beyond its worst case
 GONE_S: Final = 1.0
 """How long a gateway that has gone from the bus may take to be there again: it tries twice a second."""
 LATEST_ANSWER_S: Final = 10.0
@@ -30,7 +31,7 @@ class Until(StrEnum):
     SENT = "sent"
     """The frame was written."""
     STOPPED = "stopped"
-    """The whole stop was written."""
+    """The car showed the stop, or can show nothing of it."""
     OVER = "over"
     """The drive has ended."""
 
@@ -52,6 +53,8 @@ class Outcome:
     """A stop's: the longest it could take until the motors are off, as announced. None if no stop was announced."""
     took_s: float = 0.0
     """From asking until this was known, here."""
+    basis: str = ""
+    """A stop's: `shown` if the car's readings show that it stands, `sent` if they can show nothing."""
 
     def check(self) -> Self:
         """Itself; raises NotCarriedOut if it was not carried out."""
@@ -86,6 +89,7 @@ class Progress:
         self._asked_at = asked_at
         self._lasts_s = lasts_s
         self._phase = NO_ANSWER
+        self._basis = ""
         self._heard_at = asked_at
         self._counts_from = asked_at
         self._worst_case_s = 0.0
@@ -110,7 +114,9 @@ class Progress:
             return self._asked_at + LATEST_ANSWER_S + MARGIN_S
         if self._joined:
             return self._counts_from + self._lasts_s
-        wait_s = {Until.SENT: PATIENCE_S, Until.STOPPED: self._worst_case_s, Until.OVER: self._lasts_s}[self._until]
+        wait_s = {Until.SENT: PATIENCE_S, Until.STOPPED: self._worst_case_s + SHOW_S, Until.OVER: self._lasts_s}[
+            self._until
+        ]
         return self._counts_from + wait_s + MARGIN_S
 
     @property
@@ -128,10 +134,14 @@ class Progress:
         if status == SENT and self._until is Until.STOPPED and worst_case_s == 0:
             self._end(SENT, reason, words, at, ok=True)
 
-    def event(self, phase: str, reason: str, words: str, worst_case_s: float, at: float) -> None:
-        """Take one record of `event/command`."""
+    def event(self, phase: str, reason: str, words: str, worst_case_s: float, at: float, basis: str = "") -> None:
+        """Take one record of `event/command`. Only the last record of a stop has a basis."""
         self._sent_told = self._sent_told or phase == SENT
         self._worst_case_s = max(self._worst_case_s, worst_case_s)
+        self._basis = basis
+        if basis and phase == SENT:
+            self._heard_at = at
+            self._end(SENT, reason, words, at, ok=True)
         self._note(phase, reason, words, at)
 
     def missing(self, present: Sequence[str], at: float) -> None:
@@ -194,4 +204,4 @@ class Progress:
     def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
         if self.outcome is None:
             took_s = at - self._asked_at
-            self.outcome = Outcome(self.car, ok, phase, reason, words, self._worst_case_s or None, took_s)
+            self.outcome = Outcome(self.car, ok, phase, reason, words, self._worst_case_s or None, took_s, self._basis)

@@ -57,7 +57,12 @@ FRESH_S: Final = 0.25
 """Bytes that could not be looked at so soon are not looked at: what comes after them matters more."""
 FLOOD_OVER_S: Final = 10.0
 """A flood is told of again when it was over for so long."""
-_LEVELS: Final = {Level.DEBUG: logging.DEBUG, Level.INFO: logging.INFO, Level.WARNING: logging.WARNING, Level.ERROR: logging.ERROR}
+_LEVELS: Final = {
+    Level.DEBUG: logging.DEBUG,
+    Level.INFO: logging.INFO,
+    Level.WARNING: logging.WARNING,
+    Level.ERROR: logging.ERROR,
+}
 
 log = logging.getLogger("gateway")
 

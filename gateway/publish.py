@@ -194,7 +194,13 @@ class Publications:
             "state/link": (health.state, health.reconnects, health.state == "lost" and health.reason),
             "state/mode": (mode.asked, mode.inferred, mode.verdict),
             "state/motion": (control.motion, control.owner, believed.fan, believed.servo_deg, believed.speed),
-            "state/safety": (safety.kept, lease and lease.holder, control.motors, control.basis, control.model.trust.state),
+            "state/safety": (
+                safety.kept,
+                lease and lease.holder,
+                control.motors,
+                control.basis,
+                control.model.trust.state,
+            ),
         }
         for name, told in changes.items():
             late = now - self._told_at.get(name, float("-inf")) >= STATE_EVERY_S

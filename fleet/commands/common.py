@@ -134,9 +134,10 @@ def _words(outcome: Outcome) -> str:
         return f"{outcome}{' (--take)' if outcome.reason == 'leased' else ''}"
     notes = [outcome.words] if outcome.words else []
     if outcome.worst_case_s is not None:
-        notes.append(f"motors off within {outcome.worst_case_s:.2f} s at worst")
+        notes.append(f"motors off within {outcome.worst_case_s:.2f} s if the frames arrived")
     more = f" ({'; '.join(notes)})" if notes else ""
-    return f"{outcome.car}: {outcome.phase} after {outcome.took_s:.2f} s{more}"
+    how = f", {outcome.basis}" if outcome.basis == "shown" else ", nothing shows it" if outcome.basis else ""
+    return f"{outcome.car}: {outcome.phase} after {outcome.took_s:.2f} s{how}{more}"
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from gateway.protocol.profile import Profile, StopStyle
 from gateway.protocol.values import Mode, Motion
 
 KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
-"""In these states the last recovery is over and no write has failed since: the car reads what is sent as it is meant."""
+"""In these states the last recovery is over and no write has failed since, so the car reads frames as they are."""
 
 
 @dataclass(slots=True)

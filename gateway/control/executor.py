@@ -32,8 +32,8 @@ UNKNOWN_PROBES: Final = 2
 GAP_S: Final = 1.5
 """Minimum time to the next try of a stop in which other frames may go out."""
 CLEARING_RENEWALS: Final = 4
-"""After a stop that an arduino could not show, so many times `MODE00` is sent again. A general stop does nothing to a car
-that was sent half a named frame (protocol.md, hazards). No more than that, since it beeps."""
+"""Maximum renewals by `MODE00` after a stop that an arduino could not show. A general stop does nothing to a car that
+keeps half a named frame (protocol.md, hazards). `MODE00` beeps, so there are no more."""
 _STOP: Final = General(Motion.STOP)
 
 
@@ -181,7 +181,7 @@ class Executor:
         """Return when the next frame of a renewal is due."""
         if self._general_stop_follows:
             return self.model.pacing.written_at + recipes.REPEAT_S
-        # In one string behind a servo or colour frame `MODE00` would open a mode: its digits are read out of that frame.
+        # In one string behind a servo frame `MODE00` would open a mode: its digits are read out of that frame.
         return max(self._renew_at, self.model.pacing.ready_at(Gate.ALONE)) if self._renewal_clears() else self._renew_at
 
     def _renewal_clears(self) -> bool:
@@ -198,7 +198,7 @@ class Executor:
         model, frame = self.model, write.frame
         if isinstance(frame, ModeClose):
             if not model.manual:
-                # A turn of the mode that is left may be deaf for longer than the closing takes; only a stop may meet it.
+                # A turn of the mode that is left may be deaf for longer than the closing takes.
                 deaf_until = max(now, model.pacing.block_until) + model.for_stop(now).turn_s
                 self.left_at, self.left_until = now, deaf_until + model.profile.block_s(frame) + FLIGHT_S
             model.evidence.closed(now, awake=model.is_awake(now))
@@ -541,9 +541,7 @@ class Executor:
                 self._not_shown_logged = True
                 self._ledger.log(Level.ERROR, "not_shown", words, now)
 
-    def _finish(
-        self, running: Running, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL
-    ) -> None:
+    def _finish(self, running: Running, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL) -> None:
         """End the stop: the car showed it, or can show nothing."""
         model = self.model
         self.running = None
@@ -576,7 +574,9 @@ class Executor:
             elif held.pending.sent:
                 words = "its time is over"
                 if held.began_at is not None and held.began_at > held.pending.asked_at + LATE_S:
-                    words += f", of which {self.model.name} was driven for {now - held.began_at:.2f} s: it was busy before"
+                    words += (
+                        f", of which {self.model.name} was driven for {now - held.began_at:.2f} s: it was busy before"
+                    )
                 self.release(Phase.COMPLETE, None, words, now)
             else:
                 self.release(Phase.EXPIRED, Reason.EXPIRED, f"{self.model.name} was busy until its time was over", now)
@@ -584,7 +584,12 @@ class Executor:
 
     def release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
         """End the held motion with a soft stop, unless the car stands and never got it."""
-        self.waiting.close_held(phase, reason, words, now)
+        deaf = self.model.can_show and self.model.evidence.obeyed_at is None
+        if phase is Phase.COMPLETE and deaf:
+            words += f"; nothing shows that {self.model.name} moved: it has not reacted to any frame on this link"
+            self.waiting.close_held(Phase.SENT, reason, words, now, Basis.SENT)
+        else:
+            self.waiting.close_held(phase, reason, words, now)
         if self.model.link_open and self.running is None and not self.model.at_rest:
             self.begin(self.soft(now), Why.STOP, now)
 

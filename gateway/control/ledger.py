@@ -56,7 +56,9 @@ class Ledger:
         pending.sent = pending.sent or phase is Phase.SENT
         took = now - pending.asked_at
         self._records.append(
-            CommandRecord(pending.command, phase, now, reason, words, worst_case_s, took, evidence, pending.count, basis)
+            CommandRecord(
+                pending.command, phase, now, reason, words, worst_case_s, took, evidence, pending.count, basis
+            )
         )
 
     def sent(self, pending: Pending, now: float, words: str = "") -> None:

@@ -20,8 +20,8 @@ CLOSED_S: Final = 0.95
 """A report sooner after `MODE00` was written than this was sent before the car obeyed: closing takes 1.0 s."""
 LEFT_S: Final = 2.2
 """Maximum time from `MODE00` to the first mode-0 report if that frame closed the mode: 1.0 s of closing, 0.9 s to the
-report, and 0.2 s of turn and wire. A `MODE00` that lost one of its digits opens mode 0 instead, with the motors on; that
-blocks for 2.3 s, so the report comes later."""
+report, and 0.2 s of turn and wire. A `MODE00` that lost a digit opens mode 0 instead, with the motors on. That blocks
+for 2.3 s, so the report comes later."""
 RANGING_S: Final = 1.0
 """A report without an echo comes so much later."""
 SHAPE_UNTIL_S: Final = 1.0

@@ -71,8 +71,8 @@ class Waiting:
         while self.acts:
             self.ledger.record(self.acts.popleft(), phase, now, reason=reason, words=words)
 
-    def close_held(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
-        """The held motion is over; with the lease of a sender that is gone."""
+    def close_held(self, phase: Phase, reason: Reason | None, words: str, now: float, basis: str = "") -> None:
+        """End the held motion. Release the lease too if its holder has disconnected."""
         held, self.held = self.held, None
         if held is None:
             return
@@ -80,7 +80,7 @@ class Waiting:
             self.safety.release(held.sender)
         if phase is not Phase.SUPERSEDED:
             self.safety.driven_no_more(now)
-        self.ledger.record(held.pending, phase, now, reason=reason, words=words)
+        self.ledger.record(held.pending, phase, now, reason=reason, words=words, basis=basis)
 
     def close_opening(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
         """The mode will not be opened."""

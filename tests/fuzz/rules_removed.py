@@ -65,7 +65,9 @@ def _confirmations_stay(patch: Patch) -> None:
 
 
 def _shutdown_waits_for_time(patch: Patch) -> None:
-    patch(Executor, "finished", property(lambda self: self.closing and (self.running is None or self.running.frames_sent)))
+    patch(
+        Executor, "finished", property(lambda self: self.closing and (self.running is None or self.running.frames_sent))
+    )
 
 
 def _sent_without_a_report(patch: Patch) -> None:

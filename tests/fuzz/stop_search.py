@@ -107,7 +107,6 @@ class Ending(StrEnum):
     RECONNECT = "reconnect"
 
 
-
 @dataclass(frozen=True, slots=True)
 class Plan:
     """All that is random about one episode."""
@@ -203,14 +202,22 @@ def _damaged_reports(seed: int, moments: random.Random) -> Plan:
 
 
 def _misread_and_lost(seed: int, moments: random.Random) -> Plan:
-    """A drive, then half a general frame and `MODE00` in one string, which opens a silent mode; later tries are lost."""
+    """Half a general frame and `MODE00` in one string open a silent mode while driving. Later tries are lost."""
     cut = Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(2, 18) / BYTES_PER_S, 0.03)
     later = Fault(Kind.DEAD, Way.TO_CAR, 1.5, moments.uniform(9.0, 15.0))
     again_s = moments.uniform(0.02, 0.2) if moments.random() < 0.5 else 0.0
     return _theme(seed, "steer", moments.uniform(0.5, 4.0), (cut, later), again_s=again_s)
 
 
-THEMES = (_report_swallowed, _digit_lost, _stop_while_opening, _half_a_frame, _short_gap, _damaged_reports, _misread_and_lost)
+THEMES = (
+    _report_swallowed,
+    _digit_lost,
+    _stop_while_opening,
+    _half_a_frame,
+    _short_gap,
+    _damaged_reports,
+    _misread_and_lost,
+)
 
 
 def _any(seed: int, moments: random.Random) -> Plan:
@@ -246,7 +253,11 @@ def _any(seed: int, moments: random.Random) -> Plan:
         told,
         world,
         load,
-        moments.uniform(0.1, 3.5) if opening else moments.uniform(0.5, 9.0) if load in modes else moments.uniform(0.2, 2.0),
+        moments.uniform(0.1, 3.5)
+        if opening
+        else moments.uniform(0.5, 9.0)
+        if load in modes
+        else moments.uniform(0.2, 2.0),
         moments.choice(endings),
         _faults(moments),
         opening=opening,
@@ -535,7 +546,9 @@ class Episode:
         wake = min(end, self.car.next_event(), self._up.next_at + zero, self._down.next_at + zero)
         if self._linked:
             deadline = self.decoder.deadline()
-            wake = min(wake, self.control.next_at(self.now), self._next_tick, float("inf") if deadline is None else deadline)
+            wake = min(
+                wake, self.control.next_at(self.now), self._next_tick, float("inf") if deadline is None else deadline
+            )
         self.now = max(self.now + 1e-4, min(wake, end))
         self._carry(zero)
         if self._linked:
@@ -583,7 +596,9 @@ class Episode:
             self._note(f"write {write.data!r} {write.why}")
             zero = self.zero if self.zero < float("inf") else 0.0
             took_s = len(write.data) / BYTES_PER_S
-            if self.zero < float("inf") and (self._down.next_at < float("inf") or self._touched(now) or self._touched(now + took_s)):
+            if self.zero < float("inf") and (
+                self._down.next_at < float("inf") or self._touched(now) or self._touched(now + took_s)
+            ):
                 self._down.put(write.data, now - zero, now + took_s - zero)
             else:
                 self.car.feed(write.data, max(now, self.car.now))
@@ -606,9 +621,12 @@ class Episode:
     def _record(self, record: CommandRecord) -> None:
         identity = record.command.id
         last = (
-            "complete" if record.phase is Phase.COMPLETE
-            else "sent" if record.phase is Phase.SENT and record.basis
-            else "failed" if record.phase is Phase.FAILED
+            "complete"
+            if record.phase is Phase.COMPLETE
+            else "sent"
+            if record.phase is Phase.SENT and record.basis
+            else "failed"
+            if record.phase is Phase.FAILED
             else ""
         )
         self._note(f"record {identity} {record.phase} {record.basis} {record.words} {record.evidence}")
@@ -769,7 +787,9 @@ def shrink(plan: Plan) -> Plan:
     smaller = True
     while smaller:
         smaller = False
-        candidates = [replace(plan, faults=tuple(each for each in plan.faults if each is not fault)) for fault in plan.faults]
+        candidates = [
+            replace(plan, faults=tuple(each for each in plan.faults if each is not fault)) for fault in plan.faults
+        ]
         candidates += [replace(plan, again_s=0.0)] if plan.again_s else []
         candidates += [replace(plan, drive_again_s=0.0)] if plan.drive_again_s else []
         for candidate in candidates:
