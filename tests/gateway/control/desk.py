@@ -56,7 +56,7 @@ class ObedientCar:
         self._profile = parse_platform(platform.replace("unknown", "arduino"))
         self._pi = self._profile.kind is Platform.RASPBERRY_PI
         self._mode = Mode.MANUAL
-        self._fan = False
+        self.fan = False
         self.reading = PI_READING if self._pi else READING
         self.report_at = now + REPORT_S
 
@@ -77,7 +77,7 @@ class ObedientCar:
             case _:
                 pass
         if isinstance(frame, General) and frame.fan:
-            self._fan = not self._fan
+            self.fan = not self.fan
 
     def report(self, now: float) -> bytes:
         """Return what it sends now, and go on; empty if it sends nothing."""
@@ -85,7 +85,7 @@ class ObedientCar:
         self.report_at = now + (RUNNING_S if running else REPORT_S)
         if self._mode is not Mode.MANUAL:
             return running
-        return b"" if self._fan else self.reading
+        return b"" if self.fan else self.reading
 
 
 class Desk:

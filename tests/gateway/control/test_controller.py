@@ -633,7 +633,7 @@ def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_st
 ) -> None:
     desk = Desk(platform).ready()
     state(desk)
-    if state is idle:
+    if desk.control.basis is not None:
         desk.ask(Drive(Motion.FORWARD, 0.2))
         desk.run(0.1)
     began = desk.now
@@ -736,9 +736,15 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
         before = len(desk.sent)
         desk.ask(Stop(), identity="the-stop")
         desk.run(16.0)
-        assert desk.control.motors == "off"
         assert set(desk.frames[before:]) <= stops, seed
         ends = [each for each in desk.records if each.command.id == "the-stop"]
+        if (
+            desk.car.fan and not desk.control.believed.fan
+        ):  # it ran when the link was lost: nobody knows why it is silent
+            assert (ends[-1].phase, ends[-1].reason) == (Phase.FAILED, Reason.NOT_SHOWN), seed
+            assert desk.control.motors == "unknown", seed
+            continue
+        assert desk.control.motors == "off", seed
         assert (ends[-1].phase is COMPLETE) == (ends[-1].basis == Basis.SHOWN), seed
         assert ends[-1].phase is COMPLETE or (ends[-1].phase, ends[-1].basis) == (SENT, Basis.SENT), seed
 
