@@ -162,8 +162,7 @@ class CarMonitor:
         self._ledger.log(Level.INFO, "answers_again", words, now)
         self._executor.waiting.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self.model.learn(TrustEvent.HEARD, now, words)
-        if self._executor.running is not None and self._executor.running.at_rest:
-            self._executor.recover(now, words)
+        self._executor.heard_again(now, words)
 
     def stalled(self, gap_s: float, now: float) -> None:
         """Stop a car that is driven: the loop slept for `gap_s`."""

@@ -402,6 +402,14 @@ class Executor:
         assert self.running is not None
         return self._step(self.running, now)
 
+    def heard_again(self, now: float, words: str) -> None:
+        """Stop a car that is heard again: what was written meanwhile may be lost, or come all at once."""
+        running = self.running
+        if running is not None and running.at_rest:
+            self.recover(now, words)
+        elif running is not None:
+            self._try_again(running, now)
+
     def recover(self, now: float, words: str) -> None:
         """Bring the car to a known state, whatever runs. Commands that wait for a stop wait for this one."""
         before = self.running
@@ -513,7 +521,7 @@ class Executor:
         if running.case is StopCase.SOFT:
             return StopCase.SOFT if over else None
         if running.case is StopCase.RASPBERRY_PI:
-            heard = running.report_at > (running.first_at or now) or running.recipe.rank == recipes.SOFT.rank
+            heard = running.report_at > running.try_at or running.recipe.rank == recipes.SOFT.rank
             return StopCase.RASPBERRY_PI if over and heard else None
         if over and model.believed.fan and model.profile.fan_silences:
             return StopCase.FAN
