@@ -18,7 +18,8 @@ WORDS: Final[Mapping[str, tuple[str, ...]]] = {
     "mode.verdict": ("assumed", "confirmed", "contradicted"),
     "motion.motion": _MOTIONS,
     "motion.source": ("commanded", "assumed", "unknown"),
-    "safety.motors": ("off", "on", "unknown"),
+    "safety.motors": ("off", "on", "stopping", "unknown"),
+    "safety.motors_basis": ("shown", "sent"),
 }
 """All that these ever are (schemas/proto); a field is named after the last word of its topic."""
 RANGES: Final[Mapping[str, tuple[float, float]]] = {
