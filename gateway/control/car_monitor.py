@@ -21,8 +21,8 @@ from gateway.protocol.values import Mode
 
 STALL_S: Final = 0.5
 """A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
-STALE_TIMES_S: Final = 0.2
-"""If the loop slept longer, reports may have been taken later than they came."""
+STALE_TIMES_S: Final = 0.5
+"""If the loop slept longer, reports were taken so much later than they came that a normal gap may look like a pause."""
 FAN_SETTLED_S: Final = 2.0
 """Readings this long after a toggle were sent with the fan as it is now."""
 

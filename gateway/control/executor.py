@@ -290,7 +290,7 @@ class Executor:
             case ModeOpen(mode):
                 self.mode_sent = None
                 model.mode.ask(mode, now=now, block_s=block_s)
-                model.evidence.opened(mode, silent=mode in model.profile.silent_modes, shown=shown)
+                model.evidence.opened(mode, now, silent=mode in model.profile.silent_modes, shown=shown)
                 self._moves(TrustEvent.MODE_SENT, now)
             case ModeClose():
                 if self.mode_sent is not None and self.mode_sent[0].command.what != SetMode(Mode.MANUAL):
@@ -468,7 +468,9 @@ class Executor:
             case Finding.SHOWN:
                 self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
             case Finding.NO_ECHO if at > running.closed_at + CLOSED_S:
-                running.no_echo_at = at
+                running.without_echo += 1
+                if max(running.without_echo, self.model.evidence.without_echo) >= 2:
+                    running.no_echo_at = at
             case Finding.LOST:
                 self._lost(running, now)
             case _:
@@ -544,7 +546,8 @@ class Executor:
         running.commands[:] = waiting
         if now >= running.gives_up_at and not running.overdue:
             running.overdue = True
-            self.model.learn(TrustEvent.NOT_SHOWN, now)
+            heard = self.model.mode.heard_at > running.began_at
+            self.model.learn(TrustEvent.NOT_SHOWN if heard else TrustEvent.SILENT, now)
             if not self._not_shown_logged:
                 self._not_shown_logged = True
                 self._ledger.log(Level.ERROR, "not_shown", words, now)
@@ -559,7 +562,7 @@ class Executor:
         model.learn(TrustEvent.STOP_SHOWN if basis is Basis.SHOWN else TrustEvent.STOP_SENT, now, words)
         if recovered:
             how = "shown" if basis is Basis.SHOWN else f"sent: {words}"
-            self._ledger.log(Level.INFO, "recovered", f"{model.name} is stopped, mode manual ({how})", now)
+            self._ledger.log(Level.INFO, "recovered", f"{model.name} is in a known state: stopped ({how}), mode manual", now)
         model.believed.motors_on = False
         if basis is Basis.SENT:
             self._renewals, self._general_stop_follows = 0, False

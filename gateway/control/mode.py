@@ -152,12 +152,17 @@ class ModeTruth:
             words = f"no reading with the shape of {self.asked} for {own_s:.1f} s, the last has that of {shape}"
             self._conclude(Verdict.CONTRADICTED, words, now)
 
+    @property
+    def heard_at(self) -> float:
+        """Return when the last reading came; -inf if none did."""
+        return self._heard_at
+
     def fade(self, now: float) -> None:
         """Take back a confirmation that is older than the silence that the asked mode allows."""
         if self.verdict is not Verdict.CONFIRMED or self.asked is None:
             return
         limit = MANUAL_SILENCE_S if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
-        since_s = now - max(self._own_at, self._excused_at)
+        since_s = now - max(self.evidence_at or self._own_at, self._excused_at)
         blocked_s = sum(block_s for at, block_s in self._blocks if at > now - since_s)
         if self.inferred is None or since_s > limit + blocked_s + MODE_CLOSE_S:
             self._conclude(Verdict.ASSUMED, f"no reading with the shape of {self.asked} for {since_s:.1f} s", now)

@@ -97,7 +97,9 @@ class Running:
     report_at: float = float("-inf")
     """When the last report of mode 0 came that was sent after its newest `MODE00`."""
     no_echo_at: float = float("-inf")
-    """The same, of one without an echo."""
+    """The same, of one without an echo. One alone may be damaged, so two count."""
+    without_echo: int = 0
+    """Such reports since the stop began."""
     probes: int = 0
     overdue: bool = False
     """Nothing showed it in time. The stop goes on."""

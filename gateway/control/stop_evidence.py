@@ -16,6 +16,9 @@ from gateway.protocol.values import Mode
 SETTLED_S: Final = 0.8
 """Minimum silence before a mode-0 report that counts. A mode that reports sends 20 frames a second: a damaged frame of
 such a mode can look like mode 0 (there is no checksum), but silence never comes before it."""
+BUNCHED_S: Final = 0.4
+"""Reports closer than this were delayed by the link, so a pause before them may be the link's. A loaded machine takes a
+report up to 0.5 s late."""
 CLOSED_S: Final = 0.95
 """A report sooner after `MODE00` was written than this was sent before the car obeyed: closing takes 1.0 s."""
 LEFT_S: Final = 2.2
@@ -29,6 +32,8 @@ SHAPE_UNTIL_S: Final = 1.0
 OPENING_SILENCE_S: Final = 2.3
 """Minimum silence before the report that shows that a silent mode was left: opening alone blocks for 2.5 s. A slow link
 delivers older reports meanwhile, one a second."""
+OPENED_S: Final = 2.5
+"""Minimum time that opening a mode blocks (protocol.md): the car can report that it left the mode no sooner."""
 PAUSE_MIN_S: Final = 1.88
 PAUSE_MAX_S: Final = 2.6
 """Two reports around a `MODE00` that was obeyed are 1.9 s apart or a little more (protocol.md)."""
@@ -149,6 +154,8 @@ class StopEvidence:
     """When the car last showed that a frame arrived; None if never on this link."""
     words: str = ""
     """What `SHOWN` rests on."""
+    without_echo: int = 0
+    """Reports without an echo in a row."""
     _last_at: float = float("-inf")
     """When the last bytes came that are no report of the options (arm, gyro)."""
     _before: float | None = None
@@ -162,6 +169,8 @@ class StopEvidence:
     """When the last reading of another mode came, if the car was seen in one since the last motion or opening."""
     _silent_mode: Mode | None = None
     """The silent mode that was opened from a shown rest."""
+    _opened_at: float = float("-inf")
+    """When the last mode was opened."""
     _closed_at: float | None = None
     """When the first `MODE00` since then was written; None if another frame came first."""
     _plain: bool = False
@@ -183,9 +192,10 @@ class StopEvidence:
         self._pending = None
         self._leave_nothing()
 
-    def opened(self, mode: Mode, *, silent: bool, shown: bool) -> None:
+    def opened(self, mode: Mode, now: float, *, silent: bool, shown: bool) -> None:
         """Note a mode that was opened; `shown`: from a rest that the car has shown."""
         self.sent_motion()
+        self._opened_at = now
         self._plain = True
         self._silent_mode = mode if silent and shown else None
 
@@ -227,9 +237,15 @@ class StopEvidence:
             return Finding.NOTHING
         self._shapes = 0
         if quiet_s < SETTLED_S:
-            self._before, self._pauses = None, 0
+            self._before = None
+            if quiet_s < BUNCHED_S:
+                self._pauses = 0
+            return Finding.NOTHING
+        if event.range_cm is None:  # damaged: it says nothing of an echo either
+            self._before = None
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
+        self.without_echo = 0 if event.range_cm else self.without_echo + 1
         if self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S):
             return self._obeyed(at)
         pending = self._pending
@@ -275,7 +291,7 @@ class StopEvidence:
         shape_at, silent = self._shape_at, self._silent_mode
         if closed_at is None or at <= closed_at + CLOSED_S:
             return False
-        if silent is not None and quiet_s < OPENING_SILENCE_S:
+        if silent is not None and (quiet_s < OPENING_SILENCE_S or at < self._opened_at + OPENED_S + CLOSED_S):
             return False  # an older report, on a slow link
         self._shape_at = self._silent_mode = None
         if not self._plain or at > closed_at + within_s:

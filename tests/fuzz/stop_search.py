@@ -648,7 +648,9 @@ class Episode:
     def _shows(self) -> bool:
         """Return True if the car can show a stop, and nothing hides that."""
         plan = self.plan
-        return (plan.platform, plan.told) in _WITH_MODES and plan.world == "echo" and not self.car.truth.fan
+        return (plan.platform, plan.told) in _WITH_MODES and plan.world == "echo" and not (
+            self.car.truth.fan or self.control.platform.doubted
+        )
 
     def _judge(self) -> None:
         """Hold the claims against the true motors."""

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from gateway.control.records import Drive, Fan, Phase, SetMode, Stop
 from gateway.control.stop_evidence import (
+    BUNCHED_S,
     CLOSED_S,
     EVIDENCE,
     LEFT_S,
@@ -18,7 +19,6 @@ from gateway.control.stop_evidence import (
     PAUSES,
     RANGING_S,
     ROUND_TRIP_S,
-    SETTLED_S,
     Finding,
     StopCase,
     StopEvidence,
@@ -143,7 +143,7 @@ def test_a_car_that_hears_nothing_shows_nothing_also_where_one_report_is_lost(
             assert watch.reports(at) != [SHOWN]
 
 
-@given(st.lists(st.floats(0.01, SETTLED_S - 0.02), min_size=1, max_size=10))
+@given(st.lists(st.floats(0.01, BUNCHED_S - 0.02), min_size=1, max_size=10))
 def test_bunched_reports_begin_anew(gaps: list[float]) -> None:
     """What a stuck link delivers at once says nothing of when it was sent."""
     watch = Watch()
@@ -213,7 +213,7 @@ def test_a_ranging_without_echo_takes_a_second_and_shows_nothing(without: int) -
 def tracking(until: float) -> Watch:
     """A car that is seen in tracking."""
     watch = Watch()
-    watch.evidence.opened(Mode.TRACKING, silent=False, shown=True)
+    watch.evidence.opened(Mode.TRACKING, 0.0, silent=False, shown=True)
     for number in range(40):
         assert watch.evidence.reading(event(TRACKING, until - 2.0 + 0.05 * number)) is NOTHING
     return watch
@@ -223,7 +223,7 @@ def silent(*, shown: bool = True) -> Watch:
     """A car that was brought to color LED mode at 5.0."""
     watch = Watch()
     watch.reports(4.9)
-    watch.evidence.opened(Mode.COLOR_LED, silent=True, shown=shown)
+    watch.evidence.opened(Mode.COLOR_LED, 5.0, silent=True, shown=shown)
     return watch
 
 
@@ -275,7 +275,7 @@ def test_the_shape_of_the_mode_long_after_mode00_shows_the_opposite() -> None:
 
 def test_one_damaged_reading_is_no_mode_that_was_seen() -> None:
     watch = Watch()
-    watch.evidence.opened(Mode.TRACKING, silent=False, shown=True)
+    watch.evidence.opened(Mode.TRACKING, 0.0, silent=False, shown=True)
     watch.evidence.reading(event(TRACKING, 9.0))
     watch.closed(10.0)
     assert watch.reports(11.95)[-1] is not SHOWN
