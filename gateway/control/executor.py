@@ -61,7 +61,6 @@ class Executor:
         self._renew_at = float("inf")
         self._general_stop_follows = False
         """The last renewal was a `MODE00`, which a Raspberry Pi ignores: a general stop follows, alone."""
-        self._not_shown_logged = False
         self._left_mode = False
         """The last stop left a mode, in which a general stop is ignored."""
 
@@ -427,7 +426,6 @@ class Executor:
         self.running = Running(
             recipe, why, now, now, commands, worst_at=now + worst_s, patience_s=patience_s, case=self._case(recipe)
         )
-        self._not_shown_logged = False
         model.learn(TrustEvent.STOP_BEGUN, now, f"{recipe.name} stop ({why})")
 
     def _case(self, recipe: Recipe) -> StopCase:
@@ -546,11 +544,13 @@ class Executor:
         running.commands[:] = waiting
         if now >= running.gives_up_at and not running.overdue:
             running.overdue = True
-            heard = self.model.mode.heard_at > running.began_at
-            self.model.learn(TrustEvent.NOT_SHOWN if heard else TrustEvent.SILENT, now)
-            if not self._not_shown_logged:
-                self._not_shown_logged = True
+            if self.model.mode.heard_at > running.began_at:
+                self.model.learn(TrustEvent.NOT_SHOWN, now)
                 self._ledger.log(Level.ERROR, "not_shown", words, now)
+            elif self.model.trust.state is not CarTrust.UNHEARD:
+                words = f"{car} was not heard since the stop began. The gateway goes on stopping it."
+                self.model.learn(TrustEvent.SILENT, now, words)
+                self._ledger.log(Level.WARNING, "unheard", words, now)
 
     def _finish(self, running: Running, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL) -> None:
         """End the stop: the car showed it, or can show nothing."""
@@ -562,7 +562,8 @@ class Executor:
         model.learn(TrustEvent.STOP_SHOWN if basis is Basis.SHOWN else TrustEvent.STOP_SENT, now, words)
         if recovered:
             how = "shown" if basis is Basis.SHOWN else f"sent: {words}"
-            self._ledger.log(Level.INFO, "recovered", f"{model.name} is in a known state: stopped ({how}), mode manual", now)
+            known = f"{model.name} is in a known state: stopped ({how}), mode manual"
+            self._ledger.log(Level.INFO, "recovered", known, now)
         model.believed.motors_on = False
         if basis is Basis.SENT:
             self._renewals, self._general_stop_follows = 0, False

@@ -52,7 +52,11 @@ def _any_frame_before_it(patch: Patch) -> None:
 
 def _silent_mode_after_any_rest(patch: Patch) -> None:
     original = StopEvidence.opened
-    patch(StopEvidence, "opened", lambda self, mode, now, *, silent, shown: original(self, mode, now, silent=silent, shown=True))
+    patch(
+        StopEvidence,
+        "opened",
+        lambda self, mode, now, *, silent, shown: original(self, mode, now, silent=silent, shown=True),
+    )
     patch(stop_evidence, "OPENING_SILENCE_S", 0.0)
 
 

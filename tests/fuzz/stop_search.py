@@ -389,6 +389,7 @@ class Episode:
         self._verdict_since: float | None = None
         self._case = ""
         self._ended_as_sent = False
+        self._platform_doubted = False
         self._false_counted = False
         self.trace: list[str] = []
         self.tracing = False
@@ -648,8 +649,10 @@ class Episode:
     def _shows(self) -> bool:
         """Return True if the car can show a stop, and nothing hides that."""
         plan = self.plan
-        return (plan.platform, plan.told) in _WITH_MODES and plan.world == "echo" and not (
-            self.car.truth.fan or self.control.platform.doubted
+        return (
+            (plan.platform, plan.told) in _WITH_MODES
+            and plan.world == "echo"
+            and not (self.car.truth.fan or self._platform_doubted)
         )
 
     def _judge(self) -> None:
@@ -657,6 +660,7 @@ class Episode:
         if self.zero == float("inf"):
             return
         control, truth, now = self.control, self.car.truth, self.now
+        self._platform_doubted = self._platform_doubted or control.platform.doubted
         driving = truth.driving
         if not driving:
             self._on_since = None
