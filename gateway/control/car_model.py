@@ -122,7 +122,7 @@ class CarModel:
     def is_awake(self, now: float) -> bool:
         """Return True if the car reads a frame at once: no block of ours runs, nor one that we know nothing of."""
         pacing = self.pacing
-        if now <= pacing.heard_at + AWAKE_S and pacing.heard_at > pacing.written_at + FLIGHT_S:
+        if now <= pacing.heard_at + AWAKE_S and now >= pacing.block_from - FLIGHT_S / 2:
             return True
         if now < pacing.block_until - FLIGHT_S:
             return False

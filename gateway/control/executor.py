@@ -29,6 +29,8 @@ RENEW_S: Final = (2.2, 4.0, 6.0)
 """Intervals at which a rest that nothing has shown is sent again, by how often it was. A lost stop is made up for."""
 UNKNOWN_PROBES: Final = 2
 """Maximum probes of a car of an unknown platform: a Raspberry Pi shows nothing of them."""
+RESETTING_STEPS: Final = 1
+"""Index of recovery's first `MODE00`, which is written before anything may take the place of the rest."""
 GAP_S: Final = 1.5
 """Minimum time to the next try of a stop in which other frames may go out."""
 CLEARING_RENEWALS: Final = 4
@@ -485,7 +487,8 @@ class Executor:
             return False
         if running.case is StopCase.UNKNOWN_PLATFORM:
             return running.frames_sent and running.probes < UNKNOWN_PROBES
-        return True
+        # First the `#` that ends half a frame: `MODE00` behind one would open a mode.
+        return running.recipe is not recipes.RECOVERY or running.index > RESETTING_STEPS
 
     def _lost(self, running: Running, now: float) -> None:
         """Send the stop again: the reports came on as before. A Raspberry Pi does the same."""
@@ -596,7 +599,8 @@ class Executor:
 
     def release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
         """End the held motion with a soft stop, unless the car stands and never got it."""
-        deaf = self.model.can_show and self.model.evidence.obeyed_at is None
+        evidence = self.model.evidence
+        deaf = self.model.can_show and evidence.obeyed_at is None and not evidence.without_echo
         if phase is Phase.COMPLETE and deaf:
             words += f"; nothing shows that {self.model.name} moved: it has not reacted to any frame on this link"
             self.waiting.close_held(Phase.SENT, reason, words, now, Basis.SENT)

@@ -307,7 +307,7 @@ def test_an_interrupted_drive_stops_its_cars(cars: Cars, number: signal.Signals)
         out, err = drive.communicate(timeout=60)
     assert drive.returncode == 130
     assert "Traceback" not in err
-    assert [line.split(" after")[0] for line in out.splitlines()] == ["blue: complete", "green: complete"]
+    assert [line.split(" after")[0] for line in out.splitlines()] == ["blue: sent", "green: sent"]
     assert not driving(cars.sim, "green")
     assert not driving(cars.sim, "blue")
 
@@ -318,8 +318,8 @@ def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
         _, err = drive.communicate(timeout=60)
     assert done.returncode == 0
     assert [line.split(" after")[0] for line in done.stdout.splitlines()] == [
-        "blue: complete",
-        "green: complete",
+        "blue: sent",  # a Raspberry Pi can show nothing
+        "green: sent",
         "red: complete",
     ]
     assert not driving(cars.sim, "green")

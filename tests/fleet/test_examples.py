@@ -112,6 +112,7 @@ def test_notebook(cars: Cars) -> None:
     assert len(ast.literal_eval(past)) > 3
     assert "ok=True, phase='complete'" in drove
     assert motors == "'off'"
-    assert stopped.count("ok=True, phase='complete'") == 3
+    assert stopped.count("ok=True, phase='sent'") == 2, "a Raspberry Pi can show nothing"
+    assert stopped.count("ok=True, phase='complete'") == 1
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
         assert all(outcome.ok for outcome in mia.resume(list(cars.gateways)))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.outcome import Progress, Until
+from fleet.outcome import SHOW_S, Progress, Until
 
 # Each step: ("answer" | "event", phase, worst case); at 1, 2, 3 ... s after asking at 100.
 Steps = list[tuple[str, str, float]]
@@ -58,14 +58,14 @@ def test_an_answer_that_its_last_record_overtook_still_says_the_worst_case() -> 
 
 
 def test_a_stop_is_waited_for_as_long_as_its_gateway_announced_and_a_margin() -> None:
-    assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(100 + 7.3 + 5.0)
+    assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(100 + 7.3 + SHOW_S + 5.0)
 
 
 def test_what_is_waited_for_after_a_late_answer_is_counted_from_it() -> None:
     progress = Progress("red", Until.STOPPED, 100.0)
     assert progress.deadline > 110.0, "the query is over before it"
     progress.answered("queued", "", "", 0.5, 108.0)
-    assert progress.deadline == pytest.approx(108.0 + 0.5 + 5.0)
+    assert progress.deadline == pytest.approx(108.0 + 0.5 + SHOW_S + 5.0)
 
 
 @pytest.mark.parametrize(
