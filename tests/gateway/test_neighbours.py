@@ -79,12 +79,12 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
             neighbours = Neighbours(opened, "fleet", "red")
             keeping = asyncio.ensure_future(neighbours.keep_united(learn))
             for car in asked:
-                neighbours.changed((car, True))
+                neighbours.changed({car: True})
                 await asyncio.to_thread(wait_for, lambda car=car: car in learned, f"{car} is asked")
             assert learned == ["blue", "green"]
             neighbours.ask_soon()
             await asyncio.to_thread(wait_for, lambda: learned == ["blue", "green"] * 2, "all are asked")
-            neighbours.changed(("blue", False))
+            neighbours.changed({"blue": False})
             neighbours.ask_soon()
             await asyncio.to_thread(wait_for, lambda: len(learned) == 5, "who is there is asked")
             assert learned[4] == "green"

@@ -132,7 +132,7 @@ def test_records_leave_out_what_does_not_apply(published: Published) -> None:
     desk.records.clear()
     desk.ask(SetMode(Mode.TRACKING), SCRIPT, age_s=0.0)
     desk.ask(Stop(), PERSON)
-    desk.run(3.0)
+    desk.run(9.0)
     found = {(each["verb"], each["phase"]): each for each in map(published.record, desk.records)}
     queued, opened = found["SetMode", "queued"], found["SetMode", "sent"]
     stop, sent, complete = (found["Stop", phase] for phase in ("queued", "sent", "complete"))
