@@ -216,15 +216,32 @@ def frames(data: bytes) -> list[bytes]:
     return re.findall(rb"[^#]*#|[^#]+", data)
 
 
+MODE00 = b"$4WD,MODE00#"
+REPORT = b"$4WD,CSB57.00,PV7.91,GS5,LF0000,HW00,GM11#"
+"""What a car in mode 0 sends that has an echo and a good battery."""
+PI_REPORT = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
+"""The same of a Raspberry Pi, whose voltage and grayscale are constants."""
+REPORT_S = 0.95
+"""A car in mode 0 reports so often (protocol.md, "about one sensor frame per second")."""
+CLOSING_S = 1.0
+"""`MODE00` blocks a car for so long (protocol.md, blocks), and so delays its next report."""
+
+
 class TcpCar:
     """A TCP server that knows nothing of us: it keeps what comes, and sends what it is told to.
 
     Of writes that one receive brought together, for it was late to ask, each frame is kept by itself; half a frame is
-    kept as it came. `echoes`: it sends back all that comes.
+    kept as it came. `echoes`: it sends back all that comes. Until `obey` it shows nothing of what it was sent.
     """
 
     def __init__(self, *, echoes: bool = False) -> None:
         self._echoes = echoes
+        self._report = b""
+        self._report_at = float("inf")
+        self._turn = threading.Condition()
+        self._closed = False
+        self._reporter = threading.Thread(target=self._report_on)
+        self._reporter.start()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.link = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
         self.received: list[bytes] = []
@@ -239,6 +256,12 @@ class TcpCar:
         """Send to the last that connected."""
         self._peers[-1].sendall(data)
 
+    def obey(self, report: bytes = REPORT) -> None:
+        """From now on do as a car in mode 0 does: report, and be blocked by each `MODE00`."""
+        with self._turn:
+            self._report, self._report_at = report, time.monotonic()
+            self._turn.notify()
+
     def pour(self, data: bytes, per_s: float, seconds: float) -> int:
         """Send this over and over; how many bytes were taken."""
         began, sent = time.monotonic(), 0
@@ -251,6 +274,10 @@ class TcpCar:
 
     def close(self) -> None:
         """Hang up and end."""
+        with self._turn:
+            self._closed = True
+            self._turn.notify()
+        self._reporter.join()
         for each in (self._listener, *self._peers):
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
@@ -274,6 +301,20 @@ class TcpCar:
         with contextlib.suppress(OSError):
             while data := peer.recv(4096):
                 self.received += frames(data)
+                with self._turn:
+                    self._report_at += CLOSING_S * data.count(MODE00)
                 if self._echoes:
                     peer.sendall(data)
         self.hung_up += 1
+
+    def _report_on(self) -> None:
+        with self._turn:
+            while not self._closed:
+                left_s = min(self._report_at - time.monotonic(), REPORT_S)
+                if left_s > 0:
+                    self._turn.wait(left_s)
+                    continue
+                for peer in self._peers:
+                    with contextlib.suppress(OSError):  # the other end has gone
+                        peer.sendall(self._report)
+                self._report_at = time.monotonic() + REPORT_S
