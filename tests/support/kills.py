@@ -20,8 +20,6 @@ The soak, which runs alone, allows nothing.
 """
 BEGINS_S: Final = 0.1
 """From a link that is open to the first byte of a recovery: at once."""
-BEGINS: Final = (b"#", b"$4WD,MODE00#")
-"""What a recovery sends first. A stuck link may have taken its `#` before it was back."""
 WATCHED_S: Final = 2.5
 """Motors that are off for so long stay off: the longest block after a stop that is not obstacle avoidance is over."""
 OPERATOR: Final = Path(__file__).parents[1] / "e2e" / "operator_that_dies.py"
@@ -228,7 +226,7 @@ def cut_links(fleet: Fleet, directory: Path) -> dict[str, Took]:
         for car, cut in cuts.items():
             judge = judges[car]
             first_s = wait_for(
-                lambda judge=judge: next((at for at, data in judge.written_after(back_ns) if data in BEGINS), None),
+                lambda judge=judge: next((at for at, data in judge.written_after(back_ns) if data == b"#"), None),
                 f"{car} is recovered",
             )
             found[f"{cut}: begins"] = Took(first_s, 1.1)  # a report a second, or a try a second
