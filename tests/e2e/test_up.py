@@ -140,7 +140,7 @@ def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
         gone = started.fleet("status")
         assert gone.returncode == 1
         assert "no fleet is running at" in gone.stderr
-        assert "red is stopped, mode manual (shown)" in started.fleet("logs", "red").stdout
+        assert "is in a known state: stopped (shown)" in started.fleet("logs", "red").stdout
 
 
 def test_a_hold_of_an_earlier_run_is_told_at_the_start_with_how_to_end_it(tmp_path: Path) -> None:
