@@ -23,7 +23,7 @@ from fleet.supervise.desk import Desk, Refused
 from fleet.supervise.farewell import Farewell
 from fleet.supervise.process import copied, new_run, remove_links
 from fleet.supervise.reload import change
-from fleet.supervise.restart import State, grace_s
+from fleet.supervise.restart import GATEWAY_GRACE_S, State
 from fleet.supervise.wanted import COORDINATOR, HUB, RECORDER, SELF, SIMULATOR, Kind, Wanted, WantedCar
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
@@ -174,8 +174,8 @@ class Supervisor:
             await asyncio.to_thread(self._desk.bus.close)
             self._desk = None
         for process in self.crew:
-            self.crew.end(process, grace_s(None))
-        await self.crew.gone(self.crew, grace_s(None))
+            self.crew.end(process, GATEWAY_GRACE_S)
+        await self.crew.gone(self.crew, GATEWAY_GRACE_S)
 
     # ------------------------------------------------------------------ what is to run
 

@@ -23,6 +23,7 @@ from gateway import requests
 from gateway.control.backoff import Attempts
 from gateway.control.battery import Policy
 from gateway.control.controller import Controller
+from gateway.control.executor import SHUTDOWN_S
 from gateway.control.link_health import LinkHealth
 from gateway.control.records import Answer, Command, EmergencyStop, Level, LogRecord, Phase
 from gateway.control.safety import Estop
@@ -44,8 +45,9 @@ LONGEST_SLEEP_S: Final = 3600.0
 HUB_GONE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 0.5
 """Two gateways that started at the same moment see each other when both have declared (design.md, "Keys")."""
-YIELDS_S: Final = 10.0
-"""How long the one that remains waits for the link that the other has open: that one looks, and stops the car first."""
+YIELDS_S: Final = SHUTDOWN_S + 2.0
+"""Maximum time that the gateway that remains waits for the link that the other one has open. The other one must notice
+the conflict, and waits until the car has shown its stop."""
 HEALTH_EVERY_S: Final = 1.0
 TURN_BYTES: Final = 1024
 """Bytes that are looked at before others get their turn, a stop above all; a car sends 960 a second."""

@@ -23,11 +23,10 @@ from fleet.edit import CannotEdit, with_link
 from fleet.found import Found
 from fleet.links import LinkKind, parse_link
 from fleet.marked import BadFile, read_text
+from fleet.supervise.restart import GATEWAY_GRACE_S
 
 _READY_S: Final = 15.0
 """A gateway starts in one, and brings a car of an unknown platform to a known state within six."""
-_END_S: Final = 15.0
-"""As systemd is told: a stop's whole recipe, its worst case, and a second."""
 _LOOK_S: Final = 0.1
 _AGAIN: Final = "again"
 _NONE: Final = "-"
@@ -89,7 +88,7 @@ def _gateway(client: Fleet, name: str, link: str) -> Iterator[str | None]:
         finally:
             gateway.terminate()
             try:
-                gateway.wait(_END_S)
+                gateway.wait(GATEWAY_GRACE_S)
             except subprocess.TimeoutExpired:
                 gateway.kill()
                 gateway.wait()

@@ -26,7 +26,6 @@ class Row:
     rate_hz: float | None = None
     """Frames from the car."""
     event: str = ""
-    worst_stop_s: float | None = None
     welcomed: bool = False
     """Its state of safety was heard, of any gateway."""
     reached: bool = False
@@ -71,7 +70,6 @@ class Row:
         self.hold = value.hold.by if value.HasField("hold") else ""
         self.estop = " ".join(each.id for each in value.estops)
         self.lease = value.lease.holder if value.HasField("lease") else ""
-        self.worst_stop_s = value.worst_stop_s
         self.motors = value.motors
         if self.estop:
             return self._change("safety", f"e-stop {self.estop}")

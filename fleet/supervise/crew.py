@@ -15,7 +15,7 @@ from fleet.supervise import cpu_time
 from fleet.supervise.admission import Admission
 from fleet.supervise.hang import Pulse, WatchClock, are_many, longest_silence_s
 from fleet.supervise.process import Child, Log
-from fleet.supervise.restart import HUNG, WRONG_USE_RETRY_S, Act, State, Ward, grace_s
+from fleet.supervise.restart import GATEWAY_GRACE_S, HUNG, WRONG_USE_RETRY_S, Act, State, Ward
 from fleet.supervise.wanted import PATIENCE, Kind
 
 TURN_S: Final = 0.1
@@ -102,7 +102,7 @@ class Crew:
             self._processes[name] = Process(name, kind, command, Ward(PATIENCE[kind], self.now), log)
         elif anew or process.command != command or process.leaving or process.ward.state is State.REFUSED:
             process.command, process.leaving, process.urgent = command, False, False
-            self.end(process, grace_s(None), again=True)
+            self.end(process, GATEWAY_GRACE_S, again=True)
 
     def remove(self, name: str, grace: float) -> None:
         """End it, and forget it."""

@@ -9,7 +9,7 @@ from typing import Final
 
 from fleet.supervise.cars import Row
 from fleet.supervise.crew import Crew, Process
-from fleet.supervise.restart import WRONG_USE, State, delay_s, grace_s
+from fleet.supervise.restart import GATEWAY_GRACE_S, WRONG_USE, State, delay_s
 
 NOT_STOPPED: Final = "not stopped"
 """How the words begin on a car that may be moving."""
@@ -158,8 +158,7 @@ class Farewell:
 
     def _end(self, process: Process) -> None:
         self._awaited.discard(process.name)
-        row = self._rows.get(process.name)
-        self._crew.end(process, grace_s(row.worst_stop_s if row else None))
+        self._crew.end(process, GATEWAY_GRACE_S)
 
     def _became(self, process: Process, words: str) -> None:
         self._forget(process.name)

@@ -18,12 +18,11 @@ WRONG_USE: Final = 2
 """Exit code of a process that refuses its arguments. Another start seldom changes that."""
 WRONG_USE_RETRY_S: Final = 60.0
 """Interval of the retries then. Nothing is given up for good: a file or a device may be put right meanwhile."""
-RECIPE_S: Final = 4.9
-MARGIN_S: Final = 1.0
+GATEWAY_GRACE_S: Final = 16.0
+"""Time that a gateway has from SIGTERM to its end before it is killed. It waits up to 13 s for its car to show the stop
+(gateway.control.executor, `SHUTDOWN_S`), and leaves the bus after that."""
 HUNG: Final = "hung"
 """How the words begin on a process that was killed for its silence."""
-UNKNOWN_STOP_S: Final = 9.1
-"""design.md: the longest stop recipe, and a second more, to SIGKILL; with this as worst case the 15 s of systemd."""
 
 
 class State(StrEnum):
@@ -60,11 +59,6 @@ def delay_s(falls: int, chance: float) -> float:
     """How long to wait after so many falls in a row (1, 2, ...); `chance` in 0..1 spreads it by JITTER either way."""
     delay: float = min(LONGEST_S, FIRST_S * 2.0 ** min(falls - 1, 16))
     return delay * (1 + JITTER * (2 * chance - 1))
-
-
-def grace_s(worst_stop_s: float | None) -> float:
-    """How long a gateway may take from SIGTERM to its end, if its stop takes so long at worst; None: not known."""
-    return RECIPE_S + MARGIN_S + (UNKNOWN_STOP_S if worst_stop_s is None else worst_stop_s)
 
 
 @dataclass(slots=True)

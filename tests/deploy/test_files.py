@@ -13,8 +13,8 @@ import pytest
 from fleet.commands.config import schema_text
 from fleet.config import read_fleet
 from fleet.supervise.farewell import LINK_S, START_S
-from fleet.supervise.restart import grace_s
-from fleet.supervisor import RECORDER_END_S
+from fleet.supervise.restart import GATEWAY_GRACE_S
+from fleet.supervisor import END_S, RECORDER_END_S, TRIES_S
 
 DEPLOY = Path(__file__).parent.parent.parent / "deploy"
 FILES = sorted(DEPLOY.glob("fleet.*.yaml"))
@@ -80,8 +80,9 @@ def test_the_unit_gives_cars_the_time_to_stop(tmp_path: Path) -> None:
     unit.read(path)
     assert unit.sections() == ["Unit", "Service", "Install"]
     service = unit["Service"]
-    assert (service["Restart"], service["KillMode"], service["KillSignal"]) == ("on-failure", "mixed", "SIGINT")
-    longest_s = 2 * grace_s(None) + START_S + LINK_S + RECORDER_END_S  # a gateway hangs, the one for it is slow
+    assert (service["Restart"], service["KillMode"], service["KillSignal"]) == ("on-failure", "mixed", "SIGTERM")
+    first_s = 2 * GATEWAY_GRACE_S + START_S + LINK_S  # a gateway hangs, and the gateway that replaces it is slow
+    longest_s = max(first_s, TRIES_S + GATEWAY_GRACE_S) + RECORDER_END_S + 2 * END_S
     assert int(service["TimeoutStopSec"]) >= longest_s
     assert re.fullmatch(r"/usr/bin/env %h/\S+/\.venv/bin/fleet up fleet\.yaml", service["ExecStart"])
     assert unit["Install"]["WantedBy"] == "default.target"  # of a user's systemd: multi-user.target is the system's

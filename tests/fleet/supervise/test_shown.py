@@ -33,11 +33,11 @@ def test_a_row_says_what_is_new_once() -> None:
 def test_a_row_shows_hold_and_e_stop() -> None:
     row = Row("red")
     assert row.take("state/safety", pb.Safety(motors="off"), 0.0) == ""
-    held = pb.Safety(hold=pb.Hold(by="ann"), worst_stop_s=1.8)
+    held = pb.Safety(hold=pb.Hold(by="ann"))
     assert row.take("state/safety", held, 1.0) == "on hold by ann"
     held.estops.add(id="e1", by="bob")
     assert row.take("state/safety", held, 2.0) == "e-stop e1"
-    assert (row.hold, row.estop, row.worst_stop_s) == ("ann", "e1", 1.8)
+    assert (row.hold, row.estop) == ("ann", "e1")
     assert row.take("state/safety", pb.Safety(), 3.0) == "not on hold"
 
 
