@@ -57,6 +57,9 @@ def _silent_mode_after_any_rest(patch: Patch) -> None:
         "opened",
         lambda self, mode, now, *, silent, shown: original(self, mode, now, silent=silent, shown=True),
     )
+
+
+def _silent_mode_without_its_silence(patch: Patch) -> None:
     patch(stop_evidence, "OPENING_SILENCE_S", 0.0)
 
 
@@ -100,7 +103,8 @@ RULES: dict[str, Callable[[Patch], None]] = {
     "damaged frames are no reports": _damaged_frames_count,
     "a report after LEFT_S does not show that a mode was left": _any_report_shows_that_a_mode_was_left,
     "nor one after more frames than MODE00": _any_frame_before_it,
-    "a silent mode is left only from a shown rest, after its silence": _silent_mode_after_any_rest,
+    "a silent mode shows that it was left only if it was opened from a shown rest": _silent_mode_after_any_rest,
+    "and after its silence": _silent_mode_without_its_silence,
     "a rest that is only sent is renewed": _no_renewal,
     "a confirmation fades": _confirmations_stay,
     "a shutdown waits for evidence": _shutdown_waits_for_time,

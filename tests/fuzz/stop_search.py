@@ -50,6 +50,8 @@ ENDS_S = 16.0
 VERDICT_S = 5.5
 """A mode may be confirmed for so long after it has ended: 3 s of silence, a block of ours, and a reading on its way."""
 READY_S = 14.0
+EARLY_S = 3.0
+"""Time before a mode is asked for in which the link may fail already."""
 
 ALL_WORLDS = {**WORLDS, "black": on_black, "pen": in_a_pen, "wall": before_a_wall}
 
@@ -127,6 +129,10 @@ class Plan:
     """A second stop so long after the first; 0: none."""
     drive_again_s: float = 0.0
     """A drive so long after the stop, and a stop after it; 0: none."""
+    early: bool = False
+    """The faults hit the opening of the mode as well. They count from its request, and from the stop again."""
+    driven: bool = False
+    """The car drives when the mode is asked for."""
 
 
 @dataclass(slots=True)
@@ -150,7 +156,8 @@ def draw(seed: int) -> Plan:
 
 
 def _theme(seed: int, load: str, load_s: float, faults: tuple[Fault, ...], **more: Any) -> Plan:
-    return Plan(seed, "arduino", "arduino", "echo", load, load_s, more.pop("ending", Ending.STOP), faults, **more)
+    world, ending = more.pop("world", "echo"), more.pop("ending", Ending.STOP)
+    return Plan(seed, "arduino", "arduino", world, load, load_s, ending, faults, **more)
 
 
 def _report_swallowed(seed: int, moments: random.Random) -> Plan:
@@ -172,10 +179,22 @@ def _digit_lost(seed: int, moments: random.Random) -> Plan:
 
 def _stop_while_opening(seed: int, moments: random.Random) -> Plan:
     """Old reports come late while a silent mode opens, and the stop is lost."""
-    slow = Fault(Kind.SLOW, Way.TO_HOST, -4.0, 30.0, delay_s=moments.uniform(1.5, 4.0))
+    slow = Fault(Kind.SLOW, Way.TO_HOST, -3.0, 30.0, delay_s=1.2)  # in two steps: a gap of 3 s would show
+    slower = Fault(Kind.SLOW, Way.TO_HOST, -1.5, 28.5, delay_s=moments.uniform(1.8, 2.5))
     lost = Fault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
     load_s = moments.uniform(0.05, 0.4)
-    return _theme(seed, "obstacle_avoidance", load_s, (slow, lost), opening=True)
+    return _theme(seed, "obstacle_avoidance", load_s, (slow, slower, lost), opening=True, early=True)
+
+
+def _mode_over_a_lost_stop(seed: int, moments: random.Random) -> Plan:
+    """Without an echo nothing shows the stop before a mode. That stop, the opening and the next stop are lost."""
+    load_s = moments.uniform(0.1, 2.0)
+    lost = Fault(Kind.DEAD, Way.TO_CAR, -load_s - 0.01, moments.uniform(12.0, 20.0))
+    unheard = Fault(Kind.DEAD, Way.TO_HOST, moments.uniform(-1.0, 0.5), moments.uniform(1.0, 2.5))
+    return _theme(
+        seed, moments.choice(["obstacle_avoidance", "color_led", "remote_control"]), load_s, (lost, unheard),
+        world=moments.choice(["no-echo", "no-echo", "flickering"]), opening=True, early=True, driven=True,
+    )  # fmt: skip
 
 
 def _half_a_frame(seed: int, moments: random.Random) -> Plan:
@@ -213,6 +232,7 @@ THEMES = (
     _report_swallowed,
     _digit_lost,
     _stop_while_opening,
+    _mode_over_a_lost_stop,
     _half_a_frame,
     _short_gap,
     _damaged_reports,
@@ -264,6 +284,8 @@ def _any(seed: int, moments: random.Random) -> Plan:
         report_every_s=moments.choice([0.9, 0.9, moments.uniform(0.9, 1.0)]),
         again_s=moments.uniform(0.3, 6.0) if moments.random() < 0.15 else 0.0,
         drive_again_s=moments.uniform(4.0, 14.0) if moments.random() < 0.15 else 0.0,
+        early=opening and moments.random() < 0.5,
+        driven=load in modes and moments.random() < 0.15,
     )
 
 
@@ -446,6 +468,12 @@ class Episode:
                 for what in acts:
                     self._ask(what)
             case mode:
+                if plan.driven:
+                    self._ask(Drive(Motion.FORWARD, 10.0))
+                    self._run(0.5 + moments.random())
+                if plan.early:
+                    self.zero = self.now + EARLY_S + plan.load_s
+                    self._run(EARLY_S)
                 self._ask(SetMode(Mode(mode)))
                 if plan.opening:
                     self._until(lambda: self.control.model.trust.state is CarTrust.IN_MODE, 12.0, fails=False)
@@ -803,6 +831,24 @@ def shrink(plan: Plan) -> Plan:
                 plan, smaller = candidate, True
                 break
     return plan
+
+
+def explain(total: Total, limit: int = 5) -> str:
+    """Return the failures with their seeds, and what is left of their plans when they are shrunk."""
+    shrunk = [f"seed {each.plan.seed}: {each.violations}\n  {shrink(each.plan)}" for each in total.failures[:limit]]
+    return "\n".join([f"{len(total.failures)} failures", *shrunk])
+
+
+def found_at(seeds: Iterable[int]) -> str:
+    """Return the first seed that fails and its violations; empty if none does. For a control with a rule taken out."""
+    for seed in seeds:
+        try:
+            violations = play(seed).violations
+        except AssertionError as error:  # the car was not even brought to a known state
+            violations = [str(error)]
+        if violations:
+            return f"seed {seed}: {'; '.join(violations)}"
+    return ""
 
 
 def search(seeds: Iterable[int], *, processes: int = 1) -> Total:

@@ -1,0 +1,32 @@
+"""The search for a stop that is claimed and false, over 30,000 episodes; and each rule taken out, so that it finds one.
+
+`STOP_SEARCH=FROM:TO make soak` plays the episodes of other seeds.
+"""
+
+import os
+
+import pytest
+
+from tests.fuzz.rules_removed import RULES
+from tests.fuzz.stop_search import explain, found_at, search
+
+FIRST, BEHIND = (int(seed) for seed in os.environ.get("STOP_SEARCH", "1000:31000").split(":"))
+WITHIN = 400
+"""Maximum number of episodes in which the search finds the fault that a rule prevents: those of `make test`."""
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+def test_thirty_thousand_episodes() -> None:
+    total = search(range(FIRST, BEHIND), processes=2)
+    print(f"\nseeds {FIRST} to {BEHIND - 1}\n{total}")
+    assert not total.failures, explain(total)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("rule", RULES)
+def test_the_search_finds_what_each_rule_prevents(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    RULES[rule](monkeypatch.setattr)
+    found = found_at(range(WITHIN))
+    print(f"\nwithout {rule!r}: {found}")
+    assert found, f"{rule} is redundant, or the search is blind to it"
