@@ -1,21 +1,27 @@
-"""The generated parts of README.md: `python -m tests.readme` writes them, tests/test_readme.py compares them."""
+"""The generated parts of README.md and docs/: `python -m tests.readme` writes them, tests/test_readme.py compares."""
 
 import csv
+import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
 
-from gateway.control.evidence import STALL_S
 from google.protobuf.descriptor import FieldDescriptor
 
+from gateway.control.car_monitor import STALL_S
+from gateway.control.executor import RENEW_S, SHUTDOWN_S
 from gateway.control.recipes import REPEAT_S
 from gateway.control.senders import PAUSE_S, SENDER_GONE_S
+from gateway.control.stop_evidence import EVIDENCE
+from gateway.control.trust import TRANSITIONS, CarTrust, TrustEvent, TrustState
 from gateway.requests import LONGEST_DRIVE_S
 from schemas import messages, topics
 from tests.support import vectors
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
+STOP_EVIDENCE = ROOT / "docs" / "reference" / "stop-evidence.md"
 _COMMON = {"sender", "kind", "id", "asked", "take", "ttl_s"}
 _ABOUT = {
     "drive": "hold a motion for `duration_s` (0.5 s by default, at most 10 or what its gateway allows), then stop",
@@ -107,22 +113,86 @@ def stops() -> list[dict[str, str]]:
         return list(csv.DictReader(file, delimiter="\t"))
 
 
-def _longest(name: str, column: str) -> float:
-    """Of the rows of this name."""
+def _rows(name: str) -> list[dict[str, str]]:
+    """Return the rows of this name."""
     grouped = name in ("opening", "raspberry_pi", "unknown platform")
     named = [row for row in stops() if row["state"] == name]
     begun = [row for row in stops() if row["state"].startswith(name)]
-    found = [row for row in begun if not row["state"].endswith(("restored", "under way"))] if grouped else named
-    return max(float(row[column]) for row in found)
+    return [row for row in begun if not row["state"].endswith(("restored", "under way"))] if grouped else named
+
+
+def _longest(name: str, column: str) -> float:
+    """Return the longest of the rows of this name; 0 if no stop of theirs has such a time."""
+    times = [float(row[column]) for row in _rows(name)]
+    return max((each for each in times if each != float("inf")), default=0.0)
+
+
+def _shown_after(name: str) -> str:
+    """Return when the car had shown its stop, and how often it showed none."""
+    rows = _rows(name)
+    stops_shown, asked = sum(int(row["shown"]) for row in rows), sum(int(row["stops"]) for row in rows)
+    if not stops_shown:
+        return "never"
+    middle, worst = _longest(name, "shown_p50_s"), _longest(name, "shown_worst_s")
+    return f"{middle:.1f} s, at worst {worst:.1f} s ({100 * stops_shown / asked:.0f} % of stops)"
 
 
 def stop_table() -> str:
     """How long a stop takes, by what the car is doing."""
-    rows = ["| the car is | in the middle | worst seen | longest announced |", "|---|---|---|---|"]
+    rows = ["| the car is | in the middle | worst seen | longest announced | shown after |", "|---|---|---|---|---|"]
     for name, words in _STATES.items():
         middle, worst, announced = (_longest(name, column) for column in ("p50_s", "worst_s", "announced_s"))
-        rows.append(f"| {words} | {middle:.2f} s | {worst:.2f} s | {announced:.2f} s |")
+        rows.append(f"| {words} | {middle:.2f} s | {worst:.2f} s | {announced:.2f} s | {_shown_after(name)} |")
     return "\n".join(rows)
+
+
+def evidence_table() -> str:
+    """Return the table of what shows a stop, from the table that the gateway runs on."""
+    rows = ["| stop | shown by | otherwise |", "|---|---|---|"]
+    rows += [f"| {row.stop} | {row.shown_by or 'nothing'} | {row.otherwise} |" for row in EVIDENCE.values()]
+    return "\n".join(rows)
+
+
+def trust_table() -> str:
+    """Return the states of trust, with the words that stand below each in the code."""
+    about = dict(re.findall(r'^    [A-Z_]+ = "(\w+)"\n    """(.+?)"""', inspect.getsource(CarTrust), re.MULTILINE))
+    rows = ["| trust | motors | what the gateway believes |", "|---|---|---|"]
+    rows += [f"| `{state}` | {TrustState(state).motors} | {about[state]} |" for state in CarTrust]
+    return "\n".join(rows)
+
+
+def transition_table() -> str:
+    """Return where each event leads from each state. A dot stands for no change."""
+    rows = [f"| what happens | {' | '.join(f'`{state}`' for state in CarTrust)} |", "|---" * (len(CarTrust) + 1) + "|"]
+    for event in TrustEvent:
+        to = [TRANSITIONS[state, event] for state in CarTrust]
+        cells = ["·" if new is state else str(new) for state, new in zip(CarTrust, to, strict=True)]
+        rows.append(f"| {event} | {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def stop_evidence_page() -> str:
+    """Return the page of the reference on what shows a stop."""
+    return f"""# What shows that a car stopped
+
+`make readme` generates this page from `gateway/control/stop_evidence.py` and `gateway/control/trust.py`.
+
+No car acknowledges a frame. The gateway sends a stop, and then looks for evidence in the car's readings. The table says
+what counts as evidence, by platform, mode and kind of stop. A stop is `shown` if the car gave the evidence. A stop ends
+as `sent` if the car can show nothing. If the car could have shown the stop and did not, the stop goes on.
+
+{evidence_table()}
+
+## States of trust
+
+`state/safety` has the state as `trust`, the reason as `trust_evidence`, and the basis of `off` as `motors_basis`.
+
+{trust_table()}
+
+The table of transitions. The columns are the states before the event, and a dot means that the state stays.
+
+{transition_table()}
+"""
 
 
 def mode_table() -> str:
@@ -151,20 +221,21 @@ def failure_table() -> str:
     """Each failure: what the car does, how long, what is seen. Its times are the code's, and the table of stops'."""
     middle, worst = (_longest("manual, nothing unread", column) for column in ("p50_s", "worst_s"))
     driving = f"{middle:.2f} s, at worst {worst:.1f} s"
+    renewed = f"{RENEW_S[0]:g}, {RENEW_S[1]:g} and then every {RENEW_S[2]:g} s"
     restored = _longest("link just restored", "worst_s")
     rows = ["| what happens | what the car does | for how long | what you see |", "|---|---|---|---|"]
     for what, does, long, see in (
         (
             "You let go, or a drive's time is over",
             "stops; the stop is sent again, alone, later",
-            f"{driving} after that; again after {REPEAT_S:g} s",
-            "`complete` on `event/command`",
+            f"{driving} after that; again after {REPEAT_S:g} s, and until something shows it after {renewed}",
+            "`complete` of the drive on `event/command`; `motors` off, `sent`: nothing shows this stop",
         ),
         (
             "Somebody says `stop`",
             "stops, and is on hold; a stick that is leaned on is not heard before it was let go",
             f"see below; the stick {PAUSE_S:g} s",
-            "`worst_case_s` in the answer, `complete` when the motors are off for good",
+            "`worst_case_s` in the answer, `complete` when the car has shown it (see below)",
         ),
         (
             "The program that drives is killed",
@@ -192,9 +263,21 @@ def failure_table() -> str:
         ),
         (
             "The link hangs, and says nothing",
-            "keeps its last motion; is stopped when it is heard again",
-            "noticed after 3 s of silence that nothing explains",
-            "`stale`, `motors: unknown`, `unheard` on `event/log`",
+            "keeps its last motion; the gateway sends the stop again and again",
+            "noticed after 3 s of silence that nothing explains; stands 15 s after the link is whole (avoiding: 20)",
+            "`stale`, `motors: unknown`, trust `unheard`, `unheard` on `event/log`",
+        ),
+        (
+            "The link loses the stop, and the car is heard",
+            "drives on until the next try arrives",
+            "each 4 to 7 s, for ever",
+            "`failed`, `not_shown` on `event/command` and `event/log`, exit code 1; trust `unproven`",
+        ),
+        (
+            "The gateway is told to end, and its car shows no stop",
+            "what the last stop did, if that arrived",
+            f"the gateway waits {SHUTDOWN_S:g} s; under `fleet up` another one goes on",
+            "`not_stopped` on `event/log`, exit code 1",
         ),
         (
             "A Raspberry Pi car loses its TCP client",
@@ -260,6 +343,7 @@ PARTS = {
     "verbs": verb_table,
     "failures": failure_table,
     "stops": stop_table,
+    "evidence": evidence_table,
     "modes": mode_table,
     "help": help_text,
     "any_client": any_client,
@@ -281,3 +365,5 @@ def generated(text: str) -> str:
 
 if __name__ == "__main__":
     README.write_text(generated(README.read_text(encoding="utf-8")), encoding="utf-8")
+    STOP_EVIDENCE.parent.mkdir(parents=True, exist_ok=True)
+    STOP_EVIDENCE.write_text(stop_evidence_page(), encoding="utf-8")
