@@ -53,7 +53,7 @@ proto: .venv/.ready ## generate schemas/gen from schemas/proto
 pictures: .venv/.ready ## the README's pictures, of the newest session (needs a Vulkan driver, which may be software)
 	$(BIN)/python -m fleet.replay.picture "$$(ls -td sessions/*/ | head -n 1)" .github
 
-readme: .venv/.ready ## generate the tables and help texts of the README, and the SDK's reference
+readme: .venv/.ready ## generate the README's tables and help texts, docs/reference and the SDK's reference
 	$(BIN)/python -m tests.readme
 	$(BIN)/python -m tests.reference
 

@@ -68,7 +68,8 @@ def test_ten_minutes_of_links_that_fail_around_stops(tmp_path: Path) -> None:
         trouble.play(SECONDS)
         print(f"\nseed {SEED}: " + ", ".join(f"{count} {what}" for what, count in sorted(trouble.counts.items())))
         print(f"{claims}\n{len(trouble.driving):4} cars that did not stand in time")
-        assert up.fleet("down").returncode == 0
+        down = up.fleet("down")
+        assert down.returncode == 0, f"{down.stdout}{down.stderr}"
         assert up.process.wait() == 0
     assert not trouble.driving
     assert not _false(claims)

@@ -78,10 +78,13 @@ class Trouble:
         if time.monotonic() > self._ends:
             return
         chance = self.chance
-        self._ask(car, "resume")
-        load = chance.choice(["rest", "drive", "drive", "steer", "mode", "mode", "mode"])
+        # A drive or a mode of a script ends the hold. `role`: the coordinator gives the car something to do.
+        load = chance.choice(["role", "rest", "drive", "drive", "steer", "mode", "mode", "mode"])
         stop_s = 1.0 + 3.0 * chance.random()
         match load:
+            case "role":
+                self._ask(car, "resume")
+                stop_s += 4.0 * chance.random()
             case "drive":
                 self._ask(car, "drive", motion="forward", duration_s=9.0)
             case "steer":
@@ -111,7 +114,11 @@ class Trouble:
 
         def judge() -> None:
             disturbed = self._killed_at > asked_at - RECOVERS_S
-            if taken and not disturbed:
+            if not self.up.simulator(ask="truth", car=car)["alive"]:
+                # The program of a Raspberry Pi dies of a damaged frame (protocol.md). A person switches it off and on.
+                self.counts["programs that died"] += 1
+                assert self.up.simulator(car=car, fault="brownout")["ok"]
+            elif taken and not disturbed:
                 self.counts["stops judged"] += 1
                 if self.claims.runs(car):
                     self.driving.append(f"{car} ({episode}), {time.monotonic() - asked_at:.0f} s after its stop")
