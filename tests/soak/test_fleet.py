@@ -64,7 +64,7 @@ def test_ten_minutes_of_links_that_fail_around_stops(tmp_path: Path) -> None:
                 f"{car} is known",
                 90.0,
             )
-        trouble = Trouble(up, CARS, claims, random.Random(SEED))
+        trouble = Trouble(up, CARS, random.Random(SEED))
         trouble.play(SECONDS)
         print(f"\nseed {SEED}: " + ", ".join(f"{count} {what}" for what, count in sorted(trouble.counts.items())))
         print(f"{claims}\n{len(trouble.driving):4} cars that did not stand in time")

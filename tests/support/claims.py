@@ -77,12 +77,6 @@ class Claims:
         bus.subscribe("fleet/*/event/command", claims._command)
         return claims
 
-    def runs(self, car: str) -> bool:
-        """Return True if the motors of a car run, as last heard."""
-        with self._lock:
-            spans = self._car(car).motors
-            return bool(spans) and spans[-1].value == "on"
-
     def false(self) -> dict[str, list[str]]:
         """Return the false claims by kind, in words."""
         found: dict[str, list[str]] = {kind: [] for kind in (*KINDS, SENT)}

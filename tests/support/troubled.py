@@ -18,14 +18,13 @@ from typing import Any, Final
 from gateway.protocol.values import Mode
 from schemas import messages
 from schemas.bus import Bus, BusError, Sample
-from tests.support.claims import Claims
 from tests.support.processes import TAKEN
 from tests.support.up import Up
 
 STANDS_S: Final = 20.0
 """So long after its link is whole, a car that was stopped stands: issue 10, in obstacle avoidance."""
-RECOVERS_S: Final = 40.0
-"""A gateway that was killed is back, and has stopped its car, so long after it."""
+RECOVERS_S: Final = 10.0
+"""A car whose gateway was killed later than so long before its stop is not judged: another gateway must come first."""
 KILL_EVERY_S: Final = 25.0
 FAULTS: Final[dict[str, dict[str, Any]]] = {
     "deaf": {},
@@ -47,7 +46,6 @@ class Trouble:
 
     up: Up
     cars: tuple[str, ...]
-    claims: Claims
     chance: random.Random
     kills: tuple[str, ...] = ("gateway", "hub", "coordinator")
     """What is killed now and then; empty: nothing."""
@@ -56,7 +54,8 @@ class Trouble:
     """Cars that did not stand in time, in words."""
     _due: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
     _numbers: "itertools.count[int]" = field(default_factory=itertools.count)
-    _killed_at: float = float("-inf")
+    _killed: dict[str, float] = field(default_factory=dict)
+    """When a car's gateway was killed last."""
     _ends: float = 0.0
 
     def play(self, seconds: float) -> None:
@@ -113,14 +112,18 @@ class Trouble:
         asked_at = time.monotonic()
 
         def judge() -> None:
-            disturbed = self._killed_at > asked_at - RECOVERS_S
-            if not self.up.simulator(ask="truth", car=car)["alive"]:
+            truth = self.up.simulator(ask="truth", car=car)
+            if not truth["alive"]:
                 # The program of a Raspberry Pi dies of a damaged frame (protocol.md). A person switches it off and on.
                 self.counts["programs that died"] += 1
-                assert self.up.simulator(car=car, fault="brownout")["ok"]
-            elif taken and not disturbed:
+                for fields in (
+                    {"fault": "brownout"},
+                    {"fault": "link_drop", "for_s": 0.2},
+                ):  # and plugs its link in again
+                    assert self.up.simulator(car=car, **fields)["ok"]
+            elif taken and self._killed.get(car, 0.0) < asked_at - RECOVERS_S:
                 self.counts["stops judged"] += 1
-                if self.claims.runs(car):
+                if truth["motor_left"] or truth["motor_right"]:
                     self.driving.append(f"{car} ({episode}), {time.monotonic() - asked_at:.0f} s after its stop")
             self._begin(car)
 
@@ -153,6 +156,6 @@ class Trouble:
         pid = self.up.hub() if name == "@hub" else state.pid if state is not None else 0
         if pid:
             self.counts[f"{what} killed"] += 1
-            self._killed_at = time.monotonic()
+            self._killed[name] = time.monotonic()
             self.up.kill(pid)
         self._after(KILL_EVERY_S * 2 * self.chance.random(), self._kill)
