@@ -1,0 +1,244 @@
+"""Strangers' cars behind wires with gaps, and what was claimed of them: shared by tests/e2e and tests/soak.
+
+Each car's own program says what is true (tests/e2e/strangers_car.py). A car stands if its motors are off in mode 0.
+"""
+
+import json
+import random
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from schemas.bus import Bus, Sample
+from tests.support.gap import Direction, Gap, Wire
+from tests.support.judge import stamp_ns
+from tests.support.processes import Process, wait_for
+
+PROGRAM: Final = Path(__file__).parents[1] / "e2e" / "strangers_car.py"
+MODES: Final = {
+    "manual": 0,
+    "remote_control": 1,
+    "tracking": 2,
+    "obstacle_avoidance": 3,
+    "color_led": 4,
+    "light_seeking": 5,
+    "following": 6,
+}
+FALSE_S: Final = 0.3
+"""Maximum time that a claim may be false."""
+STANDS_S: Final = 12.0
+"""Maximum time from a whole link to a car that stands."""
+SHOWN_S: Final = 40.0
+"""Maximum time from a whole link to the evidence, on a busy machine."""
+WATCHED_S: Final = 3.0
+"""A car that stands for so long, with the stop shown, stays."""
+STOP_BYTES: Final = 13
+"""Of `$4WD,MODE00#`, and one more."""
+LENGTHS_S: Final = (0.3, 0.6, 2.0, 6.0)
+
+
+def gaps(cars: Iterable[str], seed: int) -> dict[str, Gap]:
+    """One gap for each car; every length and direction comes up among seven cars."""
+    chance = random.Random(seed)
+    cars = list(cars)
+    lengths = [LENGTHS_S[each % len(LENGTHS_S)] for each in range(len(cars))]
+    directions = [list(Direction)[each % 3] for each in range(len(cars))]
+    chance.shuffle(lengths)
+    chance.shuffle(directions)
+    return {
+        car: Gap(direction, length_s, chance.randrange(STOP_BYTES), chance.random() < 0.4, 1.0, chance.randrange(1000))
+        for car, length_s, direction in zip(cars, lengths, directions, strict=True)
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """Somebody says that the car stands, from then until then, s since the epoch."""
+
+    by: str
+    since: float
+    until: float
+
+
+@dataclass
+class Stranger:
+    """One car, its wire, and all that gateways say of it."""
+
+    mode: str
+    """The mode in which it is stopped; also its name."""
+    process: Process
+    wire: Wire
+    truths: list[tuple[float, bool, int]] = field(default_factory=list)
+    """When the motors or the mode changed."""
+    read: list[tuple[float, str]] = field(default_factory=list)
+    """The strings that it read."""
+    heard_until: float = 0.0
+    claims: list[tuple[float, str, str, str]] = field(default_factory=list)
+    """state/safety: when, motors, basis, trust."""
+    records: list[Any] = field(default_factory=list)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def follow(self, bus: Bus) -> None:
+        """Begin to listen to what is said of it."""
+        bus.subscribe(f"fleet/{self.mode}/state/safety", self._safety)
+        bus.subscribe(f"fleet/{self.mode}/event/command", self._record)
+
+    def look(self) -> "Stranger":
+        """Take what its program has said."""
+        for line in self.process.lines():
+            said = json.loads(line)
+            self.heard_until = max(self.heard_until, said["t"])
+            if "read" in said:
+                self.read.append((said["t"], said["read"]))
+            now = said["motors"], said["mode"]
+            if not self.truths or self.truths[-1][1:] != now:
+                self.truths.append((said["t"], *now))
+        return self
+
+    @property
+    def true_mode(self) -> int:
+        return self.look().truths[-1][2] if self.truths else MODES["manual"]
+
+    @property
+    def motors(self) -> bool:
+        return bool(self.look().truths) and self.truths[-1][1]
+
+    @property
+    def shown(self) -> bool:
+        """True if the newest claim is that it stands, and rests on the car's readings."""
+        with self._lock:
+            return bool(self.claims) and self.claims[-1][1:3] == ("off", "shown")
+
+    def stands_since(self) -> float | None:
+        """Return since when it stands; None if it does not."""
+        self.look()
+        return next((at for at, on, mode in self.truths[-1:] if not on and mode == 0), None)
+
+    def stays(self, since: float) -> bool:
+        """True if it has been standing for long enough, and after this moment, too."""
+        at = self.stands_since()
+        return at is not None and self.heard_until >= max(at, since) + WATCHED_S
+
+    def moving(self) -> list[tuple[float, float]]:
+        """Return from when to when it did not stand."""
+        self.look()
+        ends = [at for at, _, _ in self.truths[1:]] + [self.heard_until]
+        found: list[tuple[float, float]] = []
+        for (at, on, mode), end in zip(self.truths, ends, strict=True):
+            if not on and mode == 0:
+                continue
+            if found and found[-1][1] == at:
+                at = found.pop()[0]
+            found.append((at, end))
+        return found
+
+    def stop_records(self, since: float) -> list[Any]:
+        """Return the last records of stops."""
+        with self._lock:
+            return [
+                each
+                for each in self.records
+                if each.verb == "stop" and stamp_ns(each) / 1e9 >= since and _is_last(each)
+            ]
+
+    def claimed(self, since: float) -> list[Claim]:
+        """Return what was claimed after this moment."""
+        with self._lock:
+            ends = [at for at, *_ in self.claims[1:]] + [float("inf")]
+            found = [
+                Claim("state/safety", at, end)
+                for (at, motors, basis, _), end in zip(self.claims, ends, strict=True)
+                # Before the change there was no basis, and `off` was said of every stop.
+                if motors == "off" and basis in ("shown", "") and at >= since
+            ]
+        complete = [each for each in self.stop_records(since) if each.phase == "complete"]
+        return found + [Claim("stop complete", stamp_ns(each) / 1e9, float("inf")) for each in complete]
+
+    def false_claims(self, since: float) -> list[str]:
+        """Return the claims that were false for longer than they may be."""
+        return [
+            f"{self.mode}: {claim.by} at {claim.since - since:.2f} s, but it moved from {begin - since:.2f} "
+            f"to {end - since:.2f} s"
+            for claim in self.claimed(since)
+            for begin, end in self.moving()
+            if min(end, claim.until) - max(begin, claim.since) > FALSE_S
+        ]
+
+    def late_s(self, whole_at: float) -> float:
+        """Return how long after this moment it moved last, s."""
+        return max((end - whole_at for _, end in self.moving()), default=0.0)
+
+    def story(self, since: float) -> str:
+        """Return what happened, in order, s after this moment."""
+        self.look()
+        with self._lock:
+            told = [(at, f"says    {motors} {basis} {trust}") for at, motors, basis, trust in self.claims]
+            told += [
+                (stamp_ns(each) / 1e9, f"record  {each.verb} {each.phase} {each.reason} {each.basis}: {each.words}")
+                for each in self.records
+            ]
+        told += [(at, f"truth   motors {'on' if on else 'off'}, mode {mode}") for at, on, mode in self.truths]
+        told += [(at, f"reads   {text}") for at, text in self.read]
+        told += [
+            (at, f"written {data.decode()}" + ("" if kept == data else f" arrives as {kept.decode()!r}"))
+            for at, data, kept in self.wire.frames(since - 10)
+        ]
+        told += [(at, f"hears   {data!r} as {kept!r}") for at, data, kept in self.wire.to_host.passed if kept != data]
+        told += [(self.wire.whole_at, "the wire is whole")] if self.wire.whole_at else []
+        return "\n".join(f"{at - since:8.3f} {what}" for at, what in sorted(told) if at >= since - 10)
+
+    def _safety(self, sample: Sample) -> None:
+        said: Any = sample.message()
+        basis, trust = getattr(said, "motors_basis", ""), getattr(said, "trust", "")
+        with self._lock:
+            self.claims.append((stamp_ns(said) / 1e9, said.motors, basis, trust))
+
+    def _record(self, sample: Sample) -> None:
+        with self._lock:
+            self.records.append(sample.message())
+
+
+def _is_last(record: Any) -> bool:
+    return record.phase in ("complete", "failed", "superseded", "rejected") or (
+        record.phase == "sent" and bool(getattr(record, "basis", ""))
+    )
+
+
+@dataclass
+class Strangers:
+    """Cars of their own programs, each in the mode of its name."""
+
+    cars: list[Stranger]
+
+    def __iter__(self) -> "Iterable[Stranger]":
+        return iter(self.cars)
+
+    def enter_modes(self, fleet: Any) -> None:
+        """Bring each car into the mode in which it is to be stopped."""
+        for car in self.cars:
+            if car.mode == "manual":
+                answer = fleet.ask("drive", car.mode, motion="forward", duration_s=60)
+            else:
+                answer = fleet.ask("mode", car.mode, mode=car.mode)
+            assert answer["status"] in ("sent", "queued"), answer
+        for car in self.cars:
+            wait_for(lambda car=car: self._is_in_mode(car), f"{car.mode} is in its mode")
+
+    def _is_in_mode(self, car: Stranger) -> bool:
+        return car.motors if car.mode == "manual" else car.true_mode == MODES[car.mode]
+
+    def run(self, seconds: float) -> None:
+        """Let them go on for so long, by their own clocks."""
+        ends = {car.mode: car.look().heard_until + seconds for car in self.cars}
+        for car in self.cars:
+            wait_for(lambda car=car: car.look().heard_until >= ends[car.mode], f"{car.mode} goes on")
+
+    def arm(self, gaps: dict[str, Gap]) -> None:
+        for car in self.cars:
+            car.wire.arm(gaps[car.mode])
+
+    def close(self) -> None:
+        for car in self.cars:
+            car.wire.close()
