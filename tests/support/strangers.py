@@ -6,6 +6,7 @@ Each car's own program says what is true (tests/e2e/strangers_car.py). A car sta
 import json
 import random
 import threading
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -99,7 +100,7 @@ class Stranger:
 
     @property
     def true_mode(self) -> int:
-        return self.look().truths[-1][2] if self.truths else MODES["manual"]
+        return next((mode for *_, mode in self.look().truths[-1:]), MODES["manual"])
 
     @property
     def motors(self) -> bool:
@@ -150,8 +151,7 @@ class Stranger:
             found = [
                 Claim("state/safety", at, end)
                 for (at, motors, basis, _), end in zip(self.claims, ends, strict=True)
-                # Before the change there was no basis, and `off` was said of every stop.
-                if motors == "off" and basis in ("shown", "") and at >= since
+                if motors == "off" and basis == "shown" and at >= since
             ]
         complete = [each for each in self.stop_records(since) if each.phase == "complete"]
         return found + [Claim("stop complete", stamp_ns(each) / 1e9, float("inf")) for each in complete]
@@ -191,9 +191,8 @@ class Stranger:
 
     def _safety(self, sample: Sample) -> None:
         said: Any = sample.message()
-        basis, trust = getattr(said, "motors_basis", ""), getattr(said, "trust", "")
         with self._lock:
-            self.claims.append((stamp_ns(said) / 1e9, said.motors, basis, trust))
+            self.claims.append((stamp_ns(said) / 1e9, said.motors, said.motors_basis, said.trust))
 
     def _record(self, sample: Sample) -> None:
         with self._lock:
@@ -202,7 +201,7 @@ class Stranger:
 
 def _is_last(record: Any) -> bool:
     return record.phase in ("complete", "failed", "superseded", "rejected") or (
-        record.phase == "sent" and bool(getattr(record, "basis", ""))
+        record.phase == "sent" and bool(record.basis)
     )
 
 
@@ -223,8 +222,12 @@ class Strangers:
             else:
                 answer = fleet.ask("mode", car.mode, mode=car.mode)
             assert answer["status"] in ("sent", "queued"), answer
+        began = time.time()
         for car in self.cars:
-            wait_for(lambda car=car: self._is_in_mode(car), f"{car.mode} is in its mode")
+            try:
+                wait_for(lambda car=car: self._is_in_mode(car), f"{car.mode} is in its mode")
+            except AssertionError as error:
+                raise AssertionError(f"{error}\n{car.story(began)}") from error
 
     def _is_in_mode(self, car: Stranger) -> bool:
         return car.motors if car.mode == "manual" else car.true_mode == MODES[car.mode]
