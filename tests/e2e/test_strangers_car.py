@@ -3,57 +3,25 @@
 The car's own program judges (strangers_car.py). Many more gaps: tests/soak/test_strangers_car.py.
 """
 
-import random
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.support.gap import Direction, Gap, Wire
+from tests.support.gap import Direction, Gap
 from tests.support.kills import BUSY_S
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet, Process, wait_for
-from tests.support.strangers import MODES, PROGRAM, SHOWN_S, STANDS_S, Stranger, Strangers, gaps
+from tests.support.processes import Fleet, wait_for
+from tests.support.strangers import MODES, STANDS_S, Lot, gaps, start, stop_all, told
 from tests.support.up import Up
 
 pytestmark = pytest.mark.xdist_group("strangers")
 
 
-def start(fleet: Fleet, modes: list[str], seed: int) -> Strangers:
-    """Cars and wires, without gateways."""
-    cars = []
-    for number, mode in enumerate(modes):
-        process = fleet.start(str(PROGRAM), "--seed", str(seed + number))
-        cars.append(Stranger(mode, process, Wire(process.line()["port"])))
-    return Strangers(cars)
-
-
-class Lot:
-    """Seven cars, one for each mode, with their gateways."""
-
-    def __init__(self, directory: Path, seed: int) -> None:
-        self.fleet = Fleet(free_endpoint(), directory)
-        self.cars = start(self.fleet, list(MODES), seed)
-        for car in self.cars:
-            car.follow(self.fleet.bus)
-        self.gateways: dict[str, Process] = {
-            car.mode: self.fleet.gateway(car.wire.link, "--longest-drive", "60", car=car.mode) for car in self.cars
-        }
-
-    def ready(self) -> None:
-        """Wait until each car is in a known state."""
-        for car in self.cars:
-            self.fleet.ready(car.mode)
-
-    def close(self) -> None:
-        self.cars.close()
-        self.fleet.close()
-
-
 @pytest.fixture(scope="module")
 def lot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lot]:
-    started = Lot(tmp_path_factory.mktemp("strangers"), seed=1)
+    started = Lot(tmp_path_factory.mktemp("strangers"))
     try:
         started.ready()
         yield started
@@ -61,54 +29,9 @@ def lot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lot]:
         started.close()
 
 
-def stop_all(lot: Lot, seed: int) -> list[str]:
-    """Stop all cars with `fleet stop`; what was wrong."""
-    wanted = gaps(MODES, seed)
-    lot.cars.enter_modes(lot.fleet)
-    lot.cars.run(random.Random(seed).uniform(0.0, 4.0))
-    lot.cars.arm(wanted)
-    began = time.time()
-    stopping = lot.fleet.start("-m", "fleet.cli", "stop")
-    code = stopping.wait()
-    said = stopping.lines()
-    found = judge(lot.cars, wanted, began)
-    records = {car.mode: [each.phase for each in car.stop_records(began)] for car in lot.cars}
-    found += [f"{mode}: ends as {phases}" for mode, phases in records.items() if len(phases) != 1]
-    if (code == 0) != all(phases in (["complete"], ["sent"]) for phases in records.values()):
-        found.append(f"fleet stop: exit code {code} for {records}: {said}")
-    return found
-
-
-def judge(cars: Strangers, wanted: dict[str, Gap], began: float) -> list[str]:
-    """Wait until each car stands and has shown it; what was wrong meanwhile, each with its story."""
-    found: list[str] = []
-    for car in cars:
-        whole_at = wait_for(lambda car=car: car.wire.whole_at, f"a frame is written to {car.mode}")
-        wrong = []
-        try:
-            wait_for(lambda car=car, at=whole_at: car.shown and car.stays(at), f"{car.mode} has shown it", SHOWN_S)
-        except AssertionError as error:
-            wrong.append(str(error))
-        found += told(car, wanted[car.mode], began, wrong + verdict(car, began, whole_at))
-    return found
-
-
-def verdict(car: Stranger, began: float, whole_at: float) -> list[str]:
-    """What was wrong with one car after a stop."""
-    wrong = car.false_claims(began)
-    if (late_s := car.late_s(max(began, whole_at))) > STANDS_S + BUSY_S:
-        wrong.append(f"{car.mode}: moved until {late_s:.1f} s after the wire was whole")
-    return wrong
-
-
-def told(car: Stranger, gap: Gap, began: float, wrong: list[str]) -> list[str]:
-    """One text of what was wrong, with the story."""
-    return ["\n".join([*wrong, f"({gap})", car.story(began)])] if wrong else []
-
-
 @pytest.mark.timeout(240)
 def test_fleet_stop_claims_what_is_true_and_every_car_stands(lot: Lot) -> None:
-    found = stop_all(lot, seed=10)
+    found = stop_all(lot, gaps(MODES, seed=10))
     assert not found, "\n\n".join(found)
 
 

@@ -1,4 +1,4 @@
-"""A wire between a gateway and its car, TCP, that swallows bytes around a moment: from any byte on, in any direction."""
+"""A TCP wire between a gateway and its car that swallows bytes around a stop: from any byte on, in any direction."""
 
 import contextlib
 import random
@@ -20,16 +20,16 @@ class Direction(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """What a wire swallows. Its time counts from the first byte that the gateway writes after `Wire.arm`."""
+    """Bytes that a wire loses. The length counts from the gateway's first byte after `Wire.arm`."""
 
     direction: Direction
     length_s: float
     first: int = 0
-    """The first byte that is swallowed, counted from there."""
+    """First byte that is lost, counted from the gateway's first byte."""
     early: bool = False
-    """Also what comes before the gateway writes."""
+    """True if the gap begins with `Wire.arm`."""
     share: float = 1.0
-    """How much of it is swallowed; the rest passes."""
+    """Share of these bytes that is lost."""
     seed: int = 0
 
     def __str__(self) -> str:
@@ -44,7 +44,7 @@ class _Flow:
 
     name: Direction
     passed: list[tuple[float, bytes, bytes]] = field(default_factory=list)
-    """When, what came, and what of it went on."""
+    """Time, bytes that came, bytes that went on."""
     last_at: float = 0.0
 
 
@@ -61,22 +61,20 @@ class Wire:
         self._until = float("inf")
         self._chance = random.Random()
         self._closing = False
+        self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
     def arm(self, gap: Gap) -> None:
-        """Wait for the gateway's next byte with this gap."""
-        self._count, self._until, self._chance = 0, float("inf"), random.Random(gap.seed)
-        self._gap = gap
+        """Begin this gap at the gateway's next byte."""
+        with self._lock:
+            self._count, self._until, self._chance = 0, float("inf"), random.Random(gap.seed)
+            self._gap = gap
 
     @property
     def whole_at(self) -> float | None:
         """When the wire passes everything again, s since the epoch; None while that is not known."""
         return None if self._until == float("inf") else self._until
-
-    def mend(self) -> None:
-        """End the gap now."""
-        self._until = min(self._until, time.time())
 
     def frames(self, since: float) -> list[tuple[float, bytes, bytes]]:
         """What the gateway wrote: when, what, and what of it arrived."""
@@ -96,18 +94,19 @@ class Wire:
         if flow is self.to_car:
             if self._count == 0:
                 self._until = at + gap.length_s
-            begun = gap.early or self._count >= gap.first
             self._count += 1
+            begun = gap.early or self._count > gap.first
         hit = begun and at < self._until and gap.direction in (flow.name, Direction.BOTH)
         return hit and self._chance.random() < gap.share
 
     def _filter(self, flow: _Flow, data: bytes) -> bytes:
         """Return what of it goes on; each byte has its own time, as on a UART."""
         now, kept = time.time(), bytearray()
-        for byte in data:
-            flow.last_at = max(now, flow.last_at) + BYTE_S
-            if not self._swallows(flow, flow.last_at):
-                kept.append(byte)
+        with self._lock:
+            for byte in data:
+                flow.last_at = max(now, flow.last_at) + BYTE_S
+                if not self._swallows(flow, flow.last_at):
+                    kept.append(byte)
         flow.passed.append((now, data, bytes(kept)))
         return bytes(kept)
 

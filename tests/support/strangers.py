@@ -7,7 +7,7 @@ import json
 import random
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +15,10 @@ from typing import Any, Final
 from schemas.bus import Bus, Sample
 from tests.support.gap import Direction, Gap, Wire
 from tests.support.judge import stamp_ns
-from tests.support.processes import Process, wait_for
+from tests.support.kills import BUSY_S
+from tests.support.ports import free_endpoint
+from tests.support.processes import Fleet, Process, wait_for
+from tests.support.up import Up
 
 PROGRAM: Final = Path(__file__).parents[1] / "e2e" / "strangers_car.py"
 MODES: Final = {
@@ -51,6 +54,22 @@ def gaps(cars: Iterable[str], seed: int) -> dict[str, Gap]:
     return {
         car: Gap(direction, length_s, chance.randrange(STOP_BYTES), chance.random() < 0.4, 1.0, chance.randrange(1000))
         for car, length_s, direction in zip(cars, lengths, directions, strict=True)
+    }
+
+
+def any_gaps(cars: Iterable[str], seed: int) -> dict[str, Gap]:
+    """One gap for each car, of any length and direction; some lose a tenth of the bytes."""
+    chance = random.Random(seed)
+    return {
+        car: Gap(
+            chance.choice(list(Direction)),
+            chance.uniform(0.3, 6.0),
+            chance.randrange(2 * STOP_BYTES),
+            chance.random() < 0.4,
+            chance.choice((1.0, 1.0, 0.1)),
+            chance.randrange(1000),
+        )
+        for car in cars
     }
 
 
@@ -125,15 +144,16 @@ class Stranger:
     def moving(self) -> list[tuple[float, float]]:
         """Return from when to when it did not stand."""
         self.look()
-        ends = [at for at, _, _ in self.truths[1:]] + [self.heard_until]
         found: list[tuple[float, float]] = []
-        for (at, on, mode), end in zip(self.truths, ends, strict=True):
-            if not on and mode == 0:
-                continue
-            if found and found[-1][1] == at:
-                at = found.pop()[0]
-            found.append((at, end))
-        return found
+        began = None
+        for at, on, mode in self.truths:
+            moves = on or mode != MODES["manual"]
+            if moves and began is None:
+                began = at
+            elif not moves and began is not None:
+                found.append((began, at))
+                began = None
+        return found if began is None else [*found, (began, self.heard_until)]
 
     def stop_records(self, since: float) -> list[Any]:
         """Return the last records of stops."""
@@ -169,6 +189,13 @@ class Stranger:
     def late_s(self, whole_at: float) -> float:
         """Return how long after this moment it moved last, s."""
         return max((end - whole_at for _, end in self.moving()), default=0.0)
+
+    def outcome(self, began: float, whole_at: float) -> str:
+        """Return in words how a stop ended: times in s after it was asked."""
+        stood = max((end for _, end in self.moving()), default=began) - began
+        last = "; ".join(f"{each.phase} {stamp_ns(each) / 1e9 - began:.1f}" for each in self.stop_records(began))
+        shown = next((f"{claim.since - began:.1f}" for claim in self.claimed(began)), "never")
+        return f"whole {whole_at - began:.1f}, stands {max(0.0, stood):.1f}, shown {shown}, {last}"
 
     def story(self, since: float) -> str:
         """Return what happened, in order, s after this moment."""
@@ -211,10 +238,10 @@ class Strangers:
 
     cars: list[Stranger]
 
-    def __iter__(self) -> "Iterable[Stranger]":
+    def __iter__(self) -> Iterator[Stranger]:
         return iter(self.cars)
 
-    def enter_modes(self, fleet: Any) -> None:
+    def enter_modes(self, fleet: Fleet | Up) -> None:
         """Bring each car into the mode in which it is to be stopped."""
         for car in self.cars:
             if car.mode == "manual":
@@ -245,3 +272,80 @@ class Strangers:
     def close(self) -> None:
         for car in self.cars:
             car.wire.close()
+
+
+def start(fleet: Fleet, modes: list[str], seed: int) -> Strangers:
+    """Cars and wires, without gateways."""
+    cars = []
+    for number, mode in enumerate(modes):
+        process = fleet.start(str(PROGRAM), "--seed", str(seed + number))
+        cars.append(Stranger(mode, process, Wire(process.line()["port"])))
+    return Strangers(cars)
+
+
+class Lot:
+    """Seven cars, one for each mode, with their gateways."""
+
+    def __init__(self, directory: Path) -> None:
+        self.fleet = Fleet(free_endpoint(), directory)
+        self.cars = start(self.fleet, list(MODES), seed=1)
+        for car in self.cars:
+            car.follow(self.fleet.bus)
+        self.gateways: dict[str, Process] = {
+            car.mode: self.fleet.gateway(car.wire.link, "--longest-drive", "60", car=car.mode) for car in self.cars
+        }
+
+    def ready(self) -> None:
+        """Wait until each car is in a known state."""
+        for car in self.cars:
+            self.fleet.ready(car.mode)
+
+    def close(self) -> None:
+        self.cars.close()
+        self.fleet.close()
+
+
+def stop_all(lot: Lot, wanted: dict[str, Gap], busy_s: float = BUSY_S) -> list[str]:
+    """Stop all cars with `fleet stop`; what was wrong."""
+    lot.cars.enter_modes(lot.fleet)
+    lot.cars.run(1.0)
+    lot.cars.arm(wanted)
+    began = time.time()
+    stopping = lot.fleet.start("-m", "fleet.cli", "stop")
+    code = stopping.wait()
+    said = stopping.lines()
+    found = judge(lot.cars, wanted, began, busy_s)
+    records = {car.mode: [each.phase for each in car.stop_records(began)] for car in lot.cars}
+    found += [f"{mode}: ends as {phases}" for mode, phases in records.items() if len(phases) != 1]
+    if (code == 0) != all(phases in (["complete"], ["sent"]) for phases in records.values()):
+        found.append(f"fleet stop: exit code {code} for {records}: {said}")
+    return found
+
+
+def judge(cars: Strangers, wanted: dict[str, Gap], began: float, busy_s: float) -> list[str]:
+    """Wait until each car stands and has shown it; what was wrong meanwhile, each with its story."""
+    found: list[str] = []
+    for car in cars:
+        whole_at = wait_for(lambda car=car: car.wire.whole_at, f"a frame is written to {car.mode}")
+        wrong = []
+        try:
+            left_s = max(1.0, whole_at + SHOWN_S - time.time())
+            wait_for(lambda car=car, at=whole_at: car.shown and car.stays(at), f"{car.mode} has shown it", left_s)
+        except AssertionError as error:
+            wrong.append(str(error))
+        print(f"{car.mode:20}{wanted[car.mode]!s:50}{car.outcome(began, whole_at)}")
+        found += told(car, wanted[car.mode], began, wrong + verdict(car, began, whole_at, busy_s))
+    return found
+
+
+def verdict(car: Stranger, began: float, whole_at: float, busy_s: float) -> list[str]:
+    """What was wrong with one car after a stop."""
+    wrong = car.false_claims(began)
+    if (late_s := car.late_s(max(began, whole_at))) > STANDS_S + busy_s:
+        wrong.append(f"{car.mode}: moved until {late_s:.1f} s after the wire was whole")
+    return wrong
+
+
+def told(car: Stranger, gap: Gap, began: float, wrong: list[str]) -> list[str]:
+    """One text of what was wrong, with the story."""
+    return ["\n".join([*wrong, f"({gap})", car.story(began)])] if wrong else []

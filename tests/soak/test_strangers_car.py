@@ -1,0 +1,26 @@
+"""Many gaps around stops of strangers' cars, of any length and direction, in every mode; strictly."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.support.strangers import MODES, Lot, any_gaps, stop_all
+
+ROUNDS = 30
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(60 * ROUNDS)
+def test_stops_behind_many_gaps(tmp_path: Path) -> None:
+    seed = int(time.time())
+    lot = Lot(tmp_path)
+    found = []
+    try:
+        lot.ready()
+        for each in range(seed, seed + ROUNDS):
+            print(f"\nseed {each}")
+            found += stop_all(lot, any_gaps(MODES, each), busy_s=0.0)
+    finally:
+        lot.close()
+    assert not found, "\n\n".join(found)
