@@ -166,13 +166,18 @@ class Stranger:
 
     def claimed(self, since: float) -> list[Claim]:
         """Return what was claimed after this moment."""
+        found: list[Claim] = []
+        since_at = None
         with self._lock:
-            ends = [at for at, *_ in self.claims[1:]] + [float("inf")]
-            found = [
-                Claim("state/safety", at, end)
-                for (at, motors, basis, _), end in zip(self.claims, ends, strict=True)
-                if motors == "off" and basis == "shown" and at >= since
-            ]
+            for at, motors, basis, _ in self.claims:
+                stands = at >= since and motors == "off" and basis == "shown"
+                if stands and since_at is None:
+                    since_at = at
+                elif not stands and since_at is not None:
+                    found.append(Claim("state/safety", since_at, at))
+                    since_at = None
+        if since_at is not None:
+            found.append(Claim("state/safety", since_at, float("inf")))
         complete = [each for each in self.stop_records(since) if each.phase == "complete"]
         return found + [Claim("stop complete", stamp_ns(each) / 1e9, float("inf")) for each in complete]
 
@@ -275,7 +280,7 @@ class Strangers:
 
 
 def start(fleet: Fleet, modes: list[str], seed: int) -> Strangers:
-    """Cars and wires, without gateways."""
+    """Start cars and wires, without gateways."""
     cars = []
     for number, mode in enumerate(modes):
         process = fleet.start(str(PROGRAM), "--seed", str(seed + number))
@@ -305,10 +310,10 @@ class Lot:
         self.fleet.close()
 
 
-def stop_all(lot: Lot, wanted: dict[str, Gap], busy_s: float = BUSY_S) -> list[str]:
-    """Stop all cars with `fleet stop`; what was wrong."""
+def stop_all(lot: Lot, wanted: dict[str, Gap], *, pause_s: float = 1.0, busy_s: float = BUSY_S) -> list[str]:
+    """Stop all cars with `fleet stop`, so long after they are in their modes. Return what was wrong."""
     lot.cars.enter_modes(lot.fleet)
-    lot.cars.run(1.0)
+    lot.cars.run(pause_s)
     lot.cars.arm(wanted)
     began = time.time()
     stopping = lot.fleet.start("-m", "fleet.cli", "stop")
@@ -323,7 +328,7 @@ def stop_all(lot: Lot, wanted: dict[str, Gap], busy_s: float = BUSY_S) -> list[s
 
 
 def judge(cars: Strangers, wanted: dict[str, Gap], began: float, busy_s: float) -> list[str]:
-    """Wait until each car stands and has shown it; what was wrong meanwhile, each with its story."""
+    """Wait until each car stands and has shown it. Return what was wrong meanwhile, each with its story."""
     found: list[str] = []
     for car in cars:
         whole_at = wait_for(lambda car=car: car.wire.whole_at, f"a frame is written to {car.mode}")
@@ -339,7 +344,7 @@ def judge(cars: Strangers, wanted: dict[str, Gap], began: float, busy_s: float) 
 
 
 def verdict(car: Stranger, began: float, whole_at: float, busy_s: float) -> list[str]:
-    """What was wrong with one car after a stop."""
+    """Return what was wrong with one car after a stop."""
     wrong = car.false_claims(began)
     if (late_s := car.late_s(max(began, whole_at))) > STANDS_S + busy_s:
         wrong.append(f"{car.mode}: moved until {late_s:.1f} s after the wire was whole")
@@ -347,5 +352,5 @@ def verdict(car: Stranger, began: float, whole_at: float, busy_s: float) -> list
 
 
 def told(car: Stranger, gap: Gap, began: float, wrong: list[str]) -> list[str]:
-    """One text of what was wrong, with the story."""
+    """Return one text of what was wrong, with the story."""
     return ["\n".join([*wrong, f"({gap})", car.story(began)])] if wrong else []
