@@ -49,7 +49,8 @@ class CarMonitor:
     def heard(self, event: Event, now: float) -> None:
         """Take an event of the decoder as evidence."""
         model = self.model
-        for words in model.platform.heard(event):
+        settled = not isinstance(event, Sensors) or model.evidence.is_settled(event)
+        for words in model.platform.heard(event) if settled else ():
             self._ledger.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
             # The last stop may have been of the wrong kind, unless the car has shown it.
             stopping = model.trust.state in STOP_GOES_ON or model.trust.basis is Basis.SENT
@@ -60,7 +61,7 @@ class CarMonitor:
         if not isinstance(event, Sensors):
             return
         before = model.mode.verdict
-        model.mode.heard(event)
+        model.mode.heard(event, counts=settled)
         self._note_verdict(before, now)
         self._note_effect(event, now)
         if model.trust.state is CarTrust.UNHEARD:

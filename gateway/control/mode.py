@@ -104,10 +104,12 @@ class ModeTruth:
         self.evidence = "the link was lost"
         self.evidence_at = None
 
-    def heard(self, event: Sensors) -> None:
-        """Take a sensors frame as evidence."""
+    def heard(self, event: Sensors, *, counts: bool = True) -> None:
+        """Take a sensors frame as evidence; one that does not count only ends the silence."""
         at = event.at
         self._heard_at = at
+        if not counts:
+            return
         candidates = event.candidates
         self._fits(candidates)
         if self.asked is None:
@@ -206,6 +208,11 @@ class ModeTruth:
     def _fits(self, candidates: tuple[Mode, ...]) -> None:
         self.candidates = candidates
         self.inferred = candidates[0] if len(candidates) == 1 else None
+        if self.verdict is Verdict.CONFIRMED and self.inferred is None:
+            if self.asked in candidates:
+                self.inferred = self.asked
+            else:
+                self.verdict = Verdict.ASSUMED
 
     def _conclude(self, verdict: Verdict, evidence: str, at: float) -> None:
         self.verdict = verdict

@@ -18,10 +18,10 @@ WIRE_S: Final = 0.02  # protocol.md: 20 ms of wire for a frame of 19 bytes at 96
 RECOVERY_WORST_S: Final = 7.3  # protocol.md, "recovery": theory, never over 7.3 s outside avoidance
 _AVOIDING_S: Final = MODE_TURN_S[Mode.OBSTACLE_AVOIDANCE]
 """Of a car in an unknown state it is not known that it is not avoiding obstacles."""
-SHOW_S: Final = 10.0
+SHOW_S: Final = 12.0
 """Time that a car has to show a stop, beyond the announced worst case, before a command counts as failed."""
 LONGEST_WORST_S: Final = 5.0
-"""Maximum of the worst case that counts for that: nobody waits longer than 15 s for an answer."""
+"""Maximum of the worst case that counts for that: nobody waits longer than 17 s for an answer."""
 SHOWN_S: Final = 2.0
 """Usual time from the last frame to the evidence."""
 RETRY_S: Final = (recipes.SILENCE_S, 4.5, 5.5, 6.5)

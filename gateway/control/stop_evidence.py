@@ -228,6 +228,10 @@ class StopEvidence:
         self._before = self._pending = None
         self._pauses = 0
 
+    def is_settled(self, event: Sensors) -> bool:
+        """Return False for a report of mode 0 that may be a damaged frame of another mode: bytes came just before it."""
+        return event.at - self._last_at >= SETTLED_S or Mode.MANUAL not in event.candidates
+
     def reading(self, event: Sensors) -> Finding:
         """Return what a sensors frame shows."""
         at, quiet_s = event.at, event.at - self._last_at

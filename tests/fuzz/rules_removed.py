@@ -61,6 +61,7 @@ def _silent_mode_after_any_rest(patch: Patch) -> None:
 
 def _silent_mode_without_its_silence(patch: Patch) -> None:
     patch(stop_evidence, "OPENING_SILENCE_S", 0.0)
+    patch(stop_evidence, "OPENED_S", -1.0)
 
 
 def _no_renewal(patch: Patch) -> None:

@@ -45,7 +45,7 @@ FALSE_S = 0.3
 """A claim may be false for so long."""
 STANDS_S, AVOIDING_STANDS_S = 15.0, 20.0
 """So long after the link is whole, the motors of a car that was stopped are off for good."""
-ENDS_S = 16.0
+ENDS_S = 17.5
 """Every stop has ended so long after it was asked."""
 VERDICT_S = 5.5
 """A mode may be confirmed for so long after it has ended: 3 s of silence, a block of ours, and a reading on its way."""
@@ -228,6 +228,15 @@ def _misread_and_lost(seed: int, moments: random.Random) -> Plan:
     return _theme(seed, "steer", moments.uniform(0.5, 4.0), (cut, later), again_s=again_s)
 
 
+def _driven_over(seed: int, moments: random.Random) -> Plan:
+    """Nothing shows the stop, since the link is mute or the car hears nothing; then somebody drives all the same."""
+    way = moments.choice([Way.TO_CAR, Way.TO_CAR, Way.TO_HOST])
+    fault = Fault(Kind.DEAD, way, -0.1, moments.uniform(14.0, 24.0))
+    return _theme(
+        seed, "drive", 1.0, (fault,), again_s=moments.uniform(2.0, 6.0), drive_again_s=moments.uniform(10.0, 16.0)
+    )  # fmt: skip
+
+
 THEMES = (
     _report_swallowed,
     _digit_lost,
@@ -237,6 +246,7 @@ THEMES = (
     _short_gap,
     _damaged_reports,
     _misread_and_lost,
+    _driven_over,
 )
 
 
