@@ -229,7 +229,7 @@ class StopEvidence:
         self._pauses = 0
 
     def is_settled(self, event: Sensors) -> bool:
-        """Return False for a report of mode 0 that may be a damaged frame of another mode: bytes came just before it."""
+        """Return False if bytes came just before a report of mode 0: it may be a damaged frame of another mode."""
         return event.at - self._last_at >= SETTLED_S or Mode.MANUAL not in event.candidates
 
     def reading(self, event: Sensors) -> Finding:

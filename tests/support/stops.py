@@ -454,6 +454,8 @@ def state_of(pair: Pair) -> str:
         return f"{kind[style]}mode contradicted"
     if mode is None or mode is Mode.MANUAL:
         pacing = control.pacing
+        if control.at_rest and control.basis is Basis.SENT and pacing.blocked_at(now):
+            return f"{kind[style]}at rest, a renewal blocks"  # the motors are off, so the ratio says nothing
         unread = "a frame may be unread" if not pacing.clear_at(now) else ""
         what = unread or ("in a block of ours" if pacing.blocked_at(now) else "nothing unread")
         return f"{kind[style]}{Mode.MANUAL}, {what}"
