@@ -12,7 +12,7 @@ from itertools import product
 
 from gateway.control.mode import Verdict
 from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, SetMode, Stop
-from gateway.control.trust import CarTrust
+from gateway.control.trust import Basis, CarTrust
 from gateway.protocol.encode import ColorLed, General, ModeOpen, Ptz, encode
 from gateway.protocol.profile import Platform, StopStyle
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
