@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.gap import Direction, Gap
+from tests.support.foreign_cars import MODES, STANDS_S, ForeignLot, gaps, report, start, stop_all
+from tests.support.gap_proxy import ByteGap, GapDirection
 from tests.support.kills import BUSY_S
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, wait_for
-from tests.support.strangers import MODES, STANDS_S, Lot, gaps, start, stop_all, told
 from tests.support.up import Up
 
 pytestmark = pytest.mark.xdist_group("strangers")
 
 
 @pytest.fixture(scope="module")
-def lot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lot]:
-    started = Lot(tmp_path_factory.mktemp("strangers"))
+def lot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ForeignLot]:
+    started = ForeignLot(tmp_path_factory.mktemp("strangers"))
     try:
         started.ready()
         yield started
@@ -30,15 +30,15 @@ def lot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lot]:
 
 
 @pytest.mark.timeout(240)
-def test_fleet_stop_claims_what_is_true_and_every_car_stands(lot: Lot) -> None:
+def test_fleet_stop_claims_what_is_true_and_every_car_stands(lot: ForeignLot) -> None:
     found = stop_all(lot, gaps(MODES, seed=10))
     assert not found, "\n\n".join(found)
 
 
 @pytest.mark.timeout(240)
-def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_not(lot: Lot) -> None:
+def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_not(lot: ForeignLot) -> None:
     """One wire is broken for good; the others have gaps."""
-    wanted = gaps(MODES, 20) | {"light_seeking": Gap(Direction.BOTH, 3600.0)}
+    wanted = gaps(MODES, 20) | {"light_seeking": ByteGap(GapDirection.BOTH, 3600.0)}
     lot.cars.enter_modes(lot.fleet)
     lot.cars.arm(wanted)
     began = time.time()
@@ -58,7 +58,7 @@ def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_n
             wrong.append(f"{car.mode}: exit code {code}: {gateway.stderr}")
         if gap.length_s > 60 and code == 0:
             wrong.append(f"{car.mode}: exit code 0 on a dead wire")
-        found += told(car, gap, began, wrong)
+        found += report(car, gap, began, wrong)
     assert not found, "\n\n".join(found)
 
 
@@ -96,7 +96,7 @@ def test_fleet_down_says_stopped_of_cars_that_stand(tmp_path: Path, fleet: Fleet
                         wrong.append(f"{car.mode}: moves, but fleet down says: stopped")
                 if car.late_s(max(began, car.wire.whole_at or began)) > STANDS_S + BUSY_S:
                     wrong.append(f"{car.mode}: moves for too long")
-                found += told(car, wanted[car.mode], began, wrong)
+                found += report(car, wanted[car.mode], began, wrong)
             assert not found, "\n\n".join(found)
             assert done.returncode == 0, done
     finally:

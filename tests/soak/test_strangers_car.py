@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.strangers import MODES, Lot, any_gaps, stop_all
+from tests.support.foreign_cars import MODES, ForeignLot, any_gaps, stop_all
 
 ROUNDS = 30
 
@@ -15,7 +15,7 @@ ROUNDS = 30
 @pytest.mark.timeout(60 * ROUNDS)
 def test_stops_behind_many_gaps(tmp_path: Path) -> None:
     seed = int(time.time())
-    lot = Lot(tmp_path)
+    lot = ForeignLot(tmp_path)
     found = []
     try:
         lot.ready()

@@ -12,22 +12,22 @@ from enum import StrEnum
 BYTE_S = 1 / 960
 
 
-class Direction(StrEnum):
+class GapDirection(StrEnum):
     TO_CAR = "to car"
     TO_HOST = "to host"
     BOTH = "both"
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
-    """Bytes that a wire loses. The length counts from the gateway's first byte after `Wire.arm`."""
+class ByteGap:
+    """Bytes that a wire loses. The length counts from the gateway's first byte after `GapProxy.arm`."""
 
-    direction: Direction
+    direction: GapDirection
     length_s: float
     first: int = 0
     """First byte that is lost, counted from the gateway's first byte."""
     early: bool = False
-    """True if the gap begins with `Wire.arm`."""
+    """True if the gap begins with `GapProxy.arm`."""
     share: float = 1.0
     """Share of these bytes that is lost."""
     seed: int = 0
@@ -42,21 +42,21 @@ class Gap:
 class _Flow:
     """One direction of the wire."""
 
-    name: Direction
+    name: GapDirection
     passed: list[tuple[float, bytes, bytes]] = field(default_factory=list)
     """Time, bytes that came, bytes that went on."""
     last_at: float = 0.0
 
 
-class Wire:
+class GapProxy:
     """Passes bytes to the car at this port of loopback, and from it."""
 
     def __init__(self, port: int) -> None:
         self._car = ("127.0.0.1", port)
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.link = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
-        self.to_car, self.to_host = _Flow(Direction.TO_CAR), _Flow(Direction.TO_HOST)
-        self._gap: Gap | None = None
+        self.to_car, self.to_host = _Flow(GapDirection.TO_CAR), _Flow(GapDirection.TO_HOST)
+        self._gap: ByteGap | None = None
         self._count = 0
         self._until = float("inf")
         self._chance = random.Random()
@@ -65,7 +65,7 @@ class Wire:
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
-    def arm(self, gap: Gap) -> None:
+    def arm(self, gap: ByteGap) -> None:
         """Begin this gap at the gateway's next byte."""
         with self._lock:
             self._count, self._until, self._chance = 0, float("inf"), random.Random(gap.seed)
@@ -96,7 +96,7 @@ class Wire:
                 self._until = at + gap.length_s
             self._count += 1
             begun = gap.early or self._count > gap.first
-        hit = begun and at < self._until and gap.direction in (flow.name, Direction.BOTH)
+        hit = begun and at < self._until and gap.direction in (flow.name, GapDirection.BOTH)
         return hit and self._chance.random() < gap.share
 
     def _filter(self, flow: _Flow, data: bytes) -> bytes:
