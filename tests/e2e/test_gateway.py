@@ -520,8 +520,11 @@ def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: Fleet) 
     wait_for(lambda: fleet.left() and bus.accepts(fleet.endpoint), "another hub")
     assert wait_for(lambda: fleet.bus.tokens("fleet/*") == ["fleet/blue", "fleet/red"], "both are back")
     for car in ("red", "blue"):
-        assert fleet.ask("drive", car, motion="forward", duration_s=5)["status"] in TAKEN
-        wait_for(lambda car=car: driving(sim, car), f"{car} drives")
+
+        def drives(car: str = car) -> bool:  # a gateway that stalled stops its car: asked again
+            return fleet.ask("drive", car, motion="forward", duration_s=5)["status"] in TAKEN and driving(sim, car)
+
+        wait_for(drives, f"{car} drives")
         assert fleet.ask("stop", car)["status"] in TAKEN
         wait_for(lambda car=car: not driving(sim, car), f"{car} stands")
 
@@ -585,7 +588,7 @@ def test_a_signal_while_nothing_is_connected_ends_at_once(fleet: Fleet, tmp_path
     gateway = fleet.gateway(str(tmp_path / "tty"), "--retry")
     wait_for(lambda: fleet.state("link"), "it runs")
     assert gateway.end(signal.SIGINT) == 1, gateway.stderr
-    words = "red may still be moving: red cannot be reached (not connected yet)"
+    words = "red may still be moving: red cannot be reached ("
     assert words in gateway.stderr, "the one before may have left it driving"
 
 
