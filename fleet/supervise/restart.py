@@ -18,8 +18,8 @@ WRONG_USE: Final = 2
 """Exit code of a process that refuses its arguments. Another start seldom changes that."""
 WRONG_USE_RETRY_S: Final = 60.0
 """Interval of the retries then. Nothing is given up for good: a file or a device may be put right meanwhile."""
-GATEWAY_GRACE_S: Final = 16.0
-"""Time that a gateway has from SIGTERM to its end before it is killed. It waits up to 13 s for its car to show the stop
+GATEWAY_GRACE_S: Final = 19.0
+"""Time that a gateway has from SIGTERM to its end before it is killed. It waits up to 16 s for its car to show the stop
 (gateway.control.executor, `SHUTDOWN_S`), and leaves the bus after that."""
 HUNG: Final = "hung"
 """How the words begin on a process that was killed for its silence."""

@@ -23,7 +23,7 @@ from gateway.protocol.values import Mode, Motion
 
 LATE_S: Final = 0.1
 """Report a drive as shortened if its frame goes out later than this; its duration counts from the request."""
-SHUTDOWN_S: Final = 13.0
+SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that ends waits for its car to show the stop."""
 RENEW_S: Final = (2.2, 4.0, 6.0)
 """Intervals at which a rest that nothing has shown is sent again, by how often it was. A lost stop is made up for."""
