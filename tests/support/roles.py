@@ -33,6 +33,8 @@ FILL_S: Final = 3.0
 """issue 5: a role that another free car can fill, and one whose only car has ended its recovery."""
 NOTICED_S: Final = 4.5
 """What a car that reset itself does looks as asked until three of its frames, one a second, say otherwise."""
+SHOWN_S: Final = 4.0
+"""Its stop, before the mode is opened again, is shown by two pauses in its reports."""
 IN_FORCE_S: Final = 3.5 + 1.0
 """protocol.md: the longest opening, and issue 5's second."""
 STRAY_S: Final = 2.5
@@ -193,7 +195,7 @@ class Stage:
             fields = {"fault": "link_drop", "for_s": 4.0} if what == "link" else {"fault": "brownout"}
             assert self.up.simulator(car=car, **fields)["ok"]
         hit = name is None or name == car
-        limit_s = FILL_S + (NOTICED_S if what == "brownout" else 0.0)
+        limit_s = FILL_S + (NOTICED_S + SHOWN_S if what == "brownout" else 0.0)
         filled_s = in_force_s = None
         if hit and mode is not None:
             opened = wait_for(lambda: watcher.opened_after(at_ns, mode), f"{what} {car}: {mode} is given")
