@@ -16,7 +16,7 @@ from gateway.control.records import Level, Phase, Reason, SetMode, Why
 from gateway.control.stop_evidence import Finding, StopCase
 from gateway.control.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
 from gateway.protocol.profile import StopStyle
-from gateway.protocol.readings import Event, Rejected, Sensors
+from gateway.protocol.readings import Cause, Event, Rejected, Sensors
 from gateway.protocol.values import Mode
 
 STALL_S: Final = 0.5
@@ -56,8 +56,8 @@ class CarMonitor:
             stopping = model.trust.state in STOP_GOES_ON or model.trust.basis is Basis.SENT
             if model.platform.doubted and stopping and model.link_open:
                 self._executor.recover(now, words)
-        if isinstance(event, Rejected):
-            model.evidence.noise(event.at)
+        if isinstance(event, Rejected) and event.raw.strip():  # some cars end a frame with CR and LF
+            model.evidence.noise(event.at, damaged=event.cause is not Cause.NO_START)
         if not isinstance(event, Sensors):
             return
         before = model.mode.verdict

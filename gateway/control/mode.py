@@ -207,14 +207,13 @@ class ModeTruth:
 
     def _fits(self, candidates: tuple[Mode, ...]) -> None:
         self.candidates = candidates
-        self.inferred = candidates[0] if len(candidates) == 1 else None
-        if self.verdict is Verdict.CONFIRMED and self.inferred is None:
-            if self.asked in candidates:
-                self.inferred = self.asked
-            else:
-                self.verdict = Verdict.ASSUMED
+        # One ambiguous reading takes nothing back from a mode that is confirmed: it may be damaged.
+        if len(candidates) == 1 or self.verdict is not Verdict.CONFIRMED:
+            self.inferred = candidates[0] if len(candidates) == 1 else None
 
     def _conclude(self, verdict: Verdict, evidence: str, at: float) -> None:
         self.verdict = verdict
         self.evidence = evidence
         self.evidence_at = at
+        if verdict is not Verdict.CONFIRMED:
+            self.inferred = self.candidates[0] if len(self.candidates) == 1 else None

@@ -158,6 +158,8 @@ class StopEvidence:
     """Reports without an echo in a row."""
     _last_at: float = float("-inf")
     """When the last bytes came that are no report of the options (arm, gyro)."""
+    _foreign_at: float = float("-inf")
+    """When the last frame came, whole or damaged, that is no report of mode 0."""
     _before: float | None = None
     """When the last report with an echo came, if nothing else came since."""
     _pending: float | None = None
@@ -181,7 +183,7 @@ class StopEvidence:
     def begin_link(self) -> None:
         """Forget everything: the link is new."""
         self.obeyed_at = None
-        self._last_at = float("-inf")
+        self._last_at = self._foreign_at = float("-inf")
         self._window_s = CLOSED_S
         self.stalled()
         self.sent_motion()
@@ -218,10 +220,12 @@ class StopEvidence:
 
     # ------------------------------------------------------------------ what is heard
 
-    def noise(self, at: float) -> None:
-        """Take bytes that are no reading: the link damages frames, or the car is in another mode."""
+    def noise(self, at: float, *, damaged: bool = True) -> None:
+        """Take bytes that are no reading; `damaged`: they begin like a frame, so the next may be damaged as well."""
         self._last_at = at
         self._before = None
+        if damaged:
+            self._foreign_at = at
 
     def stalled(self) -> None:
         """Drop what depends on times: the loop slept, so reports may have come sooner than they were taken."""
@@ -229,8 +233,8 @@ class StopEvidence:
         self._pauses = 0
 
     def is_settled(self, event: Sensors) -> bool:
-        """Return False if bytes came just before a report of mode 0: it may be a damaged frame of another mode."""
-        return event.at - self._last_at >= SETTLED_S or Mode.MANUAL not in event.candidates
+        """Return False for a report of mode 0 just after other frames: it may be a damaged one of another mode."""
+        return event.at - self._foreign_at >= SETTLED_S or Mode.MANUAL not in event.candidates
 
     def reading(self, event: Sensors) -> Finding:
         """Return what a sensors frame shows."""
@@ -284,6 +288,7 @@ class StopEvidence:
 
     def _other_mode(self, at: float) -> None:
         self._shapes += 1
+        self._foreign_at = at
         self._before, self._pauses = None, 0
         if self._shapes >= SHAPES or self._shape_at is not None:
             self._shape_at = at

@@ -33,7 +33,7 @@ def _one_pause(patch: Patch) -> None:
 
 def _damaged_frames_count(patch: Patch) -> None:
     patch(stop_evidence, "SETTLED_S", -1.0)
-    patch(StopEvidence, "noise", lambda self, at: None)
+    patch(StopEvidence, "noise", lambda self, at, damaged=True: None)
 
 
 def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:

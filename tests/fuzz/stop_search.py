@@ -526,7 +526,7 @@ class Episode:
         """End the gateway; where its car was not stopped, another one follows, as under `fleet up`."""
         for _ in range(6):
             self.control.shutdown(self.now)
-            self._until(lambda: self.control.finished, 15.0)
+            self._until(lambda: self.control.finished, 18.0)
             ended, self._claim_since = self.control, None
             self._note(f"ended: not stopped {ended.not_stopped!r}, {ended.basis}")
             if not ended.not_stopped:

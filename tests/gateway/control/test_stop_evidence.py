@@ -25,9 +25,10 @@ from gateway.control.stop_evidence import (
 )
 from gateway.control.trust import Basis
 from gateway.protocol.decode import Decoder
-from gateway.protocol.readings import Sensors
+from gateway.protocol.readings import Cause, Rejected, Sensors
 from gateway.protocol.values import Mode, Motion
 from gateway.sim.core.world import World
+from tests.gateway.control.desk import Desk
 from tests.support.virtual import Pair
 
 ECHO = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
@@ -385,3 +386,20 @@ def test_every_row_is_played() -> None:
 
 
 assert NORMAL_MAX_S < PAUSE_MIN_S
+
+
+def test_line_ends_between_reports_hide_no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    """protocol.md, framing: CR and LF after `#` are junk that happens."""
+    desk = Desk().ready()
+    hear = desk.hear
+
+    def hear_a_line(frame: bytes = b"") -> None:
+        hear(frame)
+        desk.control.heard(Rejected(b"\r\n", desk.now, Cause.NO_START), desk.now)
+
+    monkeypatch.setattr(desk, "hear", hear_a_line)
+    desk.ask(Drive(Motion.FORWARD, 5.0))
+    desk.run(2.0)
+    desk.ask(Stop(), identity="stop")
+    desk.run(9.0)
+    assert desk.end("stop")[0] is Phase.COMPLETE

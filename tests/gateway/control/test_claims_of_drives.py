@@ -1,0 +1,44 @@
+"""What is claimed of a drive when nothing shows that the car got it."""
+
+import pytest
+
+from gateway.control.records import Drive, Phase
+from gateway.control.trust import CarTrust
+from gateway.protocol.values import Motion
+from tests.support.virtual import Pair
+
+
+def driven(*, deaf: bool) -> Pair:
+    """A car that was driven for a second, as far as it heard."""
+    pair = Pair(start_s=2.0)
+    if deaf:
+        pair.car.feed = lambda data, now: None  # type: ignore[method-assign]
+    pair.connect()
+    pair.run(20.0)
+    assert pair.control.model.trust.state is (CarTrust.UNPROVEN if deaf else CarTrust.STOPPED)
+    pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
+    pair.run(4.0)
+    return pair
+
+
+def test_a_drive_of_a_deaf_car_was_sent_and_nothing_shows_that_it_moved() -> None:
+    pair = driven(deaf=True)
+    last = [record for record in pair.records if record.command.id == "drive"][-1]
+    assert (last.phase, last.basis) == (Phase.SENT, "sent")
+    assert "nothing shows that red moved" in last.words
+
+
+def test_a_drive_of_a_car_that_hears_is_complete() -> None:
+    last = [record for record in driven(deaf=False).records if record.command.id == "drive"][-1]
+    assert (last.phase, last.basis) == (Phase.COMPLETE, "")
+
+
+@pytest.mark.parametrize("seconds", [3.0, 30.0, 90.0])
+def test_no_mode_is_confirmed_by_old_evidence_while_a_stop_goes_on(seconds: float) -> None:
+    pair = Pair(start_s=2.0).ready()
+    assert pair.control.mode.confirmed is not None
+    pair.deaf_until = float("inf")
+    pair.run(4.5)
+    for _ in range(int(seconds)):
+        pair.run(1.0)
+        assert pair.control.mode.confirmed is None
