@@ -25,7 +25,7 @@ from tests.support.virtual import Pair
 LONGEST_S = 4.0
 """Outside obstacle avoidance and links just restored no stop takes longer."""
 AVOIDING_S = 4.3
-ENDS_S = 16.0
+ENDS_S = 18.5
 """So long after it was asked, every stop has its last record (gateway/control/stop.py)."""
 OPENS_S = 14.0
 """So long after it was asked, a mode opens: the stop before it is over within 10 s, or the mode is given up."""

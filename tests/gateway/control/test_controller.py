@@ -33,6 +33,7 @@ from gateway.control.waiting import PATIENCE_S
 from gateway.protocol.encode import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
 from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from tests.gateway.control.desk import BACK, COORDINATOR, MODE00, PERSON, RUN, SCRIPT, SHOWN_STOP, STOP, TRACKING, Desk
+from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 
 ASKED, QUEUED, SENT, COMPLETE = Phase.ASKED, Phase.QUEUED, Phase.SENT, Phase.COMPLETE
@@ -735,7 +736,7 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
             desk.run(moments.choice([0.0, 0.01, 0.05, 0.3, 1.5]), reports=moments.random() < 0.8)
         before = len(desk.sent)
         desk.ask(Stop(), identity="the-stop")
-        desk.run(16.0)
+        desk.run(ENDS_S)
         assert set(desk.frames[before:]) <= stops, seed
         ends = [each for each in desk.records if each.command.id == "the-stop"]
         if (
