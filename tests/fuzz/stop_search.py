@@ -754,7 +754,7 @@ class Episode:
         end = self.now + seconds
         while self.now < end:
             if self.car.truth.driving and self.car.alive:
-                if _is_wedged(self.car) and self.control.basis == "sent":
+                if _is_lost(self.car) or (_is_wedged(self.car) and self.control.basis == "sent"):
                     self.report.wedged = True
                 elif self._ended_as_sent:
                     self.report.false_sent["shutdown"] += 1  # nothing showed it, and no gateway is left
@@ -771,6 +771,11 @@ class Episode:
         if not any(each.startswith(short) for each in self.report.violations):
             self.report.violations.append(words)
             self._note(f"VIOLATION {words}")
+
+
+def _is_lost(car: object) -> bool:
+    """Return True for a string without its first bytes, which no frame of recovery clears (test_stops.py, an xfail)."""
+    return isinstance(car, ArduinoCar) and car._string.startswith(("4WD", "WD", "D,", "MODE"))
 
 
 def _is_wedged(car: object) -> bool:
