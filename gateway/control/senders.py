@@ -30,8 +30,11 @@ class Senders:
         self._tokens[name] = None
 
     def vanished(self, name: str, now: float, *, driving: bool) -> None:
-        """The sender's token is gone; of who does not drive, or never had one, nothing need be remembered."""
-        if driving and name in self._tokens:
+        """A sender's liveliness token disappeared. Remember it only if that sender is driving.
+
+        Changes are merged, so a token that came and went may be known only from its end.
+        """
+        if driving:
             self._tokens[name] = now
         else:
             self._tokens.pop(name, None)

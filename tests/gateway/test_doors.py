@@ -100,7 +100,7 @@ async def test_a_stop_finds_room_where_other_commands_find_none(hall: tuple[Hall
         return [each for found in words for each in found if each != "Timeout"]
 
     assert await asyncio.to_thread(fill) == [bus.BUSY] * 2
-    assert await asyncio.to_thread(ask, asker, "@cmd/stop") == ["Timeout"]
+    assert set(await asyncio.to_thread(ask, asker, "@cmd/stop")) == {"Timeout"}
     there.attach()
     await there.until(lambda: len(there.commands) == COMMANDS_WAITING + 1, "all that waited")
     assert str(there.commands[-1][0].key_expr).endswith("/stop"), "and none after a stop that came before it"

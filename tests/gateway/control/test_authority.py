@@ -316,3 +316,13 @@ def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Desk) -> None:
     assert desk.ask(SetMode(Mode.MANUAL), COORDINATOR).reason is Reason.LEASED
     desk.run(2.0, reports=False)
     assert desk.ask(SetMode(Mode.MANUAL), COORDINATOR).status is QUEUED
+
+
+def test_a_token_that_is_known_only_from_its_end_ends_the_drive() -> None:
+    """Changes of tokens are merged: one that came and went within 50 ms is told as gone."""
+    desk = Desk().ready()
+    desk.ask(Drive(Motion.FORWARD, 60.0), SCRIPT, identity="drive")
+    desk.control.sender_alive(SCRIPT.name, alive=False, now=desk.now)
+    desk.run(1.5)
+    assert desk.life("drive")[-1] is Phase.EXPIRED
+    assert STOP in desk.frames

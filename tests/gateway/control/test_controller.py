@@ -283,7 +283,7 @@ def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Desk) -> No
 
 def test_a_sender_without_a_token_is_not_watched(desk: Desk) -> None:
     desk.ask(Drive(Motion.FORWARD, 5.0), PERSON)
-    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    desk.control.sender_alive("ann", alive=False, now=desk.now)
     desk.run(4.0)
     assert desk.frames == [RUN, RUN]
 
