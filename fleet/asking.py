@@ -53,7 +53,7 @@ class Asking:
         self.inbox: queue.Queue[Item] = queue.Queue(_QUEUE)
         self._asked_at = time.monotonic()
         self._late_at: float | None = self._asked_at + ANSWER_S
-        """When it is said who has not answered; None: it was."""
+        """When to warn who has not answered; None after the warning."""
         self._open = 0
         self._progress: dict[str, Progress] = {}
         for car in present if named is None else named:
@@ -93,7 +93,7 @@ class Asking:
             self._take(item, at)
 
     def concerns(self, car: str) -> bool:
-        """Whether it was asked of this car; on any thread."""
+        """Return True if this command asks this car; on any thread."""
         return car in self._progress
 
     def _say_who_is_late(self, waiting: list[Progress]) -> None:

@@ -49,7 +49,7 @@ _QUESTIONS: Final = 64
 """Queries that may wait in it."""
 _ASKERS: Final = 4
 _APIECE: Final = 8
-"""So many cars that came together are asked each for itself, of more all cars with one question."""
+"""Maximum cars that are asked one by one. If more came together, one question asks all cars."""
 INTERNAL_ERROR: Final = "internal_error"
 """Code of the event about an exception that nobody foresaw. The coordinator goes on."""
 _LONGEST_ERROR: Final = 500
@@ -107,7 +107,7 @@ class Coordinator:
     _questions: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(_QUESTIONS))
     """How many queries find room."""
     _tokens: Latest[bool] = field(default_factory=Latest)
-    """Whether each car's gateway is on the bus, where that has changed."""
+    """Changes of tokens by car: True if the gateway is on the bus."""
     _came: set[str] = field(default_factory=set)
     """Cars whose gateways came and were not asked yet."""
     _asked: "list[Future[None]]" = field(default_factory=list)

@@ -17,9 +17,9 @@ _HEALTH: Final = "state/health"
 FORGOTTEN_S: Final = 60.0
 """A car is forgotten whose gateway has been away for so long, unless the fleet file or the plan names it."""
 MOST_GONE: Final = 256
-"""So many cars are remembered whose gateways are away; of more those that went first are forgotten at once."""
+"""Maximum cars that are remembered while their gateways are away. The oldest are forgotten first."""
 MOST_UNHEARD: Final = 256
-"""So many names count as cars that are on the bus, have said nothing yet, and stand in no fleet file."""
+"""Maximum names on the bus that count as cars before they publish a state, if no fleet file lists them."""
 
 
 @dataclass(slots=True)

@@ -35,7 +35,6 @@ When a hub comes back every gateway asks all others: a hundred are 10,000 answer
 come too late and are asked for again, which keeps two processors busy for more than a minute. An e-stop that is asked
 for meanwhile does not wait for this: its gateway passes it on at once.
 """
-MANY_TIMEOUT_S: Final = 4.0
 
 log = logging.getLogger("gateway")
 

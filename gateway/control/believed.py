@@ -5,7 +5,7 @@ The car confirms none of it; its mode, of which readings give evidence, is in mo
 
 from dataclasses import dataclass, field
 
-from gateway.protocol.encode import ColorLed, Frame, General, ModeClose, ModeOpen, Ptz
+from gateway.protocol.encode import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.protocol.profile import Profile
 from gateway.protocol.values import Motion
 
@@ -17,8 +17,6 @@ class Believed:
     profile: Profile
     motion: Motion = Motion.STOP
     """The last that was sent."""
-    motors_on: bool = False
-    """Motion was sent, or a mode opened, since the last stop that is complete."""
     repeat: bool = False
     """The motion changed, and was not sent again alone yet (protocol.md: the 1.1 s rule)."""
     fan: bool | None = None
@@ -37,15 +35,12 @@ class Believed:
             case General():
                 if frame.motion is not Motion.STOP:
                     self.repeat = self.repeat or frame.motion is not self.motion
-                    self.motors_on = True
                 self.motion = frame.motion
                 if frame.speed is not None:
                     self.speed = self.profile.speed.step(self.speed, frame.speed)
                 if frame.fan:
                     self.fan = None if self.fan is None else not self.fan
                     self.fan_at = now
-            case ModeOpen():
-                self.motors_on = True
             case ModeClose():
                 self.motion = Motion.STOP
             case Ptz(deg):

@@ -19,7 +19,7 @@ from gateway.protocol.profile import Profile, StopStyle
 from gateway.protocol.values import Mode, Motion
 
 KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
-"""In these states the last recovery is over and no write has failed since, so the car reads frames as they are."""
+"""In these states the last recovery is over and no write has failed since, so the car reads frames as meant."""
 
 
 @dataclass(slots=True)
@@ -91,7 +91,7 @@ class CarModel:
     @property
     def for_stop_style(self) -> StopStyle:
         """Return which kind of stop the car takes now."""
-        return StopStyle.UNKNOWN if self.platform.doubted else self.profile.stop_style
+        return stop.style_of(self.profile, doubted=self.platform.doubted)
 
     @property
     def motors(self) -> str:

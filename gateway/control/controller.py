@@ -143,11 +143,6 @@ class Controller:
         return self.model.at_rest
 
     @property
-    def hears(self) -> bool:
-        """Return True if the car has shown on this link that a frame arrived."""
-        return self.model.evidence.obeyed_at is not None
-
-    @property
     def is_heard(self) -> bool:
         """Return False if the car is silent for longer than it ever is."""
         return self.model.trust.state is not CarTrust.UNHEARD

@@ -567,7 +567,6 @@ class Executor:
             how = "shown" if basis is Basis.SHOWN else f"sent: {words}"
             known = f"{model.name} is in a known state: stopped ({how}), mode manual"
             self._ledger.log(Level.INFO, "recovered", known, now)
-        model.believed.motors_on = False
         if basis is Basis.SENT:
             self._renewals, self._general_stop_follows = 0, False
             self._schedule_renewal(now)

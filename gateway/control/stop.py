@@ -34,6 +34,11 @@ IN_TIME_S: Final = 0.2
 """A frame written so long before a block can end lies in the buffer when it does, whatever the link's own delay."""
 
 
+def style_of(profile: Profile, *, doubted: bool) -> StopStyle:
+    """Return which kind of stop a car takes; `doubted`: its bytes speak against its platform."""
+    return StopStyle.UNKNOWN if doubted else profile.stop_style
+
+
 @dataclass(frozen=True, slots=True)
 class Situation:
     """What the choice of a stop looks at."""
@@ -54,7 +59,7 @@ class Situation:
     @property
     def style(self) -> StopStyle:
         """Which kind of stop it takes."""
-        return StopStyle.UNKNOWN if self.doubted else self.profile.stop_style
+        return style_of(self.profile, doubted=self.doubted)
 
     @property
     def manual(self) -> bool:

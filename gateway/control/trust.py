@@ -4,7 +4,7 @@ Each transition names what happened; `TRANSITIONS` is total, so every state answ
 frames that were written and from what the car has shown, never from time alone.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
@@ -116,7 +116,7 @@ class TrustState:
     evidence: str = "not connected yet"
     basis: Basis | None = None
     """Set in `STOPPED` only."""
-    shown_at: float | None = field(default=None)
+    shown_at: float | None = None
     """When the car showed its last stop."""
 
     def take(self, event: TrustEvent, now: float, evidence: str = "") -> bool:

@@ -313,7 +313,7 @@ def within(what: Act | SetMode, block_s: float) -> Load:
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(what)
-        pair.until(lambda: pair.car.truth.blocked and not pair.control.believed.motors_on, 12.0)
+        pair.until(lambda: pair.car.truth.blocked and pair.control.motors == "off", 12.0)
         pair.run(block_s * moments.random())
 
     return load
