@@ -1,6 +1,6 @@
 """The `fleet` command as a script and as `python -m fleet`: a Ctrl-C while it is imported is no traceback."""
 
-from schemas import startup
+from schemas.process import startup
 
 
 def main() -> None:

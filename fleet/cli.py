@@ -11,7 +11,7 @@ from typing import Final
 
 import click
 
-from schemas import startup, streams
+from schemas.process import startup, stdio
 
 COMMANDS: Final = {
     "up": ("fleet.commands.up:up", "Start a fleet from its file, or simulated cars, and keep it running."),
@@ -99,7 +99,7 @@ def cli() -> None:
 
 def main() -> None:
     """Entry point."""
-    streams.complete()
+    stdio.complete()
     try:
         code = cli.main(prog_name="fleet", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:

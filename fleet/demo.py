@@ -23,8 +23,9 @@ import click
 from fleet.client import Fleet
 from fleet.commands.common import sigterm_interrupts
 from fleet.readings import Reading
-from schemas import bus, ending, keys, messages
+from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.process import signals
 
 CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
 PLAN: Final = """\
@@ -143,7 +144,7 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
 def _run(run: Demo) -> tuple[Path | None, Path | None]:
     began = time.monotonic()
     with ExitStack() as stack:
-        _started(stack, _process(run, "hub", "schemas.hub", "--endpoint", run.endpoint))
+        _started(stack, _process(run, "hub", "schemas.bus.hub", "--endpoint", run.endpoint))
         if not run.until(lambda: bus.accepts(run.endpoint)):
             raise click.ClickException(f"no hub came up at {run.endpoint}")
         recorder = _started(
@@ -371,7 +372,7 @@ def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[su
 
 def _started(stack: ExitStack, process: "AbstractContextManager[subprocess.Popen[str]]") -> "subprocess.Popen[str]":
     """Start a process that the stack ends. A signal that comes meanwhile waits: it would leave the process behind."""
-    with ending.held_back():
+    with signals.held_back():
         return stack.enter_context(process)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.policy.memory import Kept
-from schemas.state_dir import directory_of
+from schemas.process.state_dir import directory_of
 
 
 class Keeper:

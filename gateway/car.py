@@ -35,8 +35,9 @@ from gateway.protocol.profile import Profile
 from gateway.protocol.readings import Echo, Event, Rejected
 from gateway.publish import RAW_PER_S, STALLED_S, Publications
 from gateway.store import Store
-from schemas import bus, ending, keys, messages, topics
+from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.process import signals
 
 TICK_S: Final = 0.2
 """How often silence is weighed, states are looked at, and the loop notes that it was not stalled."""
@@ -575,5 +576,5 @@ async def serve(settings: Settings, opened: bus.Bus, doors: Doors) -> bool:
     # What was imported stays: the collector need not look at it again while readings wait.
     gc.freeze()
     loop = asyncio.get_running_loop()
-    ending.calls_in(loop, lambda _: car.stop())
+    signals.calls_in(loop, lambda _: car.stop())
     return await car.run()

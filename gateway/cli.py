@@ -9,8 +9,8 @@ import os
 import sys
 from typing import Final
 
-from schemas import startup, streams
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
+from schemas.process import startup, stdio
 
 COMMANDS: Final = {
     "sim": ("gateway.sim.command", "simulated cars that behave like the real ones, hazards included"),
@@ -31,7 +31,7 @@ Ctrl-C stops the car before the process ends."""
 
 def main() -> None:
     """Entry point; exit code 2 for wrong use, 1 for a failure."""
-    streams.complete()
+    stdio.complete()
     parser = argparse.ArgumentParser(
         prog="gateway", description="One process per car: its bytes, keyed on the bus.", epilog=_EPILOG
     )
@@ -54,7 +54,7 @@ def _parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
         try:
             sys.stdout.flush()
         except OSError as error:
-            streams.silence(sys.stdout)
+            stdio.silence(sys.stdout)
             sys.exit(_failed(f"the output cannot be written: {error.strerror}", 1))
         raise
 
@@ -141,7 +141,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
             from gateway.car import Settings, serve
             from gateway.control.battery import Action, Policy
-            from schemas.state_dir import directory_of
+            from schemas.process.state_dir import directory_of
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
             state_dir = directory_of(opened.endpoint, Path(arguments.state_dir) if arguments.state_dir else None)

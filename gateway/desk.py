@@ -12,7 +12,7 @@ from gateway.capture import BadCapture
 from gateway.link import BadUrl, LinkError, LinkUrl
 from gateway.link.url import TcpUrl
 from gateway.protocol.profile import Profile, parse_platform
-from schemas import startup, streams
+from schemas.process import startup, stdio
 
 LINK_HELP: Final = "/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04"
 PLATFORM_HELP: Final = "arduino, stm32, raspberry_pi; +arm, +imu (default unknown)"
@@ -47,7 +47,7 @@ def explained(name: str, run: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         return startup.INTERRUPTED
     except OSError as error:  # the commands explain what they open; this is the output's
-        streams.silence(sys.stdout)
+        stdio.silence(sys.stdout)
         quiet = isinstance(error, BrokenPipeError)  # whoever closed a pipe has seen enough
         return 1 if quiet else _told(f"{name}: the output cannot be written: {error.strerror}", 1)
     return 0
@@ -113,7 +113,7 @@ def run_until_interrupted(work: Coroutine[Any, Any, None]) -> None:
     """Run it; what ends a process is taken as Ctrl-C is: the work may clean up, and KeyboardInterrupt is raised."""
     import asyncio
 
-    from schemas import ending
+    from schemas.process import signals
 
-    with ending.taken_as_ctrl_c(lambda: signal.raise_signal(signal.SIGINT)):
+    with signals.taken_as_ctrl_c(lambda: signal.raise_signal(signal.SIGINT)):
         asyncio.run(work)

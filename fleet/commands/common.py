@@ -13,8 +13,9 @@ import click
 from fleet.client import Fleet
 from fleet.outcome import Outcome
 from fleet.verbs import LONGEST_DRIVE_S, Request
-from schemas import ending, keys
+from schemas import keys
 from schemas.bus import BadEndpoint, BusError
+from schemas.process import signals
 
 _Function = Callable[..., Any]
 
@@ -147,5 +148,5 @@ def sigterm_interrupts() -> Iterator[None]:
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    with ending.taken_as_ctrl_c(interrupt):
+    with signals.taken_as_ctrl_c(interrupt):
         yield

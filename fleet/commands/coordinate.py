@@ -16,7 +16,7 @@ from fleet.marked import read_text
 from fleet.policy.check import faults
 from fleet.policy.decision import Decision
 from fleet.policy.reader import parse
-from schemas import ending
+from schemas.process import signals
 
 
 @click.command(
@@ -58,7 +58,7 @@ def coordinate(
         click.echo(f"fleet: {path}: {each}", err=True)
     stop = threading.Event()
 
-    ending.calls(stop.set)
+    signals.calls(stop.set)
 
     def decided(decision: Decision) -> None:
         click.echo(_json(decision) if as_json else line(decision))

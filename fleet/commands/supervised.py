@@ -14,8 +14,9 @@ from fleet.commands.common import bus_options, json_option, sigterm_interrupts
 from fleet.supervise.desk import STATUS, ask_service, ask_status
 from fleet.supervise.farewell import NOT_STOPPED
 from fleet.supervise.process import entry, runs
-from schemas import keys, messages, startup
+from schemas import keys, messages
 from schemas.bus import Bus, BusError, resolve_endpoint
+from schemas.process import startup
 
 DOWN_S: Final = 120.0
 """The longest stop of a car, and a recorder that writes what it has."""

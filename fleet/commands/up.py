@@ -23,8 +23,9 @@ from fleet.policy.reader import parse as parse_plan
 from fleet.supervise.desk import AnotherSupervisor
 from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, listing, wanted
 from fleet.supervisor import TRIES_S, Happening, Supervisor
-from schemas import ending, keys
+from schemas import keys
 from schemas.bus import accepts, check_listening, resolve_endpoint
+from schemas.process import signals
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
 _Tell = Callable[[Happening], None]
@@ -152,7 +153,7 @@ async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool
             case _:
                 supervisor.end("the terminal was closed", TRIES_S)
 
-    ending.calls_in(loop, end)
+    signals.calls_in(loop, end)
     if as_json and wish.simulated:
         await _pass_stdin(loop, supervisor.tell_simulator)
     if table is None:

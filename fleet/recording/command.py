@@ -14,8 +14,9 @@ from click.core import ParameterSource
 
 from fleet.commands.asked import Span
 from fleet.recording import asking
-from schemas import ending, keys
+from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, ensure_hub
+from schemas.process import signals
 
 LOOK_S: Final = 0.25
 ALONE_S: Final = 0.5
@@ -149,7 +150,7 @@ def record(
     )
     parent = os.getppid() if with_parent else None
     stop = threading.Event()
-    ending.calls(stop.set)
+    signals.calls(stop.set)
     try:
         with Bus.open(connect, start_hub=True) as bus:
             recorder = Recorder(bus, fleet, out, options, tell=_warn)

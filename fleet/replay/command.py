@@ -14,7 +14,7 @@ import click
 from fleet.commands.common import Cars, from_option
 from fleet.replay.to_bus_command import refuse_without, to_bus_options
 from fleet.replay.to_bus_command import to_bus as play_to_bus
-from schemas import startup
+from schemas.process import startup
 
 if TYPE_CHECKING:
     from fleet.recording.session import Session

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from schemas import ending, keys
+from schemas import keys
+from schemas.process import signals
 
 if TYPE_CHECKING:
     from fleet.recording.session import Recorded, Session
@@ -84,7 +85,7 @@ def to_bus(
     from schemas.bus import Bus
 
     stop = threading.Event()
-    ending.calls(stop.set)
+    signals.calls(stop.set)
     with explained():
         try:
             session = Session.open(path)

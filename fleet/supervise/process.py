@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from schemas.state_dir import directory_of
+from schemas.process.state_dir import directory_of
 
 LOG_BYTES: Final = 1_000_000
 """Of one log file; there are at most two for each process."""

@@ -203,7 +203,7 @@ def module(name: str, *arguments: str) -> tuple[str, ...]:
 def hub_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
     """The hub."""
     open_to_lan = ("--insecure-lan",) if wish.insecure_lan else ()
-    return module("schemas.hub", "--endpoint", endpoint, *open_to_lan)
+    return module("schemas.bus.hub", "--endpoint", endpoint, *open_to_lan)
 
 
 def gateway_command(wish: Wanted, car: WantedCar, link: str, endpoint: str) -> tuple[str, ...]:

@@ -4,10 +4,10 @@ import argparse
 import sys
 
 from gateway.sim.command import add_arguments, run
-from schemas import streams
+from schemas.process import stdio
 
 if __name__ == "__main__":
-    streams.complete()
+    stdio.complete()
     parser = argparse.ArgumentParser(prog="gateway sim")
     add_arguments(parser)
     sys.exit(run(parser.parse_args()))

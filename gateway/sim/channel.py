@@ -14,7 +14,7 @@ from gateway.sim.faults import fault_of, press_of
 from gateway.sim.links import LinkError
 from gateway.sim.shell import Simulation
 from gateway.sim.spec import BadSpec
-from schemas import streams
+from schemas.process import stdio
 
 LINE_LIMIT: Final = 65536
 
@@ -25,7 +25,7 @@ def say(line: dict[str, object]) -> None:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
     except OSError as error:
-        streams.silence(sys.stdout)
+        stdio.silence(sys.stdout)
         if not isinstance(error, BrokenPipeError):  # whoever closed a pipe knows
             sys.stderr.write(
                 f"gateway sim: stdout cannot be written ({error.strerror}): the cars go on, and no more is said there\n"

@@ -20,7 +20,8 @@ from gateway.sim.faults import Fault, Scheduled, parse_fault, parse_press, targe
 from gateway.sim.links import LinkError, Taken
 from gateway.sim.shell import SimCar, Simulation
 from gateway.sim.spec import BadSpec, CarSpec, ReplaySpec, parse_cars, parse_replay, refuse_twins
-from schemas import ending, keys
+from schemas import keys
+from schemas.process import signals
 
 WORLDS: Final = {"room": World.room, "open": World.open_field}
 PARENT_EVERY_S: Final = 0.1
@@ -214,7 +215,7 @@ async def _serve(
     loop = asyncio.get_running_loop()
     parent = os.getppid()
     ended = asyncio.Event()
-    ending.calls_in(loop, lambda _: ended.set())
+    signals.calls_in(loop, lambda _: ended.set())
     simulation = Simulation(specs, seed=args.seed, world=world, replays=replays)
     for car in simulation.cars.values():
         car.failed = lambda failed, error: _complain(f"car {failed.spec.name}: {error}")

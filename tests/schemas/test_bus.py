@@ -27,7 +27,7 @@ def wait_for(condition: Callable[[], object]) -> None:
 @pytest.fixture
 def endpoint() -> Iterator[str]:
     where = free_endpoint()
-    hub = subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", where])
+    hub = subprocess.Popen([sys.executable, "-m", "schemas.bus.hub", "--endpoint", where])
     wait_for(lambda: bus.accepts(where))
     yield where
     hub.terminate()
@@ -109,12 +109,12 @@ def test_who_watches_tokens_sees_all_of_them_when_it_asks_at_once(endpoint: str)
 
 def test_a_hub_is_started_once_and_ends_by_itself() -> None:
     where = free_endpoint()
-    idle = subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", where, "--idle-s", "3"])
+    idle = subprocess.Popen([sys.executable, "-m", "schemas.bus.hub", "--endpoint", where, "--idle-s", "3"])
     wait_for(lambda: bus.accepts(where))
     with bus.Bus.open(where, start_hub=True) as opened:  # it must not end while the second one starts
         assert opened.connected
         second = subprocess.run(
-            [sys.executable, "-m", "schemas.hub", "--endpoint", where],
+            [sys.executable, "-m", "schemas.bus.hub", "--endpoint", where],
             capture_output=True,
             text=True,
             timeout=processes.PATIENCE_S,
@@ -142,7 +142,7 @@ def test_a_hub_listens_on_a_network_only_if_a_user_says_so(host: str, loopback: 
 
 
 def test_a_hub_on_a_network_is_wrong_use() -> None:
-    command = [sys.executable, "-m", "schemas.hub", "--endpoint", "tcp/0.0.0.0:7447"]
+    command = [sys.executable, "-m", "schemas.bus.hub", "--endpoint", "tcp/0.0.0.0:7447"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=processes.PATIENCE_S, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("hub: a hub at tcp/0.0.0.0:7447 would let everyone")
@@ -154,14 +154,14 @@ def test_a_killed_hub_comes_back_and_everything_with_it() -> None:
         car.token("fleet/red")
         wait_for(lambda: watcher.tokens("fleet/*") == ["fleet/red"])
         found = subprocess.run(
-            ["pgrep", "-f", f"schemas.hub --endpoint {where}"], capture_output=True, text=True, check=True
+            ["pgrep", "-f", f"schemas.bus.hub --endpoint {where}"], capture_output=True, text=True, check=True
         )
         os.kill(int(found.stdout), signal.SIGKILL)
         wait_for(lambda: not car.connected)
         bus.ensure_hub(where)
         wait_for(lambda: watcher.tokens("fleet/*") == ["fleet/red"])
         found = subprocess.run(
-            ["pgrep", "-f", f"schemas.hub --endpoint {where}"], capture_output=True, text=True, check=True
+            ["pgrep", "-f", f"schemas.bus.hub --endpoint {where}"], capture_output=True, text=True, check=True
         )
     os.kill(int(found.stdout), signal.SIGTERM)
 

@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from schemas import ending
+from schemas.process import signals
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -16,7 +16,7 @@ def test_what_comes_while_it_is_held_back_counts_when_all_is_done(number: signal
         raise KeyboardInterrupt
 
     def work() -> None:
-        with ending.taken_as_ctrl_c(interrupt), ending.held_back():
+        with signals.taken_as_ctrl_c(interrupt), signals.held_back():
             os.kill(os.getpid(), number)
             done.append("whole")
 
@@ -30,7 +30,7 @@ def test_ctrl_c_counts_also_where_a_shell_had_it_ignored(number: signal.Signals)
     """As it has of what it starts in the background; what is taken as Ctrl-C may be made one, and would be nothing."""
 
     def work() -> None:
-        with ending.taken_as_ctrl_c(lambda: signal.raise_signal(signal.SIGINT)):
+        with signals.taken_as_ctrl_c(lambda: signal.raise_signal(signal.SIGINT)):
             os.kill(os.getpid(), number)
 
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -43,7 +43,7 @@ def test_ctrl_c_counts_also_where_a_shell_had_it_ignored(number: signal.Signals)
 
 
 def test_nothing_that_came_is_nothing_that_counts() -> None:
-    before = [signal.getsignal(number) for number in ending.signals()]
-    with ending.held_back():
-        assert before != [signal.getsignal(number) for number in ending.signals()]
-    assert before == [signal.getsignal(number) for number in ending.signals()]
+    before = [signal.getsignal(number) for number in signals.signals()]
+    with signals.held_back():
+        assert before != [signal.getsignal(number) for number in signals.signals()]
+    assert before == [signal.getsignal(number) for number in signals.signals()]

@@ -124,7 +124,7 @@ class Fleet:
         self._started: list[Process] = []
         self._bus: bus.Bus | None = None
         # On a busy machine the first that is its client may come later than a hub waits for one.
-        self.hub = self.start("-m", "schemas.hub", "--endpoint", endpoint, "--idle-s", str(2 * PATIENCE_S))
+        self.hub = self.start("-m", "schemas.bus.hub", "--endpoint", endpoint, "--idle-s", str(2 * PATIENCE_S))
         wait_for(lambda: bus.accepts(endpoint), "the hub listens")
 
     def start(self, *arguments: str) -> Process:

@@ -46,7 +46,7 @@ class Up:
 
     def left(self, *, ours: bool = False) -> list[int]:
         """Processes that still run at this endpoint, by the system's own list; `ours`: but the hub, which lingers."""
-        return [pid for pid, words in self._mine() if not (ours and "schemas.hub" in words)]
+        return [pid for pid, words in self._mine() if not (ours and "schemas.bus.hub" in words)]
 
     def _mine(self) -> list[tuple[int, str]]:
         listed = subprocess.run(["ps", "-axwwo", "pid=,args="], capture_output=True, text=True, check=True).stdout
@@ -116,7 +116,7 @@ class Up:
         """The hub, the supervisor's or one that a gateway started; by the system's own list."""
 
         def one() -> int | None:
-            return next((pid for pid, words in self._mine() if "schemas.hub" in words), None)
+            return next((pid for pid, words in self._mine() if "schemas.bus.hub" in words), None)
 
         return int(wait_for(one, "there is a hub"))
 

@@ -495,7 +495,7 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Proce
     sim = Process("--car", "red:arduino:pty", "--connect", endpoint, "--fleet", "mine")
     started.append(sim)
     link = sim.line()["link"]
-    hub = subprocess.Popen([sys.executable, "-m", "schemas.hub", "--endpoint", endpoint])
+    hub = subprocess.Popen([sys.executable, "-m", "schemas.bus.hub", "--endpoint", endpoint])
     seen: list[Sample] = []
     worlds: list[Sample] = []
     try:

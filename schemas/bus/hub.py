@@ -1,7 +1,7 @@
 """The local rendezvous: a Zenoh router on loopback in a process of its own; it ends by itself when nobody is left.
 
 The listening port is the mutex: a second hub on it fails at once. Started by `bus.ensure_hub`, or by hand:
-`python -m schemas.hub --endpoint tcp/127.0.0.1:7447`.
+`python -m schemas.bus.hub --endpoint tcp/127.0.0.1:7447`.
 """
 
 import argparse
@@ -12,8 +12,8 @@ from typing import Final
 
 import zenoh
 
-from schemas import ending
 from schemas.bus import DEFAULT_ENDPOINT, BusError, check_listening, router_config
+from schemas.process import signals
 
 IDLE_S: Final = 10.0
 """How long a hub outlives its last link."""
@@ -34,7 +34,7 @@ def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
 
 def main() -> int:
     """Run a hub; 0 when it ended by itself or was told to, 1 if it could not listen, 2 for wrong use."""
-    parser = argparse.ArgumentParser(prog="python -m schemas.hub", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m schemas.bus.hub", description=__doc__)
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
     parser.add_argument("--idle-s", type=float, default=IDLE_S, help="end after so long without a link (default 10)")
     parser.add_argument(
@@ -47,7 +47,7 @@ def main() -> int:
         sys.stderr.write(f"hub: {error}\n")
         return 2
     stop = threading.Event()
-    ending.calls(stop.set)
+    signals.calls(stop.set)
     try:
         serve(arguments.endpoint, arguments.idle_s, stop)
     except (zenoh.ZError, BusError) as error:

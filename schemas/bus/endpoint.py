@@ -1,0 +1,128 @@
+"""Where the hub listens: endpoints, Zenoh configurations, and starting a hub that is missing."""
+
+import contextlib
+import json
+import os
+import re
+import socket
+import sys
+import time
+from typing import Any, Final
+
+import zenoh
+
+from schemas.bus.errors import BadEndpoint, BusError, NoFleet
+
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+ENDPOINT_VARIABLE: Final = "FLEET_ENDPOINT"
+
+_ENDPOINT: Final = re.compile(r"(?P<proto>tcp|tls|udp|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
+_LOOPBACK: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
+
+
+def resolve_endpoint(argument: str | None = None) -> str:
+    """The endpoint to use: the argument, else FLEET_ENDPOINT, else loopback port 7447; raises BadEndpoint."""
+    endpoint = argument or os.environ.get(ENDPOINT_VARIABLE) or DEFAULT_ENDPOINT
+    _host_and_port(endpoint)
+    return endpoint
+
+
+def _host_and_port(endpoint: str) -> tuple[str, int]:
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or not 0 < int(match["port"]) < 65536:
+        raise BadEndpoint(
+            f"endpoint {endpoint!r} is not allowed: write it as tcp/HOST:PORT (tls, udp, quic or ws also), "
+            f"port 1 to 65535, for example {DEFAULT_ENDPOINT}"
+        )
+    return match["host"], int(match["port"])
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Return True if no other machine can reach the endpoint; raises BadEndpoint."""
+    host, _ = _host_and_port(endpoint)
+    return _LOOPBACK.fullmatch(host) is not None
+
+
+def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
+    """Raise BadEndpoint if a hub would be open to a network without a word from the user.
+
+    A hub knows no passwords and no certificates: whoever reaches it drives the cars.
+    """
+    if not insecure_lan and not is_loopback(endpoint):
+        raise BadEndpoint(
+            f"a hub at {endpoint} would let everyone on that network drive the cars: "
+            f"use {DEFAULT_ENDPOINT}, start a Zenoh router of your own there, or accept it with --insecure-lan"
+        )
+
+
+_COMMON: Final[dict[str, Any]] = {
+    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+    "timestamping": {"enabled": True},
+    "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": 2000}}},
+}
+
+
+def router_config(endpoint: str) -> zenoh.Config:
+    """The hub's configuration: it listens, everyone else is its client."""
+    _host_and_port(endpoint)
+    listen = {"endpoints": [endpoint], "exit_on_failure": True, "timeout_ms": 0}
+    return zenoh.Config.from_json5(json.dumps({"mode": "router", "listen": listen, **_COMMON}))
+
+
+def client_config(endpoint: str, timeout_s: float) -> zenoh.Config:
+    """Return the configuration of a client of the hub, which retries for `timeout_s`."""
+    connect = {
+        "endpoints": [endpoint],
+        "timeout_ms": int(timeout_s * 1000),
+        "exit_on_failure": True,
+        "retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2},
+    }
+    return zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect, **_COMMON}))
+
+
+def accepts(endpoint: str, timeout_s: float = 1.0) -> bool:
+    """Whether something accepts connections at the endpoint; a datagram endpoint cannot be asked and counts as yes."""
+    host, port = _host_and_port(endpoint)
+    if endpoint.startswith(("udp/", "quic/")):
+        return True
+    try:
+        with socket.create_connection((host.strip("[]"), port), timeout=timeout_s):
+            return True
+    except OSError:
+        return False
+
+
+def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
+    """Start a hub if nothing accepts at a loopback endpoint, and wait until it does; raises BusError.
+
+    The hub outlives its starter: it is a session leader of its own, so that Ctrl-C at a terminal does not take the bus
+    away before the cars are stopped. It ends by itself 10 s after its last link. A busy computer may take ten seconds
+    to start it.
+    """
+    if accepts(endpoint):
+        return
+    if not is_loopback(endpoint):
+        raise NoFleet(
+            f"nothing listens at {endpoint}, and a hub is started on loopback only: start a Zenoh router there "
+            "(or fleet up --insecure-lan), or name another endpoint with --connect"
+        )
+    import subprocess
+
+    command = [sys.executable, "-m", "schemas.bus.hub", "--endpoint", endpoint]
+    hub = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + timeout_s
+    while not accepts(endpoint):
+        if time.monotonic() > deadline:
+            raise BusError(f"no hub came up at {endpoint} within {timeout_s:g} s: is the port used by something else?")
+        # A hub that lost the race for the port has ended; the winner accepts in a moment.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            hub.wait(0.02)
+            time.sleep(0.02)
+    # The hub is nobody's child to wait for; without this the interpreter warns that it still runs.
+    hub.returncode = 0 if hub.returncode is None else hub.returncode

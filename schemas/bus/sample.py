@@ -1,0 +1,89 @@
+"""Publications and replies as values, and the limits on what a process reads of a query."""
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import zenoh
+
+if TYPE_CHECKING:  # a gateway is on the bus before it has imported these
+    from google.protobuf.message import Message
+
+
+LARGEST_PAYLOAD: Final = 1 << 16
+"""Bytes of a query's payload, or of a streamed command's: what is larger is refused, and its payload is not read.
+
+Reading 5 MB of JSON stalls a process for a second."""
+
+LONGEST_SELECTOR: Final = 4096
+"""Characters of a query's selector (key and parameters), and of its encoding."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One publication or reply as it came: payload bytes untouched."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    time_ns: int
+    """Zenoh timestamp of the publisher's session, ns since the epoch; the time of receipt where there is none."""
+    sequence: int
+    """The publisher's number for the key, modulo 2^32; 0 if it gave none."""
+    deleted: bool = False
+    unread: str = ""
+    """Why the payload was not read, and is left out: it is too large."""
+
+    def message(self) -> "Message":
+        """The payload as the message that the encoding names; raises messages.BadPayload or KeyError."""
+        from schemas import messages
+
+        name = messages.name_in(self.encoding)
+        if name is None:
+            raise messages.BadPayload(f"{self.key}: encoding {self.encoding!r} names no message")
+        return messages.parse(name, self.payload, self.encoding)
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An error reply."""
+
+    words: str
+
+
+def sequence_of(info: zenoh.SourceInfo) -> int:
+    """A publisher's number for a key, from 1, modulo 2^32: Zenoh counts from 0."""
+    return (int(info.source_sn) + 1) & 0xFFFFFFFF
+
+
+def sample_of(sample: zenoh.Sample, largest: int | None = None) -> Sample:
+    """Copy what is wanted out of a Zenoh sample; `largest`: bytes of a payload that is read."""
+    stamp = sample.timestamp
+    info = sample.source_info
+    unread = "" if largest is None else _too_many_bytes(len(sample.payload), largest)
+    return Sample(
+        key=str(sample.key_expr),
+        payload=b"" if unread else sample.payload.to_bytes(),
+        encoding=str(sample.encoding),
+        time_ns=stamp.get_time_as_ntp64().as_nanos() if stamp is not None else time.time_ns(),
+        sequence=sequence_of(info) if info is not None else 0,
+        deleted=sample.kind == zenoh.SampleKind.DELETE,
+        unread=unread,
+    )
+
+
+def _too_many_bytes(size: int, largest: int) -> str:
+    if size <= largest:
+        return ""
+    return f"a payload of {size} bytes is too large: at most {largest} are read, so nothing of it was"
+
+
+def unread(query: zenoh.Query) -> str:
+    """Why nothing of a query is read: something in it is too large. Empty if nothing is."""
+    payload = query.payload
+    if payload is not None and (words := _too_many_bytes(len(payload), LARGEST_PAYLOAD)):
+        return words
+    longest = max(len(str(query.selector)), len(str(query.encoding)) if query.encoding is not None else 0)
+    if longest > LONGEST_SELECTOR:
+        return f"a key, parameters or an encoding of {longest} characters: at most {LONGEST_SELECTOR} are read"
+    return ""
