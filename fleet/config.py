@@ -22,7 +22,7 @@ from fleet.config_fields import (
 from fleet.faults import Where, meant, shown
 from fleet.links import BadLink, Link, LinkKind, parse_link, shared_ports
 from fleet.marked import Document, read_text
-from gateway.protocol.profile import AUTO, Platform, parse_platform, parse_told
+from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_told
 
 PALETTE: Final = ("#e01b24", "#33d17a", "#3584e4", "#f6d32d", "#9141ac", "#ff7800", "#2ec7c0", "#986a44")
 """Colours of cars that are given none, in the order of the file."""

@@ -11,8 +11,8 @@ from pydantic import AfterValidator, Field
 from fleet.faults import shown
 from fleet.links import ALLOWED, BadLink, parse_link
 from fleet.marked import Entry
-from gateway.protocol.profile import AUTO, OPTIONS, Platform, parse_platform, parse_told
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
+from gateway.protocol.platforms import AUTO, OPTIONS, Platform, parse_platform, parse_told
 from schemas import bus, keys
 
 LONGEST_DRIVE_S: Final = 10.0

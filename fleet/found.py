@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from fleet.links import LinkKind, parse_link
-from gateway.protocol.profile import AUTO, Platform
+from gateway.protocol.platforms import AUTO, Platform
 
 LIKELY: Final = ("car", "ble", "given")
 POSSIBLE: Final = (*LIKELY, "silent", "busy")

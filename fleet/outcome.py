@@ -15,7 +15,7 @@ MARGIN_S: Final = 5.0
 """What is waited beyond the time in which the gateway said, or must say, what became of a command.
 
 A stop's worst case ends when the motors are off; the car shows it later, see `SHOW_S`."""
-SHOW_S: Final = 12.0  # gateway.control.stop: time that a car has to show a stop beyond its worst case
+SHOW_S: Final = 12.0  # gateway.control.stops.stopping: time that a car has to show a stop beyond its worst case
 GONE_S: Final = 1.0
 """How long a gateway that has gone from the bus may take to be there again: it tries twice a second."""
 LATEST_ANSWER_S: Final = 10.0

@@ -18,7 +18,7 @@ from typing import Final
 
 from fleet.config import CarSpec
 from fleet.links import Link, LinkKind, parse_link
-from gateway.protocol.profile import Platform
+from gateway.protocol.platforms import Platform
 
 PATIENCE_S: Final = 3.0
 DISCARD: Final = 9

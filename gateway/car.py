@@ -19,22 +19,22 @@ from typing import Final
 
 import zenoh
 
-from gateway import requests
+from gateway.bus import requests
+from gateway.bus.estop_sync import Neighbours
+from gateway.bus.publisher import RAW_PER_S, STALLED_S, Publications
+from gateway.bus.service import Doors
 from gateway.control.backoff import Attempts
-from gateway.control.battery import Policy
+from gateway.control.commands import Answer, Command, EmergencyStop, Level, LogRecord, Phase
 from gateway.control.controller import Controller
+from gateway.control.estimate.battery import Policy
+from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.executor import SHUTDOWN_S
-from gateway.control.link_health import LinkHealth
-from gateway.control.records import Answer, Command, EmergencyStop, Level, LogRecord, Phase
 from gateway.control.safety import Estop
-from gateway.doors import Doors
 from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
-from gateway.neighbours import Neighbours
-from gateway.protocol.decode import Decoder
-from gateway.protocol.profile import Profile
-from gateway.protocol.readings import Echo, Event, Rejected
-from gateway.publish import RAW_PER_S, STALLED_S, Publications
-from gateway.store import Store
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.events import Echo, Event, Rejected
+from gateway.protocol.platforms import Profile
+from gateway.state_file import Store
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals

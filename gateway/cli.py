@@ -13,10 +13,10 @@ from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio
 
 COMMANDS: Final = {
-    "sim": ("gateway.sim.command", "simulated cars that behave like the real ones, hazards included"),
-    "scan": ("gateway.scan", "the ports and Bluetooth devices there are, and which of them speak as a car does"),
-    "monitor": ("gateway.monitor", "what a car says, decoded beside the raw bytes"),
-    "send": ("gateway.send", "one frame to a car on the desk, checked against the table"),
+    "sim": ("gateway.sim.cli", "simulated cars that behave like the real ones, hazards included"),
+    "scan": ("gateway.tools.scan", "the ports and Bluetooth devices there are, and which of them speak as a car does"),
+    "monitor": ("gateway.tools.monitor", "what a car says, decoded beside the raw bytes"),
+    "send": ("gateway.tools.send", "one frame to a car on the desk, checked against the table"),
 }
 """Subcommand: the module with its `add_arguments` and `run`, imported when it is called; its line in the help."""
 
@@ -110,9 +110,9 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 def _run(arguments: argparse.Namespace) -> int:
     parent = os.getppid() if arguments.with_parent else None
-    from gateway.doors import AlreadyServed, Doors
+    from gateway.bus.service import AlreadyServed, Doors
     from gateway.link import BadUrl, LinkError, parse_url
-    from gateway.protocol.profile import parse_told
+    from gateway.protocol.platforms import parse_told
     from schemas.bus import BadEndpoint, Bus, BusError
 
     try:
@@ -140,7 +140,7 @@ def _run(arguments: argparse.Namespace) -> int:
             from pathlib import Path
 
             from gateway.car import Settings, serve
-            from gateway.control.battery import Action, Policy
+            from gateway.control.estimate.battery import Action, Policy
             from schemas.process.state_dir import directory_of
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)

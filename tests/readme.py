@@ -9,13 +9,13 @@ from pathlib import Path
 
 from google.protobuf.descriptor import FieldDescriptor
 
+from gateway.bus.requests import LONGEST_DRIVE_S
 from gateway.control.car_monitor import STALL_S
+from gateway.control.estimate.trust import TRANSITIONS, CarTrust, TrustEvent, TrustState
 from gateway.control.executor import RENEW_S, SHUTDOWN_S
-from gateway.control.recipes import REPEAT_S
 from gateway.control.senders import PAUSE_S, SENDER_GONE_S
-from gateway.control.stop_evidence import EVIDENCE
-from gateway.control.trust import TRANSITIONS, CarTrust, TrustEvent, TrustState
-from gateway.requests import LONGEST_DRIVE_S
+from gateway.control.stops.evidence import EVIDENCE
+from gateway.control.stops.sequences import REPEAT_S
 from schemas import messages, topics
 from tests.support import vectors
 
@@ -175,7 +175,7 @@ def stop_evidence_page() -> str:
     """Return the page of the reference on what shows a stop."""
     return f"""# What shows that a car stopped
 
-`make readme` generates this page from `gateway/control/stop_evidence.py` and `gateway/control/trust.py`.
+`make readme` generates this page from `gateway/control/stops/evidence.py` and `gateway/control/estimate/trust.py`.
 
 No car acknowledges a frame. The gateway sends a stop, and then looks for evidence in the car's readings. The table says
 what counts as evidence, by platform, mode and kind of stop. A stop is `shown` if the car gave the evidence. A stop ends

@@ -18,7 +18,7 @@ from fleet.verbs import (
     speed_request,
     whistle_request,
 )
-from gateway.protocol.values import Light, SpeedStep
+from gateway.protocol.enums import Light, SpeedStep
 
 _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """So that -1 is told what is allowed instead of being taken for an option."""

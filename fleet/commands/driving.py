@@ -19,7 +19,7 @@ from fleet.commands.common import (
 )
 from fleet.outcome import Outcome
 from fleet.verbs import drive_request, estop_request, mode_request, resume_request, stop_request
-from gateway.protocol.values import Mode, Motion
+from gateway.protocol.enums import Mode, Motion
 from schemas.process import startup
 
 

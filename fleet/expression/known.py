@@ -6,7 +6,7 @@ from typing import Final
 from fleet.expression.contradiction import contradictory
 from fleet.expression.reader import parse
 from fleet.expression.tree import Expression
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 
 _MOTIONS: Final = ("stop", "forward", "back", "left", "right", "spin_left", "spin_right", "unknown")
 _MODES: Final = (*Mode, "unknown")

@@ -15,7 +15,7 @@ from fleet.policy.measured import Outlook, Reach, seen, unmeasured
 from fleet.policy.picture import NAMES, CarPicture
 from fleet.policy.plan import ALL, OTHERS, THAT, Effect, Phase, Plan, Role, Rule
 from fleet.policy.steady import HYSTERESIS_S
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 
 
 class Gravity(StrEnum):

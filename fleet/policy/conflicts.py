@@ -11,7 +11,7 @@ from fleet.expression import Expression, contradictory
 from fleet.expression.tree import Compare, Kind, Literal, Name, Op
 from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Plan, Rule
 from fleet.policy.steady import HYSTERESIS_S
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 
 _REMEMBERED: Final = 4096
 """Maximum pairs of conditions whose contradiction is cached: the rules of a large plan, each against each."""

@@ -16,7 +16,7 @@ from fleet.policy.plan import Effect, Plan, Rule
 from fleet.policy.rules import Cars, RuleState, follow_phase, follow_rules, targets
 from fleet.policy.staffing import Barrier, Staff, Staffing, fill, follow_needs
 from fleet.policy.steady import HYSTERESIS_S
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 
 LONGEST_WAIT_S: Final = 30.0
 """A mode that does not come about is asked for ever more slowly, at least so often."""

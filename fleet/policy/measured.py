@@ -15,8 +15,8 @@ from fleet.policy.assign import assign
 from fleet.policy.picture import NAMES, CarPicture, topic_of
 from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Plan, Role, Rule
 from fleet.policy.staffing import unfit
-from gateway.protocol.profile import OPTIONS, Platform, Profile, parse_platform
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
+from gateway.protocol.platforms import OPTIONS, Platform, Profile, parse_platform
 
 ANY_CAR: Final = "a car"
 """Without a fleet file: a car that the plan does not name."""

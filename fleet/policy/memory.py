@@ -9,7 +9,7 @@ from fleet.policy.picture import NOBODY, Picture
 from fleet.policy.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.steady import HYSTERESIS_S, Settled, Steady
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Why a car has a role that it had before."""

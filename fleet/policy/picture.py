@@ -13,7 +13,7 @@ from typing import Any, Final
 from google.protobuf.descriptor import FieldDescriptor
 
 from fleet.expression import Expression
-from gateway.protocol.profile import Profile, parse_platform
+from gateway.protocol.platforms import Profile, parse_platform
 from schemas import messages, topics
 
 CONTRADICTED: Final = "contradicted"

@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Final
 
 from fleet.expression import Expression
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 
 THAT: Final = "that"
 OTHERS: Final = "others"

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from fleet.marked import Entry
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 from schemas import keys
 
 _Name = Annotated[str, Field(description=keys.NAME_RULE)]

@@ -11,8 +11,8 @@ from fleet.marked import BadFile, Document
 from fleet.policy.picture import NAMES
 from fleet.policy.plan import OTHERS, RESERVED, THAT, Condition, Effect, Of, Phase, Plan, Role, Rule
 from fleet.policy.plan_file import ConditionEntry, EffectEntry, PhaseEntry, PlanEntry, RoleEntry, RuleEntry
-from gateway.protocol.profile import OPTIONS, parse_platform
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
+from gateway.protocol.platforms import OPTIONS, parse_platform
 from schemas import keys
 
 BadPlan = BadFile

@@ -36,7 +36,7 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
     from fleet.recording.session import NoSession
     from fleet.replay.redecode import NoPlatform
     from fleet.replay.vector import ENDING, BadVector
-    from gateway.protocol.profile import parse_platform
+    from gateway.protocol.platforms import parse_platform
 
     if platform is not None:
         try:

@@ -13,11 +13,11 @@ from itertools import product
 from typing import Any, Final
 
 from fleet.replay.wire import Confirmed, Item, Rx, Treated, Tx
-from gateway.protocol.decode import ECHO_S, MAX_FRAME, Decoder
-from gateway.protocol.measured import measured, verdict_of
-from gateway.protocol.profile import Profile, parse_platform
-from gateway.protocol.readings import Event
-from gateway.protocol.values import Mode
+from gateway.protocol.decoder import ECHO_S, MAX_FRAME, Decoder
+from gateway.protocol.enums import Mode
+from gateway.protocol.events import Event
+from gateway.protocol.measurements import measured, verdict_of
+from gateway.protocol.platforms import Profile, parse_platform
 
 MODE_NS: Final = 500_000_000
 """A mode is published so much later than it follows, at most: a gateway's loop takes what came in turns."""

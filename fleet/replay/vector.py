@@ -17,8 +17,8 @@ from typing import Any, Final
 
 from fleet.recording import times
 from fleet.replay.wire import Confirmed, Item, Rx, Treated, Tx
-from gateway.protocol.decode import ECHO_S
-from gateway.protocol.values import Mode
+from gateway.protocol.decoder import ECHO_S
+from gateway.protocol.enums import Mode
 
 ENDING: Final = ".jsonl"
 FORMAT: Final = 1

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fleet.recording.session import Recorded
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 from schemas import keys, messages
 from schemas.topics import TOPICS
 

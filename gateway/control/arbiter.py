@@ -6,7 +6,7 @@ Pure: a picture of the car in, a refusal or none out. From every state stop and 
 from dataclasses import dataclass
 from typing import Final
 
-from gateway.control.records import (
+from gateway.control.commands import (
     Act,
     ChangeSpeed,
     Command,
@@ -23,9 +23,9 @@ from gateway.control.records import (
     What,
 )
 from gateway.control.safety import Estop, Lease
-from gateway.protocol.encode import ArmSet, General, Ptz
-from gateway.protocol.profile import Profile
-from gateway.protocol.values import Mode, Motion
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.frames import ArmSet, General, Ptz
+from gateway.protocol.platforms import Profile
 
 QUEUE_LIMIT: Final = 8
 """One-shots that may wait; more are refused."""

@@ -5,18 +5,18 @@
 
 from dataclasses import dataclass, field, replace
 
-from gateway.control import recipes, stop
-from gateway.control.battery import Battery, Policy
-from gateway.control.believed import Believed
-from gateway.control.ledger import Ledger
-from gateway.control.mode import ModeTruth, Verdict
-from gateway.control.outbox import AWAKE_S, FLIGHT_S, Pacing
-from gateway.control.platform import PlatformTruth
-from gateway.control.records import Level
-from gateway.control.stop_evidence import StopCase, StopEvidence
-from gateway.control.trust import Basis, CarTrust, TrustEvent, TrustState
-from gateway.protocol.profile import Profile, StopStyle
-from gateway.protocol.values import Mode, Motion
+from gateway.control.command_log import Ledger
+from gateway.control.commands import Level
+from gateway.control.estimate.battery import Battery, Policy
+from gateway.control.estimate.mode import ModeTruth, Verdict
+from gateway.control.estimate.outputs import Believed
+from gateway.control.estimate.platform import PlatformTruth
+from gateway.control.estimate.trust import Basis, CarTrust, TrustEvent, TrustState
+from gateway.control.pacing import AWAKE_S, FLIGHT_S, Pacing
+from gateway.control.stops import sequences, stopping
+from gateway.control.stops.evidence import StopCase, StopEvidence
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.platforms import Profile, StopStyle
 
 KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
 """In these states the last recovery is over and no write has failed since, so the car reads frames as meant."""
@@ -91,7 +91,7 @@ class CarModel:
     @property
     def for_stop_style(self) -> StopStyle:
         """Return which kind of stop the car takes now."""
-        return stop.style_of(self.profile, doubted=self.platform.doubted)
+        return stopping.style_of(self.profile, doubted=self.platform.doubted)
 
     @property
     def motors(self) -> str:
@@ -111,11 +111,11 @@ class CarModel:
         """Return the motion that was sent last; None if the state is unknown or the car moves by itself."""
         return self.believed.motion if self.known and self.manual else None
 
-    def for_stop(self, now: float) -> stop.Situation:
+    def for_stop(self, now: float) -> stopping.Situation:
         """Return what the choice of a stop looks at."""
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
         clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
-        return stop.Situation(
+        return stopping.Situation(
             self.profile, self.known, self.mode.asked, contradicted, clear, blocked, self.platform.doubted
         )
 
@@ -128,4 +128,4 @@ class CarModel:
             return False
         if self.known and self.manual:
             return True
-        return now >= self.pacing.written_at + recipes.SILENCE_S - 0.1
+        return now >= self.pacing.written_at + sequences.SILENCE_S - 0.1

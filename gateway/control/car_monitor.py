@@ -5,19 +5,19 @@ It changes `CarModel`, and tells `Executor` when the car must be stopped.
 
 from typing import Final
 
-from gateway.control.battery import Action, BatteryLevel
 from gateway.control.car_model import CarModel
+from gateway.control.command_log import Ledger
+from gateway.control.commands import Level, Phase, Reason, SetMode, Why
+from gateway.control.estimate.battery import Action, BatteryLevel
+from gateway.control.estimate.mode import MANUAL_SILENCE_S, Verdict
+from gateway.control.estimate.platform import PlatformTruth
+from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
 from gateway.control.executor import Executor
-from gateway.control.ledger import Ledger
-from gateway.control.mode import MANUAL_SILENCE_S, Verdict
-from gateway.control.outbox import FLIGHT_S
-from gateway.control.platform import PlatformTruth
-from gateway.control.records import Level, Phase, Reason, SetMode, Why
-from gateway.control.stop_evidence import Finding, StopCase
-from gateway.control.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
-from gateway.protocol.profile import StopStyle
-from gateway.protocol.readings import Cause, Event, Rejected, Sensors
-from gateway.protocol.values import Mode
+from gateway.control.pacing import FLIGHT_S
+from gateway.control.stops.evidence import Finding, StopCase
+from gateway.protocol.enums import Mode
+from gateway.protocol.events import Cause, Event, Rejected, Sensors
+from gateway.protocol.platforms import StopStyle
 
 STALL_S: Final = 0.5
 """A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""

@@ -7,17 +7,12 @@ one frame on its way.
 
 from collections.abc import Iterable
 
-from gateway.control import arbiter, recipes
-from gateway.control.battery import Battery, Policy
-from gateway.control.believed import Believed
+from gateway.control import arbiter
 from gateway.control.car_model import CarModel
 from gateway.control.car_monitor import CarMonitor
-from gateway.control.executor import Executor
-from gateway.control.ledger import Ledger, Pending
-from gateway.control.mode import ModeTruth, Verdict
-from gateway.control.outbox import Pacing
-from gateway.control.platform import PlatformTruth
-from gateway.control.records import (
+from gateway.control.command_log import Ledger, Pending
+from gateway.control.command_queue import Held
+from gateway.control.commands import (
     Act,
     Answer,
     ChangeSpeed,
@@ -40,15 +35,21 @@ from gateway.control.records import (
     Why,
     Write,
 )
+from gateway.control.estimate.battery import Battery, Policy
+from gateway.control.estimate.mode import ModeTruth, Verdict
+from gateway.control.estimate.outputs import Believed
+from gateway.control.estimate.platform import PlatformTruth
+from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.control.executor import Executor
+from gateway.control.pacing import Pacing
 from gateway.control.safety import LEASE_S, Estop, Hold, Kept, Safety
 from gateway.control.senders import PAUSE_S
-from gateway.control.stop import Running
-from gateway.control.trust import Basis, CarTrust
-from gateway.control.waiting import Held
-from gateway.protocol.encode import ColorLed, Frame, General, ModeOpen
-from gateway.protocol.profile import Profile
-from gateway.protocol.readings import Event
-from gateway.protocol.values import Mode, Motion
+from gateway.control.stops import sequences
+from gateway.control.stops.stopping import Running
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.events import Event
+from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
+from gateway.protocol.platforms import Profile
 
 
 class Controller:
@@ -437,7 +438,7 @@ class Controller:
             self._ledger.sent(pending, now, "the motion is held on")
             return Answer(Phase.SENT, words="the motion is held on")
         running = self._executor.running
-        if running is not None and running.recipe.rank == recipes.SOFT.rank:
+        if running is not None and running.recipe.rank == sequences.SOFT.rank:
             # The car is wanted to move again: the rest of a soft stop would only jerk it.
             self._executor.running = None
             for other in running.commands:

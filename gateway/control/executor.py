@@ -5,21 +5,21 @@
 
 from typing import Final
 
-from gateway.control import recipes, stop
 from gateway.control.car_model import CarModel
-from gateway.control.ledger import Ledger, Pending
-from gateway.control.outbox import FLIGHT_S
-from gateway.control.recipes import Gate, Recipe
-from gateway.control.records import Fan, Level, Phase, Reason, SetMode, Why, Write
+from gateway.control.command_log import Ledger, Pending
+from gateway.control.command_queue import Held, Waiting
+from gateway.control.commands import Fan, Level, Phase, Reason, SetMode, Why, Write
+from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
+from gateway.control.pacing import FLIGHT_S
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
-from gateway.control.stop import Running
-from gateway.control.stop_evidence import CLOSED_S, EVIDENCE, Finding, StopCase
-from gateway.control.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
-from gateway.control.waiting import Held, Waiting
-from gateway.protocol.encode import Frame, General, ModeClose, ModeOpen, encode
-from gateway.protocol.profile import StopStyle
-from gateway.protocol.values import Mode, Motion
+from gateway.control.stops import sequences, stopping
+from gateway.control.stops.evidence import CLOSED_S, EVIDENCE, Finding, StopCase
+from gateway.control.stops.sequences import Gate, Recipe
+from gateway.control.stops.stopping import Running
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen, encode
+from gateway.protocol.platforms import StopStyle
 
 LATE_S: Final = 0.1
 """Report a drive as shortened if its frame goes out later than this; its duration counts from the request."""
@@ -181,7 +181,7 @@ class Executor:
     def _renewal_at(self) -> float:
         """Return when the next frame of a renewal is due."""
         if self._general_stop_follows:
-            return self.model.pacing.written_at + recipes.REPEAT_S
+            return self.model.pacing.written_at + sequences.REPEAT_S
         # In one string behind a servo frame `MODE00` would open a mode: its digits are read out of that frame.
         return max(self._renew_at, self.model.pacing.ready_at(Gate.ALONE)) if self._renewal_clears() else self._renew_at
 
@@ -327,7 +327,7 @@ class Executor:
         recipe, running = self.full(now), self.running
         if running is not None and running.recipe.rank >= recipe.rank:
             return running.worst_s(now)
-        return stop.worst_s(recipe, self.model.for_stop(now), self.model.pacing, now)
+        return stopping.worst_s(recipe, self.model.for_stop(now), self.model.pacing, now)
 
     def shutdown(self, now: float) -> None:
         """Stop the car and accept nothing else: the gateway ends."""
@@ -367,11 +367,11 @@ class Executor:
 
     def soft(self, now: float) -> Recipe:
         """Return the stop of a drive's end."""
-        return stop.soft(self.model.for_stop(now))
+        return stopping.soft(self.model.for_stop(now))
 
     def full(self, now: float) -> Recipe:
         """Return the stop that `stop`, `estop` and a shutdown send."""
-        return stop.full(self.model.for_stop(now))
+        return stopping.full(self.model.for_stop(now))
 
     def begin(self, recipe: Recipe, why: Why, now: float, pending: Pending | None = None) -> None:
         """Carry out a stop, or join the one that runs if that is no weaker."""
@@ -386,7 +386,7 @@ class Executor:
         if why is Why.SHUTDOWN:
             running.why = why
         # Whoever asks for a stop need not wait for the next try, but silence makes that certain.
-        if pending is not None and running.frames_sent and now >= running.closed_at + recipes.SILENCE_S:
+        if pending is not None and running.frames_sent and now >= running.closed_at + sequences.SILENCE_S:
             running.again(self.full(now), now)
         if running.first_at is not None and pending is not None:
             self._ledger.sent(pending, now, f"joined the {running.recipe.name} stop under way")
@@ -419,12 +419,12 @@ class Executor:
         self._begin_recovery(why, now, commands)
 
     def _begin_recovery(self, why: Why, now: float, commands: list[Pending]) -> None:
-        self._start(stop.recovery(self.model.for_stop(now)), why, now, commands)
+        self._start(stopping.recovery(self.model.for_stop(now)), why, now, commands)
 
     def _start(self, recipe: Recipe, why: Why, now: float, commands: list[Pending]) -> None:
         model = self.model
-        worst_s = stop.worst_s(recipe, model.for_stop(now), model.pacing, now)
-        patience_s = min(worst_s, stop.LONGEST_WORST_S) + stop.SHOW_S
+        worst_s = stopping.worst_s(recipe, model.for_stop(now), model.pacing, now)
+        patience_s = min(worst_s, stopping.LONGEST_WORST_S) + stopping.SHOW_S
         self.running = Running(
             recipe, why, now, now, commands, worst_at=now + worst_s, patience_s=patience_s, case=self._case(recipe)
         )
@@ -435,7 +435,7 @@ class Executor:
         model = self.model
         if model.for_stop_style is StopStyle.RASPBERRY_PI:
             return StopCase.RASPBERRY_PI
-        if recipe.rank == recipes.SOFT.rank:
+        if recipe.rank == sequences.SOFT.rank:
             return StopCase.SOFT
         if model.for_stop_style is StopStyle.UNKNOWN:
             return StopCase.UNKNOWN_PLATFORM
@@ -479,7 +479,7 @@ class Executor:
             self._await(running, now)
         if self.running is running and finding in (Finding.REPORT, Finding.PAUSE) and self._may_probe(running):
             running.probes += 1
-            running.again(recipes.PROBE, now)
+            running.again(sequences.PROBE, now)
 
     def _may_probe(self, running: Running) -> bool:
         """Return True if a `MODE00` now would show something: not to a car that may not know that frame."""
@@ -488,19 +488,19 @@ class Executor:
         if running.case is StopCase.UNKNOWN_PLATFORM:
             return running.frames_sent and running.probes < UNKNOWN_PROBES
         # First the `#` that ends half a frame: `MODE00` behind one would open a mode.
-        return running.recipe is not recipes.RECOVERY or running.index > RESETTING_STEPS
+        return running.recipe is not sequences.RECOVERY or running.index > RESETTING_STEPS
 
     def _lost(self, running: Running, now: float) -> None:
         """Send the stop again: the reports came on as before. A Raspberry Pi does the same."""
         running.probes += 1
         unknown = running.case is StopCase.UNKNOWN_PLATFORM
-        if not unknown and running.tries == 1 and (running.frames_sent or running.recipe is recipes.PROBE):
+        if not unknown and running.tries == 1 and (running.frames_sent or running.recipe is sequences.PROBE):
             self._try_again(running, now)
 
     def _try_again(self, running: Running, now: float) -> None:
         running.tries += 1
         situation = self.model.for_stop(now)
-        running.again(stop.soft(situation) if running.at_rest else stop.recovery(situation), now)
+        running.again(stopping.soft(situation) if running.at_rest else stopping.recovery(situation), now)
         self.model.evidence.tried_again()
 
     def _await(self, running: Running, now: float) -> None:
@@ -524,7 +524,7 @@ class Executor:
         if running.case is StopCase.SOFT:
             return StopCase.SOFT if over else None
         if running.case is StopCase.RASPBERRY_PI:
-            heard = running.report_at > running.try_at or running.recipe.rank == recipes.SOFT.rank
+            heard = running.report_at > running.try_at or running.recipe.rank == sequences.SOFT.rank
             return StopCase.RASPBERRY_PI if over and heard else None
         if over and model.believed.fan and model.profile.fan_silences:
             return StopCase.FAN
@@ -616,6 +616,6 @@ class Executor:
     def free_at(self, now: float) -> float:
         """Return when the car can take a motion, as far as that is known."""
         running = self.running
-        if running is None or running.overdue or running.recipe.rank == recipes.SOFT.rank:
+        if running is None or running.overdue or running.recipe.rank == sequences.SOFT.rank:
             return self.ready_at
         return max(running.over_at(self.model.pacing, now), self.ready_at)

@@ -1,13 +1,13 @@
 """Who may move the car: the hold, the e-stops, and the lease. Values and small rules; what is sent is not decided here.
 
-What must survive a restart is `Kept`; `gateway.store` writes it to disk.
+What must survive a restart is `Kept`; `gateway.state_file` writes it to disk.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gateway.control.records import Kind, Sender
+from gateway.control.commands import Kind, Sender
 
 LEASE_S: Final = 2.0
 """How long a lease outlives the driving (design.md, "Commands")."""

@@ -6,8 +6,8 @@ Every number is a row of protocol.md ("observed about time" unless another secti
 
 from typing import Final
 
-from gateway.protocol.encode import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
+from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
 
 # framing: UART 9600 8N1, so at most 960 bytes/s each way
 BYTES_PER_S: Final = 960

@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from gateway.sim.command import add_arguments, run
+from gateway.sim.cli import add_arguments, run
 from schemas.process import stdio
 
 if __name__ == "__main__":

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from gateway.sim.core.line import Flood, Way
-from gateway.sim.core.remote import Button
-from gateway.sim.spec import BadSpec, CarSpec, PtyLink, ReplaySpec
+from gateway.sim.car_spec import BadSpec, CarSpec, PtyLink, ReplaySpec
+from gateway.sim.model.faulty_link import Flood, Way
+from gateway.sim.model.ir_remote import Button
 
 GARBAGE_LIMIT: Final = 100_000
 LIMIT_S: Final = 86_400.0

@@ -1,8 +1,6 @@
 """Errors of the bus; each names the endpoint and what to do."""
 
 
-
-
 class BusError(Exception):
     """The bus cannot be had; its text names the endpoint and what to do."""
 

@@ -1,6 +1,5 @@
 """Key expressions as Zenoh writes and compares them."""
 
-
 import zenoh
 
 from schemas.keys import BadKey

@@ -3,7 +3,7 @@
 import re
 from time import perf_counter
 
-from gateway.protocol.decode import Decoder, Sensors
+from gateway.protocol.decoder import Decoder, Sensors
 from tests.bench.measured import Measured, in_turns
 
 FRAMES = [

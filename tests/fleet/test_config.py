@@ -13,8 +13,8 @@ from fleet.config import CarSpec, FleetFile, Limits, parse_fleet, profile_capabi
 from fleet.config_fields import CRITICAL_V, EMPTY_V, FULL_V, LONGEST_DRIVE_S, LOW_V, BatteryAction, schema
 from fleet.links import BadLink, Link, LinkKind, parse_link, shared_ports
 from fleet.marked import BadFile
-from gateway import requests
-from gateway.control import battery
+from gateway.bus import requests
+from gateway.control.estimate import battery
 from gateway.link import BadUrl, parse_url
 
 LAYERS = """\

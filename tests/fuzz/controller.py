@@ -9,8 +9,7 @@ import random
 from collections.abc import Callable
 from typing import Any
 
-from gateway.control.controller import Controller
-from gateway.control.records import (
+from gateway.control.commands import (
     Act,
     ChangeSpeed,
     Command,
@@ -31,12 +30,13 @@ from gateway.control.records import (
     Why,
     Write,
 )
+from gateway.control.controller import Controller
+from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.control.safety import Estop
-from gateway.control.trust import Basis, CarTrust
-from gateway.protocol.decode import Decoder
-from gateway.protocol.encode import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
-from gateway.protocol.profile import Platform, parse_platform
-from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
+from gateway.protocol.platforms import Platform, parse_platform
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")
 SENDERS = [Sender(f"{kind}-{number}", kind) for kind in Kind for number in range(3)]

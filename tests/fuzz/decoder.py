@@ -2,8 +2,8 @@
 
 import random
 
-from gateway.protocol.decode import Decoder, Echo, Rejected
-from gateway.protocol.readings import Sensors
+from gateway.protocol.decoder import Decoder, Echo, Rejected
+from gateway.protocol.events import Sensors
 from tests.fuzz.controller import MANUAL, READINGS
 
 FRESH = 2_000

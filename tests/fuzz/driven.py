@@ -3,10 +3,10 @@
 import random
 from dataclasses import dataclass
 
-from gateway.control.records import Act, EmergencyStop, Find, Phase, Resume, Sender, SetMode, Stop
-from gateway.protocol.values import Mode
-from gateway.sim.core.arduino import ArduinoCar
-from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
+from gateway.control.commands import Act, EmergencyStop, Find, Phase, Resume, Sender, SetMode, Stop
+from gateway.protocol.enums import Mode
+from gateway.sim.model.arduino import ArduinoCar
+from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from tests.fuzz.controller import PLATFORMS, SENDERS, anything
 from tests.support.stops import WORLDS, state_of
 from tests.support.virtual import Pair

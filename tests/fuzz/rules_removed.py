@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-from gateway.control import stop_evidence
+from gateway.control.estimate.mode import ModeTruth
+from gateway.control.estimate.trust import Basis
 from gateway.control.executor import Executor
-from gateway.control.mode import ModeTruth
-from gateway.control.stop import Running
-from gateway.control.stop_evidence import StopCase, StopEvidence
-from gateway.control.trust import Basis
+from gateway.control.stops import evidence
+from gateway.control.stops.evidence import StopCase, StopEvidence
+from gateway.control.stops.stopping import Running
 
 Patch = Callable[[object, str, Any], None]
 """`pytest.MonkeyPatch.setattr`."""
@@ -28,16 +28,16 @@ def _no_second_try(patch: Patch) -> None:
 
 
 def _one_pause(patch: Patch) -> None:
-    patch(stop_evidence, "PAUSES", 1)
+    patch(evidence, "PAUSES", 1)
 
 
 def _damaged_frames_count(patch: Patch) -> None:
-    patch(stop_evidence, "SETTLED_S", -1.0)
+    patch(evidence, "SETTLED_S", -1.0)
     patch(StopEvidence, "noise", lambda self, at, damaged=True: None)
 
 
 def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:
-    patch(stop_evidence, "LEFT_S", 20.0)
+    patch(evidence, "LEFT_S", 20.0)
 
 
 def _any_frame_before_it(patch: Patch) -> None:
@@ -60,8 +60,8 @@ def _silent_mode_after_any_rest(patch: Patch) -> None:
 
 
 def _silent_mode_without_its_silence(patch: Patch) -> None:
-    patch(stop_evidence, "OPENING_SILENCE_S", 0.0)
-    patch(stop_evidence, "OPENED_S", -1.0)
+    patch(evidence, "OPENING_SILENCE_S", 0.0)
+    patch(evidence, "OPENED_S", -1.0)
 
 
 def _no_renewal(patch: Patch) -> None:

@@ -14,9 +14,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from gateway.control.controller import Controller
-from gateway.control.mode import Verdict
-from gateway.control.records import (
+from gateway.control.commands import (
     Act,
     Command,
     CommandRecord,
@@ -29,14 +27,16 @@ from gateway.control.records import (
     Stop,
     What,
 )
-from gateway.control.trust import CarTrust
-from gateway.protocol.decode import Decoder
-from gateway.protocol.encode import ColorLed, General, Ptz
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.values import Mode, Motion
-from gateway.sim.core.arduino import ArduinoCar
-from gateway.sim.core.cars import build
-from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
+from gateway.control.controller import Controller
+from gateway.control.estimate.mode import Verdict
+from gateway.control.estimate.trust import CarTrust
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.frames import ColorLed, General, Ptz
+from gateway.protocol.platforms import parse_platform
+from gateway.sim.model.arduino import ArduinoCar
+from gateway.sim.model.factory import build
+from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black
 
 BYTES_PER_S = 960

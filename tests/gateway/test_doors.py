@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.doors import COMMANDS_WAITING, HISTORIES_WAITING, Doors
+from gateway.bus.service import COMMANDS_WAITING, HISTORIES_WAITING, Doors
 from schemas import bus, keys
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, wait_for

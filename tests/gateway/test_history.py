@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.history import BadRange, Ring, parse_range
+from gateway.bus.history import BadRange, Ring, parse_range
 from schemas.topics import HISTORY
 
 S = 1_000_000_000

@@ -255,7 +255,7 @@ def test_a_file_that_is_there_is_not_written_over(command: Command, tmp_path: Pa
     kept.write_text("mine")
     done = command("monitor", "--link", "/dev/nope", "--raw", kept)
     assert done.returncode == 2
-    assert "there is such a file already" in done.stderr
+    assert "exists already and is not overwritten" in done.stderr
     assert kept.read_text() == "mine"
 
 

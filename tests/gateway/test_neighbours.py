@@ -7,8 +7,8 @@ from pathlib import Path
 
 import zenoh
 
+from gateway.bus.estop_sync import Neighbours
 from gateway.control.safety import Estop
-from gateway.neighbours import Neighbours
 from schemas.bus import Bus, Handover, reply
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.messages import encoding_of

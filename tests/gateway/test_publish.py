@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 import zenoh
 
+from gateway.bus.publisher import SLICE, Publications
+from gateway.control.commands import Command, CommandRecord, Drive, Find, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
-from gateway.control.link_health import LinkHealth
-from gateway.control.platform import PlatformTruth
-from gateway.control.records import Command, CommandRecord, Drive, Find, Phase, Reason, SetMode, Stop
-from gateway.protocol.decode import Decoder
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.readings import ImuReading
-from gateway.protocol.values import Mode, Motion
-from gateway.publish import SLICE, Publications
+from gateway.control.estimate.link_health import LinkHealth
+from gateway.control.estimate.platform import PlatformTruth
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.events import ImuReading
+from gateway.protocol.platforms import parse_platform
 from schemas import keys, messages
 from schemas.bus import Bus, Sample
 from tests.gateway.control.desk import PERSON, READING, SCRIPT, Desk

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.control.records import (
+from gateway.bus.requests import BadRequest, Request, parse
+from gateway.control.commands import (
     Act,
     ChangeSpeed,
     Command,
@@ -25,9 +26,8 @@ from gateway.control.records import (
     TakeLease,
     What,
 )
-from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz
-from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
-from gateway.requests import BadRequest, Request, parse
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import COMMANDS, PROTOBUF

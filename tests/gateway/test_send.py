@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.values import Mode
-from gateway.send import why_not
+from gateway.protocol.enums import Mode
+from gateway.protocol.platforms import parse_platform
+from gateway.tools.send import why_not
 from tests.gateway.conftest import PATIENCE_S, Command
 from tests.support.processes import TcpCar, driving, wait_for
 
@@ -139,8 +139,8 @@ def test_a_tcp_car_that_nothing_could_stop_is_not_set_going(command: Command) ->
 
 
 def test_every_mode_has_its_words(command: Command) -> None:
-    from gateway.protocol.encode import ModeOpen
-    from gateway.send import aftermath
+    from gateway.protocol.frames import ModeOpen
+    from gateway.tools.send import aftermath
 
     for mode in set(Mode) - {Mode.MANUAL}:
         words = "\n".join(aftermath(ModeOpen(mode), parse_platform("arduino"), "/dev/my port"))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.safety import Estop, Hold, Kept
-from gateway.store import Store
+from gateway.state_file import Store
 
 NOW = 1_800_000_000_000_000_000
 

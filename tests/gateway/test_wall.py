@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from gateway.wall import STEP_NS, TRIES, Wall
+from gateway.clock import STEP_NS, TRIES, Wall
 
 EPOCH_NS = 1_795_000_000_000_000_000
 MS = 1_000_000

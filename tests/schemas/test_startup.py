@@ -24,9 +24,9 @@ RUN = ("run", "--car", "red", "--link", "tcp://127.0.0.1:9", "--connect", "tcp/1
     ("package", "imported", "arguments"),
     [
         ("gateway", "gateway.cli", RUN),
-        ("gateway", "gateway.doors", RUN),
-        ("gateway", "gateway.sim.command", ("sim",)),
-        ("gateway", "gateway.monitor", ("monitor",)),
+        ("gateway", "gateway.bus.service", RUN),
+        ("gateway", "gateway.sim.cli", ("sim",)),
+        ("gateway", "gateway.tools.monitor", ("monitor",)),
         ("fleet", "click", ("list",)),
         ("fleet", "fleet.commands.reading", ("list",)),
         ("fleet", "fleet.policy.check", ("plan", "check", "pyproject.toml")),

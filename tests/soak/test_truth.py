@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 from tests.support.normal import Run, normal
 from tests.support.truth import WORLDS
 

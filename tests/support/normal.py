@@ -3,13 +3,13 @@
 import random
 from collections.abc import Callable
 
-from gateway.control.link_health import LinkHealth, LinkState
-from gateway.control.mode import Verdict
-from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, Reason, SetMode, Stop, What
-from gateway.protocol.encode import ColorLed, General, Ptz
-from gateway.protocol.readings import Event, Sensors
-from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
-from gateway.sim.core.raspberry_pi import Transport
+from gateway.control.commands import Act, ChangeSpeed, Drive, Fan, Find, Phase, Reason, SetMode, Stop, What
+from gateway.control.estimate.link_health import LinkHealth, LinkState
+from gateway.control.estimate.mode import Verdict
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.events import Event, Sensors
+from gateway.protocol.frames import ColorLed, General, Ptz
+from gateway.sim.model.raspberry_pi import Transport
 from tests.support.truth import WORLDS
 from tests.support.virtual import Pair
 

@@ -13,8 +13,8 @@ from typing import Any, Final
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from gateway.protocol.encode import ModeOpen, encode
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
+from gateway.protocol.frames import ModeOpen, encode
 from schemas import messages
 from schemas.bus import Bus, Sample, sample_of
 from tests.support.judge import stamp_ns

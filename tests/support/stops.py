@@ -10,23 +10,23 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from itertools import product
 
-from gateway.control.mode import Verdict
-from gateway.control.records import Act, ChangeSpeed, Drive, Fan, Find, Phase, SetMode, Stop
-from gateway.control.trust import Basis, CarTrust
-from gateway.protocol.encode import ColorLed, General, ModeOpen, Ptz, encode
-from gateway.protocol.profile import Platform, StopStyle
-from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
-from gateway.sim.core.body import SONAR_CONE, SONAR_STEEPEST
-from gateway.sim.core.raspberry_pi import Transport
-from gateway.sim.core.things import Lamp
-from gateway.sim.core.world import World
+from gateway.control.commands import Act, ChangeSpeed, Drive, Fan, Find, Phase, SetMode, Stop
+from gateway.control.estimate.mode import Verdict
+from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.frames import ColorLed, General, ModeOpen, Ptz, encode
+from gateway.protocol.platforms import Platform, StopStyle
+from gateway.sim.model.car_body import SONAR_CONE, SONAR_STEEPEST
+from gateway.sim.model.objects import Lamp
+from gateway.sim.model.raspberry_pi import Transport
+from gateway.sim.model.world import World
 from tests.support.virtual import Pair
 
 LONGEST_S = 4.0
 """Outside obstacle avoidance and links just restored no stop takes longer."""
 AVOIDING_S = 4.3
 ENDS_S = 18.5
-"""So long after it was asked, every stop has its last record (gateway/control/stop.py)."""
+"""So long after it was asked, every stop has its last record (gateway/control/stops/stopping.py)."""
 OPENS_S = 14.0
 """So long after it was asked, a mode opens: the stop before it is over within 10 s, or the mode is given up."""
 RATIO = 1.5

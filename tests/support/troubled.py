@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 from schemas import messages
 from schemas.bus import Bus, BusError, Sample
 from tests.support.processes import TAKEN

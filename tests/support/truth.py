@@ -3,12 +3,12 @@
 import random
 from collections.abc import Callable
 
-from gateway.control.records import SetMode
-from gateway.protocol.encode import ModeClose, ModeOpen, encode
-from gateway.protocol.values import Mode
-from gateway.sim.core.geometry import Segment
-from gateway.sim.core.things import Lamp
-from gateway.sim.core.world import World
+from gateway.control.commands import SetMode
+from gateway.protocol.enums import Mode
+from gateway.protocol.frames import ModeClose, ModeOpen, encode
+from gateway.sim.model.geometry import Segment
+from gateway.sim.model.objects import Lamp
+from gateway.sim.model.world import World
 from tests.support.virtual import Pair
 
 

@@ -3,14 +3,14 @@
 import random
 from collections.abc import Callable
 
+from gateway.control.commands import Answer, Command, CommandRecord, Level, LogRecord, Phase, Sender, What
 from gateway.control.controller import Controller
-from gateway.control.records import Answer, Command, CommandRecord, Level, LogRecord, Phase, Sender, What
-from gateway.protocol.decode import Decoder
-from gateway.protocol.profile import parse_platform
-from gateway.sim.core.cars import build
-from gateway.sim.core.firmware import Firmware
-from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
-from gateway.sim.core.world import World
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.platforms import parse_platform
+from gateway.sim.model.factory import build
+from gateway.sim.model.firmware import Firmware
+from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.model.world import World
 
 TICK_S = 0.05
 """How often control weighs silence. All else wakes the loop when it is due: bytes, deadlines, what the car does."""

@@ -14,8 +14,8 @@ from fleet.policy.memory import Memory
 from fleet.policy.picture import NAMES, CarPicture, Picture
 from fleet.policy.plan import Plan
 from fleet.policy.reader import parse
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
+from gateway.protocol.platforms import parse_platform
 from tests.fleet.policy.cars import HERE, seen
 
 FLEET = {

@@ -5,7 +5,7 @@ import pytest
 from fleet.policy.check import Gravity, check, faults
 from fleet.policy.picture import CarPicture
 from fleet.policy.reader import parse
-from gateway.protocol.profile import parse_platform
+from gateway.protocol.platforms import parse_platform
 
 
 def listed(platform: str, *roles: str) -> CarPicture:

@@ -8,7 +8,7 @@ from fleet.marked import BadFile
 from fleet.policy.check import check
 from fleet.policy.plan import Of
 from fleet.policy.reader import parse
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 

@@ -13,7 +13,7 @@ from fleet.cli import cli
 from fleet.replay import vector
 from fleet.replay.redecode import Difference, Redecoding
 from fleet.replay.wire import Confirmed, Item, Rx, Treated, Tx
-from gateway.protocol.values import Mode
+from gateway.protocol.enums import Mode
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.replay.make_session import Made, make
 

@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from gateway.control.controller import Controller
-from gateway.control.records import (
+from gateway.control.commands import (
     Answer,
     Command,
     CommandRecord,
@@ -16,12 +15,13 @@ from gateway.control.records import (
     What,
     Why,
 )
+from gateway.control.controller import Controller
 from gateway.control.safety import Kept
-from gateway.protocol.decode import Decoder
-from gateway.protocol.encode import Frame, General, ModeClose, ModeOpen
-from gateway.protocol.profile import Platform, parse_platform
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.enums import Mode
+from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
+from gateway.protocol.platforms import Platform, parse_platform
 from gateway.protocol.timing import FRAME_S
-from gateway.protocol.values import Mode
 from tests.support.virtual import SHORTEST_S
 
 READING = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"

@@ -1,6 +1,6 @@
 """So much per second and no more."""
 
-from gateway.control.allowance import Allowance
+from gateway.control.rate_limit import Allowance
 
 
 def test_so_much_at_once_and_so_much_a_second() -> None:

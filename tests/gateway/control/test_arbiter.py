@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from gateway.control.arbiter import QUEUE_LIMIT, TABLE, Situation, needs, refuse
-from gateway.control.records import (
+from gateway.control.commands import (
     Act,
     ChangeSpeed,
     Command,
@@ -25,9 +25,9 @@ from gateway.control.records import (
     What,
 )
 from gateway.control.safety import Estop, Lease
-from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
+from gateway.protocol.platforms import parse_platform
 
 NOW = 100.0
 WHATS: list[What] = [

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.control.records import (
+from gateway.control.commands import (
     Act,
     ChangeSpeed,
     Drive,
@@ -18,8 +18,8 @@ from gateway.control.records import (
     What,
 )
 from gateway.control.safety import Estop, Kept
-from gateway.protocol.encode import ColorLed
-from gateway.protocol.values import Mode, Motion, SpeedStep
+from gateway.protocol.enums import Mode, Motion, SpeedStep
+from gateway.protocol.frames import ColorLed
 from tests.gateway.control.desk import COORDINATOR, MODE00, PERSON, RUN, SCRIPT, SHOWN_STOP, STOP, TRACKING, Desk
 
 SENT, QUEUED, REJECTED, SUPERSEDED = Phase.SENT, Phase.QUEUED, Phase.REJECTED, Phase.SUPERSEDED

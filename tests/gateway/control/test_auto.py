@@ -2,11 +2,11 @@
 
 import pytest
 
+from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
-from gateway.control.records import Drive, SetMode, Stop
-from gateway.protocol.profile import parse_platform, parse_told
-from gateway.protocol.values import Mode, Motion
-from gateway.sim.core.raspberry_pi import Transport
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.platforms import parse_platform, parse_told
+from gateway.sim.model.raspberry_pi import Transport
 from tests.support.virtual import Pair
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.battery import HOLD_S, LOW_V, Action, Battery, BatteryLevel, Policy, charge
+from gateway.control.estimate.battery import HOLD_S, LOW_V, Action, Battery, BatteryLevel, Policy, charge
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,12 @@
 
 import pytest
 
-from gateway.control.battery import Action, Policy
+from gateway.control.commands import Act, Drive, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
-from gateway.control.records import Act, Drive, Phase, Reason, SetMode, Stop
-from gateway.protocol.encode import General
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.values import Light, Mode, Motion
+from gateway.control.estimate.battery import Action, Policy
+from gateway.protocol.enums import Light, Mode, Motion
+from gateway.protocol.frames import General
+from gateway.protocol.platforms import parse_platform
 from tests.gateway.control.desk import MODE00, RUN, STOP, Desk
 
 FORWARD = Drive(Motion.FORWARD, 9.0)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from gateway.control.records import Drive, Phase
-from gateway.control.trust import CarTrust
-from gateway.protocol.values import Motion
+from gateway.control.commands import Drive, Phase
+from gateway.control.estimate.trust import CarTrust
+from gateway.protocol.enums import Motion
 from tests.support.virtual import Pair
 
 

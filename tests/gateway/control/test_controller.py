@@ -7,9 +7,8 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.control.executor import RENEW_S, SHUTDOWN_S
-from gateway.control.mode import Verdict
-from gateway.control.records import (
+from gateway.control.command_queue import PATIENCE_S
+from gateway.control.commands import (
     Act,
     ChangeSpeed,
     Drive,
@@ -25,13 +24,14 @@ from gateway.control.records import (
     What,
     Why,
 )
+from gateway.control.estimate.mode import Verdict
+from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.control.executor import RENEW_S, SHUTDOWN_S
 from gateway.control.safety import Hold, Kept
-from gateway.control.stop import RETRY_S
-from gateway.control.stop_evidence import EVIDENCE, StopCase
-from gateway.control.trust import Basis, CarTrust
-from gateway.control.waiting import PATIENCE_S
-from gateway.protocol.encode import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
-from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.control.stops.evidence import EVIDENCE, StopCase
+from gateway.control.stops.stopping import RETRY_S
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
 from tests.gateway.control.desk import BACK, COORDINATOR, MODE00, PERSON, RUN, SCRIPT, SHOWN_STOP, STOP, TRACKING, Desk
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair

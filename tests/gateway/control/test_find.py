@@ -2,9 +2,9 @@
 
 import pytest
 
-from gateway.control.records import Act, Drive, Find, Phase
-from gateway.protocol.encode import ColorLed
-from gateway.protocol.values import Motion
+from gateway.control.commands import Act, Drive, Find, Phase
+from gateway.protocol.enums import Motion
+from gateway.protocol.frames import ColorLed
 from tests.support.virtual import Pair
 
 WHITE, COLOUR = "#ffffff", "#0a141e"

@@ -10,12 +10,12 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.control.records import Act, Answer, Drive, Fan, Phase, Reason, SetMode, Stop
-from gateway.control.stop_evidence import EVIDENCE, StopCase
-from gateway.control.trust import Basis
-from gateway.protocol.encode import ArmSet, ColorLed, General, Ptz, parse_sent
-from gateway.protocol.values import Light, Mode, Motion
-from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
+from gateway.control.commands import Act, Answer, Drive, Fan, Phase, Reason, SetMode, Stop
+from gateway.control.estimate.trust import Basis
+from gateway.control.stops.evidence import EVIDENCE, StopCase
+from gateway.protocol.enums import Light, Mode, Motion
+from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz, parse_sent
+from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from tests.gateway.sim.hazards import HAZARDS, Hazard
 from tests.gateway.sim.strangers import virtual
 from tests.support.virtual import Pair

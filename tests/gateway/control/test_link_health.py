@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.control.link_health import LinkHealth, LinkState
+from gateway.control.estimate.link_health import LinkHealth, LinkState
 
 
 def judged(

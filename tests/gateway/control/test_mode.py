@@ -2,10 +2,10 @@
 
 import pytest
 
-from gateway.control.mode import CONTRADICTING_FRAMES, ModeTruth, Verdict
-from gateway.protocol.decode import SILENCE_S, Decoder, Sensors
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.values import Mode
+from gateway.control.estimate.mode import CONTRADICTING_FRAMES, ModeTruth, Verdict
+from gateway.protocol.decoder import SILENCE_S, Decoder, Sensors
+from gateway.protocol.enums import Mode
+from gateway.protocol.platforms import parse_platform
 
 ASSUMED, CONFIRMED, CONTRADICTED = Verdict.ASSUMED, Verdict.CONFIRMED, Verdict.CONTRADICTED
 SHAPES = {

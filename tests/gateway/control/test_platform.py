@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.platform import RUNNING, PlatformTruth
-from gateway.protocol.decode import SILENCE_S, Decoder
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.readings import Event
-from gateway.protocol.values import Mode
-from gateway.sim.core.cars import build
+from gateway.control.estimate.platform import RUNNING, PlatformTruth
+from gateway.protocol.decoder import SILENCE_S, Decoder
+from gateway.protocol.enums import Mode
+from gateway.protocol.events import Event
+from gateway.protocol.platforms import parse_platform
+from gateway.sim.model.factory import build
 from tests.support.truth import WORLDS, frame_of
 from tests.support.vectors import ids, rows, wire
 

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.records import Kind, Sender
+from gateway.control.commands import Kind, Sender
 from gateway.control.safety import REMEMBERED_ENDED, Estop, Hold, Kept, Lease, Safety
 
 ANN, BOB = Sender("ann", Kind.PERSON), Sender("bob", Kind.PERSON)

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.records import Drive, Fan, Phase, SetMode, Stop
-from gateway.control.stop_evidence import (
+from gateway.control.commands import Drive, Fan, Phase, SetMode, Stop
+from gateway.control.estimate.trust import Basis
+from gateway.control.stops.evidence import (
     BUNCHED_S,
     CLOSED_S,
     EVIDENCE,
@@ -23,11 +24,10 @@ from gateway.control.stop_evidence import (
     StopCase,
     StopEvidence,
 )
-from gateway.control.trust import Basis
-from gateway.protocol.decode import Decoder
-from gateway.protocol.readings import Cause, Rejected, Sensors
-from gateway.protocol.values import Mode, Motion
-from gateway.sim.core.world import World
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.events import Cause, Rejected, Sensors
+from gateway.sim.model.world import World
 from tests.gateway.control.desk import Desk
 from tests.support.virtual import Pair
 

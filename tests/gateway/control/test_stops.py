@@ -10,15 +10,15 @@ from itertools import product
 
 import pytest
 
-from gateway.control import recipes, stop
-from gateway.control.outbox import Pacing
-from gateway.control.records import Drive, Phase, SetMode, Stop
-from gateway.control.stop_evidence import EVIDENCE, StopCase
-from gateway.control.trust import Basis
-from gateway.protocol.profile import Platform, StopStyle, parse_platform
-from gateway.protocol.values import Mode, Motion
-from gateway.sim.core.raspberry_pi import Transport
-from gateway.sim.core.world import World
+from gateway.control.commands import Drive, Phase, SetMode, Stop
+from gateway.control.estimate.trust import Basis
+from gateway.control.pacing import Pacing
+from gateway.control.stops import sequences, stopping
+from gateway.control.stops.evidence import EVIDENCE, StopCase
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.platforms import Platform, StopStyle, parse_platform
+from gateway.sim.model.raspberry_pi import Transport
+from gateway.sim.model.world import World
 from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Case, Seen, inside, play
 from tests.support.virtual import Pair
 
@@ -143,29 +143,29 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
 # ---------------------------------------------------------------------- the choice, as a table
 
 
-def situations() -> list[stop.Situation]:
+def situations() -> list[stopping.Situation]:
     """The whole product of what the choice looks at."""
     return [
-        stop.Situation(parse_platform(platform), known, mode, *flags)
+        stopping.Situation(parse_platform(platform), known, mode, *flags)
         for platform, known, mode, *flags in product(
             Platform, (True, False), (None, *Mode), (True, False), (True, False), (True, False), (True, False)
         )
     ]
 
 
-def certain(situation: stop.Situation) -> bool:
+def certain(situation: stopping.Situation) -> bool:
     """Known to be in mode 0, where general frames are obeyed."""
     return situation.known and situation.mode is Mode.MANUAL and not situation.contradicted
 
 
 # protocol.md, stopping: the first row that fits.
-FULL: tuple[tuple[Callable[[stop.Situation], bool], recipes.Recipe], ...] = (
-    (lambda it: (it.doubted or it.profile.kind is Platform.UNKNOWN) and certain(it), recipes.UNKNOWN_MANUAL),
-    (lambda it: it.doubted or it.profile.kind is Platform.UNKNOWN, recipes.UNKNOWN),
-    (lambda it: it.profile.stop_style is StopStyle.RASPBERRY_PI, recipes.PI),
-    (lambda it: not it.known, recipes.RECOVERY),
-    (lambda it: certain(it) and not it.clear, recipes.FULL_BEHIND),
-    (lambda it: True, recipes.FULL),
+FULL: tuple[tuple[Callable[[stopping.Situation], bool], sequences.Recipe], ...] = (
+    (lambda it: (it.doubted or it.profile.kind is Platform.UNKNOWN) and certain(it), sequences.UNKNOWN_MANUAL),
+    (lambda it: it.doubted or it.profile.kind is Platform.UNKNOWN, sequences.UNKNOWN),
+    (lambda it: it.profile.stop_style is StopStyle.RASPBERRY_PI, sequences.PI),
+    (lambda it: not it.known, sequences.RECOVERY),
+    (lambda it: certain(it) and not it.clear, sequences.FULL_BEHIND),
+    (lambda it: True, sequences.FULL),
 )
 
 
@@ -174,20 +174,20 @@ def test_the_choice_of_a_stop_over_the_whole_product_of_its_inputs() -> None:
     assert len(everything) == 4 * 2 * 8 * 2 * 2 * 2 * 2
     for situation in everything:
         full = next(recipe for fits, recipe in FULL if fits(situation))
-        assert stop.full(situation) is full, situation
+        assert stopping.full(situation) is full, situation
         style = StopStyle.UNKNOWN if situation.doubted else situation.profile.stop_style
         if style is StopStyle.RASPBERRY_PI:
-            soft = recipes.PI_SOFT
+            soft = sequences.PI_SOFT
         else:
-            soft = recipes.SOFT if certain(situation) and style is StopStyle.MODE_FRAME else full
-        assert stop.soft(situation) is soft, situation
-        assert stop.recovery(situation).rank <= max(full.rank, recipes.RECOVERY.rank)
+            soft = sequences.SOFT if certain(situation) and style is StopStyle.MODE_FRAME else full
+        assert stopping.soft(situation) is soft, situation
+        assert stopping.recovery(situation).rank <= max(full.rank, sequences.RECOVERY.rank)
 
 
 def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
     for situation in situations():
         profile = parse_platform("unknown") if situation.doubted else situation.profile
-        for recipe in (stop.full(situation), stop.soft(situation), stop.recovery(situation)):
+        for recipe in (stopping.full(situation), stopping.soft(situation), stopping.recovery(situation)):
             for step in recipe.steps:
                 assert profile.refusal(step.frame) is None, (situation, recipe)
 
@@ -195,20 +195,20 @@ def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
 def test_every_recipe_ends_alone_in_the_buffer() -> None:
     """The last frame of each is certain: 1.1 s after the one before it, or waiting for that to be read."""
     for situation in situations():
-        for recipe in (stop.full(situation), stop.soft(situation)):
+        for recipe in (stopping.full(situation), stopping.soft(situation)):
             last = recipe.steps[-1]
-            assert last.after_s >= recipes.REPEAT_S - 1e-9 or last.gate is recipes.Gate.ALONE, recipe
+            assert last.after_s >= sequences.REPEAT_S - 1e-9 or last.gate is sequences.Gate.ALONE, recipe
 
 
 def test_what_is_announced_is_never_less_than_what_is_waited_for() -> None:
     for each in situations():
         for ago_s in (0.0, 0.05, 0.3, 1.0, 2.0, 9.0):
             pacing = Pacing(each.profile)
-            pacing.wrote(recipes.SOFT.steps[0].frame, 100.0 - ago_s)
+            pacing.wrote(sequences.SOFT.steps[0].frame, 100.0 - ago_s)
             situation = replace(each, clear=pacing.clear_at(100.0), blocked=False)
-            for recipe in (stop.full(situation), stop.soft(situation)):
-                worst_s = stop.worst_s(recipe, situation, pacing, 100.0)
-                assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stop.WIRE_S
+            for recipe in (stopping.full(situation), stopping.soft(situation)):
+                worst_s = stopping.worst_s(recipe, situation, pacing, 100.0)
+                assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stopping.WIRE_S
                 sure = situation.known and not (situation.contradicted or situation.doubted)
                 possible = sure and situation.mode in situation.profile.modes
                 assert worst_s <= LONGEST_S or situation.turn_s > 1.0 or not possible, (situation, recipe)

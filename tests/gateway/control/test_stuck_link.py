@@ -6,11 +6,11 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.control.records import Act, Drive, Phase, Reason, SetMode, Stop
-from gateway.control.trust import Basis, CarTrust
-from gateway.protocol.encode import ColorLed
-from gateway.protocol.values import Mode, Motion
-from gateway.sim.core.world import World
+from gateway.control.commands import Act, Drive, Phase, Reason, SetMode, Stop
+from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.frames import ColorLed
+from gateway.sim.model.world import World
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from gateway.protocol.values import Mode
-from gateway.sim.core.raspberry_pi import Transport
+from gateway.protocol.enums import Mode
+from gateway.sim.model.raspberry_pi import Transport
 from tests.support.normal import Run, normal
 from tests.support.truth import WORLDS
 

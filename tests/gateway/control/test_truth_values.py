@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.control.records import Drive, Fan, SetMode, Stop
-from gateway.protocol.parse import fullmatch_sensors, sensors
-from gateway.protocol.profile import parse_platform
-from gateway.protocol.readings import Event, Sensors
-from gateway.protocol.values import Mode, Motion
+from gateway.control.commands import Drive, Fan, SetMode, Stop
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.events import Event, Sensors
+from gateway.protocol.parser import fullmatch_sensors, sensors
+from gateway.protocol.platforms import parse_platform
 from tests.support.truth import WORLDS, car_in, frame_of
 from tests.support.virtual import Pair
 

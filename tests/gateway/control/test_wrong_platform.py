@@ -2,9 +2,9 @@
 
 import pytest
 
-from gateway.control.records import Drive, Fan, Phase, Reason, Stop
-from gateway.control.trust import Basis
-from gateway.protocol.values import Mode, Motion
+from gateway.control.commands import Drive, Fan, Phase, Reason, Stop
+from gateway.control.estimate.trust import Basis
+from gateway.protocol.enums import Mode, Motion
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 

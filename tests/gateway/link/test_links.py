@@ -22,8 +22,8 @@ import serial
 from gateway.link import Busy, CannotOpen, Link, LinkLost, open_link
 from gateway.link.tcp import TcpLink
 from gateway.link.url import TcpUrl
-from gateway.protocol.decode import Decoder
-from gateway.protocol.readings import Sensors
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.events import Sensors
 from tests.gateway.link.peers import (
     BlePeer,
     Peer,

@@ -2,16 +2,7 @@
 
 import pytest
 
-from gateway.protocol.decode import (
-    ArmReading,
-    Cause,
-    Decoder,
-    Echo,
-    Event,
-    ImuReading,
-    Rejected,
-    Sensors,
-)
+from gateway.protocol.decoder import ArmReading, Cause, Decoder, Echo, Event, ImuReading, Rejected, Sensors
 from tests.support.vectors import ids, rows, wire
 
 SENSORS, OTHERS, BAD = rows("sensors"), rows("other_readings"), rows("bad_input")

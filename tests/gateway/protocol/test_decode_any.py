@@ -6,7 +6,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.protocol.decode import Decoder, Event, ImuReading, Sensors
+from gateway.protocol.decoder import Decoder, Event, ImuReading, Sensors
 
 PIECES = (
     b"$",

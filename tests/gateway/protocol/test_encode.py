@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.protocol.encode import (
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.frames import (
     ArmSet,
     ColorLed,
     EncodeError,
@@ -17,7 +18,6 @@ from gateway.protocol.encode import (
     encode,
     parse_sent,
 )
-from gateway.protocol.values import Light, Mode, Motion, ServoAction, SpeedStep
 from tests.support.vectors import ids, rows, wire
 
 GENERAL, NAMED, REFUSED = rows("general"), rows("named"), rows("refused")

@@ -2,11 +2,11 @@
 
 import pytest
 
-from gateway.protocol.decode import Decoder, Sensors
-from gateway.protocol.encode import ArmSet, parse_sent
-from gateway.protocol.profile import Platform, StopStyle, parse_platform
+from gateway.protocol.decoder import Decoder, Sensors
+from gateway.protocol.enums import Mode, SpeedStep
+from gateway.protocol.frames import ArmSet, parse_sent
+from gateway.protocol.platforms import Platform, StopStyle, parse_platform
 from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, mode_open_s
-from gateway.protocol.values import Mode, SpeedStep
 from tests.support.vectors import ids, rows, wire
 
 PLATFORMS, PLACEHOLDERS, BLOCKS, TURNS = rows("platforms"), rows("placeholders"), rows("blocks"), rows("turns")

@@ -3,7 +3,7 @@
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from gateway.sim.core.world import World
+from gateway.sim.model.world import World
 from tests.gateway.sim.strangers import (
     BACK,
     FAN,

@@ -7,13 +7,13 @@ from typing import Protocol
 
 import serial
 
-from gateway.sim.core.arduino import ArduinoCar
-from gateway.sim.core.cars import build
-from gateway.sim.core.firmware import Firmware, Truth
-from gateway.sim.core.raspberry_pi import RaspberryPiCar, Transport
-from gateway.sim.core.world import World
-from gateway.sim.shell import SimCar, Simulation
-from gateway.sim.spec import parse_cars
+from gateway.sim.car_spec import parse_cars
+from gateway.sim.model.arduino import ArduinoCar
+from gateway.sim.model.factory import build
+from gateway.sim.model.firmware import Firmware, Truth
+from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.model.world import World
+from gateway.sim.simulation import SimCar, Simulation
 
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"

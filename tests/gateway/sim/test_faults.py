@@ -2,9 +2,8 @@
 
 import pytest
 
-from gateway.sim.command import EPILOG
-from gateway.sim.core.line import Flood, Way
-from gateway.sim.core.remote import Button
+from gateway.sim.car_spec import BadSpec, parse_car, parse_replay
+from gateway.sim.cli import EPILOG
 from gateway.sim.faults import (
     Fault,
     FaultKind,
@@ -16,7 +15,8 @@ from gateway.sim.faults import (
     press_of,
     targets,
 )
-from gateway.sim.spec import BadSpec, parse_car, parse_replay
+from gateway.sim.model.faulty_link import Flood, Way
+from gateway.sim.model.ir_remote import Button
 
 GOOD_FAULTS = [
     ("red:link_drop@5+2", Scheduled(5.0, Fault(FaultKind.LINK_DROP, "red", 2.0))),

@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import pytest
 
-from gateway.sim.core.arduino import ArduinoCar
-from gateway.sim.core.body import CarBody
-from gateway.sim.core.firmware import Body, Pose, Truth
-from gateway.sim.core.raspberry_pi import RaspberryPiCar
-from gateway.sim.core.things import Lamp
-from gateway.sim.core.world import World
+from gateway.sim.model.arduino import ArduinoCar
+from gateway.sim.model.car_body import CarBody
+from gateway.sim.model.firmware import Body, Pose, Truth
+from gateway.sim.model.objects import Lamp
+from gateway.sim.model.raspberry_pi import RaspberryPiCar
+from gateway.sim.model.world import World
 from tests.gateway.sim.strangers import (
     FAN,
     MODE00,

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from gateway.control.mode import Verdict
-from gateway.control.records import SetMode, Stop
-from gateway.protocol.values import Mode
-from gateway.sim.core.things import Lamp, Thing
-from gateway.sim.core.world import RADIUS_M, World
-from gateway.sim.worldfile import WorldSpec, read_world
+from gateway.control.commands import SetMode, Stop
+from gateway.control.estimate.mode import Verdict
+from gateway.protocol.enums import Mode
+from gateway.sim.model.objects import Lamp, Thing
+from gateway.sim.model.world import RADIUS_M, World
+from gateway.sim.world_file import WorldSpec, read_world
 from tests.support.virtual import Pair
 
 ROW = ("red", "green", "blue")

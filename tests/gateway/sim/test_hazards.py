@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from gateway.sim.core.world import World
+from gateway.sim.model.world import World
 from tests.gateway.sim.hazards import HAZARDS, Hazard
 from tests.gateway.sim.strangers import RUN, STOP, WireStranger, virtual
 

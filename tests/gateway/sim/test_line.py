@@ -6,8 +6,8 @@ from math import inf
 
 import pytest
 
-from gateway.protocol.decode import Decoder
-from gateway.sim.core.line import FLOOD_EVERY_S, TO_HOST_LIMIT, Flood, Line, Way
+from gateway.protocol.decoder import Decoder
+from gateway.sim.model.faulty_link import FLOOD_EVERY_S, TO_HOST_LIMIT, Flood, Line, Way
 
 FRAME = b"$1,0,0,0,0,0,0,0,0#"
 

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 import serial
 
-from gateway.sim.core.line import Flood, Way
-from gateway.sim.core.remote import Button
+from gateway.sim.car_spec import parse_cars
+from gateway.sim.endpoints import LinkError
 from gateway.sim.faults import Fault, FaultKind, Press
-from gateway.sim.links import LinkError
-from gateway.sim.shell import Simulation
-from gateway.sim.spec import parse_cars
+from gateway.sim.model.faulty_link import Flood, Way
+from gateway.sim.model.ir_remote import Button
+from gateway.sim.simulation import Simulation
 from tests.gateway.sim.strangers import RUN, STOP, opening
 
 PATIENCE = 40.0

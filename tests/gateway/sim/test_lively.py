@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.sim.core.body import SONAR_REACH_CM, CarBody
-from gateway.sim.core.cars import build
-from gateway.sim.core.firmware import Firmware, Pose
-from gateway.sim.core.geometry import box, distance
-from gateway.sim.core.things import Lamp, Thing
-from gateway.sim.core.world import RADIUS_M, World
+from gateway.sim.model.car_body import SONAR_REACH_CM, CarBody
+from gateway.sim.model.factory import build
+from gateway.sim.model.firmware import Firmware, Pose
+from gateway.sim.model.geometry import box, distance
+from gateway.sim.model.objects import Lamp, Thing
+from gateway.sim.model.world import RADIUS_M, World
 from tests.gateway.sim.strangers import RUN, VirtualStranger, opening, opening_s
 
 HOME = Pose(0.0, 0.0, 0.0)

@@ -4,7 +4,7 @@ from math import inf
 
 import pytest
 
-from gateway.sim.core.played import PAUSE_S, Played
+from gateway.sim.model.capture_car import PAUSE_S, Played
 
 PIECES = [(0.5, b"a"), (0.5, b"b"), (2.5, b"c")]
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.sim.core.remote import SIGNS, Button
+from gateway.sim.model.ir_remote import SIGNS, Button
 from tests.gateway.sim.strangers import FAN, MODE00, RUN, STOP, WHISTLE, VirtualStranger, opening, opening_s, virtual
 
 

@@ -15,7 +15,7 @@ import pytest
 import serial
 
 from gateway import capture
-from gateway.sim.command import add_arguments, run
+from gateway.sim.cli import add_arguments, run
 
 PATIENCE = 20.0
 PIECES = [

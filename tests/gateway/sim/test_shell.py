@@ -18,12 +18,12 @@ from typing import Any
 import pytest
 import serial
 
-from gateway.sim.core.line import Way
+from gateway.sim.car_spec import parse_cars
+from gateway.sim.endpoints import LinkError, Taken
 from gateway.sim.faults import Fault, FaultKind
-from gateway.sim.links import LinkError, Taken
-from gateway.sim.shell import Simulation
-from gateway.sim.spec import parse_cars
-from gateway.sim.truth import LOOK_AGAIN_S, TruthPublisher
+from gateway.sim.model.faulty_link import Way
+from gateway.sim.simulation import Simulation
+from gateway.sim.truth_publisher import LOOK_AGAIN_S, TruthPublisher
 from schemas.bus import Bus, Sample
 from tests.gateway.sim.strangers import FAN, MODE00, RUN, STOP, opening
 from tests.support.ports import free_endpoint
@@ -559,7 +559,7 @@ def test_lamps_and_things_are_on_the_bus_too(started: list[Process]) -> None:
 
 
 async def test_truth_that_nobody_can_see_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gateway.sim.truth.PATIENCE_S", 0.0)
+    monkeypatch.setattr("gateway.sim.truth_publisher.PATIENCE_S", 0.0)
     said: asyncio.Queue[str] = asyncio.Queue()
     simulation = Simulation(parse_cars(["red:arduino:tcp://127.0.0.1:0"]), seed=1)
     publishing = asyncio.create_task(TruthPublisher(simulation, free_endpoint(), "fleet", said.put_nowait).run())

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.sim.spec import BadSpec, CarSpec, PtyLink, ReplaySpec, TcpLink, parse_car, parse_cars, parse_replay
+from gateway.sim.car_spec import BadSpec, CarSpec, PtyLink, ReplaySpec, TcpLink, parse_car, parse_cars, parse_replay
 
 GOOD_CARS = [
     ("red:arduino:pty", CarSpec("red", "arduino", frozenset(), PtyLink())),

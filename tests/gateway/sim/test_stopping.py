@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from gateway.sim.core.things import Lamp
-from gateway.sim.core.world import World
+from gateway.sim.model.objects import Lamp
+from gateway.sim.model.world import World
 from tests.gateway.sim.strangers import FAN, MODE00, RUN, STOP, VirtualStranger, opening, opening_s, virtual
 
 MOMENTS = 200

@@ -5,10 +5,10 @@ from math import cos, hypot, pi, radians, sin
 
 import pytest
 
-from gateway.sim.core.body import CarBody
-from gateway.sim.core.firmware import Pose
-from gateway.sim.core.things import Lamp
-from gateway.sim.core.world import RADIUS_M, World
+from gateway.sim.model.car_body import CarBody
+from gateway.sim.model.firmware import Pose
+from gateway.sim.model.objects import Lamp
+from gateway.sim.model.world import RADIUS_M, World
 from tests.gateway.sim.strangers import opening, opening_s, virtual
 
 

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.sim.core.body import CarBody
-from gateway.sim.core.firmware import Pose
-from gateway.sim.core.things import Lamp, Thing
-from gateway.sim.core.world import RADIUS_M, World
-from gateway.sim.marks import LARGEST_BYTES, BadWorld
-from gateway.sim.worldfile import WorldSpec, read_world
+from gateway.sim.model.car_body import CarBody
+from gateway.sim.model.firmware import Pose
+from gateway.sim.model.objects import Lamp, Thing
+from gateway.sim.model.world import RADIUS_M, World
+from gateway.sim.world_file import WorldSpec, read_world
+from gateway.sim.yaml_reader import LARGEST_BYTES, BadWorld
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 EVERYTHING = """\

@@ -1,0 +1,289 @@
+"""From a payload on a command key to a command that control understands, or words that say what is wrong with it.
+
+Ranges are checked here, at the edge; whether the car may do it now is the arbiter's.
+"""
+
+import hashlib
+import json
+import math
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from gateway.control.commands import (
+    Act,
+    ChangeSpeed,
+    Command,
+    Drive,
+    EmergencyStop,
+    Fan,
+    Find,
+    Kind,
+    Reason,
+    Resume,
+    Sender,
+    SetMode,
+    Stop,
+    TakeLease,
+    What,
+)
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
+from schemas import messages
+from schemas.topics import COMMANDS, PROTOBUF, STOPS
+
+LONGEST_DRIVE_S: Final = 10.0
+"""A drive that holds longer is refused, unless `gateway run --longest-drive` allows it: who drives can say so again."""
+LONGEST_NAME: Final = 128
+"""Of a sender or an id, characters."""
+LONGEST_WHY: Final = 200
+"""Of an e-stop's reason, characters; the rest is cut off: nobody's e-stop fails over its words."""
+_DRIVE_TTL_S: Final = 0.5
+_TTL_S: Final = 2.0  # messages.md: greatest age at arrival, default 0.5 for drive, 2 for the rest
+_SAME_QUERY_NS: Final = 2_000_000_000
+"""One query reaches every gateway within this time."""
+BY_WILDCARD: Final = ("stop", "estop", "resume")
+"""Verbs that may be asked of several cars with one query (design.md, "Keys")."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What came: the verb, the payload, and how old it is."""
+
+    verb: str
+    payload: bytes | None
+    encoding: str
+    now_ns: int
+    """Wall clock, ns since the epoch."""
+    sampled_ns: int | None = None
+    """Zenoh timestamp of a publication; None for a query."""
+    longest_drive_s: float = LONGEST_DRIVE_S
+    by_wildcard: bool = False
+    """It was asked of several cars with one key expression."""
+    unread: str = ""
+    """Why its payload was not read, and is left out here."""
+
+    @property
+    def streamed(self) -> bool:
+        """It came as a publication: nobody waits for an answer."""
+        return self.sampled_ns is not None
+
+
+class BadRequest(ValueError):
+    """A request that is no command. Carries what is known of it, so that the refusal can be recorded under its id."""
+
+    def __init__(self, reason: Reason, words: str, command: Command) -> None:
+        super().__init__(words)
+        self.reason = reason
+        self.words = words
+        self.command = command
+
+
+def parse(request: Request) -> Command:
+    """The command in a request; raises BadRequest."""
+    verb = request.verb
+    blank = Command(_id(request), verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
+    if verb not in COMMANDS:
+        words = f"{verb!r} is no command; there are: {', '.join(COMMANDS)}"
+        raise BadRequest(Reason.UNSUPPORTED, words, blank)
+    if request.by_wildcard and verb not in BY_WILDCARD:
+        words = f"{verb} cannot be asked by wildcard: name one car (only {', '.join(BY_WILDCARD)} can)"
+        raise BadRequest(Reason.BAD_VALUE, words, blank)
+    if request.unread:
+        if verb not in STOPS:
+            raise BadRequest(Reason.BAD_VALUE, f"{verb}: {request.unread}", blank)
+        return _stopped_though(blank, request.unread, request)
+    if request.payload is None and verb not in STOPS:
+        words = f"{verb} without a payload: give {COMMANDS[verb]} or its JSON (only stop and estop need none)"
+        raise BadRequest(Reason.BAD_VALUE, words, blank)
+    try:
+        return _filled(blank, request)
+    except BadRequest as error:
+        if verb not in STOPS:
+            raise
+        return _stopped_though(error.command, error.words, request)
+
+
+def _stopped_though(command: Command, words: str, request: Request) -> Command:
+    """Whatever is wrong with its words: somebody wants this car to stop."""
+    what = Stop() if request.verb == "stop" else _readable_estop(request)
+    return replace(command, what=what, note=f"stopped, though: {words}")
+
+
+def _id(request: Request) -> str:
+    """An id for who gave none. An e-stop asked of all with one query is one e-stop: every gateway makes the same."""
+    if request.verb != "estop" or not request.by_wildcard:
+        return uuid.uuid4().hex
+    query = (request.payload or b"") + str(request.now_ns // _SAME_QUERY_NS).encode()
+    return hashlib.sha256(query).hexdigest()[:32]
+
+
+def _readable_estop(request: Request) -> EmergencyStop:
+    """What can be read of an e-stop in which something is wrong: its scope and its reason, if nothing else."""
+    try:
+        given = json.loads(request.payload or b"{}")
+    except (ValueError, RecursionError):
+        given = None
+    if not isinstance(given, dict):
+        try:
+            message: Any = messages.parse(COMMANDS["estop"], request.payload or b"", _encoding(request))
+        except messages.BadPayload:
+            return EmergencyStop()
+        given = {"why": message.why, "scope": message.scope}
+    why = given.get("why")
+    return EmergencyStop(_why(why) if isinstance(why, str) else "", given.get("scope") == "fleet")
+
+
+def _filled(blank: Command, request: Request) -> Command:
+    verb = blank.verb
+    try:
+        message: Any = messages.parse(COMMANDS[verb], request.payload or b"", _encoding(request))
+    except messages.BadPayload as error:
+        raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", blank) from None
+    command = blank
+    try:
+        command = replace(command, id=_text("id", message.id) or blank.id)
+        command = replace(command, sender=Sender(_text("sender", message.sender, "/*$#?") or "anonymous"))
+        kind: Kind = _word("kind", message.kind or Kind.SCRIPT, Kind)
+        command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
+        ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
+        what = _drive(message, request.longest_drive_s) if verb == "drive" else _WHAT[verb](message)
+    except (ValueError, EncodeError) as error:
+        raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", command) from None
+    return replace(
+        command,
+        what=what,
+        age_s=_age_s(message, request),
+        ttl_s=ttl_s if ttl_s is not None else _DRIVE_TTL_S if verb == "drive" else _TTL_S,
+    )
+
+
+def _encoding(request: Request) -> str:
+    if request.payload:
+        return request.encoding
+    return PROTOBUF  # zero bytes are a message without fields
+
+
+def _age_s(message: Any, request: Request) -> float | None:
+    """Return the seconds since it was asked, None if unknown; a clock that is ahead of ours gives 0, not a bonus."""
+    if message.HasField("asked"):
+        asked_ns = message.asked.seconds * 1_000_000_000 + message.asked.nanos
+    elif request.sampled_ns is not None:
+        asked_ns = request.sampled_ns
+    else:
+        return None
+    age_ns: int = request.now_ns - asked_ns
+    return max(0.0, age_ns / 1e9)
+
+
+def _text(field: str, value: str, forbidden: str = "") -> str:
+    """A name as it goes into states and files; a sender's also stands in the key of its token."""
+    if set(value) & set(forbidden):
+        raise ValueError(f"{field} {value!r} is not allowed: none of {' '.join(forbidden)} may be in it")
+    if not value.isprintable():
+        raise ValueError(f"{field} {value!r} is not allowed: no control characters")
+    if len(value) > LONGEST_NAME:
+        raise ValueError(f"{field} of {len(value)} characters is too long: at most {LONGEST_NAME}")
+    return value
+
+
+def _word(field: str, value: str, kind: Any) -> Any:
+    try:
+        return kind(value)
+    except ValueError:
+        given = f"{field} {value!r}" if value else f"no {field} given"
+        raise ValueError(f"{given}: allowed are {', '.join(kind)}") from None
+
+
+def _seconds(field: str, value: float, top: float) -> float:
+    if not (math.isfinite(value) and 0 < value <= top):
+        raise ValueError(f"{field} {value:g}: allowed are more than 0 and at most {top:g} s")
+    return value
+
+
+def _drive(message: Any, longest_s: float) -> What:
+    duration_s = 0.5
+    if message.HasField("duration_s"):
+        duration_s = _seconds("duration_s", message.duration_s, longest_s)
+    return Drive(_word("motion", message.motion, Motion), duration_s)
+
+
+def _mode(message: Any) -> What:
+    return SetMode(_word("mode", message.mode, Mode))
+
+
+def _led(message: Any) -> What:
+    missing = [name for name in "rgb" if not message.HasField(name)]
+    if missing:
+        raise ValueError(f"no {', '.join(missing)} given: r, g and b are needed, 0..255 each")
+    return _checked(ColorLed(message.r, message.g, message.b))
+
+
+def _light(message: Any) -> What:
+    return Act(General(Motion.STOP, light=_word("light", message.light, Light)))
+
+
+_SERVO_ACTIONS: Final = {
+    "front": ("left", "right", "reset"),
+    "vertical": ("up", "down", "reset"),
+    "horizontal": ("left", "right", "reset"),
+}
+
+
+def _servo(message: Any) -> What:
+    servo = message.servo or "front"
+    if servo not in _SERVO_ACTIONS:
+        raise ValueError(f"servo {servo!r}: allowed are {', '.join(_SERVO_ACTIONS)}")
+    if message.HasField("deg"):
+        if servo != "front" or message.action:
+            raise ValueError("deg: only the front servo takes degrees, and no action beside them")
+        return _checked(Ptz(message.deg))
+    if message.action not in _SERVO_ACTIONS[servo]:
+        raise ValueError(
+            f"action {message.action!r} of servo {servo}: allowed are {', '.join(_SERVO_ACTIONS[servo])}"
+            + (", or deg 0..180" if servo == "front" else "")
+        )
+    return Act(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
+
+
+def _arm(message: Any) -> What:
+    return _checked(ArmSet(tuple(message.joint_deg)))
+
+
+def _fan(message: Any) -> What:
+    if message.state not in ("", "on", "off"):
+        raise ValueError(f"state {message.state!r}: allowed are on, off, or none to toggle")
+    return Fan(None if not message.state else message.state == "on")
+
+
+def _estop(message: Any) -> What:
+    if message.scope not in ("", "car", "fleet"):
+        raise ValueError(f"scope {message.scope!r}: allowed are car (the default) and fleet")
+    return EmergencyStop(_why(message.why), message.scope == "fleet")
+
+
+def _why(text: str) -> str:
+    return "".join(each if each.isprintable() else " " for each in text)[:LONGEST_WHY]
+
+
+def _checked(frame: ColorLed | Ptz | ArmSet) -> Act:
+    encode(frame)  # raises EncodeError with the field and its range
+    return Act(frame)
+
+
+_WHAT: Final[dict[str, Callable[[Any], What]]] = {
+    "mode": _mode,
+    "led": _led,
+    "light": _light,
+    "servo": _servo,
+    "arm": _arm,
+    "whistle": lambda _: Act(General(Motion.STOP, whistle=True)),
+    "speed": lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
+    "fan": _fan,
+    "stop": lambda _: Stop(),
+    "estop": _estop,
+    "resume": lambda message: Resume(tuple(message.ids)),
+    "lease": lambda message: TakeLease(message.release),
+    "find": lambda _: Find(),
+}

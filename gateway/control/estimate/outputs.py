@@ -1,0 +1,57 @@
+"""What the gateway believes of the car from the frames that it wrote: motion, speed, fan, servo, LED. Estimates all.
+
+The car confirms none of it; its mode, of which readings give evidence, is in mode.py.
+"""
+
+from dataclasses import dataclass, field
+
+from gateway.protocol.enums import Motion
+from gateway.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
+from gateway.protocol.platforms import Profile
+
+
+@dataclass(slots=True)
+class Believed:
+    """The sum of what was written since the link came up. Times are seconds on one monotonic clock."""
+
+    profile: Profile
+    motion: Motion = Motion.STOP
+    """The last that was sent."""
+    repeat: bool = False
+    """The motion changed, and was not sent again alone yet (protocol.md: the 1.1 s rule)."""
+    fan: bool | None = None
+    fan_at: float = float("-inf")
+    """When the fan was last toggled."""
+    servo_deg: int | None = None
+    led: ColorLed = field(default_factory=lambda: ColorLed(0, 0, 0))
+    speed: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.speed = self.profile.speed.start
+
+    def wrote(self, frame: Frame, now: float) -> None:
+        """A frame went out whole."""
+        match frame:
+            case General():
+                if frame.motion is not Motion.STOP:
+                    self.repeat = self.repeat or frame.motion is not self.motion
+                self.motion = frame.motion
+                if frame.speed is not None:
+                    self.speed = self.profile.speed.step(self.speed, frame.speed)
+                if frame.fan:
+                    self.fan = None if self.fan is None else not self.fan
+                    self.fan_at = now
+            case ModeClose():
+                self.motion = Motion.STOP
+            case Ptz(deg):
+                self.servo_deg = deg
+            case ColorLed():
+                self.led = frame
+            case _:
+                pass
+
+    def with_motion(self, frame: Frame) -> Frame:
+        """Every general frame carries a motion: the one that holds now."""
+        if not isinstance(frame, General):
+            return frame
+        return General(self.motion, frame.whistle, frame.speed, frame.servo, frame.sing, frame.light, frame.fan)

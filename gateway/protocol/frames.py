@@ -1,0 +1,193 @@
+"""Frames to the car: one value per frame of the table, to bytes and back.
+
+Whether a particular car knows a frame is not decided here (see `profile`), nor when it may be sent.
+"""
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, TypeVar
+
+from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+
+ARM_JOINTS: Final = 6
+DEG_MAX: Final = 180  # protocol.md, named frames: PTZ and joints 0..180 degrees
+COLOR_MAX: Final = 255  # protocol.md, named frames: colour LED 0..255 each
+
+
+class EncodeError(ValueError):
+    """A value that the table does not allow; the words name the field, the value and the range."""
+
+
+@dataclass(frozen=True, slots=True)
+class General:
+    """The nine-field frame. It always carries a motion: the default, stop, stops the car.
+
+    All but `motion` are one-shot: sent again they act again (the fan toggles, speed climbs).
+    """
+
+    motion: Motion
+    whistle: bool = False
+    speed: SpeedStep | None = None
+    servo: ServoAction | None = None
+    sing: bool = False
+    light: Light | None = None
+    fan: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Ptz:
+    """The front servo, 0..180 degrees; observed: the car drives its servo to 180 - deg."""
+
+    deg: int
+
+
+@dataclass(frozen=True, slots=True)
+class ColorLed:
+    """The colour LED, 0..255 each."""
+
+    r: int
+    g: int
+    b: int
+
+
+@dataclass(frozen=True, slots=True)
+class ModeOpen:
+    """Enter a mode; `Mode.MANUAL` (`MODE01`) is refused."""
+
+    mode: Mode
+
+
+@dataclass(frozen=True, slots=True)
+class ModeClose:
+    """Stop the motors and return to mode 0; `Mode.MANUAL` (`MODE00`) closes whatever is open."""
+
+    mode: Mode = Mode.MANUAL
+
+
+@dataclass(frozen=True, slots=True)
+class ArmSet:
+    """The six joints of an arm, 0..180 degrees each."""
+
+    joint_deg: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """A lone `#`: ends a half frame in the car's buffer; with nothing pending it is a stop in mode 0."""
+
+
+_Word = TypeVar("_Word", bound=StrEnum)
+Frame = General | Ptz | ColorLed | ModeOpen | ModeClose | ArmSet | Reset
+
+
+def encode(frame: Frame) -> bytes:
+    """The bytes of a frame; raises EncodeError for a value that the table does not allow."""
+    match frame:
+        case General():
+            return _general(frame)
+        case Ptz(deg):
+            return b"$4WD,PTZ%d#" % _ranged("deg", deg, DEG_MAX)
+        case ColorLed(r, g, b):
+            rgb = (_ranged("r", r, COLOR_MAX), _ranged("g", g, COLOR_MAX), _ranged("b", b, COLOR_MAX))
+            return b"$4WD,CLR%d,CLG%d,CLB%d#" % rgb
+        case ModeOpen(mode):
+            digit = _member("mode", mode, Mode).digit
+            if not digit:
+                raise EncodeError("mode: 'manual' cannot be opened (MODE01); allowed are the other six, or close it")
+            return b"$4WD,MODE%d1#" % digit
+        case ModeClose(mode):
+            return b"$4WD,MODE%d0#" % _member("mode", mode, Mode).digit
+        case ArmSet(joints):
+            if len(joints) != ARM_JOINTS:
+                raise EncodeError(f"joint_deg: {len(joints)} values, allowed are {ARM_JOINTS}, each 0..{DEG_MAX}")
+            degs = tuple(_ranged(f"joint_deg[{i}]", deg, DEG_MAX) for i, deg in enumerate(joints))
+            return b"$4WD,ServoJ1%d,J2%d,J3%d,J4%d,J5%d,J6%d#" % degs
+        case Reset():
+            return b"#"
+
+
+def parse_sent(data: bytes) -> Frame | None:
+    """The frame that these bytes are, or None if they are not one whole frame of the table.
+
+    Rotation wins over place 1, as in the car. None also for what a `Frame` cannot say: MODE01, and a servo moved
+    (place 5) and reset (place 9) at once.
+    """
+    if data == b"#":
+        return Reset()
+    if found := _GENERAL.fullmatch(data):
+        return _parse_general(*map(int, found.groups()))
+    if found := _NAMED.fullmatch(data):
+        frame = _parse_named({name: int(text) for name, text in found.groupdict().items() if text is not None})
+        try:
+            encode(frame)
+        except EncodeError:
+            return None
+        return frame
+    return None
+
+
+def _general(frame: General) -> bytes:
+    run, spin = _member("motion", frame.motion, Motion).digits
+    speed = 0 if frame.speed is None else _member("speed", frame.speed, SpeedStep).digit
+    servo, reset = (0, 0) if frame.servo is None else _member("servo", frame.servo, ServoAction).digits
+    light = 0 if frame.light is None else _member("light", frame.light, Light).digit
+    places = (run, spin, bool(frame.whistle), speed, servo, bool(frame.sing), light, bool(frame.fan), reset)
+    return b"$%d,%d,%d,%d,%d,%d,%d,%d,%d#" % places
+
+
+def _ranged(field: str, value: int, top: int) -> int:
+    if type(value) is not int or not 0 <= value <= top:
+        raise EncodeError(f"{field}: {value!r}, allowed are whole numbers 0..{top}")
+    return value
+
+
+def _member(field: str, value: _Word, kind: type[_Word]) -> _Word:
+    if not isinstance(value, kind):
+        raise EncodeError(f"{field}: {value!r}, allowed are {', '.join(kind)}")
+    return value
+
+
+def _parse_general(
+    run: int, spin: int, whistle: int, speed: int, servo: int, sing: int, light: int, fan: int, reset: int
+) -> General | None:
+    if servo and reset:
+        return None
+    return General(
+        motion=_MOTION_AT[(0, spin) if spin else (run, 0)],
+        whistle=bool(whistle),
+        speed=_SPEED_AT.get(speed),
+        servo=_SERVO_AT.get((servo, reset)),
+        sing=bool(sing),
+        light=_LIGHT_AT.get(light),
+        fan=bool(fan),
+    )
+
+
+def _parse_named(value: dict[str, int]) -> Frame:
+    if "deg" in value:
+        return Ptz(value["deg"])
+    if "r" in value:
+        return ColorLed(value["r"], value["g"], value["b"])
+    if "mode" in value:
+        mode = _MODE_AT[value["mode"]]
+        return ModeOpen(mode) if value["open"] else ModeClose(mode)
+    return ArmSet(tuple(value[f"j{joint}"] for joint in range(1, ARM_JOINTS + 1)))
+
+
+_MOTION_AT = {motion.digits: motion for motion in Motion}
+_SPEED_AT = {step.digit: step for step in SpeedStep}
+_SERVO_AT = {action.digits: action for action in ServoAction}
+_LIGHT_AT = {light.digit: light for light in Light}
+_MODE_AT = {mode.digit: mode for mode in Mode}
+
+# protocol.md, general frame: nine one-digit fields, always all nine
+_GENERAL = re.compile(rb"\$([0-4]),([0-2]),([01]),([0-2]),([0-8]),([01]),([0-8]),([01]),([01])#")
+# protocol.md, named frames
+_NAMED = re.compile(
+    rb"\$4WD,(?:PTZ(?P<deg>\d{1,3})"
+    rb"|CLR(?P<r>\d{1,3}),CLG(?P<g>\d{1,3}),CLB(?P<b>\d{1,3})"
+    rb"|MODE(?P<mode>[0-6])(?P<open>[01])"
+    rb"|ServoJ1(?P<j1>\d{1,3}),J2(?P<j2>\d{1,3}),J3(?P<j3>\d{1,3}),J4(?P<j4>\d{1,3}),J5(?P<j5>\d{1,3}),J6(?P<j6>\d{1,3})"
+    rb")#"
+)

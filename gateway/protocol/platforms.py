@@ -1,0 +1,350 @@
+"""What each kind of car knows, how it is stopped, and which of its readings are measured.
+
+Every number cites its row of protocol.md; the times are in `timing`. When to send is not decided here (see `control`).
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+from typing import Final
+
+from gateway.protocol.enums import Light, Mode, ServoAction, SpeedStep
+from gateway.protocol.events import Sensors
+from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
+from gateway.protocol.timing import MODE_TURN_S, RASPBERRY_PI_FAN_S, RATE_HZ, block_s
+
+
+class Platform(StrEnum):
+    """The programs that run on the cars."""
+
+    ARDUINO = "arduino"
+    STM32 = "stm32"
+    RASPBERRY_PI = "raspberry_pi"
+    UNKNOWN = "unknown"
+
+
+class StopStyle(StrEnum):
+    """Which of the stop recipes (protocol.md, stopping) a car gets."""
+
+    MODE_FRAME = "mode_frame"
+    RASPBERRY_PI = "raspberry_pi"
+    UNKNOWN = "unknown"
+
+
+OPTIONS: Final = frozenset({"arm", "imu"})
+
+# observed placeholders: what each mode's frame measures
+_ALL: Final = frozenset({"range", "battery", "grayscale", "line", "obstacle", "light"})
+_MEASURED: Final = {
+    Mode.TRACKING: frozenset({"line"}),
+    Mode.LIGHT_SEEKING: frozenset({"light"}),
+    Mode.FOLLOWING: frozenset({"obstacle"}),
+}
+
+_FRONT: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
+_VERTICAL: Final = frozenset({ServoAction.VERTICAL_UP, ServoAction.VERTICAL_DOWN, ServoAction.VERTICAL_RESET})
+_HORIZONTAL: Final = frozenset(
+    {ServoAction.HORIZONTAL_LEFT, ServoAction.HORIZONTAL_RIGHT, ServoAction.HORIZONTAL_RESET}
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedModel:
+    """Speed as the gateway estimates it: in the car's own unit, known only by counting steps."""
+
+    start: float
+    increment: float
+    low: float  # a step down that would end below this ends at `rebound`
+    rebound: float
+    top: float
+
+    def step(self, value: float, step: SpeedStep) -> float:
+        """The value after one step."""
+        if step is SpeedStep.UP:
+            return min(value + self.increment, self.top)
+        lower = value - self.increment
+        return lower if lower >= self.low else self.rebound
+
+    def fraction(self, value: float) -> float:
+        """The value as 0..1 of the greatest."""
+        return min(max(value / self.top, 0.0), 1.0)
+
+
+# platforms: speed. Arduino 150 of 255, +-50, ceiling 255, a step that would end below 50 becomes 100
+ARDUINO_SPEED: Final = SpeedModel(start=150, increment=50, low=50, rebound=100, top=255)
+# platforms: speed. Raspberry Pi +-20 in 20..100 %; no row gives the start: half of full speed is assumed
+RASPBERRY_PI_SPEED: Final = SpeedModel(start=50, increment=20, low=20, rebound=20, top=100)
+
+# platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimetres
+_PI_VOLTAGE_V, _PI_GRAYSCALE = 8.4, 0
+_CONSTANTS: Final = (("battery", _PI_VOLTAGE_V), ("grayscale", float(_PI_GRAYSCALE)))
+
+
+_FIELDS: Final = {
+    "range": "range_cm",
+    "battery": "voltage_v",
+    "grayscale": "grayscale",
+    "line": "line",
+    "obstacle": "obstacle",
+    "light": "light",
+}
+"""Where a sensors frame has them."""
+
+
+@cache
+def _sure(candidates: tuple[Mode, ...]) -> frozenset[str]:
+    """What is measured whichever of these modes a frame comes from."""
+    sure = frozenset.intersection(*(_MEASURED.get(candidate, _ALL) for candidate in candidates))
+    if len(candidates) > 1 and Mode.FOLLOWING in candidates:
+        return sure - {"obstacle"}  # inverted in one of them
+    return sure
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """One kind of car: protocol.md's table of platforms, one column."""
+
+    kind: Platform
+    options: frozenset[str]
+    modes: frozenset[Mode]
+    capabilities: frozenset[str]
+    lights: frozenset[Light]
+    servos: frozenset[ServoAction]
+    stop_style: StopStyle
+    speed: SpeedModel
+    constants: tuple[tuple[str, float], ...] = ()  # readings that are constants of the platform in mode 0
+    not_observed: tuple[str, ...] = ()  # what is only read or assumed, in words
+
+    @property
+    def name(self) -> str:
+        """As `parse_platform` takes it."""
+        return "+".join((self.kind, *sorted(self.options)))
+
+    @property
+    def observed(self) -> bool:
+        """Whether all of this profile was observed on a running program."""
+        return not self.not_observed
+
+    @property
+    def silent_modes(self) -> frozenset[Mode]:
+        """The modes in which this car sends no readings (observed placeholders: 1, 3, 4 silent)."""
+        return self.modes & {Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED}
+
+    @property
+    def possible_modes(self) -> frozenset[Mode]:
+        """The modes that this car may be in, whoever brought it there; any, if its platform is not known."""
+        return frozenset(Mode) if self.kind is Platform.UNKNOWN else self.modes
+
+    @property
+    def fan_silences(self) -> bool:
+        """Whether it may send no readings while its fan runs (hazards: the fan on; Raspberry Pi: it blocks 1 s)."""
+        return self.kind is not Platform.RASPBERRY_PI
+
+    def refusal(self, frame: Frame) -> str | None:
+        """Why this frame is never sent to this car, in words for a person; None if the car knows it."""
+        match frame:
+            case General():
+                return self._general_refusal(frame)
+            case Ptz():
+                return self._unless("servo_deg", "the pan/tilt frame (a servo angle in degrees)")
+            case ColorLed():
+                return self._unless("led", "the colour LED frame")
+            case ModeOpen(mode):
+                if mode in self.modes and mode is not Mode.MANUAL:
+                    return None
+                return f"mode {mode} cannot be opened on {self._these}: {self._known(self.modes - {Mode.MANUAL})}"
+            case ModeClose(mode):
+                if "mode" in self.capabilities or (self.kind is Platform.UNKNOWN and mode is Mode.MANUAL):
+                    return None
+                return f"{self._these} are not known to obey the frame that closes mode {mode}"
+            case ArmSet():
+                return self._unless("arm", "the arm frame (an option: +arm)")
+            case Reset():
+                # hazards of the Raspberry Pi programs: a lone `#` is never sent to this platform
+                return self._unless("mode", "a lone '#'")
+
+    def block_s(self, frame: Frame) -> float:
+        """How long the car may be blocked after this frame, seconds (see `timing.block_s`)."""
+        slow_fan = self.kind in {Platform.RASPBERRY_PI, Platform.UNKNOWN}
+        return block_s(frame, fan_s=RASPBERRY_PI_FAN_S if slow_fan else 0.0)
+
+    def mode_turn_s(self, mode: Mode) -> float:
+        """The longest block of one turn of this mode's own loop, during which nothing is obeyed."""
+        return MODE_TURN_S[mode]
+
+    def rate_hz(self, mode: Mode) -> float:
+        """Sensors frames per second at most; 0 in a silent mode."""
+        return RATE_HZ.get(mode, 0.0)
+
+    def resolved(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
+        """The modes this frame may come from.
+
+        `mode`, the confirmed one, chooses among the candidates; a frame of none but other modes may be one of `mode`
+        with a byte damaged, until three of them have contradicted it.
+        """
+        candidates = event.candidates
+        if mode is None:
+            return candidates
+        return (mode,) if mode in candidates else (*candidates, mode)
+
+    def measured(self, event: Sensors, mode: Mode | None = None) -> frozenset[str]:
+        """Which of range, battery, grayscale, line, obstacle, light are measurements here, in every candidate mode.
+
+        The frame's text decides first; `mode` is the confirmed mode, or None (see `resolved`).
+        A rejected field is never measured. No echo is: it is the range's business to say so.
+        """
+        there = {name for name in _sure(self.resolved(event, mode)) if getattr(event, _FIELDS[name]) is not None}
+        if self.constants and self._may_be_constant(event):
+            there -= {name for name, value in self.constants if getattr(event, _FIELDS[name]) == value}
+        return frozenset(there)
+
+    def measurable(self, mode: Mode) -> frozenset[str]:
+        """What a car of this kind can ever measure in this mode; constants of the platform are no measurements."""
+        if mode not in self.modes or mode in self.silent_modes:
+            return frozenset()
+        if mode is not Mode.MANUAL:
+            return _MEASURED[mode]
+        return (_ALL | (self.options & OPTIONS)) - {name for name, _ in self.constants}
+
+    def obstacle(self, event: Sensors, mode: Mode | None = None) -> tuple[bool, bool] | None:
+        """Obstacle left, right, with the inversion of following undone; None if it is not measured here."""
+        if event.obstacle is None or "obstacle" not in self.measured(event, mode):
+            return None
+        left, right = event.obstacle
+        # observed placeholders, mode 6: HW inverted, 0 = object seen
+        return (not left, not right) if self.resolved(event, mode) == (Mode.FOLLOWING,) else (left, right)
+
+    def contradictions(self, event: Sensors) -> tuple[str, ...]:
+        """What in this frame speaks against this platform, in words; empty is no proof of it."""
+        if self.kind is Platform.UNKNOWN:
+            return ()
+        candidates = event.candidates
+        found: list[str] = []
+        if self.modes.isdisjoint(candidates):
+            found.append(f"a reading of mode {' or '.join(candidates)}, which {self._these} do not have")
+        if candidates != (Mode.MANUAL,):
+            return tuple(found)
+        if self.kind is Platform.RASPBERRY_PI:
+            if not _whole_cm(event):
+                found.append("decimals in CSB; a raspberry_pi car sends whole centimetres")
+            if event.voltage_v not in {None, _PI_VOLTAGE_V}:
+                found.append("PV is not 8.4, the constant of a raspberry_pi car")
+            if event.grayscale not in {None, _PI_GRAYSCALE}:
+                found.append("GS is not 0, the constant of a raspberry_pi car")
+            return tuple(found)
+        if _pi_constants(event):
+            found.append("PV8.4 and GS0, the constants of a raspberry_pi car")
+        if self.kind is Platform.ARDUINO and _whole_cm(event):
+            found.append("whole centimetres in CSB; an arduino car sends decimals in mode 0")
+        return tuple(found)
+
+    def _may_be_constant(self, event: Sensors) -> bool:
+        return self.kind is not Platform.UNKNOWN or (_whole_cm(event) and _pi_constants(event))
+
+    def _general_refusal(self, frame: General) -> str | None:
+        if frame.sing:
+            return "sing is not supported by any car (the table: temporarily not supported)"
+        if frame.servo and frame.servo not in self.servos:
+            return f"servo action {frame.servo} is not known to {self._these}: {self._known(self.servos)}"
+        if frame.light and frame.light not in self.lights:
+            return f"light {frame.light} is not known to {self._these}: {self._known(self.lights)}"
+        return None
+
+    def _unless(self, capability: str, what: str) -> str | None:
+        return None if capability in self.capabilities else f"{self._these} do not know {what}"
+
+    @property
+    def _these(self) -> str:
+        return "cars of an unknown platform" if self.kind is Platform.UNKNOWN else f"{self.name} cars"
+
+    @staticmethod
+    def _known(words: frozenset[Light] | frozenset[Mode] | frozenset[ServoAction]) -> str:
+        return f"they know {', '.join(sorted(words))}" if words else "they know none"
+
+
+AUTO: Final = "auto"
+
+
+def parse_told(text: str) -> tuple[Profile, bool]:
+    """As `parse_platform`, and whether to find out: `auto` begins as `unknown`, and settles on what the bytes show."""
+    auto = text.partition("+")[0] == AUTO
+    try:
+        return parse_platform(text.replace(AUTO, Platform.UNKNOWN, 1) if auto else text), auto
+    except ValueError as error:
+        raise ValueError(f"{error}; or auto, to find out") from None
+
+
+def parse_platform(text: str) -> Profile:
+    """The profile of `arduino`, `stm32`, `raspberry_pi` or `unknown`, with `+arm` and `+imu`; else ValueError."""
+    kind, *options = text.split("+")
+    allowed = f"allowed are {', '.join(Platform)}, each with +arm, +imu or both"
+    if kind not in set(Platform):
+        raise ValueError(f"platform {text!r}: {kind!r} is not known, {allowed}")
+    for option in options:
+        if option not in OPTIONS:
+            raise ValueError(f"platform {text!r}: option {option!r} is not known, {allowed}")
+    return _profile(Platform(kind), frozenset(options))
+
+
+# protocol.md, the table of platforms
+_EVERY_CAR: Final = frozenset({"drive", "whistle", "speed", "servo", "fan", "light"})
+_MODE_CAR: Final = _EVERY_CAR | {"servo_deg", "led", "mode"}
+_PI_CAR: Final = _EVERY_CAR | {"servo_deg", "led", "servo_vertical", "servo_horizontal"}
+_ALL_MODES: Final = frozenset(Mode)
+_MODE_0: Final = frozenset({Mode.MANUAL})
+_ALL_LIGHTS: Final = frozenset(Light)
+_LIGHTS_2_TO_4: Final = frozenset({Light.RED, Light.GREEN, Light.BLUE})
+
+
+def _profile(kind: Platform, options: frozenset[str]) -> Profile:
+    match kind:
+        case Platform.ARDUINO:
+            return Profile(
+                kind, options, _ALL_MODES, _MODE_CAR | options, _ALL_LIGHTS, _FRONT, StopStyle.MODE_FRAME, ARDUINO_SPEED
+            )
+        case Platform.STM32:
+            return Profile(
+                kind,
+                options,
+                _ALL_MODES,
+                _MODE_CAR | options,
+                _ALL_LIGHTS,
+                _FRONT,
+                StopStyle.MODE_FRAME,
+                ARDUINO_SPEED,
+                not_observed=("the program was read, not run", "constants in mode 0: as arduino", "speed: as arduino"),
+            )
+        case Platform.RASPBERRY_PI:
+            return Profile(
+                kind,
+                options,
+                _MODE_0,
+                _PI_CAR | options,
+                _LIGHTS_2_TO_4,
+                _FRONT | _VERTICAL | _HORIZONTAL,
+                StopStyle.RASPBERRY_PI,
+                RASPBERRY_PI_SPEED,
+                constants=_CONSTANTS,
+                not_observed=("the speed at the start",),
+            )
+        case Platform.UNKNOWN:
+            return Profile(
+                kind,
+                options,
+                _MODE_0,
+                _EVERY_CAR | options,
+                _LIGHTS_2_TO_4,
+                _FRONT,
+                StopStyle.UNKNOWN,
+                ARDUINO_SPEED,
+                constants=_CONSTANTS,
+                not_observed=("only what every known platform has is used",),
+            )
+
+
+def _whole_cm(event: Sensors) -> bool:
+    return b"." not in event.raw.partition(b",PV")[0]
+
+
+def _pi_constants(event: Sensors) -> bool:
+    return b",PV8.4,GS0," in event.raw

@@ -1,0 +1,125 @@
+"""What a user writes to describe a car, simulated or replayed: words checked, one-line errors, nothing opened. Pure."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from gateway.sim.model.factory import OPTIONS, PLATFORMS
+from schemas import keys
+
+_TCP: Final = re.compile(r"tcp(?:://(?P<host>\[[^\]]+\]|[^:/\[\]]+):(?P<port>\d{1,5}))?")
+_REPLAY: Final = re.compile(r"(?P<file>.+?)(?::(?P<name>[a-z0-9_-]+)(?::(?P<link>(?:pty|tcp)(?::.*)?))?)?")
+
+
+class BadSpec(ValueError):
+    """A description that is not allowed; its text names what, where and what is."""
+
+
+@dataclass(frozen=True, slots=True)
+class PtyLink:
+    """A pseudo terminal; `path`: a symlink to it that stays the same when the link comes back."""
+
+    path: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TcpLink:
+    """A listening TCP port; 0 lets the system choose."""
+
+    host: str = "127.0.0.1"
+    port: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CarSpec:
+    """One simulated car."""
+
+    name: str
+    platform: str
+    options: frozenset[str]
+    link: PtyLink | TcpLink
+
+    @property
+    def platform_words(self) -> str:
+        """The platform with its options, as the user writes it."""
+        return "+".join((self.platform, *sorted(self.options)))
+
+
+@dataclass(frozen=True, slots=True)
+class ReplaySpec:
+    """A file that `gateway monitor --raw` kept, as a car."""
+
+    name: str
+    path: str
+    link: PtyLink | TcpLink
+
+
+def parse_car(text: str) -> CarSpec:
+    """NAME:PLATFORM[+OPTION...]:LINK; raises BadSpec."""
+    parts = text.split(":", 2)
+    if len(parts) != 3:
+        raise BadSpec(f"car {text!r} is not allowed: write NAME:PLATFORM:LINK, for example red:arduino:pty")
+    name, platform_words, link = parts
+    try:
+        keys.check_name(name)
+    except keys.BadKey as error:
+        raise BadSpec(f"car {text!r}: {error}") from None
+    platform, *options = platform_words.split("+")
+    if platform not in PLATFORMS:
+        raise BadSpec(f"car {text!r}: platform {platform!r} is not allowed: use {', '.join(PLATFORMS)}")
+    for option in options:
+        if option not in OPTIONS:
+            allowed = ", ".join(f"+{word}" for word in OPTIONS)
+            raise BadSpec(f"car {text!r}: option '+{option}' is not allowed: use {allowed} or none")
+    return CarSpec(name, platform, frozenset(options), _parse_link(f"car {text!r}", link))
+
+
+def parse_replay(text: str) -> ReplaySpec:
+    """FILE[:NAME[:LINK]]; the name is `replay` and the link a pty if they are left out. Raises BadSpec."""
+    match = _REPLAY.fullmatch(text)
+    if match is None:
+        raise BadSpec(f"replay {text!r} is not allowed: write FILE[:NAME[:LINK]], for example red.raw:red:tcp")
+    name = match["name"] or "replay"
+    try:
+        keys.check_name(name)
+    except keys.BadKey as error:
+        raise BadSpec(f"replay {text!r}: {error}") from None
+    return ReplaySpec(name, match["file"], _parse_link(f"replay {text!r}", match["link"] or "pty"))
+
+
+def _parse_link(what: str, link: str) -> PtyLink | TcpLink:
+    if link == "pty":
+        return PtyLink()
+    if link.startswith("pty:") and len(link) > 4:
+        return PtyLink(link[4:])
+    match = _TCP.fullmatch(link)
+    if match and match["host"] is None:
+        return TcpLink()
+    if match and int(match["port"]) < 65536:
+        return TcpLink(match["host"].strip("[]"), int(match["port"]))
+    raise BadSpec(
+        f"{what}: link {link!r} is not allowed: use pty, pty:PATH (a symlink is made there) or "
+        "tcp://HOST:PORT with port 0 to 65535 (0: any free one)"
+    )
+
+
+def parse_cars(texts: Sequence[str]) -> list[CarSpec]:
+    """Several cars; raises BadSpec also for two of one name, port or path."""
+    cars = [parse_car(text) for text in texts]
+    refuse_twins(cars)
+    return cars
+
+
+def refuse_twins(cars: Sequence[CarSpec | ReplaySpec]) -> None:
+    """Raises BadSpec for two cars of one name, port or path."""
+    _refuse("name", [car.name for car in cars])
+    _refuse("path", [car.link.path for car in cars if isinstance(car.link, PtyLink) and car.link.path])
+    tcp = [car.link for car in cars if isinstance(car.link, TcpLink)]
+    _refuse("port", [f"{link.host}:{link.port}" for link in tcp if link.port])
+
+
+def _refuse(what: str, values: list[str]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise BadSpec(f"two cars have the {what} {value}: give each its own")

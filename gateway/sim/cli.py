@@ -1,0 +1,279 @@
+"""`gateway sim`: arguments, the line per car, what is scheduled on the command line, a clean end.
+
+What comes in on stdin while it runs is channel.py's part.
+"""
+
+import argparse
+import asyncio
+import math
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from gateway import capture
+from gateway.sim.car_spec import BadSpec, CarSpec, ReplaySpec, parse_cars, parse_replay, refuse_twins
+from gateway.sim.control_channel import obey, say
+from gateway.sim.endpoints import LinkError, Taken
+from gateway.sim.faults import Fault, Scheduled, parse_fault, parse_press, targets
+from gateway.sim.model.capture_car import Played
+from gateway.sim.model.world import World
+from gateway.sim.simulation import SimCar, Simulation
+from schemas import keys
+from schemas.process import signals
+
+WORLDS: Final = {"room": World.room, "open": World.open_field}
+PARENT_EVERY_S: Final = 0.1
+RATES: Final = (0.01, 100.0)
+
+EPILOG: Final = """\
+Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gateway run --link`. A link that comes back
+under another name is printed again: a plain pty after each link_drop; pty:PATH keeps its name.
+
+faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may be repeated):
+  --fault red:link_drop@5+2             gone for 2 s; without +2 until it is ended
+  --fault red:rename@5+2                comes back as another device: pty:PATH points to a new one, a plain pty and TCP
+                                        have a new link; ,path=/tmp/other: back at that path instead
+  --fault red:cut_write@5+2,bytes=7     of the next frame to the car 7 bytes come through, then the link is gone for 2 s
+  --fault red:slow@5+10,factor=0.1      both ways at a tenth of 960 bytes/s, byte by byte
+  --fault red:lossy@5+10,share=0.2      a fifth of the bytes is lost; ,to=car or ,to=host: one way only
+  --fault red:stuck@5+10                stops reading: writes block (pty), or pile up in the system's buffers (TCP)
+  --fault red:deaf@5+10                 takes what is written and drops it
+  --fault red:mute@5+10                 hears and obeys, nothing comes from it
+  --fault red:echo@5+10                 sends back all that comes, and obeys it
+  --fault red:firehose@5+10,rate=1e6    random bytes/s besides its readings; ,of=frame: a frame that never ends
+  --fault red:garbage@5+200             200 random bytes to the host; ,to=car: the other way
+  --fault brownout@10                   resets; without a name every car is hit
+faults on stdin, one JSON object a line, each answered by one line on stdout; "for_s": 0 ends what lasts (rename and
+cut_write end as link_drop does); without "for_s" it lasts until then:
+  {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}
+infrared remote, which only an Arduino or STM32 car in mode remote_control obeys; buttons: forward, back, left, right,
+spin_left, spin_right, stop, whistle, faster, slower; a motion holds until the next button:
+  --ir red:forward@5                    or on stdin {"car": "red", "ir": "forward"}
+worlds: lamps that light sensors see, things to bump into and to follow, cars that see each other and are in each
+other's way come from a file; deploy/world.follow.yaml has a comment for each field. On stdin:
+  {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (of a carried one: ahead, left)
+  {"thing": "cart", "x_m": 1, "y_m": 0} stays there, off its path; or "speed_m_s" along it
+what is so:
+  {"car": "red", "ask": "truth"}        mode, motors, pose, ...; of a replay: bytes sent and ignored, rounds
+  {"ask": "world"}                      every lamp and thing: where, whether it is on, how large, how fast
+replay: a file that `gateway monitor --raw` kept plays as a car, with its timing; what is written to it is ignored. Over
+TCP it begins when a host connects, over a pty at once:
+  gateway sim --replay red.raw:red:tcp --loop --rate 2
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `gateway sim`."""
+    parser.description = (
+        "Simulated cars that behave as the real ones do, hazards included, in one world and one process."
+    )
+    parser.epilog = EPILOG
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument(
+        "--car",
+        action="append",
+        default=[],
+        metavar="NAME:PLATFORM:LINK",
+        help="PLATFORM: arduino, stm32 or raspberry_pi, with +arm, +imu; LINK: pty, pty:PATH or tcp://HOST:PORT",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="same seed and same bytes: same behaviour (default: 0)")
+    parser.add_argument(
+        "--world",
+        metavar="WORLD",
+        default="room",
+        help="room: walls and a line to track; open: nothing, so no ranging has an echo; or a file with lamps, things "
+        "and cars that meet, such as deploy/world.follow.yaml (default: room)",
+    )
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="[CAR:]FAULT@S[+AMOUNT][,FIELD=VALUE]",
+        help="what happens S seconds after the start, see below",
+    )
+    parser.add_argument(
+        "--ir", action="append", default=[], metavar="[CAR:]BUTTON@S", help="a button of the infrared remote is pressed"
+    )
+    parser.add_argument(
+        "--replay",
+        action="append",
+        default=[],
+        metavar="FILE[:NAME[:LINK]]",
+        help="a capture as a car (default: replay, on a pty)",
+    )
+    parser.add_argument("--loop", action="store_true", help="play captures over and over, 1 s between two rounds")
+    parser.add_argument("--rate", type=float, metavar="FACTOR", help="play captures so many times as fast (default: 1)")
+    parser.add_argument("--fleet", default=keys.DEFAULT_FLEET, help="fleet that the truth is published under")
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", help="hub for the truth (default: FLEET_ENDPOINT, else loopback)"
+    )
+    parser.add_argument("--no-truth", action="store_true", help="publish nothing, use no bus")
+    parser.add_argument("--with-parent", action="store_true", help="end when the process that started this one ends")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run until SIGINT or SIGTERM; the exit code."""
+    try:
+        specs = parse_cars(args.car)
+        replays = [parse_replay(text) for text in args.replay]
+        everyone: list[CarSpec | ReplaySpec] = [*specs, *replays]
+        refuse_twins(everyone)
+        scheduled = [*map(parse_fault, args.fault), *map(parse_press, args.ir)]
+        for each in scheduled:
+            targets(everyone, each.act)
+        captures = _captures(replays, args)
+        world = _world(args.world, [spec.name for spec in specs])
+        keys.check_name(args.fleet, "fleet name")
+        endpoint = None if args.no_truth else _endpoint(args.connect)
+    except (BadSpec, keys.BadKey) as error:
+        return _fail(str(error), 2)
+    try:
+        asyncio.run(_serve(specs, captures, world, scheduled, args, endpoint))
+    except LinkError as error:
+        return _fail(str(error), 2 if isinstance(error, Taken) else 1)
+    return 0
+
+
+def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[tuple[ReplaySpec, Played]]:
+    """The files, read whole: what is wrong with one is said before anything is opened. Raises BadSpec."""
+    if not replays and not args.car:
+        raise BadSpec("nothing to simulate: give --car NAME:PLATFORM:LINK or --replay FILE")
+    if not replays and (args.loop or args.rate is not None):
+        raise BadSpec("--loop and --rate are for captures: give --replay FILE as well")
+    rate = 1.0 if args.rate is None else args.rate
+    if not math.isfinite(rate) or not RATES[0] <= rate <= RATES[1]:
+        raise BadSpec(f"rate {rate!r} is not allowed: a number from {RATES[0]:g} to {RATES[1]:g}")
+    found = []
+    for spec in replays:
+        try:
+            pieces = [(piece.at, piece.data) for piece in capture.read(Path(spec.path))]
+        except capture.BadCapture as error:
+            raise BadSpec(str(error)) from None
+        except OSError as error:
+            raise BadSpec(f"{spec.path}: {error.strerror}: write FILE[:NAME[:LINK]]") from None
+        except ValueError as error:  # a NUL in the path
+            raise BadSpec(f"{spec.path!r} is no path: {error}") from None
+        if not pieces:
+            raise BadSpec(f"{spec.path}: the capture has no bytes to play")
+        found.append((spec, Played(pieces, rate=rate, loop=args.loop)))
+    return found
+
+
+def _world(words: str, cars: list[str]) -> World:
+    """A world by its name or from its file. Raises BadSpec."""
+    if words in WORLDS:
+        return WORLDS[words]()
+    # YAML is read for a world file only: a simulator starts faster without it.
+    from gateway.sim.world_file import read_world
+    from gateway.sim.yaml_reader import LARGEST_BYTES, BadWorld
+
+    try:
+        if Path(words).exists() and not Path(words).is_file():  # a FIFO would be waited for
+            raise BadSpec(f"world {words}: is a directory, FIFO or device, not a file: save the text as a file")
+        with Path(words).open("rb") as file:
+            data = file.read(LARGEST_BYTES + 1)
+        text = data.decode("utf-8-sig", errors="strict" if len(data) <= LARGEST_BYTES else "replace")
+        return read_world(text, words, cars).world()
+    except OSError as error:
+        raise BadSpec(f"world {words}: {error.strerror}: write {', '.join(WORLDS)} or the path of a file") from None
+    except UnicodeDecodeError as error:
+        raise BadSpec(f"{words}: byte {error.start} is no UTF-8: save the file as UTF-8") from None
+    except BadWorld as error:
+        raise BadSpec(str(error)) from None
+    except ValueError as error:  # a NUL in the path
+        raise BadSpec(f"world {words!r} is no path: {error}") from None
+
+
+def _complain(words: str) -> None:
+    sys.stderr.write(f"gateway sim: {words}\n")
+
+
+def _fail(words: str, code: int) -> int:
+    _complain(words)
+    return code
+
+
+def _endpoint(argument: str | None) -> str:
+    from schemas.bus import BadEndpoint, resolve_endpoint
+
+    try:
+        return resolve_endpoint(argument)
+    except BadEndpoint as error:
+        raise BadSpec(str(error)) from None
+
+
+async def _serve(
+    specs: Sequence[CarSpec],
+    replays: Sequence[tuple[ReplaySpec, Played]],
+    world: World,
+    scheduled: Sequence[Scheduled],
+    args: argparse.Namespace,
+    endpoint: str | None,
+) -> None:
+    loop = asyncio.get_running_loop()
+    parent = os.getppid()
+    ended = asyncio.Event()
+    signals.calls_in(loop, lambda _: ended.set())
+    simulation = Simulation(specs, seed=args.seed, world=world, replays=replays)
+    for car in simulation.cars.values():
+        car.failed = lambda failed, error: _complain(f"car {failed.spec.name}: {error}")
+    await simulation.start()
+    tasks = [loop.create_task(_strike(simulation, each)) for each in scheduled]
+    if endpoint is not None:
+        from gateway.sim.truth_publisher import TruthPublisher
+
+        tasks.append(loop.create_task(TruthPublisher(simulation, endpoint, args.fleet, _complain).run()))
+    if args.with_parent:
+        tasks.append(loop.create_task(_watch_parent(parent, ended)))
+
+    def end(done: "asyncio.Task[None]") -> None:
+        if not done.cancelled() and done.exception() is not None:
+            ended.set()
+
+    for task in tasks:
+        task.add_done_callback(end)
+    try:
+        for car in simulation.cars.values():
+            _introduce(car)
+            car.moved, car.ended = _introduce, _take_leave
+        tasks.append(loop.create_task(obey(simulation)))
+        tasks[-1].add_done_callback(end)
+        await ended.wait()
+    finally:
+        for task in tasks:
+            task.cancel()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        await simulation.stop()
+    for failure in results:
+        if isinstance(failure, Exception):
+            raise failure
+
+
+def _introduce(car: SimCar) -> None:
+    if isinstance(car.spec, CarSpec):
+        say({"car": car.spec.name, "platform": car.spec.platform_words, "link": car.url})
+    else:
+        say({"car": car.spec.name, "replay": car.spec.path, "link": car.url})
+
+
+def _take_leave(car: SimCar) -> None:
+    say({"car": car.spec.name, "replay": "ended"})
+
+
+async def _strike(simulation: Simulation, scheduled: Scheduled) -> None:
+    await asyncio.sleep(scheduled.at_s)
+    if not isinstance(scheduled.act, Fault):
+        simulation.press(scheduled.act)
+        return
+    try:
+        await simulation.inflict(scheduled.act)
+    except LinkError as error:
+        _complain(str(error))
+
+
+async def _watch_parent(parent: int, ended: asyncio.Event) -> None:
+    while os.getppid() == parent:  # noqa: ASYNC110 - the system tells of a dead parent in no other portable way
+        await asyncio.sleep(PARENT_EVERY_S)
+    ended.set()

@@ -1,0 +1,126 @@
+"""The control channel of `gateway sim`: JSON objects on stdin, one a line, each answered by one line on stdout."""
+
+import asyncio
+import json
+import os
+import signal
+import sys
+import threading
+from typing import Final
+
+from gateway.sim.car_spec import BadSpec
+from gateway.sim.endpoints import LinkError
+from gateway.sim.faults import fault_of, press_of
+from gateway.sim.model.capture_car import Played
+from gateway.sim.simulation import Simulation
+from gateway.sim.world_commands import change_of
+from schemas.process import stdio
+
+LINE_LIMIT: Final = 65536
+
+
+def say(line: dict[str, object]) -> None:
+    """One line of JSON on stdout. Whoever reads may have gone, or the disk be full: the cars go on, without words."""
+    try:
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+    except OSError as error:
+        stdio.silence(sys.stdout)
+        if not isinstance(error, BrokenPipeError):  # whoever closed a pipe knows
+            sys.stderr.write(
+                f"gateway sim: stdout cannot be written ({error.strerror}): the cars go on, and no more is said there\n"
+            )
+
+
+async def obey(simulation: Simulation) -> None:
+    """Answer what comes on stdin, until cancelled."""
+    lines: asyncio.Queue[bytes] = asyncio.Queue()
+    threading.Thread(target=_read_lines, args=(asyncio.get_running_loop(), lines), daemon=True).start()
+    while True:
+        line = await lines.get()
+        if line.strip():
+            say(await _answer(simulation, line))
+
+
+def _read_lines(loop: asyncio.AbstractEventLoop, lines: "asyncio.Queue[bytes]") -> None:
+    """Stdin may be a pipe, a terminal, a file or nothing, so a thread reads it; its end ends nothing.
+
+    `os.read` instead of the buffered stdin: a daemon thread that holds that one's lock breaks the interpreter's end.
+    """
+    if hasattr(signal, "pthread_sigmask"):
+        # Reading a terminal from the background would stop the whole process.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})
+    rest = b""
+    while True:
+        try:
+            data = os.read(0, 4096)
+        except OSError:
+            return
+        if not data:
+            return
+        *whole, rest = (rest + data).split(b"\n")
+        rest = rest[-LINE_LIMIT:]
+        try:
+            for line in whole:
+                loop.call_soon_threadsafe(lines.put_nowait, line)
+        except RuntimeError:  # the loop has ended
+            return
+
+
+async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
+    try:
+        fields = json.loads(line)
+        if isinstance(fields, dict) and fields.get("ask") == "truth":
+            return _truth(simulation, fields.get("car"))
+        if isinstance(fields, dict) and fields.get("ask") == "world":
+            return {"ok": True, **simulation.world_as_it_is()}
+        if isinstance(fields, dict) and ("lamp" in fields or "thing" in fields):
+            simulation.change(change_of(fields, simulation.world))
+            return {"ok": True, **{word: fields[word] for word in ("lamp", "thing") if word in fields}}
+        if isinstance(fields, dict) and "ir" in fields:
+            press = press_of(fields)
+            return {"ok": True, "ir": press.button.value, "obeyed": simulation.press(press)}
+        fault = fault_of(fields)
+        return {"ok": True, "fault": fault.kind.value, "cars": await simulation.inflict(fault)}
+    except ValueError as error:  # BadSpec, and whatever is no JSON
+        words = str(error) if isinstance(error, BadSpec) else f"no JSON: {error}"
+    except RecursionError:
+        words = "no JSON: it is nested too deep"
+    except LinkError as error:
+        words = str(error)
+    return {"ok": False, "error": words}
+
+
+def _truth(simulation: Simulation, name: object) -> dict[str, object]:
+    car = simulation.cars.get(name) if isinstance(name, str) else None
+    if car is None:
+        raise BadSpec(f"car {name!r} is not simulated here: use {', '.join(simulation.cars)}")
+    truth, pose = car.truth, car.pose
+    if truth is None or pose is None:
+        assert isinstance(car.firmware, Played)
+        sent, ignored, rounds = car.firmware.sent_bytes, car.firmware.ignored_bytes, car.firmware.rounds
+        return {
+            "ok": True,
+            "car": name,
+            "sent_bytes": sent,
+            "ignored_bytes": ignored,
+            "rounds": rounds,
+            "lost_bytes": car.lost_bytes,
+        }
+    return {
+        "ok": True,
+        "car": name,
+        "mode": truth.mode.value,
+        "motor_left": truth.motor_left,
+        "motor_right": truth.motor_right,
+        "blocked": truth.blocked,
+        "fan": truth.fan,
+        "led": truth.led,
+        "servo": truth.servo,
+        "speed": truth.speed,
+        "alive": truth.alive,
+        "x_m": pose.x_m,
+        "y_m": pose.y_m,
+        "heading_rad": pose.heading_rad,
+        "lost_bytes": car.lost_bytes,
+    }

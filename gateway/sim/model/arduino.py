@@ -1,0 +1,390 @@
+"""The Arduino car's program (the STM32 car's is the same): one loop, one string, modes.
+
+It reads its string by position as the real program does and knows nothing of our codec. "Row" in a comment means the
+row of that name in protocol.md.
+"""
+
+import re
+from collections.abc import Generator
+from math import inf
+from typing import Final
+
+from gateway.sim.model.firmware import (
+    COLOUR_S,
+    NO_ECHO_S,
+    REPORT_EVERY_S,
+    WHISTLE_S,
+    Body,
+    Firmware,
+    Program,
+    Rng,
+    Wait,
+    bits,
+    motion,
+)
+from gateway.sim.model.ir_remote import SIGNS, Button
+
+TX_BUFFER: Final = 64
+STRING_LIMIT: Final = 512
+"""A string that is never cleared (a wedged car) grows until the RAM is full; what comes then is dropped."""
+BOOT_S: Final = 0.5
+START_SPEED: Final = 150
+CLOSE_S: Final = 1.0
+OPEN_S: Final = 2.0
+BEEP_S: Final = 0.1
+AVOIDANCE_RANGINGS: Final = 5
+SHARP_S: Final = 0.08
+FAR_CM: Final = 500.0
+"""In avoidance a distance from here on is thrown away like a missing echo."""
+
+LIGHTS: Final = {
+    "1": (255, 255, 255),
+    "2": (255, 0, 0),
+    "3": (0, 255, 0),
+    "4": (0, 0, 255),
+    "5": (0, 255, 255),
+    "6": (255, 0, 255),
+    "7": (255, 255, 0),
+    "8": (0, 0, 0),
+}
+_JOINTS: Final = re.compile(r"ServoJ1(\d+),J2(\d+),J3(\d+),J4(\d+),J5(\d+),J6(\d+)#")
+
+
+class ArduinoCar(Firmware):
+    """A car with the vendor's Arduino program. Options: `arm`, `imu`."""
+
+    def __init__(self, body: Body, rng: Rng, *, options: frozenset[str] = frozenset(), now: float = 0.0) -> None:
+        super().__init__(body, rng, options=options, now=now)
+        self._joints = [90] * 6
+        self.report_every_s = REPORT_EVERY_S
+        """Loop time from one report to the next, without its ranging. About a second: cars differ."""
+        self._forget()
+
+    def _forget(self) -> None:
+        """What the program's variables are after a start."""
+        self._string = ""
+        self._started = False
+        self._complete = False
+        self._pressed = None
+        self._speed = START_SPEED
+        self._colour_position = 0
+        # Loop time until each thing that mode 0 sends; the options' frames lie between the reports so that none blocks.
+        self._due = {"report": self.report_every_s}
+        for offset, option in ((0.3, "arm"), (0.6, "imu")):
+            if option in self._options:
+                self._due[option] = offset
+
+    def _reboot(self) -> Program:
+        # Lost: mode, motion, speed (150 again), light, fan, half frames, whatever was in either buffer.
+        # The servo and the arm stay where they are.
+        self._forget()
+        yield Wait(self._now + BOOT_S)
+        self._buffer.clear()  # the UART is off while it boots
+        yield from self._main()
+
+    def _main(self) -> Program:
+        while True:
+            self._serial_event()
+            if self._complete and (yield from self._parse()):
+                continue  # what came during an opening is obeyed when its block is over, not a turn later
+            match self._mode:
+                case 0:
+                    yield from self._manual()
+                case 2:
+                    yield from self._tracking()
+                case 3:
+                    yield from self._avoidance()
+                case 4:
+                    yield from self._colour_led()
+                case 5:
+                    yield from self._light_seeking()
+                case 6:
+                    yield from self._following()
+                case _:
+                    yield from self._remote()
+
+    # From the host.
+
+    def _serial_event(self) -> None:
+        """All that waits becomes part of ONE string. `#` completes it even if no frame has begun (row "a lone #")."""
+        for byte in self._buffer:
+            char = chr(byte)
+            if char == "$":
+                self._started = True
+            if self._started and len(self._string) < STRING_LIMIT:
+                self._string += char
+            if char == "#":
+                self._complete = True
+                self._started = False
+        self._buffer.clear()
+
+    def _parse(self) -> Generator[Wait, None, bool]:
+        """Whether the string was cleared."""
+        text = self._string
+        if text.find("MODE") > 0 and text.find("4WD") > 0:
+            yield from self._mode_frame(text)
+        elif self._mode != 0:
+            pass  # row "a general stop in a mode other than 0"
+        elif not (yield from self._named_frame(text)):
+            if "4WD" in text:
+                return False  # row "a named frame it does not know": neither obeyed nor cleared
+            yield from self._general_frame(text)
+        self._string = ""
+        self._complete = False
+        return True
+
+    def _mode_frame(self, text: str) -> Program:
+        """The digits are read at places 9 and 10 of the string, whatever stands there."""
+        self._pressed = None
+        if text[10:11] == "0":
+            self._drive(0, 0)
+            self._mode = 0
+            yield from self._busy(CLOSE_S)
+            return
+        digit = text[9:10]
+        known = digit in ("0", "1", "2", "3", "4", "5", "6")
+        self._mode = int(digit) if known else 0
+        # Row "a mode opened while driving": nothing here touches the motors.
+        beeps = BEEP_S + 0.2 * (self._mode + 1) if known else 0.0
+        yield from self._busy(beeps + OPEN_S)
+
+    def _general_frame(self, text: str) -> Program:
+        """Motion last, after whatever in the frame blocks, as in the real program."""
+        left, right = motion(text)
+        if text[5:6] == "1":
+            yield from self._busy(WHISTLE_S)
+        if text[7:8] == "1":
+            self._faster()
+        elif text[7:8] == "2":
+            self._slower()
+        if text[9:10] == "1":
+            yield from self._turn_servo(180)
+        elif text[9:10] == "2":
+            yield from self._turn_servo(0)
+        self._rgb = LIGHTS.get(text[13:14], self._rgb)
+        if text[15:16] == "1":
+            self._fan = not self._fan
+        if text[17:18] == "1":
+            yield from self._turn_servo(90)
+        self._drive(left * self._speed, right * self._speed)
+
+    def _faster(self) -> None:
+        self._speed = min(255, self._speed + 50)
+
+    def _slower(self) -> None:
+        slower = self._speed - 50
+        self._speed = 100 if slower < 50 else slower
+
+    def _named_frame(self, text: str) -> Generator[Wait, None, bool]:
+        """Whether the frame was known."""
+        if (at := text.find("PTZ")) > 0:
+            end = text.find("#", at)
+            if end > at:
+                yield from self._turn_servo(180 - _to_int(text[at + 3 : end]))
+                return True
+        elif text.find("CLR") > 0:
+            red, green, blue = (_field(text, word) for word in ("CLR", "CLG", "CLB"))
+            if blue is not None:
+                old = self._rgb
+                self._rgb = (
+                    old[0] if red is None else red,
+                    old[1] if green is None else green,
+                    blue,
+                )
+                yield from self._busy(COLOUR_S)
+                return True
+        elif "arm" in self._options and (joints := _JOINTS.search(text)):
+            self._joints = [min(180, int(value)) for value in joints.groups()]
+            return True
+        return False
+
+    # Mode 0.
+
+    def _manual(self) -> Program:
+        """Wait for a byte or the next thing to send. While the fan runs loop turns do not count: it sends nothing."""
+        since = self._now
+        due = inf if self._fan else since + min(self._due.values())
+        yield Wait(due, wakes=True)
+        if self._fan:
+            return
+        for what in self._due:
+            self._due[what] -= self._now - since
+        if self._now >= due:
+            what = min(self._due, key=lambda name: self._due[name])
+            self._due[what] = self.report_every_s
+            yield from self._report(what)
+
+    def _report(self, what: str) -> Program:
+        if what == "arm":
+            self._send(("$4WD," + ",".join(f"J{n}{deg}" for n, deg in enumerate(self._joints, 1)) + "#").encode())
+        elif what == "imu":
+            self._send(self._imu_frame())
+        else:
+            cm = yield from self._ranging()
+            now, body = self._now, self._body
+            gray = min(1023, max(0, body.grayscale(now) + round(4 * (self._rng.random() - 0.5))))
+            yield from self._print(
+                f"$4WD,CSB{0.0 if cm is None else cm:.2f},PV{body.battery_v(now):.2f},GS{gray},"
+                f"LF{bits(body.line(now))},HW{bits(body.obstacle(now))},GM{bits(body.light(now))}#"
+            )
+
+    def _print(self, text: str) -> Program:
+        """Send; blocks while the 64-byte transmit buffer has no room."""
+        data = text.encode()
+        room_at = self._tx_free - (TX_BUFFER - len(data)) / self._rate
+        if room_at > self._now:
+            yield Wait(room_at)
+        self._send(data)
+
+    def _turn(self, frame: str) -> Program:
+        """The part of a loop turn in modes 2, 5 and 6 that sends: as many frames as the UART carries."""
+        if self._fan:
+            yield Wait(self._now + len(frame) / self._rate)
+        else:
+            yield from self._print(frame)
+
+    # Mode 1.
+
+    def press(self, button: Button, now: float) -> bool:
+        """Only mode 1 looks at the receiver, which keeps one button while the program is busy."""
+        self._run(now)
+        if self._mode != 1 or self._pressed is not None:
+            return False
+        self._pressed = button
+        self._run(now)
+        return True
+
+    def _remote(self) -> Program:
+        """Row "remote control": the infrared remote drives, nobody else."""
+        yield Wait(inf, wakes=True)
+        button, self._pressed = self._pressed, None
+        match button:
+            case None:
+                pass
+            case Button.WHISTLE:
+                yield from self._busy(WHISTLE_S)
+            case Button.FASTER:
+                self._faster()
+            case Button.SLOWER:
+                self._slower()
+            case _:
+                left, right = SIGNS[button]
+                self._drive(left * self._speed, right * self._speed)
+
+    # The other modes. They set the speed for themselves and leave it so: what mode 0 has afterwards is theirs.
+
+    def _go(self, left: int, right: int, speed: int) -> None:
+        self._speed = speed
+        self._drive(left * speed, right * speed)
+
+    def _tracking(self) -> Program:
+        line = self._body.line(self._now)
+        left_outer, left_inner, right_inner, right_outer = line
+        yield from self._turn(f"$4WD,CSB0,PV8,GS0,LF{bits(line)},HW00,GM00#")
+        if (left_outer or left_inner) and right_outer:
+            self._go(1, -1, 250)
+            yield from self._busy(SHARP_S)
+        elif left_outer and right_inner:
+            self._go(-1, 1, 250)
+            yield from self._busy(SHARP_S)
+        elif left_outer:
+            self._go(-1, 1, 150)
+        elif right_outer:
+            self._go(1, -1, 150)
+        elif left_inner and not right_inner:
+            self._go(0, 1, 220)
+        elif right_inner and not left_inner:
+            self._go(1, 0, 220)
+        elif left_inner and right_inner:
+            self._go(1, 1, 250)
+        # No line under any sensor: the motors stay as they were.
+
+    def _light_seeking(self) -> Program:
+        seen = self._body.light(self._now)
+        yield from self._turn(f"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM{bits(seen)}#")
+        left, right = seen
+        self._go(*((1, 1) if left and right else (0, 1) if left else (1, 0) if right else (0, 0)), 200)
+
+    def _following(self) -> Program:
+        """Row "6 following": its frame has no `#`, and its bits are inverted: 0 = object seen."""
+        seen = self._body.obstacle(self._now)
+        yield from self._turn(f"$4WD,CSB120,PV8.3,GS000,LF0000,HW{bits((not seen[0], not seen[1]))},GM00")
+        left, right = seen
+        self._go(*((1, 1) if left and right else (-1, 1) if left else (1, -1) if right else (0, 0)), 200)
+
+    def _colour_led(self) -> Program:
+        yield from self._turn_servo(self._colour_position)
+        red, green, blue = (int(self._rng.random() * 255) for _ in range(3))
+        self._rgb = (red, green, blue)
+        yield from self._busy(COLOUR_S)
+        self._colour_position = (self._colour_position + 10) % 190
+
+    def _avoidance(self) -> Program:
+        cm = yield from self._distance()
+        if cm < 20:
+            self._blocked = True
+            yield from self._manoeuvre()
+            self._blocked = False
+            return
+        left, right = self._body.obstacle(self._now)
+        if right and not left:
+            self._go(-1, 1, 200)
+            yield from self._busy(0.2)
+        elif left:
+            self._go(1, -1, 200)
+            yield from self._busy(0.2)
+        if cm > 30:
+            self._rgb = LIGHTS["3"]
+            self._go(1, 1, 200)
+        else:
+            self._go(1, 1, 100)
+
+    def _distance(self) -> Generator[Wait, None, float]:
+        """Five rangings, 0.1 s. Without echo: braked, for ever, and deaf."""
+        found = []
+        for _ in range(AVOIDANCE_RANGINGS):
+            while (cm := self._range()) is None or cm >= FAR_CM:
+                self._drive(0, 0)
+                yield from self._busy(NO_ECHO_S)
+            found.append(cm)
+            yield Wait(self._now + 0.1 / AVOIDANCE_RANGINGS)
+        return sum(sorted(found)[1:4]) / 3
+
+    def _manoeuvre(self) -> Program:
+        """Back off, look right, left and ahead, turn: with the ranging before it 4.2 s, 4.3 s when hemmed in."""
+        self._rgb = LIGHTS["2"]
+        self._go(-1, -1, 80)
+        yield from self._busy(0.08)
+        self._drive(0, 0)
+        seen = []
+        for degrees in (0, 180, 90):
+            yield from self._turn_servo(degrees)
+            yield from self._busy(0.5)
+            seen.append((yield from self._distance()))
+        right, left, _ = seen
+        if max(seen) < 10:
+            self._rgb = LIGHTS["6"]
+            self._go(1, -1, 200)
+            yield from self._busy(0.37)
+        elif left >= right:
+            self._rgb = LIGHTS["4"]
+            self._go(-1, 1, 200)
+            yield from self._busy(0.28)
+        else:
+            self._rgb = LIGHTS["6"]
+            self._go(1, -1, 200)
+            yield from self._busy(0.28)
+        self._drive(0, 0)
+
+
+def _to_int(text: str) -> int:
+    """Arduino's String.toInt(): leading digits, 0 without any."""
+    digits = re.match(r"\s*[+-]?\d{1,9}", text)
+    return int(digits[0]) if digits else 0
+
+
+def _field(text: str, word: str) -> int | None:
+    """The number behind a word of a colour frame, 0..255; None if it or what ends it is missing."""
+    at = text.find(word)
+    end = text.find("#" if word == "CLB" else ",", at) if at >= 0 else -1
+    return min(255, max(0, _to_int(text[at + 3 : end]))) if end > at else None

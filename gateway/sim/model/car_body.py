@@ -1,0 +1,218 @@
+"""One car's body in the world: how its motors move it and what its sensors report. The world itself: world.py."""
+
+from math import atan2, ceil, cos, degrees, hypot, pi, radians, sin
+from typing import Final
+
+from gateway.sim.model.firmware import Pose, Rng
+from gateway.sim.model.geometry import Point
+from gateway.sim.model.world import STEP_S, World
+
+TOP_SPEED_M_S: Final = 0.5
+"""Of a wheel at PWM 255."""
+TRACK_M: Final = 0.20
+"""Effective distance of the wheels; wider than the car's, since four wheels skid when they turn."""
+
+SONAR_AT_M: Final = 0.10
+SONAR_REACH_CM: Final = 499.0
+"""Just below the 500 cm from which the car's own program throws a reading away."""
+SONAR_CONE: Final = tuple(radians(degree) for degree in (-15.0, -7.5, 0.0, 7.5, 15.0))
+SONAR_STEEPEST: Final = cos(radians(76))
+"""A surface hit at a flatter angle than this reflects the sound away."""
+INFRARED_REACH_M: Final = 0.20
+INFRARED_SIDE: Final = radians(20)
+INFRARED_CONE: Final = tuple(radians(degree) for degree in (-30.0, -15.0, 0.0, 15.0, 30.0))
+"""For cars and things. A wall is looked for in the cone's middle alone, as ever: an avoiding car keeps its ways."""
+LINE_SENSORS: Final = ((0.08, 0.040), (0.08, 0.010), (0.08, -0.010), (0.08, -0.040))
+"""Ahead and left of the axle's middle, m: left-outer .. right-outer."""
+LAMP_SIDE: Final = radians(30)
+LAMP_CONE: Final = radians(50)
+
+FLOOR_GRAY: Final = 214
+TAPE_GRAY: Final = 740
+
+
+class CarBody:
+    """One car in the world."""
+
+    def __init__(self, world: World, pose: Pose, rng: Rng, now: float = 0.0, name: str = "") -> None:
+        self._world = world
+        self._name = name
+        self._x, self._y, self._heading = pose
+        self._now = now
+        self._left = self._right = 0
+        self._battery = 7.6 + 0.7 * rng.random()
+        self._started = now
+        world.join(self, now)
+
+    @property
+    def name(self) -> str:
+        """Of the car; empty in a world in which nobody asks."""
+        return self._name
+
+    @property
+    def place(self) -> Pose:
+        """Where it was when it was last moved."""
+        return Pose(self._x, self._y, self._heading)
+
+    @property
+    def driving(self) -> bool:
+        """Whether a motor is on."""
+        return self._left != 0 or self._right != 0
+
+    def drive(self, now: float, left: int, right: int) -> None:
+        """From `now` on the motors have these PWM values."""
+        self._move(now)
+        self._left, self._right = left, right
+
+    def pose(self, now: float) -> Pose:
+        """The true pose; heading in -pi..pi."""
+        self._move(now)
+        return Pose(self._x, self._y, (self._heading + pi) % (2 * pi) - pi)
+
+    def _wheels(self) -> tuple[float, float]:
+        return TOP_SPEED_M_S * self._left / 255, TOP_SPEED_M_S * self._right / 255
+
+    def glide(self, now: float) -> None:
+        """In a lively world: go on to `now`, at most a tick away, as far as there is room."""
+        span = now - self._now
+        if span <= 0:
+            return
+        self._now = now
+        x, y = self._x, self._y
+        if self.driving:
+            x, y, heading = self._driven(span)
+        elif not self._world.things:
+            return
+        else:
+            heading = self._heading
+        self._x, self._y = self._world.make_room(self, x, y, now)
+        self._heading = heading
+
+    def _move(self, now: float) -> None:
+        if self._world.lively:
+            self._world.settle(now)
+            self.glide(now)
+            return
+        span = now - self._now
+        if span <= 0:
+            return
+        self._now = now
+        if self._left == self._right == 0:
+            return
+        left, right = self._wheels()
+        steps = 1 if left + right == 0 else ceil(span / STEP_S)
+        step = span / steps
+        for _ in range(steps):
+            x, y, self._heading = self._driven(step)
+            self._x, self._y = self._world.push_out(x, y)
+
+    def _driven(self, span: float) -> tuple[float, float, float]:
+        """Where its wheels take it if nothing is in the way: x, y, heading."""
+        left, right = self._wheels()
+        speed, turn = (left + right) / 2, (right - left) / TRACK_M
+        heading = self._heading + turn * span
+        if abs(turn) < 1e-9:
+            return self._x + speed * span * cos(heading), self._y + speed * span * sin(heading), heading
+        radius = speed / turn
+        x = self._x + radius * (sin(heading) - sin(self._heading))
+        y = self._y - radius * (cos(heading) - cos(self._heading))
+        return x, y, heading
+
+    def _look(self, now: float) -> None:
+        """Everything that can be seen is brought to `now`."""
+        self._move(now)
+        if self._world.lively:
+            for other in self._world.bodies:
+                other.glide(now)
+
+    def _at(self, ahead: float, left: float) -> Point:
+        c, s = cos(self._heading), sin(self._heading)
+        return self._x + ahead * c - left * s, self._y + ahead * s + left * c
+
+    def range_cm(self, now: float, bearing_deg: float) -> float | None:
+        """The nearest echo within the cone, from the sensor at the car's front."""
+        self._look(now)
+        x, y = self._at(SONAR_AT_M, 0.0)
+        middle = self._heading + radians(bearing_deg)
+        rays = (self._echo(x, y, middle + offset, now) for offset in SONAR_CONE)
+        nearest = min((distance for distance in rays if distance is not None), default=None)
+        return None if nearest is None or nearest * 100 > SONAR_REACH_CM else nearest * 100
+
+    def _echo(self, x: float, y: float, angle: float, now: float) -> float | None:
+        """How far away it is that a beam of sound comes back from."""
+        wall = self._world.ray(x, y, angle, SONAR_STEEPEST)
+        if not self._world.lively:
+            return wall
+        # A wall that reflects the sound away is still in its way.
+        first = self._world.ray(x, y, angle)
+        hit = self._world.met(self, x, y, angle, SONAR_REACH_CM / 100 if first is None else first, now)
+        if hit is None:
+            return wall
+        return hit[0] if hit[1] >= SONAR_STEEPEST else None
+
+    def line(self, now: float) -> tuple[bool, bool, bool, bool]:
+        """What the four line sensors see."""
+        self._move(now)
+        if not self._world.line:
+            return (False, False, False, False)
+        seen = [self._world.on_line(*self._at(ahead, left)) for ahead, left in LINE_SENSORS]
+        return (seen[0], seen[1], seen[2], seen[3])
+
+    def obstacle(self, now: float) -> tuple[bool, bool]:
+        """Infrared, looking ahead and 20 degrees outwards."""
+        self._look(now)
+        seen = []
+        for side in (1, -1):
+            x, y = self._at(0.10, 0.06 * side)
+            middle = self._heading + side * INFRARED_SIDE
+            distance = self._world.ray(x, y, middle)
+            sees = distance is not None and distance <= INFRARED_REACH_M
+            if self._world.lively and not sees:
+                sees = any(self._glimpse(x, y, middle + offset, now) for offset in INFRARED_CONE)
+            seen.append(sees)
+        return (seen[0], seen[1])
+
+    def _glimpse(self, x: float, y: float, angle: float, now: float) -> bool:
+        """Whether a car or a thing sends infrared light back, with no wall before it."""
+        hit = self._world.met(self, x, y, angle, INFRARED_REACH_M, now)
+        if hit is None:
+            return False
+        wall = self._world.ray(x, y, angle)
+        return wall is None or hit[0] <= wall
+
+    def light(self, now: float) -> tuple[bool, bool]:
+        """Whether a lamp stands before the left and the right light sensor."""
+        self._look(now)
+        seen = [False, False]
+        for lamp in self._world.lamps:
+            if not lamp.on or (lamp.carried_by and lamp.carried_by == self._name):
+                continue
+            at = self._world.shines(lamp, now)
+            if at is None:
+                continue
+            dx, dy = at[0] - self._x, at[1] - self._y
+            if hypot(dx, dy) > lamp.seen_from_m or not (
+                lamp.overhead or self._world.clear((self._x, self._y), at, {self._name, lamp.carried_by}, now=now)
+            ):
+                continue
+            bearing = atan2(dy, dx) - self._heading
+            for index, side in enumerate((LAMP_SIDE, -LAMP_SIDE)):
+                off = (bearing - side + pi) % (2 * pi) - pi
+                seen[index] = seen[index] or abs(off) <= LAMP_CONE
+        return (seen[0], seen[1])
+
+    def grayscale(self, now: float) -> int:
+        """The floor under the car's middle: high on the tape."""
+        self._move(now)
+        return TAPE_GRAY if self._world.line and self._world.on_line(self._x, self._y) else FLOOR_GRAY
+
+    def battery_v(self, now: float) -> float:
+        """Falls by 0.3 V an hour and sags by up to 0.25 V under load; not below 6.4, where its electronics cut off."""
+        load = 0.25 * (abs(self._left) + abs(self._right)) / 510
+        return max(6.4, self._battery - 0.3 * (now - self._started) / 3600 - load)
+
+    def yaw_rate_deg_s(self, now: float) -> float:
+        """How fast the car turns."""
+        self._move(now)
+        left, right = self._wheels()
+        return degrees((right - left) / TRACK_M)

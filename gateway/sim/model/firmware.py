@@ -1,0 +1,380 @@
+"""What every car's program stands on: one blocking loop on virtual time, a UART each way, motors.
+
+A program is a generator that yields a `Wait` wherever the real one blocks, so its code reads like the real one.
+What the programs do with their bytes lives in arduino.py and raspberry_pi.py; where the car is and what it sees, in
+world.py.
+"""
+
+from collections import deque
+from collections.abc import Generator
+from dataclasses import dataclass
+from math import ceil, inf
+from typing import Final, NamedTuple, Protocol, TypeAlias
+
+from gateway.protocol.enums import Mode
+from gateway.sim.model.ir_remote import Button
+from gateway.sim.model.scheduler import Company
+
+BYTES_PER_S: Final = 960.0
+"""9600 baud, 8N1: ten bits a byte (protocol.md, "Framing")."""
+CHUNK: Final = 20
+"""Bytes are handed on in pieces of at most this many, as a Bluetooth 4.0 module does."""
+
+WHISTLE_S: Final = 0.30
+SERVO_S: Final = 0.65
+COLOUR_S: Final = 0.10
+NO_ECHO_S: Final = 1.0
+ECHO_S_PER_CM: Final = 58e-6
+"""There and back at the speed of sound."""
+REPORT_BASE_S: Final = 0.004
+REPORT_EVERY_S: Final = 0.9
+"""Loop time between two mode-0 reports; counted in turns of the loop, so it stands still while the program blocks."""
+
+MODES: Final = tuple(Mode)
+
+
+class Rng(Protocol):
+    """A seeded source of random numbers; `random.Random` is one."""
+
+    def random(self) -> float:
+        """The next number in 0..1."""
+        ...
+
+
+class Pose(NamedTuple):
+    """Where a car is (REP-103: x forward, y left, counter-clockwise)."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+class Body(Protocol):
+    """The car in its world, as its program meets it."""
+
+    def drive(self, now: float, left: int, right: int) -> None:
+        """From `now` on the motors have these PWM values, -255..255."""
+        ...
+
+    def pose(self, now: float) -> Pose:
+        """The true pose."""
+        ...
+
+    def range_cm(self, now: float, bearing_deg: float) -> float | None:
+        """Ultrasonic distance at a bearing from straight ahead, left positive; None without echo."""
+        ...
+
+    def line(self, now: float) -> tuple[bool, bool, bool, bool]:
+        """Left-outer, left-inner, right-inner, right-outer: whether each sees the line."""
+        ...
+
+    def obstacle(self, now: float) -> tuple[bool, bool]:
+        """Infrared left, right: whether each sees an obstacle."""
+        ...
+
+    def light(self, now: float) -> tuple[bool, bool]:
+        """Left, right: whether each sees light."""
+        ...
+
+    def grayscale(self, now: float) -> int:
+        """Raw ADC 0..1023 of the floor."""
+        ...
+
+    def battery_v(self, now: float) -> float:
+        """Battery voltage."""
+        ...
+
+    def yaw_rate_deg_s(self, now: float) -> float:
+        """How fast the car turns, left positive."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What is so, whatever anyone believes."""
+
+    mode: Mode
+    motor_left: int
+    motor_right: int
+    blocked: bool
+    """Inside a blocking stretch of 0.1 s or more: bytes pile up."""
+    fan: bool
+    led: str
+    """`off`, or `#rrggbb`."""
+    servo: int
+    """Where the front servo points, 0..180 degrees; 90 is straight ahead, 180 left."""
+    speed: int
+    """The PWM (0..255) that the next motion will have."""
+    alive: bool
+    """False once a Raspberry Pi program has died."""
+
+    @property
+    def driving(self) -> bool:
+        """Whether a motor is on."""
+        return self.motor_left != 0 or self.motor_right != 0
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """The program does not run again before `until`, or before the next byte if that `wakes` it."""
+
+    until: float
+    wakes: bool = False
+
+
+Program: TypeAlias = Generator[Wait, None, None]
+
+
+class Firmware:
+    """One car's program and its wires on virtual time: `feed` bytes, `advance`, look at `truth`.
+
+    Times are seconds from any origin and must not run backwards.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        rng: Rng,
+        *,
+        options: frozenset[str] = frozenset(),
+        rate: float = BYTES_PER_S,
+        buffer: int = 64,
+        now: float = 0.0,
+    ) -> None:
+        self._body = body
+        self._rng = rng
+        self._options = options
+        self._rate = rate
+        self._limit = buffer
+        self._now = now
+        self._arrivals: deque[tuple[float, int]] = deque()
+        self._buffer = bytearray()
+        self._outgoing: deque[tuple[float, bytes]] = deque()
+        self._tx_free = now
+        self._left = self._right = 0
+        self._blocked = False
+        self._alive = True
+        self._mode = 0
+        self._fan = False
+        self._servo = 90
+        self._speed = 0
+        self._rgb = (0, 0, 0)
+        self.motor_log: deque[tuple[float, int, int]] = deque([(now, 0, 0)], maxlen=4096)
+        """(time, left, right) of every change of the motors, oldest first."""
+        self.lost_bytes = 0
+        """Bytes that found the receive buffer full."""
+        self._pressed: Button | None = None
+        """A button of the remote that the program has not looked at."""
+        self.company: Company | None = None
+        """Whose programs run in one order with this one."""
+        self._program = self._main()
+        self._wait = Wait(now)
+
+    def _main(self) -> Program:
+        raise NotImplementedError
+
+    # The three verbs of a shell.
+
+    def feed(self, data: bytes, now: float) -> None:
+        """Put bytes on the link at `now`; they reach the car at the pace of its UART."""
+        self._run(now)
+        at = max(now, self._arrivals[-1][0] if self._arrivals else now)
+        for byte in data:
+            at += 1 / self._rate
+            self._arrivals.append((at, byte))
+
+    def advance(self, now: float) -> list[tuple[float, bytes]]:
+        """Run the program up to `now`; what the car has sent since, with the time of each piece's last byte."""
+        self._run(now)
+        sent = []
+        while self._outgoing and self._outgoing[0][0] <= now:
+            sent.append(self._outgoing.popleft())
+        return sent
+
+    def next_event(self) -> float:
+        """When something next happens by itself; inf if nothing will."""
+        due = self.due()
+        return min(due, self._outgoing[0][0]) if self._outgoing else due
+
+    def backlog(self, now: float) -> int:
+        """Bytes fed that are still on the wire: whoever feeds should hold back while this is large."""
+        self._run(now)
+        return len(self._arrivals)
+
+    @property
+    def now(self) -> float:
+        """How far the program has been run."""
+        return self._now
+
+    @property
+    def alive(self) -> bool:
+        """False once the program has died; it never runs again."""
+        return self._alive
+
+    @property
+    def truth(self) -> Truth:
+        """The state at `now`, as of the last call."""
+        return Truth(
+            mode=MODES[self._mode],
+            motor_left=self._left,
+            motor_right=self._right,
+            blocked=self._blocked,
+            fan=self._fan,
+            led="off" if self._rgb == (0, 0, 0) else "#{:02x}{:02x}{:02x}".format(*self._rgb),
+            servo=self._servo,
+            speed=self._pwm(),
+            alive=self._alive,
+        )
+
+    def pose(self, now: float) -> Pose:
+        """Where the car truly is."""
+        self._run(now)
+        return self._body.pose(now)
+
+    def press(self, button: Button, now: float) -> bool:  # noqa: ARG002 - for cars that have a receiver
+        """A button of the infrared remote is pressed; whether the car obeys it."""
+        self._run(now)
+        return False
+
+    # Faults.
+
+    def drop_link(self, now: float) -> None:
+        """The link is cut: bytes on the wire are lost; the car notices nothing, and keeps half a frame that it has."""
+        self._run(now)
+        self._arrivals.clear()
+
+    def brown_out(self, now: float) -> None:
+        """The battery sags: motors off, the frame being sent is cut, all RAM is lost, the program boots again."""
+        self._run(now)
+        self._cut_outgoing(now)
+        self._arrivals.clear()
+        self._buffer.clear()
+        self._tx_free = now
+        self._drive(0, 0)
+        self._blocked = False
+        self._mode = 0
+        self._fan = False
+        self._rgb = (0, 0, 0)
+        self._alive = True
+        self._program = self._reboot()
+        self._wait = Wait(now)
+
+    def _reboot(self) -> Program:
+        raise NotImplementedError
+
+    def _cut_outgoing(self, now: float) -> None:
+        kept = deque(piece for piece in self._outgoing if piece[0] <= now)
+        if len(kept) < len(self._outgoing):
+            end, data = self._outgoing[len(kept)]
+            done = len(data) - ceil((end - now) * self._rate)
+            if done > 0:
+                kept.append((now, data[:done]))
+        self._outgoing = kept
+
+    # The engine.
+
+    def due(self) -> float:
+        """When the program next runs by itself; inf if it will not."""
+        if not self._alive:
+            return inf
+        if self._wait.wakes:
+            if self._buffer or self._pressed is not None:
+                return self._now
+            if self._arrivals:
+                return min(self._wait.until, self._arrivals[0][0])
+        return self._wait.until
+
+    def _run(self, now: float) -> None:
+        if self.company is None:
+            self.run_alone(now)
+        else:
+            self.company.run(now)
+
+    def run_alone(self, now: float) -> None:
+        """Run this program up to `now`, whatever others have done by then."""
+        while (due := self.due()) <= now:
+            self._now = max(self._now, due)
+            self._receive()
+            try:
+                self._wait = next(self._program)
+            except StopIteration:
+                self._alive = False
+        self._now = max(self._now, now)
+        self._receive()
+
+    def _receive(self) -> None:
+        while self._arrivals and self._arrivals[0][0] <= self._now:
+            _, byte = self._arrivals.popleft()
+            if len(self._buffer) < self._limit:
+                self._buffer.append(byte)
+            else:
+                self.lost_bytes += 1
+
+    # What programs are made of.
+
+    def _pwm(self) -> int:
+        return self._speed
+
+    def _drive(self, left: int, right: int) -> None:
+        if (left, right) != (self._left, self._right):
+            self._left, self._right = left, right
+            self._body.drive(self._now, left, right)
+            self.motor_log.append((self._now, left, right))
+
+    def _busy(self, seconds: float) -> Program:
+        """Block, deaf, and say so in `truth` if it is long."""
+        outer = self._blocked
+        self._blocked = outer or seconds >= COLOUR_S
+        yield Wait(self._now + seconds)
+        self._blocked = outer
+
+    def _turn_servo(self, degrees: int) -> Program:
+        self._servo = min(180, max(0, degrees))
+        yield from self._busy(SERVO_S)
+
+    def _send(self, data: bytes) -> None:
+        """Queue bytes on the wire to the host."""
+        at = max(self._now, self._tx_free)
+        for start in range(0, len(data), CHUNK):
+            piece = data[start : start + CHUNK]
+            at += len(piece) / self._rate
+            self._outgoing.append((at, piece))
+        self._tx_free = at
+
+    def _ranging(self) -> Generator[Wait, None, float | None]:
+        """One ultrasonic ranging, cm; without echo it blocks until its time-out and gives None."""
+        cm = self._range()
+        if cm is None:
+            yield from self._busy(NO_ECHO_S)
+        else:
+            yield from self._busy(REPORT_BASE_S + cm * ECHO_S_PER_CM)
+        return cm
+
+    def _range(self) -> float | None:
+        cm = self._body.range_cm(self._now, self._servo - 90)
+        return None if cm is None else max(2.0, cm + 0.6 * (self._rng.random() - 0.5))
+
+    def _imu_frame(self) -> bytes:
+        """Raw counts of an MPU6050 at its default scales (131 per deg/s, 16384 per g), level, with a little noise."""
+        noise = [round(40 * (self._rng.random() - 0.5)) for _ in range(6)]
+        turning = round(131 * self._body.yaw_rate_deg_s(self._now))
+        values = [0, 0, turning, 0, 0, 16384]
+        words = ("gx", "gy", "gz", "ax", "ay", "az")
+        fields = ",".join(f"MPU{word}{value + n}" for word, value, n in zip(words, values, noise, strict=True))
+        return f"$4WD,{fields}#".encode()
+
+
+def bits(values: tuple[bool, ...]) -> str:
+    """Digits as the car prints them."""
+    return "".join("1" if value else "0" for value in values)
+
+
+MOTIONS: Final = {"1": (1, 1), "2": (-1, -1), "3": (0, 1), "4": (1, 0)}
+"""Place 1 of the general frame: sign of the left and the right motor. A turn stops the inner wheels."""
+SPINS: Final = {"1": (-1, 1), "2": (1, -1)}
+"""Place 2, which wins over place 1."""
+
+
+def motion(text: str) -> tuple[int, int]:
+    """Signs of the two motors from places 1 and 2 of whatever string is there, read by position."""
+    return SPINS.get(text[3:4]) or MOTIONS.get(text[1:2], (0, 0))

@@ -1,0 +1,258 @@
+"""The Raspberry Pi car's two programs: the TCP server and the one behind a Bluetooth module. Neither knows modes.
+
+"Row" in a comment means the row of that name in protocol.md.
+"""
+
+from collections.abc import Generator
+from enum import StrEnum
+from math import inf
+from typing import Final
+
+from gateway.sim.model.firmware import (
+    BYTES_PER_S,
+    COLOUR_S,
+    REPORT_EVERY_S,
+    WHISTLE_S,
+    Body,
+    Firmware,
+    Program,
+    Rng,
+    Wait,
+    bits,
+    motion,
+)
+
+TCP_RECEIVE: Final = 128
+"""The program receives at most so many bytes at once."""
+SOCKET_BUFFER: Final = 65536
+TTY_BUFFER: Final = 4096
+START_PERCENT: Final = 80
+FAN_S: Final = 1.0
+LIGHT_S: Final = 0.02
+BOOT_S: Final = 2.0
+GREETING: Final = b"serial is on!"
+PAN_TILT_DEG_S: Final = 35.0
+
+LIGHTS: Final = {"2": (255, 0, 0), "3": (0, 255, 0), "4": (0, 0, 255)}
+CYCLE: Final = (
+    (255, 255, 255),
+    (255, 0, 0),
+    (0, 255, 0),
+    (0, 0, 255),
+    (255, 255, 0),
+    (0, 255, 255),
+    (255, 0, 255),
+    (0, 0, 0),
+)
+_TURNS: Final = {"3": ("vertical", 1), "4": ("vertical", -1), "6": ("horizontal", 1), "7": ("horizontal", -1)}
+_RESETS: Final = {"5": "vertical", "8": "horizontal"}
+_LIMITS: Final = {"vertical": (45.0, 180.0), "horizontal": (0.0, 180.0)}
+
+
+class Transport(StrEnum):
+    """What carries the bytes to the program; the two programs read differently."""
+
+    TCP = "tcp"
+    SERIAL = "serial"
+
+
+class _Died(Exception):
+    """The program ended with an error; the motors stay as they were."""
+
+
+class RaspberryPiCar(Firmware):
+    """A car with one of the vendor's Raspberry Pi programs. Options: `arm`, `imu`."""
+
+    def __init__(
+        self,
+        body: Body,
+        rng: Rng,
+        *,
+        transport: Transport = Transport.TCP,
+        options: frozenset[str] = frozenset(),
+        now: float = 0.0,
+    ) -> None:
+        tcp = transport is Transport.TCP
+        rate, buffer = (inf, SOCKET_BUFFER) if tcp else (BYTES_PER_S, TTY_BUFFER)
+        super().__init__(body, rng, options=options, rate=rate, buffer=buffer, now=now)
+        self._tcp = tcp
+        self._camera = {"vertical": 90.0, "horizontal": 90.0}
+        self._joints = [90] * 6
+        self._forget()
+
+    def _forget(self) -> None:
+        self._cache = ""
+        self._started = False
+        self._speed = START_PERCENT
+        self._cycle = 0
+        self._turning: tuple[str, int, float] | None = None
+        self._client = False
+        self._client_gone = False
+        self._due = {"report": REPORT_EVERY_S}
+        for offset, option in ((0.3, "arm"), (0.6, "imu")):
+            if option in self._options:
+                self._due[option] = offset
+
+    def connected(self, now: float) -> None:
+        """A TCP client has connected."""
+        self._run(now)
+        self._client = True
+
+    def disconnected(self, now: float) -> None:
+        """The TCP client has gone away: the next report kills the program, also if someone has connected again."""
+        self._run(now)
+        self._client_gone = True
+
+    @property
+    def camera(self) -> dict[str, float]:
+        """Where the camera's vertical and horizontal servos point, degrees."""
+        self._settle()
+        return dict(self._camera)
+
+    def drop_link(self, now: float) -> None:
+        """The link is cut. Over TCP what the program's machine already has stays readable."""
+        super().drop_link(now)
+        if self._tcp and self._client:
+            self.disconnected(now)
+
+    def _reboot(self) -> Program:
+        # Someone has to start the program by hand on a real car unless it was made a service; here it starts by itself.
+        self._forget()
+        yield Wait(self._now + BOOT_S)
+        self._buffer.clear()
+        yield from self._main()
+
+    def _pwm(self) -> int:
+        return round(255 * self._speed / 100)
+
+    def _main(self) -> Program:
+        if not self._tcp:
+            self._send(GREETING)
+        try:
+            while True:
+                text = self._receive_tcp() if self._tcp else self._receive_serial()
+                if text is not None:
+                    yield from self._parse(text)
+                elif not self._buffer:
+                    yield from self._idle()
+        except _Died:
+            return
+
+    # From the host.
+
+    def _receive_tcp(self) -> str | None:
+        """One receive: taken whole if it begins with `$` and has a `#` anywhere, else ignored whole."""
+        data = self._buffer[:TCP_RECEIVE].decode("latin-1")
+        del self._buffer[:TCP_RECEIVE]
+        return data if data.startswith("$") and "#" in data else None
+
+    def _receive_serial(self) -> str | None:
+        """All that waits; of several frames the last. Half a frame waits for the rest, whatever that is."""
+        last = None
+        for byte in self._buffer:
+            char = chr(byte)
+            if char == "$":
+                self._started = True
+            if self._started:
+                self._cache += char
+                if char == "#":
+                    last, self._cache, self._started = self._cache, "", False
+        self._buffer.clear()
+        return last
+
+    def _parse(self, text: str) -> Program:
+        servo: int | None = None
+        if "$4WD,PTZ" in text:
+            servo = 180 - _number(text, "PTZ", "#")
+        if "CLR" in text:
+            self._rgb = (_number(text, "CLR", ",CLG"), _number(text, "CLG", ",CLB"), _number(text, "CLB", "#"))
+            yield from self._busy(COLOUR_S)
+        if "arm" in self._options and "ServoJ1" in text:
+            ends = [*(f",J{n}" for n in range(2, 7)), "#"]
+            self._joints = [min(180, _number(text, f"J{n}", end)) for n, end in enumerate(ends, 1)]
+        if "$4WD" not in text:
+            servo = yield from self._general_frame(text)
+        if servo is not None:
+            yield from self._turn_servo(servo)
+
+    def _general_frame(self, text: str) -> Generator[Wait, None, int | None]:
+        """Motion after whistle and fan, before the front servo; gives the servo's target."""
+        if len(text) < 18:
+            raise _Died  # the program reads place 9 whether it is there or not
+        left, right = motion(text)
+        if text[5] == "1":
+            yield from self._busy(WHISTLE_S)
+        if text[7] == "1":
+            self._speed = min(100, self._speed + 20)
+        elif text[7] == "2":
+            self._speed = max(20, self._speed - 20)
+        if text[13] == "1":
+            self._rgb = CYCLE[self._cycle]
+            self._cycle = (self._cycle + 1) % len(CYCLE)
+            yield from self._busy(LIGHT_S)
+        elif text[13] in LIGHTS:
+            self._rgb = LIGHTS[text[13]]
+            yield from self._busy(LIGHT_S)
+        if text[15] == "1":
+            self._fan = not self._fan
+            yield from self._busy(FAN_S)
+        self._turn_camera(text[9])
+        pwm = self._pwm()
+        self._drive(left * pwm, right * pwm)
+        return 90 if text[17] == "1" else {"1": 180, "2": 0}.get(text[9])
+
+    def _turn_camera(self, digit: str) -> None:
+        """The camera keeps turning until another general frame says something else."""
+        self._settle()
+        axis, sign = _TURNS.get(digit, ("", 0))
+        self._turning = (axis, sign, self._now) if axis else None
+        if digit in _RESETS:
+            self._camera[_RESETS[digit]] = 90.0
+
+    def _settle(self) -> None:
+        if self._turning is not None:
+            axis, sign, since = self._turning
+            low, high = _LIMITS[axis]
+            turned = self._camera[axis] + sign * PAN_TILT_DEG_S * (self._now - since)
+            self._camera[axis] = min(high, max(low, turned))
+            self._turning = (axis, sign, self._now)
+
+    # To the host.
+
+    def _idle(self) -> Program:
+        since = self._now
+        due = since + min(self._due.values())
+        yield Wait(due, wakes=True)
+        for what in self._due:
+            self._due[what] -= self._now - since
+        if self._now >= due:
+            what = min(self._due, key=lambda name: self._due[name])
+            self._due[what] = REPORT_EVERY_S
+            yield from self._report(what)
+
+    def _report(self, what: str) -> Program:
+        if what == "arm":
+            frame = ("$4WD," + ",".join(f"J{n}{deg}" for n, deg in enumerate(self._joints, 1)) + "#").encode()
+        elif what == "imu":
+            frame = self._imu_frame()
+        else:
+            cm = yield from self._ranging()
+            now, body = self._now, self._body
+            frame = (
+                f"$4WD,CSB{int(cm or 0)},PV8.4,GS0,"
+                f"LF{bits(body.line(now))},HW{bits(body.obstacle(now))},GM{bits(body.light(now))}#"
+            ).encode()
+        if self._tcp:
+            if self._client_gone:
+                raise _Died
+            if not self._client:
+                return
+        self._send(frame)
+
+
+def _number(text: str, word: str, end: str) -> int:
+    """The number between two words of the FIRST such place; the program dies of one that is none."""
+    start, stop = text.find(word) + len(word), text.find(end)
+    if stop < start or not text[start:stop].strip().lstrip("+-").isdecimal():
+        raise _Died
+    return min(255, max(0, int(text[start:stop])))

@@ -1,0 +1,383 @@
+"""The ONE flat world that all cars of a simulator share: walls, a taped line, lamps, things, and the cars as bodies.
+
+What a car's own sensors make of it is body.py's part. In the worlds of before (no things, cars that do not meet) each
+car is integrated by itself whenever someone looks; in a lively one all are brought to each tick of STEP_S together.
+REP-103: metres, x forward, y left, angles counter-clockwise.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from math import atan2, ceil, cos, floor, hypot, sin
+from typing import Final, Protocol
+
+from gateway.sim.model.firmware import Pose
+from gateway.sim.model.geometry import (
+    Hit,
+    Point,
+    Segment,
+    apart,
+    box,
+    distance,
+    foot,
+    loop,
+    nearest,
+    ray_to_circle,
+    reach,
+)
+from gateway.sim.model.objects import Lamp, Thing, carried
+from gateway.sim.model.scheduler import Company
+
+RADIUS_M: Final = 0.13
+"""Of a car: it is a disc to walls, things and other cars, and to their sensors."""
+STEP_S: Final = 0.04
+"""Longest stretch of driving between two looks for a wall, and the tick of a lively world."""
+TAPE_M: Final = 0.025
+_BUCKET_M: Final = 0.25
+_ROUNDS: Final = 3
+"""So often a car that is pushed out of one thing is pushed out of the next."""
+_HAIR_M: Final = 1e-9
+_APART_M: Final = 0.4
+"""Between two places where cars begin that have none of their own."""
+_SPREAD_M: Final = 4.0
+"""How far out they are if there are no walls."""
+
+
+class Body(Protocol):
+    """A car as the world moves it."""
+
+    @property
+    def name(self) -> str:
+        """The car's."""
+        ...
+
+    @property
+    def place(self) -> Pose:
+        """Where it was when it was last moved."""
+        ...
+
+    @property
+    def driving(self) -> bool:
+        """Whether a motor is on."""
+        ...
+
+    def glide(self, now: float) -> None:
+        """Go on to `now`, at most a tick away."""
+        ...
+
+
+class World:
+    """Walls and a line, which never change; lamps, things and cars, which do."""
+
+    def __init__(
+        self,
+        walls: Iterable[Segment] = (),
+        line: Sequence[Point] = (),
+        lamps: Iterable[Lamp] = (),
+        *,
+        things: Iterable[Thing] = (),
+        starts: Mapping[str, Pose] | None = None,
+        cars_meet: bool = False,
+    ) -> None:
+        self.walls = tuple(walls)
+        self.line = tuple(line)
+        """A closed polyline; empty for none."""
+        self.lamps = tuple(lamps)
+        self.things = tuple(things)
+        self.cars_meet = cars_meet
+        """Whether cars see each other and are in each other's way."""
+        self.lively = cars_meet or bool(self.things) or any(lamp.carried_by for lamp in self.lamps)
+        """Whether what one car does may matter to another, or something moves by itself."""
+        self.company = Company()
+        self.bodies: list[Body] = []
+        self._starts = dict(starts or {})
+        self._began = 0.0
+        self._tick = 0
+        # What is asked for a thousand times a second of simulated time is worked out once.
+        self._rays = tuple((x1, y1, x2 - x1, y2 - y1, hypot(x2 - x1, y2 - y1)) for x1, y1, x2, y2 in self.walls)
+        self._touching = tuple((wall, reach(wall, RADIUS_M)) for wall in self.walls)
+        self._near: dict[tuple[int, int], list[Segment]] = {}
+        self._length = 0.0
+        for (x1, y1), (x2, y2) in zip(self.line, (*self.line[1:], *self.line[:1]), strict=True):
+            self._length += hypot(x2 - x1, y2 - y1)
+            low_x, high_x = sorted((x1, x2))
+            low_y, high_y = sorted((y1, y2))
+            for column in range(floor((low_x - TAPE_M) / _BUCKET_M), floor((high_x + TAPE_M) / _BUCKET_M) + 1):
+                for row in range(floor((low_y - TAPE_M) / _BUCKET_M), floor((high_y + TAPE_M) / _BUCKET_M) + 1):
+                    self._near.setdefault((column, row), []).append((x1, y1, x2, y2))
+
+    @classmethod
+    def room(cls) -> "World":
+        """A room of 5.0 x 3.6 m, a box in its middle, a loop of line: small enough that every ranging has an echo."""
+        walls = (*box(0.0, 0.0, 5.0, 3.6), *box(0.0, 0.0, 0.5, 0.5))
+        return cls(walls, loop(1.7, 1.05, 0.6))
+
+    @classmethod
+    def open_field(cls) -> "World":
+        """Nothing at all: no ranging ever has an echo."""
+        return cls()
+
+    def start_pose(self, index: int, name: str = "") -> Pose:
+        """Where a car begins: at its own place, or as number `index` on the line; the cars spread over its length.
+
+        In a lively world one without a place of its own that would begin in something begins where there is room.
+        """
+        if name in self._starts:
+            return self._starts[name]
+        pose = self._spread(index)
+        if not self.lively:
+            return pose
+        return next((each for each in (pose, *self._grid()) if self._free(each)), pose)
+
+    def _grid(self) -> list[Pose]:
+        """Places to begin, the innermost first."""
+        xs = [x for wall in self.walls for x in wall[::2]] or [-_SPREAD_M, _SPREAD_M]
+        ys = [y for wall in self.walls for y in wall[1::2]] or [-_SPREAD_M, _SPREAD_M]
+        spots = [
+            Pose(_APART_M * column, _APART_M * row, 0.0)
+            for column in range(ceil(min(xs) / _APART_M), floor(max(xs) / _APART_M) + 1)
+            for row in range(ceil(min(ys) / _APART_M), floor(max(ys) / _APART_M) + 1)
+        ]
+        return sorted(spots, key=lambda pose: hypot(pose.x_m, pose.y_m))
+
+    def _free(self, pose: Pose) -> bool:
+        """Whether a car can begin there: in nothing, and not shut off from all cars that have a place of their own."""
+        x, y, _ = pose
+        cars = (*self._starts.values(), *(body.place for body in self.bodies)) if self.cars_meet else ()
+        return (
+            all(distance(x, y, wall) >= RADIUS_M for wall in self.walls)
+            and all(thing.depth(at, x, y, RADIUS_M) <= 0 for thing, at in self.solids(None, self._began))
+            and all(hypot(x - car.x_m, y - car.y_m) >= 2 * RADIUS_M for car in cars)
+            and (not self._starts or any(self._reachable(pose, start) for start in self._starts.values()))
+        )
+
+    def _reachable(self, pose: Pose, other: Pose) -> bool:
+        sight: Segment = (*pose[:2], *other[:2])
+        return all(apart(sight, wall) > _HAIR_M for wall in self.walls)
+
+    def _spread(self, index: int) -> Pose:
+        if not self.line:
+            return Pose(0.0, float(index), 0.0)
+        # Multiples of the golden ratio keep any number of cars apart.
+        left = (index * 0.6180339887 % 1.0) * self._length
+        for (x1, y1), (x2, y2) in zip(self.line, (*self.line[1:], *self.line[:1]), strict=True):
+            length = hypot(x2 - x1, y2 - y1)
+            if left <= length:
+                share = left / length
+                return Pose(x1 + share * (x2 - x1), y1 + share * (y2 - y1), atan2(y2 - y1, x2 - x1))
+            left -= length
+        return Pose(*self.line[0], 0.0)
+
+    # Walls and line.
+
+    def on_line(self, x: float, y: float) -> bool:
+        """Whether a point lies on the tape."""
+        near = self._near.get((floor(x / _BUCKET_M), floor(y / _BUCKET_M)), ())
+        return any(distance(x, y, segment) <= TAPE_M / 2 for segment in near)
+
+    def ray(self, x: float, y: float, angle: float, steepest: float = 0.0) -> float | None:
+        """Distance to the first wall; `steepest`: least cosine to its normal that sends something back."""
+        best = self._wall(x, y, cos(angle), sin(angle))
+        return None if best is None or best[1] < steepest else best[0]
+
+    def _wall(self, x: float, y: float, dx: float, dy: float) -> Hit | None:
+        best: Hit | None = None
+        for x1, y1, wx, wy, length in self._rays:
+            cross = dx * wy - dy * wx
+            if abs(cross) < 1e-12:
+                continue
+            along = ((x1 - x) * wy - (y1 - y) * wx) / cross
+            share = ((x1 - x) * dy - (y1 - y) * dx) / cross
+            if along >= 0 and 0 <= share <= 1 and (best is None or along < best[0]):
+                best = (along, abs(cross) / length)
+        return best
+
+    def push_out(self, x: float, y: float) -> Point:
+        """The nearest place at which a car does not overlap a wall."""
+        for wall, (low_x, low_y, high_x, high_y) in self._touching:
+            if not (low_x < x < high_x and low_y < y < high_y):
+                continue
+            fx, fy = foot(x, y, wall)
+            away = hypot(x - fx, y - fy)
+            if 0 < away < RADIUS_M:
+                x, y = fx + (x - fx) * RADIUS_M / away, fy + (y - fy) * RADIUS_M / away
+        return x, y
+
+    # What moves.
+
+    def join(self, body: Body, now: float) -> None:
+        """A car has been put into the world."""
+        if self.lively:
+            if not self.bodies:
+                self._began, self._tick = now, 0
+            self.bodies.append(body)
+
+    def settle(self, now: float) -> None:
+        """Bring all cars to the last tick up to `now`, each tick for all before the next."""
+        last = floor((now - self._began) / STEP_S)
+        if last <= self._tick:
+            return
+        if not any(body.driving for body in self.bodies) and not any(thing.moves for thing in self.things):
+            self._tick = last - 1
+        while self._tick < last:
+            self._tick += 1
+            at = self._began + self._tick * STEP_S
+            for body in self.bodies:
+                body.glide(at)
+            if any(thing.waits_for_m for thing in self.things):
+                self.things = tuple(self._waiting(thing, at) for thing in self.things)
+
+    def _waiting(self, thing: Thing, now: float) -> Thing:
+        x, y, _ = thing.pose(now - self._began)
+        places = [body.place for body in self.bodies]
+        near = any(hypot(place.x_m - x, place.y_m - y) <= thing.waits_for_m for place in places)
+        return thing.waiting(now - self._began, near=near)
+
+    def others(self, me: Body | None) -> Iterator[Body]:
+        """The cars that a car meets."""
+        return (body for body in self.bodies if body is not me) if self.cars_meet else iter(())
+
+    def carrier(self, name: str) -> Body | None:
+        """A car by its name, if it is there."""
+        return next((body for body in self.bodies if body.name == name), None)
+
+    def where(self, thing: Thing, now: float) -> Pose | None:
+        """Where a thing is; None if the car that carries it is not there."""
+        pose = thing.pose(now - self._began)
+        if not thing.carried_by:
+            return pose
+        car = self.carrier(thing.carried_by)
+        return None if car is None else carried(car.place, pose.x_m, pose.y_m, pose.heading_rad)
+
+    def shines(self, lamp: Lamp, now: float) -> Point | None:
+        """Where a lamp is; None if what carries it is not there."""
+        if not lamp.carried_by:
+            return lamp.x_m, lamp.y_m
+        thing = next((each for each in self.things if each.name == lamp.carried_by), None)
+        car = self.carrier(lamp.carried_by)
+        base = self.where(thing, now) if thing is not None else None if car is None else car.place
+        return None if base is None else carried(base, lamp.x_m, lamp.y_m)[:2]
+
+    def solids(self, me: Body | None, now: float) -> Iterator[tuple[Thing, Pose]]:
+        """The things that a car meets, which is not what it carries itself."""
+        for thing in self.things:
+            if me is None or thing.carried_by != me.name:
+                pose = self.where(thing, now)
+                if pose is not None:
+                    yield thing, pose
+
+    def make_room(self, me: Body, x: float, y: float, now: float) -> Point:
+        """Where a car that wants to be at x, y can be. One that is jammed stays where it is."""
+        things = [
+            (thing, pose)
+            for thing, pose in self.solids(me, now)
+            if hypot(x - pose.x_m, y - pose.y_m) < 2 * RADIUS_M + thing.extent_m
+        ]
+        cars = [
+            (other.place.x_m, other.place.y_m)
+            for other in self.others(me)
+            if hypot(x - other.place.x_m, y - other.place.y_m) < 4 * RADIUS_M
+        ]
+        wanted = x, y
+        for _ in range(_ROUNDS):
+            before = x, y
+            for ox, oy in cars:
+                away = hypot(x - ox, y - oy)
+                if 0 < away < 2 * RADIUS_M:
+                    x, y = ox + (x - ox) * 2 * RADIUS_M / away, oy + (y - oy) * 2 * RADIUS_M / away
+            for thing, pose in things:
+                x, y = thing.pushed(pose, x, y, RADIUS_M)
+            x, y = self.push_out(x, y)
+            if (x, y) == before:
+                break
+        old = me.place
+        if (x, y) == wanted and not cars:
+            return x, y  # nothing was in its way
+        if self._passes(old.x_m, old.y_m, x, y, cars):
+            return x, y
+        return old.x_m, old.y_m
+
+    def _passes(self, old_x: float, old_y: float, x: float, y: float, cars: list[Point]) -> bool:
+        """Whether a car may go there: through no wall, and no deeper into one or into a car than it is."""
+        for wall, (low_x, low_y, high_x, high_y) in self._touching:
+            if max(old_x, x) < low_x or min(old_x, x) > high_x or max(old_y, y) < low_y or min(old_y, y) > high_y:
+                continue
+            after = distance(x, y, wall)
+            if after < min(RADIUS_M, distance(old_x, old_y, wall)) - _HAIR_M:
+                return False
+            if (old_x, old_y) != (x, y) and apart((old_x, old_y, x, y), wall) <= _HAIR_M:
+                return False
+        return all(
+            hypot(x - ox, y - oy) >= min(2 * RADIUS_M, hypot(old_x - ox, old_y - oy)) - _HAIR_M for ox, oy in cars
+        )
+
+    # What is seen.
+
+    def met(self, me: Body | None, x: float, y: float, angle: float, reach_m: float, now: float) -> Hit | None:
+        """The first thing or car, no wall, that a ray meets within `reach_m`. All cars have to be at `now`."""
+        dx, dy = cos(angle), sin(angle)
+        hits: list[Hit | None] = []
+        for other in self.others(me):
+            place = other.place
+            if hypot(place.x_m - x, place.y_m - y) <= reach_m + RADIUS_M:
+                hits.append(ray_to_circle(x, y, dx, dy, (place.x_m, place.y_m), RADIUS_M))
+        for thing, pose in self.solids(me, now):
+            if hypot(pose.x_m - x, pose.y_m - y) <= reach_m + thing.extent_m:
+                hits.append(thing.met(pose, x, y, dx, dy))
+        hit = nearest(hits)
+        return hit if hit is not None and hit[0] <= reach_m else None
+
+    def clear(self, a: Point, b: Point, without: Iterable[str] = (), *, now: float = 0.0) -> bool:
+        """Whether nothing stands between two points; `without`: cars and things that do not count, by name.
+
+        The same both ways.
+        """
+        a, b = sorted((a, b))
+        sight: Segment = (*a, *b)
+        if a == b:
+            return True
+        if any(apart(sight, wall) <= _HAIR_M for wall in self.walls):
+            return False
+        ignored = set(without)
+        for other in self.others(None):
+            if other.name not in ignored and distance(other.place.x_m, other.place.y_m, sight) < RADIUS_M:
+                return False
+        for thing, pose in self.solids(None, now):
+            if thing.name in ignored or thing.carried_by in ignored - {""}:
+                continue
+            if thing.radius_m:
+                if distance(pose.x_m, pose.y_m, sight) < thing.radius_m:
+                    return False
+            elif any(apart(sight, side) <= _HAIR_M for side in thing.sides(pose)):
+                return False
+        return True
+
+    # What is changed while it runs.
+
+    def advance(self, now: float) -> None:
+        """Bring every program and every car to `now`, before something is changed or asked."""
+        self.company.run(now)
+        self.settle(now)
+        for body in self.bodies:
+            body.glide(now)
+
+    def change_lamp(self, name: str, **fields: float | bool) -> None:
+        """Change fields of a lamp that is there."""
+        self.lamps = tuple(
+            # Their names and types are what changes.py lets through.
+            replace(lamp, **fields) if lamp.name == name else lamp  # type: ignore[arg-type]
+            for lamp in self.lamps
+        )
+
+    def speed_thing(self, name: str, speed_m_s: float, now: float) -> None:
+        """Give a thing that has a path another speed."""
+        at_s = now - self._began
+        self.things = tuple(each.faster(speed_m_s, at_s) if each.name == name else each for each in self.things)
+
+    def put_thing(self, name: str, x_m: float | None, y_m: float | None, now: float) -> None:
+        """Put a thing elsewhere (None: as it is), where it stays; one that is carried: elsewhere on its car."""
+
+        def put(thing: Thing) -> Thing:
+            pose = thing.pose(now - self._began)
+            return thing.put(pose.x_m if x_m is None else x_m, pose.y_m if y_m is None else y_m)
+
+        self.things = tuple(put(each) if each.name == name else each for each in self.things)

@@ -1,0 +1,1 @@
+"""Bench commands for one link: `gateway scan`, `monitor` and `send`, and what they share."""

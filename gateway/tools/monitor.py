@@ -1,0 +1,229 @@
+"""`gateway monitor`: what a car says, decoded beside the raw bytes, live or from a file. It only listens.
+
+How an event is shown is in `Lines`; what it says, and what is counted, in `heard`.
+"""
+
+import argparse
+import asyncio
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from gateway import capture
+from gateway.link import Link, LinkLost, LinkUrl, open_link, parse_url
+from gateway.protocol.decoder import Decoder
+from gateway.protocol.events import Event, Rejected
+from gateway.protocol.platforms import Profile
+from gateway.tools import cli_support
+from gateway.tools.statistics import Tally, describe
+
+DESCRIPTION: Final = "What a car says, decoded beside the raw bytes. It only listens; Ctrl-C ends it."
+EPILOG: Final = """\
+examples:
+  gateway monitor --link /dev/ttyUSB0 --platform arduino
+  gateway monitor --link /dev/ttyUSB0 --raw morning.jsonl       keep the bytes with their times
+  gateway monitor --from morning.jsonl --json                   look at them again
+
+Only what the frame's mode measures is shown; the rest of the frame is filler. Times are seconds since the start.
+Opening a serial port can reset an Arduino that is on a USB cable; it speaks again after about three seconds."""
+
+_RAW_WIDTH: Final = 46  # a sensors frame in its longest observed spelling
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    cli_support.describe(parser, DESCRIPTION, EPILOG)
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--link", metavar="URL", help=cli_support.LINK_HELP)
+    source.add_argument("--from", dest="file", type=Path, metavar="FILE", help="look at a file that --raw kept")
+    parser.add_argument("--platform", default="unknown", help=cli_support.PLATFORM_HELP + "; decides what is filler")
+    parser.add_argument("--raw", type=Path, metavar="FILE", help="keep the bytes with their times in a new file")
+    parser.add_argument("--json", action="store_true", help="one JSON object an event, and one of the whole at the end")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Listen until Ctrl-C, or read the file; the exit code."""
+    return cli_support.explained("gateway monitor", lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    lines = Lines(cli_support.profile_of(arguments.platform), as_json=arguments.json)
+    if arguments.file is None:
+        _run_live(parse_url(arguments.link), arguments.raw, lines)
+        return
+    if arguments.raw is not None:
+        raise cli_support.WrongUse("--raw keeps what comes over a --link; the bytes of --from are in a file already")
+    lines.begin(0.0)
+    for piece in _pieces(arguments.file):
+        lines.feed(piece)
+    lines.end()
+
+
+def _pieces(path: Path) -> Iterator[capture.Piece]:
+    pieces = capture.read(path)
+    while True:
+        try:
+            piece = next(pieces, None)
+        except OSError as error:
+            raise cli_support.WrongUse(f"{path}: the file cannot be read: {error.strerror}") from None
+        if piece is None:
+            return
+        yield piece
+
+
+def _run_live(url: LinkUrl, raw: Path | None, lines: "Lines") -> None:
+    keep = None if raw is None else _new_capture(raw, url)
+    cli_support.warn_of(url)
+    origin = time.monotonic()
+    try:
+        cli_support.run_until_interrupted(_live(url, lines, keep, origin))
+    except (LinkLost, cli_support.Failed, KeyboardInterrupt):
+        lines.end(time.monotonic() - origin)
+        raise
+    finally:
+        if keep is not None and lines.tally.since is None:
+            keep.discard()
+        elif keep is not None:
+            keep.close()
+            cli_support.note(f"the bytes are in {keep.path}")
+
+
+def _new_capture(path: Path, url: LinkUrl) -> capture.Writer:
+    try:
+        return capture.Writer(path, str(url), datetime.now(UTC).isoformat(timespec="milliseconds"))
+    except FileExistsError:
+        raise cli_support.WrongUse(f"{path} exists already and is not overwritten: name another file") from None
+    except OSError as error:
+        raise cli_support.WrongUse(f"{path}: the file cannot be made: {error.strerror}") from None
+
+
+async def _live(url: LinkUrl, lines: "Lines", keep: capture.Writer | None, origin: float) -> None:
+    link = await open_link(url)
+    try:
+        lines.begin(time.monotonic() - origin)
+        await _listen(link, lines, keep, origin)
+    finally:
+        await link.close()
+
+
+async def _listen(link: Link, lines: "Lines", keep: capture.Writer | None, origin: float) -> None:
+    reading = asyncio.ensure_future(link.read())
+    try:
+        while True:
+            deadline = lines.deadline()
+            timeout = None if deadline is None else max(0.0, deadline - (time.monotonic() - origin))
+            done, _ = await asyncio.wait([reading], timeout=timeout)
+            now = round(time.monotonic() - origin, 6)  # as the file has it, so that it is decoded there as here
+            if not done:
+                lines.tick(now)
+                continue
+            piece = capture.Piece(now, reading.result())
+            reading = asyncio.ensure_future(link.read())
+            if keep is not None:
+                _add(keep, piece)
+            lines.feed(piece)
+    finally:
+        reading.cancel()
+
+
+def _add(keep: capture.Writer, piece: capture.Piece) -> None:
+    try:
+        keep.add(piece)
+    except OSError as error:
+        raise cli_support.Failed(f"{keep.path}: the file cannot be written: {error.strerror}") from None
+
+
+class Lines:
+    """A line for each event of one link's bytes, as text or JSON, and a summary at the end."""
+
+    def __init__(self, profile: Profile, *, as_json: bool) -> None:
+        self._profile = profile
+        self._as_json = as_json
+        self._decoder = Decoder()
+        self._paint = cli_support.Paint(sys.stdout)
+        self.tally = Tally()
+
+    def begin(self, at: float) -> None:
+        """The link is open; seconds since the start, as all times here."""
+        self.tally.since = at
+
+    def feed(self, piece: capture.Piece) -> None:
+        """Show what these bytes complete; raises OSError of the output."""
+        self.tally.bytes += len(piece.data)
+        self.tally.until = piece.at
+        self._show(self._decoder.feed(piece.data, piece.at))
+
+    def tick(self, now: float) -> None:
+        """Show what silence completes."""
+        self._show(self._decoder.tick(now))
+
+    def deadline(self) -> float | None:
+        """When `tick` is next wanted."""
+        return self._decoder.deadline()
+
+    def end(self, at: float | None = None) -> None:
+        """Show what is still held, and the summary; nothing if the link was never open."""
+        if self.tally.since is None:
+            return
+        self._show(self._decoder.end())
+        if at is not None:
+            self.tally.until = at
+        if self._as_json:
+            sys.stdout.write(json.dumps({"kind": "summary", **self.tally.fields()}) + "\n")
+            sys.stdout.flush()
+        else:
+            sys.stderr.write(self.tally.words() + "\n")
+
+    def _show(self, events: Sequence[Event]) -> None:
+        for event in events:
+            self.tally.count(event, self._profile)
+            fields = describe(event, self._profile)
+            line = self._json(event, fields) if self._as_json else self._text(event, fields)
+            sys.stdout.write(line + "\n")
+        if events:
+            sys.stdout.flush()
+
+    def _json(self, event: Event, fields: dict[str, Any]) -> str:
+        return json.dumps({"t": round(event.at, 6), **fields, "raw": event.raw.decode("latin-1")})
+
+    def _text(self, event: Event, fields: dict[str, Any]) -> str:
+        raw = cli_support.printable(event.raw)
+        at = self._paint("dim", f"{event.at:9.3f}")
+        # What does not fit its column has a line of its own, and is never cut.
+        gap = " " * (_RAW_WIDTH - len(raw)) if len(raw) <= _RAW_WIDTH else "\n" + " " * (_RAW_WIDTH + 11)
+        colour = (
+            "red" if isinstance(event, Rejected) else "yellow" if {"rejected", "contradicts"} & fields.keys() else ""
+        )
+        words = "  ".join(_words(fields))
+        return f"{at}  {raw}{gap}  {self._paint(colour, words) if colour else words}"
+
+
+def _words(fields: dict[str, Any]) -> Iterator[str]:
+    """The fields for a person; the kind of a sensors frame goes without saying."""
+    for name, value in fields.items():
+        match name:
+            case "kind":
+                if value not in ("sensors", "rejected"):
+                    yield value
+            case "no_echo":
+                yield "no echo"
+            case "range_m":
+                yield f"{value:.2f} m"
+            case "voltage_v":
+                yield f"{value:.2f} V"
+            case "modes":
+                yield f"({' or '.join(value)})"
+            case "cause":
+                yield f"rejected, {value}:"
+            case "detail":
+                yield value
+            case "rejected":
+                yield "rejected: " + ", ".join(word + text for word, text in value.items())
+            case "contradicts":
+                yield "not as the platform sends it"
+            case _:
+                yield f"{name} {' '.join(f'{item:g}' for item in value) if isinstance(value, list) else value}"

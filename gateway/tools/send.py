@@ -1,0 +1,197 @@
+"""`gateway send`: one frame to a car on the desk, checked against the table, and what the car may be doing then.
+
+For trying things: it paces, repeats and stops nothing. `gateway run` is what drives a car safely.
+"""
+
+import argparse
+import asyncio
+import re
+import shlex
+from typing import Final
+
+from gateway.link import LinkUrl, open_link, parse_url
+from gateway.link.url import TcpUrl
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.frames import (
+    ArmSet,
+    ColorLed,
+    Frame,
+    General,
+    ModeClose,
+    ModeOpen,
+    Ptz,
+    Reset,
+    encode,
+    parse_sent,
+)
+from gateway.protocol.platforms import Profile, StopStyle
+from gateway.protocol.timing import BYTES_PER_S, FRAME_S
+from gateway.tools import cli_support
+
+DESCRIPTION: Final = "Send one frame to a car on the desk, checked against the table, and say what the car may do then."
+EPILOG: Final = """\
+examples (in single quotes: in double ones the shell replaces $0 and $4):
+  gateway send --link /dev/ttyUSB0 '$0,0,1,0,0,0,0,0,0#'                        sound once
+  gateway send --link /dev/ttyUSB0 '$1,0,0,0,0,0,0,0,0#'                        drive on, for ever
+  gateway send --link /dev/ttyUSB0 '$0,0,0,0,0,0,0,0,0#'                        stop
+  gateway send --link /dev/ttyUSB0 --platform arduino '$4WD,PTZ90#'             only some cars know it
+
+A car keeps its last motion for ever: put it on blocks. `gateway run` is what drives a car safely.
+Opening a serial port can reset an Arduino that is on a USB cable; it misses what comes in the two seconds of its start:
+--wait 3."""
+
+LONGEST_WAIT_S: Final = 60.0
+_STOP: Final = encode(General(Motion.STOP)).decode()
+_MANUAL: Final = encode(ModeClose()).decode()
+_FORMS: Final = (
+    f"nine digits as in '{_STOP}', '$4WD,PTZ<0..180>#', '$4WD,CLR<0..255>,CLG<0..255>,CLB<0..255>#', "
+    "'$4WD,MODE<0..6><0 or 1>#', or '$4WD,ServoJ1<0..180>,J2...,J6<0..180>#'"
+)
+_PLACES: Final = ("motion", "rotate", "whistle", "speed", "servo", "sing", "light", "fan", "servo reset")
+# What is left of a frame whose `$0` or `$4` a shell has replaced: by its own name, or by nothing.
+_EXPANDED: Final = re.compile(r"(?P<name>[^,$]*)(?P<rest>(?:,\d){8}#?)|(?P<named>WD,[A-Za-z0-9,]+#?)")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    cli_support.describe(parser, DESCRIPTION, EPILOG)
+    parser.add_argument("--link", required=True, metavar="URL", help=cli_support.LINK_HELP)
+    platform_help = cli_support.PLATFORM_HELP + "; decides which frames are sent"
+    parser.add_argument("--platform", default="unknown", help=platform_help)
+    parser.add_argument("--wait", type=float, default=0.0, metavar="S", help="open the link, wait so long, then send")
+    parser.add_argument("--raw", action="store_true", help="send the text as it is, whatever it is")
+    parser.add_argument("frame", metavar="FRAME", help=f"for example '{_STOP}', in single quotes")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Send the frame; the exit code."""
+    return cli_support.explained("gateway send", lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    url, profile = parse_url(arguments.link), cli_support.profile_of(arguments.platform)
+    if not 0 <= arguments.wait <= LONGEST_WAIT_S:
+        raise cli_support.WrongUse(f"--wait {arguments.wait:g}: a number of seconds from 0 to {LONGEST_WAIT_S:g}")
+    data = raw_bytes(arguments.frame) if arguments.raw else checked(arguments.frame, profile, url)
+    cli_support.warn_of(url)
+    cli_support.run_until_interrupted(_send(url, data, arguments.wait))
+    sent = f"sent {cli_support.printable(data)} to {url}"
+    cli_support.say([sent, *aftermath(parse_sent(data), profile, arguments.link)])
+
+
+async def _send(url: LinkUrl, data: bytes, wait_s: float) -> None:
+    link = await open_link(url)
+    try:
+        await asyncio.sleep(wait_s)
+        await link.write(data)
+        # A port that is closed before its bytes are out may cut them.
+        await asyncio.sleep(len(data) / BYTES_PER_S + FRAME_S)
+    finally:
+        await link.close()
+
+
+def raw_bytes(text: str) -> bytes:
+    """The text as bytes, one each; raises WrongUse."""
+    try:
+        data = text.encode("latin-1")
+    except UnicodeEncodeError as error:
+        raise cli_support.WrongUse(f"frame {text!r}: {text[error.start]!r} is no byte: use ASCII") from None
+    if not data:
+        raise cli_support.WrongUse(f"frame '' is empty: give one as '{_STOP}'")
+    return data
+
+
+def checked(text: str, profile: Profile, url: LinkUrl) -> bytes:
+    """The bytes of a frame that is in the table and that this car knows; raises WrongUse, which says what is wrong."""
+    frame = parse_sent(raw_bytes(text))
+    if frame is None:
+        raise cli_support.WrongUse(f"frame {text!r}: {why_not(text)} (--raw sends it anyway)")
+    refusal = profile.refusal(frame)
+    if refusal is not None:
+        raise cli_support.WrongUse(
+            f"frame {text!r}: {refusal} (--platform says what the car is, --raw sends it anyway)"
+        )
+    if isinstance(url, TcpUrl) and moves(frame) and profile.stop_style is not StopStyle.MODE_FRAME:
+        raise cli_support.WrongUse(
+            f"frame {text!r}: the car would drive, and a Raspberry Pi car's program dies when this connection closes, "
+            "after which nothing can stop the car: use `gateway run` (or --platform arduino behind a bridge, or --raw)"
+        )
+    return encode(frame)
+
+
+def why_not(text: str) -> str:
+    """Why a text is no frame of the table, in words for a person."""
+    if expanded := _EXPANDED.fullmatch(text):
+        rest = expanded["rest"]
+        # `$1`..`$4` are empty in a shell, `$0` is its name.
+        meant = f"${'0' if expanded['name'] else '<digit>'}{rest}" if rest else f"$4{expanded['named']}"
+        meant += "" if meant.endswith("#") else "#"
+        return f"the shell has replaced the $ and the digit after it: put the frame in single quotes, '{meant}'"
+    if not text.startswith("$"):
+        return f"a frame begins with '$'; there are: {_FORMS}"
+    if not text.endswith("#"):
+        return f"a frame ends with '#': '{text}#'?"
+    if text == "$4WD,MODE01#":
+        return f"mode 0 is not opened; '{_MANUAL}' closes whatever mode is open"
+    places = text[1:-1].split(",")
+    if text.startswith("$4WD,"):
+        return f"it is not in the table; there are: {_FORMS}"
+    if len(places) != len(_PLACES):
+        return f"it has {len(places)} of the nine places of a general frame ({', '.join(_PLACES)})"
+    for index, (name, value) in enumerate(zip(_PLACES, places, strict=True)):
+        allowed = [digit for digit in "012345678" if _is_frame(index, digit)]
+        if value not in allowed:
+            return f"place {index + 1} ({name}) is {value!r}, allowed are {allowed[0]}..{allowed[-1]}"
+    return "a servo is moved (place 5) and reset (place 9) at once"
+
+
+def _is_frame(index: int, digit: str) -> bool:
+    places = ["0"] * len(_PLACES)
+    places[index] = digit
+    return parse_sent(f"${','.join(places)}#".encode()) is not None
+
+
+def moves(frame: Frame) -> bool:
+    """Whether the car may drive after this frame."""
+    match frame:
+        case General(motion):
+            return motion is not Motion.STOP
+        case ModeOpen():
+            return True
+        case Ptz() | ColorLed() | ModeClose() | ArmSet() | Reset():
+            return False
+
+
+def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
+    """What the car may be doing now, and how it is stopped, in lines for a person."""
+    again = f"gateway send --link {shlex.quote(link)}"
+    lines = ["cars do not answer; `gateway monitor` shows what it says"]
+    match frame:
+        case General(motion) as general:
+            if motion is Motion.STOP:
+                lines.append("its motors are off, if it is in mode 0 and was not busy: in another mode it ignores this")
+            else:
+                lines.append(f"it drives ({motion}) until it is told otherwise, also when the link is gone")
+            if general.fan:
+                lines.append("its fan was toggled; while it runs, an arduino car sends no readings")
+        case ModeOpen(mode):
+            lines.append(
+                f"it is opening mode {mode}, which takes up to 3.5 s, and keeps its motors as they were for that"
+            )
+            then = "obeys" if mode in (Mode.REMOTE_CONTROL, Mode.COLOR_LED) else "drives by itself, and obeys"
+            lines.append(f"then it {then} only a mode frame; stop it, and back to mode 0: {again} '{_MANUAL}'")
+        case ModeClose():
+            lines.append("its motors are off and it is in mode 0, as soon as it is not busy (4.3 s in avoidance)")
+        case Ptz() | ColorLed() | ArmSet():
+            lines.append("its motors are as they were; in a mode other than 0 it ignores this")
+        case Reset():
+            lines.append("half a frame in its buffer was ended, and may have been obeyed")
+        case None:
+            lines.append(
+                "this is not in the table: what the car does is not known. It may drive, or ignore what follows"
+            )
+    if frame is None or (isinstance(frame, General) and moves(frame)):
+        lines.append(f"stop it: {again} '{_STOP}'")
+        if profile.stop_style is not StopStyle.RASPBERRY_PI:
+            lines.append(f"     or: {again} '{_MANUAL}', obeyed in every mode, but a Raspberry Pi car knows none")
+    return lines
