@@ -51,11 +51,11 @@ proto: .venv/.ready ## generate schemas/gen from schemas/proto
 	$(BIN)/python -m schemas.generate
 
 pictures: .venv/.ready ## the README's pictures, of the newest session (needs a Vulkan driver, which may be software)
-	$(BIN)/python -m fleet.replay.picture "$$(ls -td sessions/*/ | head -n 1)" .github
+	$(BIN)/python -m tests.tools.screenshots "$$(ls -td sessions/*/ | head -n 1)" .github
 
 readme: .venv/.ready ## generate the README's tables and help texts, docs/reference and the SDK's reference
-	$(BIN)/python -m tests.readme
-	$(BIN)/python -m tests.reference
+	$(BIN)/python -m tests.tools.readme
+	$(BIN)/python -m tests.tools.reference
 
 clean: ## remove everything that is not tracked
 	rm -rf .venv .cache .tmp .state .hypothesis .pytest_cache .mypy_cache .ruff_cache sessions

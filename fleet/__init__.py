@@ -7,18 +7,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from fleet.client import Fleet as Fleet
-    from fleet.outcome import LeaseLost as LeaseLost
-    from fleet.outcome import NotCarriedOut as NotCarriedOut
-    from fleet.outcome import Outcome as Outcome
-    from fleet.readings import Reading as Reading
+    from fleet.client.client import Fleet as Fleet
+    from fleet.client.outcome import LeaseLost as LeaseLost
+    from fleet.client.outcome import NotCarriedOut as NotCarriedOut
+    from fleet.client.outcome import Outcome as Outcome
+    from fleet.client.reading import Reading as Reading
 
 _HOME: Final = {
-    "Fleet": "fleet.client",
-    "LeaseLost": "fleet.outcome",
-    "NotCarriedOut": "fleet.outcome",
-    "Outcome": "fleet.outcome",
-    "Reading": "fleet.readings",
+    "Fleet": "fleet.client.client",
+    "LeaseLost": "fleet.client.outcome",
+    "NotCarriedOut": "fleet.client.outcome",
+    "Outcome": "fleet.client.outcome",
+    "Reading": "fleet.client.reading",
 }
 
 

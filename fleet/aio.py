@@ -12,13 +12,13 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
-from fleet import client
-from fleet import lease as leases
-from fleet.condition import Condition
-from fleet.outcome import Outcome
-from fleet.readings import QUEUE_LIMIT, Reading, Wanted, reading_of
-from fleet.verbs import Request, Verbs
-from fleet.waiting import Waiting
+from fleet.client import client
+from fleet.client import lease as leases
+from fleet.client.commands import Request, Verbs
+from fleet.client.condition import Condition
+from fleet.client.outcome import Outcome
+from fleet.client.reading import QUEUE_LIMIT, Reading, Wanted, reading_of
+from fleet.client.wait import Waiting
 from schemas import keys, messages
 from schemas.bus import Handover, Sample
 
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 class Fleet:
-    """`async with Fleet() as fleet`; see fleet.client.Fleet for what each does and raises."""
+    """`async with Fleet() as fleet`; see fleet.client.client.Fleet for what each does and raises."""
 
     def __init__(
         self,
@@ -141,7 +141,7 @@ class Car(Verbs[Coroutine[Any, Any, Outcome]]):
     def lease(self, *, take: bool = False) -> "Lease":
         """Have the car while a block runs: `async with fleet.car("red").lease() as car: await car.drive("forward")`.
 
-        As fleet.client.Car.lease; a task that is cancelled stops the car, too.
+        As fleet.client.client.Car.lease; a task that is cancelled stops the car, too.
         """
         return Lease(self._fleet, self.name, take=take)
 

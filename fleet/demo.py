@@ -20,9 +20,8 @@ from typing import IO, Any, Final
 
 import click
 
-from fleet.client import Fleet
-from fleet.commands.common import sigterm_interrupts
-from fleet.readings import Reading
+from fleet.client.client import Fleet
+from fleet.client.reading import Reading
 from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
@@ -116,7 +115,7 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         run = Demo(out.resolve(), _free_endpoint(), say)
-        with sigterm_interrupts():
+        with signals.sigterm_interrupts():
             session, rrd = _run(run)
     except OSError as error:
         raise click.ClickException(f"no demo in {out}: {error.strerror}; name another directory with --out") from None
@@ -317,7 +316,7 @@ def _check_recording(run: Demo, session: Path) -> Counter[str]:
 
 def _replay(run: Demo, session: Path, recorded: Counter[str]) -> Path | None:
     """Make the .rrd, and read it back with Rerun: each key has as many messages in it as in the recording."""
-    from fleet.replay.to_rerun import rows
+    from fleet.replay.rerun.export import rows
 
     rrd = session / "session.rrd"
     command = [sys.executable, "-m", "fleet.cli", "replay", str(session), "--save", str(rrd)]
@@ -439,6 +438,6 @@ def _free_endpoint() -> str:
 
 
 def _can_view() -> bool:
-    from fleet.replay.viewer import has_display
+    from fleet.replay.rerun.viewer import has_display
 
     return sys.stdin.isatty() and has_display()

@@ -141,7 +141,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
             from gateway.car import Settings, serve
             from gateway.control.estimate.battery import Action, Policy
-            from schemas.process.state_dir import directory_of
+            from schemas.state_dir import directory_of
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
             state_dir = directory_of(opened.endpoint, Path(arguments.state_dir) if arguments.state_dir else None)

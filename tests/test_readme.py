@@ -1,6 +1,6 @@
 """What the README shows is what the code says."""
 
-from tests.readme import README, STOP_EVIDENCE, generated, stop_evidence_page
+from tests.tools.readme import README, STOP_EVIDENCE, generated, stop_evidence_page
 
 
 def test_the_generated_parts_are_up_to_date() -> None:

@@ -1,1 +1,4 @@
-"""The subcommands of `fleet`, in files by what they are for."""
+"""The subcommands of `fleet`: click code and no logic. `fleet.cli` lists them.
+
+They share `options`, `params` and `output`.
+"""

@@ -14,16 +14,26 @@ from typing import Final
 
 import click
 
-from fleet.client import Fleet
-from fleet.commands.common import explained, sigterm_interrupts
-from fleet.commands.config import file_argument, link_option, look_for, prompt_name, read, seconds_option, tell, write
-from fleet.config import FleetFile
-from fleet.config_fields import checked_link
-from fleet.edit import CannotEdit, with_link
-from fleet.found import Found
+from fleet.client.client import Fleet
+from fleet.commands.fleet_file import (
+    file_argument,
+    link_option,
+    look_for,
+    prompt_name,
+    read,
+    seconds_option,
+    tell,
+    write,
+)
+from fleet.commands.options import explained
+from fleet.fleetfile.editor import CannotEdit, with_link
+from fleet.fleetfile.fleet_file import FleetFile
+from fleet.fleetfile.models import checked_link
+from fleet.fleetfile.scan import Found
 from fleet.links import LinkKind, parse_link
-from fleet.marked import BadFile, read_text
-from fleet.supervise.restart import GATEWAY_GRACE_S
+from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from schemas.process import signals
+from schemas.yaml_document.document import BadFile, read_text
 
 _READY_S: Final = 15.0
 """A gateway starts in one, and brings a car of an unknown platform to a known state within six."""
@@ -55,7 +65,11 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
         raise click.ClickException(
             "there is no link that may be a car's and is no car's in the file: see what `gateway scan` shows"
         )
-    with explained(), sigterm_interrupts(), Fleet(connect or fleet.endpoint, fleet.name, start_hub=True) as client:
+    with (
+        explained(),
+        signals.sigterm_interrupts(),
+        Fleet(connect or fleet.endpoint, fleet.name, start_hub=True) as client,
+    ):
         for number, each in enumerate(found, 1):
             click.echo(f"\n{number} of {len(found)}: {each.url}\n  {each.words}")
             with _gateway(client, f"bind-{number}", each.url) as name:

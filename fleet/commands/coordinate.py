@@ -7,16 +7,16 @@ from pathlib import Path
 
 import click
 
-from fleet.client import Fleet, default_sender
-from fleet.commands.common import WrongFile, bus_options, json_option
-from fleet.config import read_fleet
-from fleet.coordinator import SENDER, AnotherCoordinator, Coordinator
-from fleet.hearing import listed_cars
-from fleet.marked import read_text
-from fleet.policy.check import faults
+from fleet.client.client import Fleet, default_sender
+from fleet.commands.options import WrongFile, bus_options, json_option
+from fleet.coordinator.coordinator import SENDER, AnotherCoordinator, Coordinator
+from fleet.coordinator.observer import listed_cars
+from fleet.fleetfile.fleet_file import read_fleet
 from fleet.policy.decision import Decision
-from fleet.policy.reader import parse
+from fleet.policy.plan.lint import faults
+from fleet.policy.plan.parser import parse
 from schemas.process import signals
+from schemas.yaml_document.document import read_text
 
 
 @click.command(

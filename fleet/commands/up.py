@@ -14,18 +14,18 @@ from typing import Final
 
 import click
 
-from fleet.commands.common import explained
-from fleet.config import parse_fleet, read_fleet
-from fleet.hearing import listed_cars
-from fleet.marked import BadFile, read_text
-from fleet.policy.check import faults
-from fleet.policy.reader import parse as parse_plan
-from fleet.supervise.desk import AnotherSupervisor
-from fleet.supervise.wanted import MOST_SIMULATED, Asked, Wanted, listing, wanted
-from fleet.supervisor import TRIES_S, Happening, Supervisor
+from fleet.commands.options import explained
+from fleet.coordinator.observer import listed_cars
+from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
+from fleet.policy.plan.lint import faults
+from fleet.policy.plan.parser import parse as parse_plan
+from fleet.supervisor.service import AnotherSupervisor
+from fleet.supervisor.spec import MOST_SIMULATED, Asked, Wanted, listing, wanted
+from fleet.supervisor.supervisor import TRIES_S, Happening, Supervisor
 from schemas import keys
 from schemas.bus import accepts, check_listening, resolve_endpoint
 from schemas.process import signals
+from schemas.yaml_document.document import BadFile, read_text
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
 _Tell = Callable[[Happening], None]
@@ -140,7 +140,7 @@ async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool
     supervisor = Supervisor(wish, str(file) if file else "", lambda: read(file, asked), tell)
     table = None
     if live:
-        from fleet.supervise.table import Table
+        from fleet.supervisor.status_table import Table
 
         table = Table(supervisor)
 

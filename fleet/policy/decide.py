@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from fleet.policy import explain
+from fleet.policy.allocation import Barrier, Staff, Staffing, fill, follow_needs
+from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import Decision, Kind
 from fleet.policy.explain import Override
-from fleet.policy.memory import HUB_BACK_S, Coloured, Held, Memory, Tried
-from fleet.policy.picture import CONTRADICTED, LOST, NOBODY, CarPicture, Picture
-from fleet.policy.plan import Effect, Plan, Rule
+from fleet.policy.plan.plan import Effect, Plan, Rule
 from fleet.policy.rules import Cars, RuleState, follow_phase, follow_rules, targets
-from fleet.policy.staffing import Barrier, Staff, Staffing, fill, follow_needs
-from fleet.policy.steady import HYSTERESIS_S
+from fleet.policy.snapshot import CONTRADICTED, LOST, NOBODY, CarPicture, Picture
+from fleet.policy.state import HUB_BACK_S, Coloured, Held, Memory, Tried
 from gateway.protocol.enums import Mode
 
 LONGEST_WAIT_S: Final = 30.0

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
+from fleet.policy.allocation import Barrier, Staff, Staffing
+from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import LEFT_ALONE, Decision, Kind
-from fleet.policy.measured import blind
-from fleet.policy.memory import Held
-from fleet.policy.picture import NOBODY, CarPicture, Picture
-from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Plan, Role, Rule
+from fleet.policy.plan.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Plan, Role, Rule
+from fleet.policy.plan.reachability import blind
 from fleet.policy.rules import PhaseState, RuleState
-from fleet.policy.staffing import Barrier, Staff, Staffing
-from fleet.policy.steady import HYSTERESIS_S
+from fleet.policy.snapshot import NOBODY, CarPicture, Picture
+from fleet.policy.state import Held
 
 _NAMED: Final = 4
 """So many roles or cars are gone into."""

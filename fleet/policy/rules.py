@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
-from fleet.policy.picture import Picture
-from fleet.policy.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Phase, Plan, Rule
-from fleet.policy.steady import HYSTERESIS_S, Steady, follow
+from fleet.policy.debounce import HYSTERESIS_S, Steady, follow
+from fleet.policy.plan.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Phase, Plan, Rule
+from fleet.policy.snapshot import Picture
 
 SETTLES_WITHIN_S: Final = 15.0
 """Maximum wait for a phase's cars before its time-out counts. Recovery and opening take 4.9 + 3.5 s (protocol.md)."""

@@ -69,3 +69,14 @@ def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
     ignored = [signal.SIGINT] if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else []
     with _taken(ignored, signal.default_int_handler), _taken(others, lambda *_: interrupt()):
         yield
+
+
+@contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """Take every signal that ends a process, SIGTERM above all, as Ctrl-C: raise KeyboardInterrupt."""
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with taken_as_ctrl_c(interrupt):
+        yield

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from time import perf_counter
 
-from fleet.client import Fleet
+from fleet.client.client import Fleet
 from schemas.bus import Sample
 from tests.bench.measured import Measured, percentile
 from tests.bench.stage import scratch

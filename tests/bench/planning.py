@@ -4,9 +4,9 @@ from dataclasses import replace
 from time import perf_counter
 
 from fleet.policy.decide import step
-from fleet.policy.memory import Memory
-from fleet.policy.picture import CarPicture, Picture, Seen
-from fleet.policy.reader import parse
+from fleet.policy.plan.parser import parse
+from fleet.policy.snapshot import CarPicture, Picture, Seen
+from fleet.policy.state import Memory
 from tests.bench.measured import Measured, in_turns, percentile
 
 CARS = tuple(f"car{number:02}" for number in range(50))

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from fleet.recording.recorder import Recorder
+from fleet.recording.writing.recorder import Recorder
 from schemas.bus import Bus
 
 

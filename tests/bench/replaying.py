@@ -6,8 +6,8 @@ from time import perf_counter
 import rerun.chunk as rrc
 from mcap.writer import Writer
 
-from fleet.recording.session import Session
-from fleet.replay.to_rerun import export
+from fleet.recording.reading.session import Session
+from fleet.replay.rerun.export import export
 from tests.bench.measured import Measured, in_turns
 from tests.bench.stage import scratch
 from tests.fleet.replay.make_session import CARS, Made, drive_about

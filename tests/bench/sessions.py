@@ -10,9 +10,9 @@ import rerun.chunk as rrc
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from fleet.recording.session import Session
-from fleet.recording.sessions.export import export
-from fleet.recording.sessions.formats import FORMATS
+from fleet.recording.reading.session import Session
+from fleet.recording.tools.export import export
+from fleet.recording.tools.table_formats import FORMATS
 from schemas import messages
 from tests.bench.measured import Measured, in_turns
 from tests.bench.replaying import _session

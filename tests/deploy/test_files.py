@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from fleet.commands.config import schema_text
-from fleet.config import read_fleet
-from fleet.supervise.farewell import LINK_S, START_S
-from fleet.supervise.restart import GATEWAY_GRACE_S
-from fleet.supervisor import END_S, RECORDER_END_S, TRIES_S
+from fleet.commands.fleet_file import schema_text
+from fleet.fleetfile.fleet_file import read_fleet
+from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from fleet.supervisor.shutdown import LINK_S, START_S
+from fleet.supervisor.supervisor import END_S, RECORDER_END_S, TRIES_S
 
 DEPLOY = Path(__file__).parent.parent.parent / "deploy"
 FILES = sorted(DEPLOY.glob("fleet.*.yaml"))

@@ -2,7 +2,7 @@
 
 import time
 
-from fleet.client import Fleet as Client
+from fleet.client.client import Fleet as Client
 from tests.support.processes import TAKEN, Fleet, driving, wait_for
 
 

@@ -5,7 +5,7 @@ The simulator's truth is the judge, with its own stamps. Many times over, and st
 
 from pathlib import Path
 
-from fleet.client import Fleet as Client
+from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.kills import BUSY_S, cut_links, kill_gateways
 from tests.support.processes import Fleet, wait_for

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.supervise.desk import ask_status
+from fleet.supervisor.service import ask_status
 from schemas import bus
 from tests.support.ports import free_endpoint, free_port
 from tests.support.processes import PATIENCE_S, TAKEN, Fleet, driving, wait_for

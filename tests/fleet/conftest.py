@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.outcome import NotCarriedOut, Outcome
+from fleet.client.outcome import NotCarriedOut, Outcome
 from tests.support.ports import free_endpoint
 from tests.support.processes import LONG_S, Fleet, Process, wait_for
 

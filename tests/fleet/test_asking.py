@@ -21,11 +21,11 @@ import zenoh
 
 from fleet import aio
 from fleet import cli as command_line
-from fleet.alive import Survey
-from fleet.condition import Condition, topics_under
-from fleet.expression import BadExpression
-from fleet.readings import Reading
-from fleet.waiting import NotInTime, Waiting
+from fleet.client.condition import Condition, topics_under
+from fleet.client.key_survey import Survey
+from fleet.client.reading import Reading
+from fleet.client.wait import NotInTime, Waiting
+from fleet.conditions import BadExpression
 from schemas import keys, topics
 from schemas.bus import Bus, reply_value
 from schemas.gen import fleet_v1_pb2 as pb

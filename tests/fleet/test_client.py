@@ -11,8 +11,8 @@ import pytest
 import zenoh
 
 from fleet.aio import Fleet as AsyncFleet
-from fleet.client import Fleet
-from fleet.verbs import led_request
+from fleet.client.client import Fleet
+from fleet.client.commands import led_request
 from schemas import keys, messages, topics
 from schemas.bus import BadEndpoint, Bus, NoFleet, reply
 from schemas.gen import fleet_v1_pb2 as pb
@@ -185,8 +185,8 @@ def test_a_gateway_that_hangs_is_told_from_one_that_answers_late(
     cars: Cars, gateway: Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Of 50 cars that stopped, six were said to hang: their answers took more than two seconds."""
-    monkeypatch.setattr("fleet.asking.ANSWER_S", 0.1)
-    monkeypatch.setattr("fleet.client.LATEST_ANSWER_S", 1.2)
+    monkeypatch.setattr("fleet.client.command_tracker.ANSWER_S", 0.1)
+    monkeypatch.setattr("fleet.client.client.LATEST_ANSWER_S", 1.2)
     caplog.set_level("WARNING", "fleet")
     events = gateway.publisher("odd/fine/event/command", topics.TOPICS["event/command"], "fine")
     held: list[zenoh.Query] = []

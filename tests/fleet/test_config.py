@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.config import CarSpec, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
-from fleet.config_fields import CRITICAL_V, EMPTY_V, FULL_V, LONGEST_DRIVE_S, LOW_V, BatteryAction, schema
+from fleet.fleetfile.fleet_file import CarSpec, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
+from fleet.fleetfile.models import CRITICAL_V, EMPTY_V, FULL_V, LONGEST_DRIVE_S, LOW_V, BatteryAction, schema
 from fleet.links import BadLink, Link, LinkKind, parse_link, shared_ports
-from fleet.marked import BadFile
 from gateway.bus import requests
 from gateway.control.estimate import battery
 from gateway.link import BadUrl, parse_url
+from schemas.yaml_document.document import BadFile
 
 LAYERS = """\
 name: lab

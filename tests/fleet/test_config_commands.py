@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-from fleet.config import parse_fleet, read_fleet
-from fleet.edit import CannotEdit, with_link
-from fleet.found import NewCar, new_file
-from fleet.marked import BadFile
+from fleet.fleetfile.editor import CannotEdit, with_link
+from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
+from fleet.fleetfile.scan import NewCar, new_file
+from schemas.yaml_document.document import BadFile
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, Process, TcpCar, wait_for
 from tests.support.terminal import Terminal

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from fleet.client import Fleet
+from fleet.client.client import Fleet
 from schemas import bus
 from tests.fleet.conftest import Cars, asked
 from tests.support.processes import LONG_S, Process, wait_for

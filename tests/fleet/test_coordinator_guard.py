@@ -12,9 +12,9 @@ from click.testing import CliRunner
 
 from fleet import Fleet
 from fleet.cli import cli
-from fleet.coordinator import INTERNAL_ERROR, SENDER, Coordinator
+from fleet.coordinator.coordinator import INTERNAL_ERROR, SENDER, Coordinator
 from fleet.policy.decision import Decision
-from fleet.policy.reader import parse
+from fleet.policy.plan.parser import parse
 from schemas import keys, messages
 from schemas.bus import Failure, Sample
 from schemas.topics import TOPICS

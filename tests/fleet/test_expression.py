@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.expression import BadExpression, contradictory, fields_of, parse, value_in
-from fleet.expression.reader import DEPTH, LENGTH
-from fleet.expression.tree import Compare, Every, Expression, Kind, Literal, Name, Node, Not, Op, Some, joined
+from fleet.conditions import BadExpression, contradictory, fields_of, parse, value_in
+from fleet.conditions.expression import Compare, Every, Expression, Kind, Literal, Name, Node, Not, Op, Some, joined
+from fleet.conditions.parser import DEPTH, LENGTH
 from schemas import messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 

@@ -2,11 +2,11 @@
 
 import pytest
 
-from fleet.hearing import FORGOTTEN_S, MOST_GONE, NEEDED, Hearing
+from fleet.coordinator.observer import FORGOTTEN_S, MOST_GONE, NEEDED, Hearing
 from fleet.policy.decide import step
-from fleet.policy.memory import Memory
-from fleet.policy.picture import CarPicture
-from fleet.policy.reader import parse
+from fleet.policy.plan.parser import parse
+from fleet.policy.snapshot import CarPicture
+from fleet.policy.state import Memory
 from schemas import messages, topics
 from schemas.bus import Sample
 

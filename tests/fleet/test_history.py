@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from fleet import history
-from fleet.client import Fleet as Client
-from fleet.csv_table import table
-from fleet.readings import Reading
+from fleet.client import history
+from fleet.client.client import Fleet as Client
+from fleet.client.reading import Reading
+from fleet.recording.tools.csv_table import table
 from schemas import topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import HISTORY

@@ -9,9 +9,9 @@ import pytest
 from fleet import Fleet, LeaseLost, NotCarriedOut
 from fleet.aio import Car as AsyncCar
 from fleet.aio import Fleet as AsyncFleet
-from fleet.client import Car
-from fleet.lease import Ours
-from fleet.outcome import Outcome
+from fleet.client.client import Car
+from fleet.client.lease import Ours
+from fleet.client.outcome import Outcome
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars, asked
 from tests.support.processes import LONG_S, driving, wait_for

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from fleet.commands.reading import row_of, shown
-from fleet.readings import Reading
+from fleet.client.reading import Reading
+from fleet.commands.observe import row_of, shown
 from schemas.gen import fleet_v1_pb2 as pb
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 from pydantic import Field
 
-from fleet.marked import LARGEST_BYTES, BadFile, Entry, read_marked, read_text
+from schemas.yaml_document.document import LARGEST_BYTES, BadFile, Entry, read_marked, read_text
 
 
 class Wheel(Entry):

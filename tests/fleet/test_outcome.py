@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.outcome import SHOW_S, Progress, Until
+from fleet.client.outcome import SHOW_S, Progress, Until
 
 # Each step: ("answer" | "event", phase, worst case); at 1, 2, 3 ... s after asking at 100.
 Steps = list[tuple[str, str, float]]

@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from fleet.aio import Watch as AsyncWatch
-from fleet.readings import QUEUE_LIMIT, Reading, Watch, reading_of
+from fleet.client.reading import QUEUE_LIMIT, Reading, Watch, reading_of
 from schemas import messages
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb

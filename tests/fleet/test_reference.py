@@ -1,6 +1,6 @@
 """The reference says what the code says."""
 
-from tests.reference import PATH, reference
+from tests.tools.reference import PATH, reference
 
 
 def test_it_is_up_to_date() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from schemas.bus import DEFAULT_ENDPOINT
-from schemas.process.state_dir import default_directory, directory_of
+from schemas.state_dir import default_directory, directory_of
 
 
 def test_the_directory_is_the_variables_or_the_platforms(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.supervise.wanted import NAMES
+from fleet.supervisor.spec import NAMES
 from tests.support.claims import KINDS, Claims
 from tests.support.ports import free_endpoint
 from tests.support.processes import wait_for

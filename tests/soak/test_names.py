@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet.coordinator import AGAIN_S
-from fleet.hearing import FORGOTTEN_S, MOST_GONE
+from fleet.coordinator.coordinator import AGAIN_S
+from fleet.coordinator.observer import FORGOTTEN_S, MOST_GONE
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, Fleet, wait_for
 

@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from fleet.client import Fleet as Client
+from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.processes import Fleet, Process, wait_for
 

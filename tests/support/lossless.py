@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from fleet.recording.session import NoSession, Session
-from fleet.recording.sessions.making import recover
-from fleet.recording.sessions.verify import verify
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.tools.transform import recover
+from fleet.recording.tools.verify import verify
 from schemas.bus import BusError
 from tests.support.processes import Fleet, wait_for
 from tests.support.recording import RATE_HZ, Load, Recording, faults, kill_hub, numbers

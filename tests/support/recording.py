@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from fleet.recording.session import Session
+from fleet.recording.reading.session import Session
 from schemas import keys
 from schemas.bus import Bus, Publisher
 from schemas.gen import fleet_v1_pb2 as pb

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any, Self
 
-from fleet.supervise.desk import ask_status
+from fleet.supervisor.service import ask_status
 from schemas import messages
 from schemas.bus import Bus, BusError, Sample
 from tests.support.processes import Process, wait_for

@@ -2,7 +2,7 @@
 
 The car acknowledges nothing (protocol.md, "What shows that a stop arrived"). Three things show that it obeyed `MODE00`:
 it left a mode that it was seen in, it left a silent mode that was opened from a shown rest, or its reports paused.
-Docs and README print `EVIDENCE`; `tests/readme.py` writes them.
+Docs and README print `EVIDENCE`; `tests/tools/readme.py` writes them.
 """
 
 from dataclasses import dataclass

@@ -4,9 +4,9 @@ from dataclasses import replace
 from typing import Any
 
 from fleet.policy.decide import Step, step
-from fleet.policy.memory import Memory
-from fleet.policy.picture import CarPicture, Picture, Seen
-from fleet.policy.plan import Plan
+from fleet.policy.plan.plan import Plan
+from fleet.policy.snapshot import CarPicture, Picture, Seen
+from fleet.policy.state import Memory
 
 HERE = CarPicture(present=True, mode="manual", verdict="confirmed", link="online", motors="off", platform="arduino")
 GONE = CarPicture()

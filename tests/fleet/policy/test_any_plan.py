@@ -6,16 +6,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.expression.reader import DEPTH, LENGTH
-from fleet.marked import BadFile
-from fleet.policy.check import faults
+from fleet.conditions.parser import DEPTH, LENGTH
 from fleet.policy.decide import step
-from fleet.policy.memory import Memory
-from fleet.policy.picture import NAMES, CarPicture, Picture
-from fleet.policy.plan import Plan
-from fleet.policy.reader import parse
+from fleet.policy.plan.lint import faults
+from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan import Plan
+from fleet.policy.snapshot import NAMES, CarPicture, Picture
+from fleet.policy.state import Memory
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import parse_platform
+from schemas.yaml_document.document import BadFile
 from tests.fleet.policy.cars import HERE, seen
 
 FLEET = {

@@ -5,7 +5,7 @@ from itertools import product
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.policy.assign import assign
+from fleet.policy.assignment import assign
 
 ROLES = ("a", "b", "c")
 

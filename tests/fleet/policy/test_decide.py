@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.policy.decide import step
-from fleet.policy.memory import HUB_BACK_S, Memory, carried, hub_back, restored, to_keep
-from fleet.policy.picture import CarPicture, Picture, Refused
-from fleet.policy.reader import parse
+from fleet.policy.plan.parser import parse
+from fleet.policy.snapshot import CarPicture, Picture, Refused
+from fleet.policy.state import HUB_BACK_S, Memory, carried, hub_back, restored, to_keep
 from tests.fleet.policy.cars import GONE, HERE, Run
 
 FIXED = parse("cars: {red: tracking}")

@@ -2,9 +2,9 @@
 
 import pytest
 
-from fleet.policy.check import Gravity, check
-from fleet.policy.picture import CarPicture
-from fleet.policy.reader import parse
+from fleet.policy.plan.lint import Gravity, check
+from fleet.policy.plan.parser import parse
+from fleet.policy.snapshot import CarPicture
 from gateway.protocol.platforms import parse_platform
 
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from fleet.kept import Keeper
-from fleet.policy.memory import Kept, restarted, restored, to_keep
-from fleet.policy.picture import Picture
-from fleet.policy.reader import parse
+from fleet.coordinator.state_file import Keeper
+from fleet.policy.plan.parser import parse
 from fleet.policy.rules import SETTLES_WITHIN_S
+from fleet.policy.snapshot import Picture
+from fleet.policy.state import Kept, restarted, restored, to_keep
 from tests.fleet.policy.cars import GONE, HERE, Run
 
 PLAN = parse(

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from fleet.marked import BadFile
-from fleet.policy.check import check
-from fleet.policy.plan import Of
-from fleet.policy.reader import parse
+from fleet.policy.plan.lint import check
+from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan import Of
 from gateway.protocol.enums import Mode
+from schemas.yaml_document.document import BadFile
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.policy.steady import Settled, Steady, follow, settle
+from fleet.policy.debounce import Settled, Steady, follow, settle
 
 
 def _followed(for_s: float, course: list[tuple[float, bool | None]]) -> list[bool]:

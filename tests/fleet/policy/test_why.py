@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from fleet.policy.decision import Kind
-from fleet.policy.picture import Refused, Seen
-from fleet.policy.reader import parse
+from fleet.policy.plan.parser import parse
+from fleet.policy.snapshot import Refused, Seen
 from tests.fleet.policy.cars import HERE, Run
 from tests.support.vectors import rows
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from fleet.recording.salvage import LIMIT
-from fleet.recording.segment import Segment
-from fleet.recording.session import NoSession, Recorded, Session
+from fleet.recording.reading.mcap_reader import LIMIT
+from fleet.recording.reading.session import NoSession, Recorded, Session
+from fleet.recording.writing.segment_writer import Segment
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from fleet.recording.session import Session
+from fleet.recording.reading.session import Session
 from schemas.bus import Bus
 from schemas.gen import fleet_v1_pb2 as pb
 
 from .conftest import heard, popen, publisher, wait_for
 
-RECORD = "from fleet.recording.command import record; record()"
+RECORD = "from fleet.commands.record import record; record()"
 
 
 def start(code: str, *arguments: str) -> "subprocess.Popen[str]":

@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-from fleet.recording import directory
-from fleet.recording.session import NoSession, Session
-from fleet.recording.sessions.verify import verify
-from fleet.recording.tape import MB, Options, Tape
+from fleet.recording import session_dir
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.tools.verify import verify
+from fleet.recording.writing.session_writer import MB, Options, Tape
 from schemas.bus import Bus, Failure, Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -190,14 +190,14 @@ def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_dro
         process.send_signal(signal.SIGINT)
         text, errors = process.communicate(timeout=60)
         end = json.loads(text)
-        description = directory.Description.read(session)
+        description = session_dir.Description.read(session)
         assert description is not None
         assert description.closed
         dropped = end["drops"].get(out.key, 0)
         assert description.drops == end["drops"]
         assert len(holds(session, out.key)) + dropped == sent
         assert description.messages == end["messages"] == sum(1 for _ in Session.open(session).messages())
-        assert not (session / directory.SPARE).exists()
+        assert not (session / session_dir.SPARE).exists()
         if kind == "keep free":  # there was room, which only was to stay free
             assert (process.returncode, dropped) == (0, 0)
             assert verify(Session.open(session)).whole
@@ -280,7 +280,7 @@ def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing
         assert 0 < written[-1] < 1500
         assert all(any(Session.open(segment).messages()) for segment in tape.path.glob("000[2-9].mcap"))
         assert tape.segments < 4
-        description = directory.Description.read(tape.path)
+        description = session_dir.Description.read(tape.path)
         assert description is not None
         assert (description.messages, description.error) == (written[-1], tape.full)
         there.free()

@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.recording.numbers import SENDERS, Numbers
+from fleet.recording.sequence_tracker import SENDERS, Numbers
 
 
 def live(numbers: Numbers, *given: int, sender: str = "a") -> list[bool]:

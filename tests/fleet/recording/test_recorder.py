@@ -14,7 +14,7 @@ from google.protobuf import descriptor_pool, message_factory
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 
-from fleet.recording.recorder import AnotherRecorder, Recorder
+from fleet.recording.writing.recorder import AnotherRecorder, Recorder
 from schemas import keys
 from schemas.bus import Bus, Sample
 from schemas.gen import fleet_v1_pb2 as pb
@@ -232,7 +232,7 @@ def test_a_second_recorder_is_refused_and_told_of_the_first(endpoint: str, bus: 
 
 
 def test_a_flush_each_second_puts_a_young_session_on_the_disk(endpoint: str, bus: Bus, tmp_path: Path) -> None:
-    from fleet.recording.session import Session
+    from fleet.recording.reading.session import Session
 
     with Bus.open(endpoint) as own:
         recorder = Recorder(own, "fleet", tmp_path)

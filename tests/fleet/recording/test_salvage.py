@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from fleet.recording.recorder import LIMIT_BYTES
-from fleet.recording.salvage import LIMIT, NotMcap, Salvage
-from fleet.recording.segment import Segment
-from fleet.recording.session import NoSession, Session
+from fleet.recording.reading.mcap_reader import LIMIT, NotMcap, Salvage
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.writing.recorder import LIMIT_BYTES
+from fleet.recording.writing.segment_writer import Segment
 
 from .damaged import CHUNKS, PER_CHUNK, Original, judge, places, written
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
+from fleet.recording.reading.session import Session
 from fleet.recording.selection import matches
-from fleet.recording.session import Session
 
 CHUNKS, PER_CHUNK = 20, 50
 KEYS = ("fleet/red/sensor/range", "fleet/red/state/link", "fleet/blue/sensor/range", "fleet/@recorder/status")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from fleet.recording.session import NoSession, Session
+from fleet.recording.reading.session import NoSession, Session
 
 
 def mcap(*sequences: int) -> bytes:

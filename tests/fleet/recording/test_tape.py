@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet.recording import directory
-from fleet.recording.directory import Description
-from fleet.recording.session import Session
-from fleet.recording.sessions.verify import verify
-from fleet.recording.tape import MB, Options, Sync, Tape
+from fleet.recording import session_dir
+from fleet.recording.reading.session import Session
+from fleet.recording.session_dir import Description
+from fleet.recording.tools.verify import verify
+from fleet.recording.writing.session_writer import MB, Options, Sync, Tape
 
 BEGUN_NS = 1_790_000_000_000_000_000
 SECOND_NS = 1_000_000_000
@@ -60,7 +60,7 @@ def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
         feed(tape, BEGUN_NS + second * SECOND_NS)
         tape.tick(BEGUN_NS + second * SECOND_NS)
     tape.close(BEGUN_NS + 12 * SECOND_NS)
-    found = json.loads((tape.path / directory.INDEX).read_text())["segments"]
+    found = json.loads((tape.path / session_dir.INDEX).read_text())["segments"]
     assert [one["file"] for one in found] == [path.name for path in Session.open(tape.path).segments]
     assert [one["bytes"] for one in found] == [path.stat().st_size for path in Session.open(tape.path).segments]
     for one in found:
@@ -79,7 +79,7 @@ def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> Non
     assert verdict.whole
     assert verdict.messages == 50
     assert [round(one["step_s"]) for one in verdict.backwards] == [3602]
-    (one,) = json.loads((tape.path / directory.INDEX).read_text())["segments"]
+    (one,) = json.loads((tape.path / session_dir.INDEX).read_text())["segments"]
     assert (one["first_ns"], one["last_ns"]) == (BEGUN_NS - 3600 * SECOND_NS, BEGUN_NS + 2 * SECOND_NS + 9)
 
 
@@ -152,11 +152,11 @@ def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp
 def test_files_are_copied_into_each_session(tmp_path: Path) -> None:
     plan = tmp_path / "my.yaml"
     plan.write_text("roles: {}\n")
-    tape = Tape(tmp_path / "out", "fleet", Options(copied={directory.PLAN: plan}), BEGUN_NS)
+    tape = Tape(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN: plan}), BEGUN_NS)
     tape.close(BEGUN_NS)
     assert (tape.path / "plan.yaml").read_text() == "roles: {}\n"
     plan.unlink()
-    after = Tape(tmp_path / "out", "fleet", Options(copied={directory.PLAN: plan}), BEGUN_NS + SECOND_NS)
+    after = Tape(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN: plan}), BEGUN_NS + SECOND_NS)
     assert after.uncopied == [f"{plan} could not be copied into {after.path}: No such file or directory"]
     after.close(BEGUN_NS + SECOND_NS)
     assert verify(Session.open(after.path)).whole

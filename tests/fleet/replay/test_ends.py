@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
 
-from fleet.replay.ends import LOGGED, PUBLISHED, Ends
+from fleet.replay.rerun.staleness import LOGGED, PUBLISHED, Ends
 
 LINE = "/fleet/red/sensor/line"
 STALE_S = 3

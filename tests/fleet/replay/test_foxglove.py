@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from fleet.replay import foxglove
+from fleet.replay import foxglove_layout
 from schemas.messages import message_class
 from schemas.topics import TOPICS, of_key
 
@@ -16,7 +16,8 @@ PATH = re.compile(r'(?:"(?P<quoted>[^"]+)"|(?P<plain>[A-Za-z0-9_/]+))(?P<fields>
 
 
 def test_the_file_is_what_the_tables_make() -> None:
-    assert json.loads(FILE.read_text()) == foxglove.layout(), "python -m fleet.replay.foxglove > deploy/foxglove.json"
+    command = "python -m fleet.replay.foxglove_layout > deploy/foxglove.json"
+    assert json.loads(FILE.read_text()) == foxglove_layout.layout(), command
 
 
 def test_every_path_is_a_field_of_a_topic_and_every_topic_is_shown() -> None:
@@ -37,7 +38,7 @@ def test_every_path_is_a_field_of_a_topic_and_every_topic_is_shown() -> None:
         if kind == "RosOut":
             topic = of_key(config["topicToRender"])
             assert topic is not None
-            assert topic.message == foxglove.LOG
+            assert topic.message == foxglove_layout.LOG
     assert shown == set(TOPICS)
 
 
@@ -53,7 +54,7 @@ def _paths(kind: str, config: dict[str, Any]) -> Iterator[str]:
 
 
 def test_every_panel_has_its_place() -> None:
-    layout = foxglove.layout(("red", "car-2"))
+    layout = foxglove_layout.layout(("red", "car-2"))
     placed = list(_places(layout["layout"], layout["configById"]))
     assert sorted(placed) == sorted(layout["configById"])
     (root,) = (each for name, each in layout["configById"].items() if name.startswith("Tab!"))

@@ -10,9 +10,9 @@ from click.testing import CliRunner, Result
 from mcap.writer import Writer
 
 from fleet.cli import cli
-from fleet.replay import vector
-from fleet.replay.redecode import Difference, Redecoding
-from fleet.replay.wire import Confirmed, Item, Rx, Treated, Tx
+from fleet.replay.analysis import test_vector
+from fleet.replay.analysis.recorded_frames import Confirmed, Item, Rx, Treated, Tx
+from fleet.replay.analysis.redecode import Difference, Redecoding
 from gateway.protocol.enums import Mode
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.replay.make_session import Made, make
@@ -36,7 +36,7 @@ def redecoded(items: list[Item], platform: str | None = None) -> tuple[list[Diff
 
 @pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
 def test_a_recorded_vector_has_no_difference(path: Path) -> None:
-    _, items = vector.read(path)
+    _, items = test_vector.read(path)
     found, one = redecoded(items)
     assert found == []
     assert one.counts.frames >= 3
@@ -50,7 +50,7 @@ def test_there_are_vectors() -> None:
 @pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
 def test_every_field_of_a_vector_counts(path: Path) -> None:
     """Whatever is changed in a recorded frame's readings is found, and named."""
-    _, items = vector.read(path)
+    _, items = test_vector.read(path)
     frames = [number for number, item in enumerate(items) if isinstance(item, Rx) and item.readings]
     changed = 0
     for number in {frames[0], frames[-1]}:

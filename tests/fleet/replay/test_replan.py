@@ -10,10 +10,10 @@ from click.testing import CliRunner, Result
 from mcap.writer import Writer
 
 from fleet.cli import cli
-from fleet.client import Fleet
-from fleet.recording import times
-from fleet.recording.session import Recorded, Session
-from fleet.replay.coordinated import Difference, Said, Timeline, Token, add, differences, presence
+from fleet.client.client import Fleet
+from fleet.recording import time_spec
+from fleet.recording.reading.session import Recorded, Session
+from fleet.replay.analysis.recorded_decisions import Difference, Said, Timeline, Token, add, differences, presence
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars
 from tests.fleet.replay.make_session import Made
@@ -126,7 +126,7 @@ def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp
     out = tmp_path / "part"
     # A plan is published again every ten seconds: between the first two times there is none.
     first, second, *_ = (each.recorded_ns for each in Session.open(recorded).messages(["fleet/@coordinator/plan"]))
-    between = ("--from", times.iso(first + S), "--to", times.iso(second))
+    between = ("--from", time_spec.iso(first + S), "--to", time_spec.iso(second))
     assert run("sessions", "cut", recorded, *between, "--out", out).exit_code == 0
     assert "has no plan: name one with --plan" in run("replan", out).output
     (out / "plan.yaml").write_text(PLAN, encoding="utf-8")

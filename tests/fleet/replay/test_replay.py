@@ -11,9 +11,10 @@ import pytest
 import rerun.chunk as rrc
 from click.testing import CliRunner
 
-from fleet.recording.session import NoSession, Session
-from fleet.replay import lenses, mapping, to_rerun
-from fleet.replay.command import replay
+from fleet.commands.replay import replay
+from fleet.recording.reading.session import NoSession, Session
+from fleet.replay import panels
+from fleet.replay.rerun import export, lenses
 from schemas.topics import TOPICS
 
 from .make_session import CARS, START_NS, make
@@ -33,25 +34,25 @@ def test_the_made_session_has_every_message_type(made: tuple[Path, Counter[str]]
 def test_the_rrd_holds_every_message_and_its_layout(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     path, counts = made
     out = tmp_path / "out.rrd"
-    assert to_rerun.export(Session.open(path), out) == counts
-    assert to_rerun.rows(out) == counts
+    assert export.export(Session.open(path), out) == counts
+    assert export.rows(out) == counts
     reader = rrc.RrdReader(out)
     (recording,), (layout,) = reader.recordings(), reader.blueprints()
-    assert recording.application_id == layout.application_id == to_rerun.APPLICATION
+    assert recording.application_id == layout.application_id == export.APPLICATION
     assert recording.recording_id == Session.open(path).name
     assert list(tmp_path.iterdir()) == [out]
 
 
 def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
-    to_rerun.export(Session.open(made[0]), out)
+    export.export(Session.open(made[0]), out)
     texts: list[str] = []
     lanes: dict[str, list[object]] = {}
     for chunk in rrc.RrdReader(out).store().stream():
         batch = chunk.to_record_batch()
-        if mapping.key_of(chunk.entity_path) == "fleet/red/event/command" and to_rerun.TEXT in batch.schema.names:
-            texts += [row[0] for row in batch.column(to_rerun.TEXT).to_pylist()]
-        if mapping.key_of(chunk.entity_path) == "fleet/red/state/mode":
+        if panels.key_of(chunk.entity_path) == "fleet/red/event/command" and export.TEXT in batch.schema.names:
+            texts += [row[0] for row in batch.column(export.TEXT).to_pylist()]
+        if panels.key_of(chunk.entity_path) == "fleet/red/state/mode":
             for name in ("mode asked", "mode inferred"):
                 if name in batch.schema.names:
                     lanes.setdefault(name, []).extend(row[0] for row in batch.column(name).to_pylist())
@@ -64,14 +65,14 @@ def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]
 
 def test_lanes_say_what_was_so_and_for_how_long(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
-    to_rerun.export(Session.open(made[0]), out)
+    export.export(Session.open(made[0]), out)
     lanes: dict[tuple[str, str], list[tuple[float, object]]] = {}
     for chunk in rrc.RrdReader(out).store().stream():
         batch = chunk.to_record_batch()
         for name in ("LED asked", "light left", "mode inferred"):
             if name in batch.schema.names:
                 times = batch.column("message_publish_time").cast("int64").to_pylist()
-                lane = lanes.setdefault((mapping.key_of(chunk.entity_path), name), [])
+                lane = lanes.setdefault((panels.key_of(chunk.entity_path), name), [])
                 for at, row in zip(times, batch.column(name).to_pylist(), strict=True):
                     lane.append(((at - START_NS) / 1e9, row[0]))
     assert lanes["fleet/red/event/command", "LED asked"] == [(4.2, "#ff0010")]
@@ -84,33 +85,33 @@ def test_lanes_say_what_was_so_and_for_how_long(made: tuple[Path, Counter[str]],
 def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
     from schemas.messages import message_class
 
-    for part in mapping.parts():
+    for part in panels.parts():
         fields = message_class(TOPICS[part.topic].message).DESCRIPTOR.fields_by_name
         names = part.field.rstrip("!").partition("[")[0].split(".")
         assert names[0] in fields, part
         assert len(names) == 1 or names[1] in fields[names[0]].message_type.fields_by_name, part
         # What may be missing must not be drawn as the zero that stands for it.
-        assert not isinstance(part, mapping.Curve) or fields[names[0]].has_presence == part.field.endswith("!"), part
-    for words in mapping.WORDS:
+        assert not isinstance(part, panels.Curve) or fields[names[0]].has_presence == part.field.endswith("!"), part
+    for words in panels.WORDS:
         fields = message_class(TOPICS[words.topic].message).DESCRIPTOR.fields_by_name
         assert {*words.fields, *words.before} <= set(fields)
 
 
 def test_every_topic_of_the_table_is_drawn() -> None:
-    drawn = {part.topic for part in mapping.parts()} | {words.topic for words in mapping.WORDS}
-    drawn |= {topic for panel in mapping.CAR_PANELS for topic in panel.topics}
-    drawn |= {topic for _, ours, theirs in mapping.FLEET_TEXTS for topic in (*ours, *theirs)}
-    assert set(TOPICS) - drawn == {mapping.PLAN, mapping.WORLD}
+    drawn = {part.topic for part in panels.parts()} | {words.topic for words in panels.WORDS}
+    drawn |= {topic for panel in panels.CAR_PANELS for topic in panel.topics}
+    drawn |= {topic for _, ours, theirs in panels.FLEET_TEXTS for topic in (*ours, *theirs)}
+    assert set(TOPICS) - drawn == {panels.PLAN, panels.WORLD}
 
 
 @pytest.mark.parametrize("key", ["fleet/red/sensor/range", "fleet/@recorder/status", "my-fleet/car_1/state/mode"])
 def test_entities_are_named_as_reruns_reader_names_them(key: str) -> None:
-    assert mapping.key_of(mapping.entity(key)) == key
+    assert panels.key_of(panels.entity(key)) == key
 
 
 def test_rerun_names_entities_as_we_do(made: tuple[Path, Counter[str]]) -> None:
     found = {chunk.entity_path for chunk in rrc.McapReader(made[0]).stream() if not chunk.is_static}
-    assert found == {mapping.entity(key) for key in made[1]}
+    assert found == {panels.entity(key) for key in made[1]}
 
 
 def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None:
@@ -135,7 +136,7 @@ def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None
     result = CliRunner().invoke(replay, [str(tmp_path), "--save", str(out)])
     assert result.exit_code == 0
     assert "is cut" in result.stderr
-    assert to_rerun.rows(out) == whole
+    assert export.rows(out) == whole
 
 
 def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,7 +192,7 @@ def test_what_is_damaged_is_said_and_only_what_is_whole_is_shown(
         result = CliRunner().invoke(replay, [str(path), "--save", str(out)])
         assert result.exit_code == 0, result.stderr
         assert "damaged" in result.stderr
-        shown = to_rerun.rows(out)
+        shown = export.rows(out)
         assert f"{shown.total()} messages" in result.stdout
         assert all(count <= made[1][key] for key, count in shown.items())
 
@@ -240,7 +241,7 @@ def test_ctrl_c_does_not_blame_the_recording(
     if where == "in a lens":
         monkeypatch.setattr(lenses, "_words", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        to_rerun.export(
+        export.export(
             Session.open(made[0]), tmp_path / "out.rrd", seen=interrupt if where == "between chunks" else lambda _: None
         )
     assert list(tmp_path.iterdir()) == []
@@ -254,7 +255,7 @@ def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
         writer.start()
         writer.finish()  # type: ignore[no-untyped-call]
     with pytest.raises(NoSession, match="holds no message"):
-        to_rerun.export(Session.open(tmp_path), tmp_path / "out.rrd")
+        export.export(Session.open(tmp_path), tmp_path / "out.rrd")
 
 
 def test_nothing_is_written_outside(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
@@ -264,7 +265,7 @@ def test_nothing_is_written_outside(made: tuple[Path, Counter[str]], tmp_path: P
     names = ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME", "TMPDIR")
     environment = {**os.environ, **dict.fromkeys(names, str(home))}
     environment.pop("CI", None)
-    code = "from fleet.replay.command import replay; replay()"
+    code = "from fleet.commands.replay import replay; replay()"
     command = [sys.executable, "-c", code, str(made[0]), "--save", str(work / "out.rrd")]
     subprocess.run(command, env=environment, check=True, capture_output=True)
     assert list(home.rglob("*")) == []
@@ -275,7 +276,7 @@ def test_cars_come_from_the_keys_and_foreign_keys_do_no_harm() -> None:
     keys = frozenset(
         {"fleet/red/sensor/range", "fleet/@recorder/status", "fleet/red/@cmd/drive", "x", "fleet/blue/other"}
     )
-    found = mapping.contents(keys)
+    found = panels.contents(keys)
     assert dict(found.cars) == {"red": frozenset({"sensor/range"})}
     assert found.services == {"@recorder/status"}
     assert tuple(sorted(CARS)) == CARS

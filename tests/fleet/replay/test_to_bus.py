@@ -12,9 +12,9 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from mcap.writer import Writer
 
-from fleet.recording.session import Recorded, Session
-from fleet.replay.schedule import Schedule
-from fleet.replay.to_bus import Player
+from fleet.recording.reading.session import Recorded, Session
+from fleet.replay.player.player import Player
+from fleet.replay.player.schedule import Schedule
 from schemas import bus
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.replay.make_session import START_NS, Made, make

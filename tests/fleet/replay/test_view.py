@@ -15,10 +15,10 @@ import pytest
 import rerun.chunk as rrc
 from click.testing import CliRunner
 
-from fleet.replay import live, to_rerun
-from fleet.replay.live import Live
-from fleet.replay.view import view
-from fleet.replay.viewer import Viewer, free_port
+from fleet.commands.view import view
+from fleet.replay.rerun import export, live
+from fleet.replay.rerun.live import Live
+from fleet.replay.rerun.viewer import Viewer, free_port
 from schemas.bus import Bus
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
@@ -78,10 +78,10 @@ def test_what_is_on_the_bus_is_in_the_file(fleet: Fleet, tmp_path: Path) -> None
         following.close()
     assert following.cars == ("blue", "red")
     assert following.dropped == 0
-    assert to_rerun.rows(out) == {"fleet/red/sensor/range": 50, "fleet/blue/sensor/range": 20}
+    assert export.rows(out) == {"fleet/red/sensor/range": 50, "fleet/blue/sensor/range": 20}
     reader = rrc.RrdReader(out)
     (layout,) = {each.application_id for each in reader.blueprints()}
-    assert layout == to_rerun.APPLICATION
+    assert layout == export.APPLICATION
 
 
 def test_a_plan_from_before_is_asked_for(fleet: Fleet, tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_plan_from_before_is_asked_for(fleet: Fleet, tmp_path: Path) -> None:
         following = Live(bus, "fleet", lambda recording: recording.save(out))
         following.start()
         following.close()
-    assert to_rerun.rows(out) == {"fleet/@coordinator/plan": 1}
+    assert export.rows(out) == {"fleet/@coordinator/plan": 1}
 
 
 def test_what_finds_no_room_is_counted(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,7 +203,9 @@ def test_a_viewer_that_cannot_start_is_said() -> None:
 
 def test_the_guard_ends_its_program_with_its_input() -> None:
     guard = subprocess.Popen(
-        [sys.executable, "-m", "fleet.replay.guard", "sleep", "600"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-m", "schemas.process.parent_guard", "sleep", "600"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
     )
     assert guard.stdin is not None
     assert guard.stdout is not None

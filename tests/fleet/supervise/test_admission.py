@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from fleet.supervise.admission import (
+from fleet.supervisor.admission import (
     KILL_INTERVAL_S,
     KILLS_AT_ONCE,
     PLACE_S,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet.supervise import cpu_time
-from fleet.supervise.hang import (
+from fleet.supervisor import cpu_time
+from fleet.supervisor.hang import (
     LONGEST_TURN_S,
     MANY_SILENT_S,
     MOVING_SILENT_S,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.supervise.restart import (
+from fleet.supervisor.restart_policy import (
     FIRST_S,
     GATEWAY_GRACE_S,
     JITTER,

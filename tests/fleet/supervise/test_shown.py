@@ -8,12 +8,12 @@ import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
 from rich.console import Console
 
-from fleet.supervise.cars import Row, left_from_before
-from fleet.supervise.process import RUNS, Log, new_run, runs
-from fleet.supervise.restart import State
-from fleet.supervise.table import Table
-from fleet.supervise.wanted import Kind, Wanted
-from fleet.supervisor import Supervisor
+from fleet.supervisor.car_status import Row, left_from_before
+from fleet.supervisor.child import RUNS, Log, new_run, runs
+from fleet.supervisor.restart_policy import State
+from fleet.supervisor.spec import Kind, Wanted
+from fleet.supervisor.status_table import Table
+from fleet.supervisor.supervisor import Supervisor
 from schemas.bus import DEFAULT_ENDPOINT
 from schemas.gen import fleet_v1_pb2 as pb
 

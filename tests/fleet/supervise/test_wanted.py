@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fleet.config import parse_fleet
-from fleet.supervise.reload import change
-from fleet.supervise.wanted import (
+from fleet.fleetfile.fleet_file import parse_fleet
+from fleet.supervisor.reload import change
+from fleet.supervisor.spec import (
     SIMULATED,
     Asked,
     Wanted,

@@ -18,8 +18,8 @@ from click.testing import CliRunner
 from mcap.reader import make_reader
 
 from fleet.cli import cli
-from fleet.recording.session import Session
-from fleet.replay.to_rerun import export
+from fleet.recording.reading.session import Session
+from fleet.replay.rerun.export import export
 from schemas import messages
 from schemas.topics import TOPICS
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from click.testing import CliRunner, Result
 
 from fleet.cli import cli
-from fleet.recording import directory
-from fleet.recording.segment import Segment
-from fleet.recording.session import Session
-from fleet.recording.sessions.overview import State, growing, overview
+from fleet.recording import session_dir
+from fleet.recording.reading.session import Session
+from fleet.recording.tools.summary import State, growing, overview
+from fleet.recording.writing.segment_writer import Segment
 
 START = 1_790_000_000_000_000_000
 S = 1_000_000_000
@@ -33,7 +33,7 @@ def write(path: Path, at_s: list[list[float]], *, closed: bool = True, cut: bool
     elif cut:
         segment.cut()
     count = sum(map(len, at_s))
-    directory.Description("fleet", "2026-09-21T14:13:20Z", "here", {}, closed=closed, messages=count).write(path)
+    session_dir.Description("fleet", "2026-09-21T14:13:20Z", "here", {}, closed=closed, messages=count).write(path)
     return segment
 
 

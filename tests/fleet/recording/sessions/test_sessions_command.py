@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from fleet.recording import directory, open_session
-from fleet.recording.salvage import MAGIC
-from fleet.recording.session import NoSession, Session
-from fleet.recording.sessions.making import recover
-from fleet.recording.sessions.verify import verify
+from fleet.recording import open_session, session_dir
+from fleet.recording.reading.mcap_reader import MAGIC
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.tools.transform import recover
+from fleet.recording.tools.verify import verify
 
 from ..damaged import Original, written  # noqa: TID252 - beside this package's tests
 from . import every_type
@@ -156,7 +156,7 @@ def test_a_description_that_went_is_told(session: Path, text: str | None) -> Non
     assert broken.returncode == 1
     assert "damage: session.json is missing, or cannot be understood" in broken.stdout
     assert fleet("recover", session).returncode == 0
-    assert directory.Description.read(session.with_name(f"{session.name}-recovered")) is not None
+    assert session_dir.Description.read(session.with_name(f"{session.name}-recovered")) is not None
 
 
 def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -
     assert done.returncode == 0
     assert "could not be saved" in done.stdout
     assert list(open_session(out).messages()) == list(open_session(session).messages())
-    description = directory.Description.read(out)
+    description = session_dir.Description.read(out)
     assert description is not None
     assert description.closed
     assert description.origin["by"] == "recover"

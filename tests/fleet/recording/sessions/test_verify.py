@@ -8,9 +8,9 @@ import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import Writer
 
-from fleet.recording.session import Session
-from fleet.recording.sessions.numbers import MOST_GAPS, Stream
-from fleet.recording.sessions.verify import Verdict, verify
+from fleet.recording.reading.session import Session
+from fleet.recording.tools.sequence_check import MOST_GAPS, Stream
+from fleet.recording.tools.verify import Verdict, verify
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 

@@ -1,0 +1,160 @@
+"""`fleet drive, mode, stop, estop, resume`: what moves cars, and what keeps them from moving."""
+
+from dataclasses import replace
+
+import click
+
+from fleet.client.client import Fleet
+from fleet.client.commands import drive_request, estop_request, mode_request, resume_request, stop_request
+from fleet.client.outcome import Outcome
+from fleet.commands.options import (
+    Cars,
+    Seconds,
+    carry_out,
+    cars_argument,
+    end_with,
+    json_option,
+    say,
+    take_option,
+    with_client,
+)
+from gateway.protocol.enums import Mode, Motion
+from schemas.process import signals, startup
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet drive red forward --for 2s
+  fleet drive red,blue spin_left --for 500ms"""
+)
+@cars_argument
+@click.argument("motion", type=click.Choice([str(motion) for motion in Motion]))
+@click.option(
+    "--for",
+    "duration_s",
+    type=Seconds(),
+    default="500ms",
+    show_default=True,
+    help="How long; at most 10s, or what the car's gateway allows.",
+)
+@take_option
+@json_option
+@with_client
+def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, take: bool, as_json: bool) -> None:
+    """Hold a motion for a time, then stop; stays until the drive is over. Ctrl-C stops the car."""
+    with signals.sigterm_interrupts():
+        try:
+            outcomes = client.ask(replace(drive_request(motion, duration_s), take=take), cars)
+        except KeyboardInterrupt:
+            say(client.ask(drive_request("stop"), cars), as_json=as_json)
+            raise SystemExit(startup.INTERRUPTED) from None
+    end_with(outcomes, as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+example:
+  fleet mode red tracking
+  fleet mode red,blue manual"""
+)
+@cars_argument
+@click.argument("mode", type=click.Choice([str(mode) for mode in Mode]))
+@take_option
+@json_option
+@with_client
+def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json: bool) -> None:
+    """Bring cars into a mode; `manual` ends whatever they do by themselves."""
+    carry_out(client, mode_request(mode), cars, take=take, as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet stop
+  fleet stop red blue"""
+)
+@click.argument("cars", type=Cars(), nargs=-1, metavar="[CAR...]")
+@json_option
+@with_client
+def stop(client: Fleet, cars: tuple[tuple[str, ...], ...], *, as_json: bool) -> None:
+    """Stop these cars, or all, and hold them against the coordinator until someone drives or resumes them."""
+    _some(client, client.ask(stop_request(), _flat(cars)), as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet estop
+  fleet estop red --why 'someone is on the track'"""
+)
+@click.argument("cars", type=Cars(), nargs=-1, metavar="[CAR...]")
+@click.option("--why", default="", help="What happened, for the record.")
+@json_option
+@with_client
+def estop(client: Fleet, cars: tuple[tuple[str, ...], ...], why: str, *, as_json: bool) -> None:
+    """Emergency stop of these cars, or of the whole fleet."""
+    request = estop_request(why, "car" if cars else "fleet")
+    _some(client, client.ask(request, _flat(cars)), as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet resume red
+  fleet resume red --estops
+  fleet resume red blue --id 5f0c2e"""
+)
+@click.argument("cars", type=Cars(), nargs=-1, required=True, metavar="CAR...")
+@click.option(
+    "--id", "ids", multiple=True, metavar="ID", help="An e-stop to end, or its beginning; as often as needed."
+)
+@click.option("--estops", is_flag=True, help="End every e-stop in force on these cars; they stay on hold.")
+@json_option
+@with_client
+def resume(
+    client: Fleet, cars: tuple[tuple[str, ...], ...], ids: tuple[str, ...], *, estops: bool, as_json: bool
+) -> None:
+    """End the hold of cars: the coordinator may use them again. With --id or --estops, end their e-stops.
+
+    An e-stop of the whole fleet ends on every car when it ends on one.
+    """
+    if estops and ids:
+        raise click.UsageError("--estops ends every e-stop: leave --id out")
+    named = list(dict.fromkeys(_flat(cars) or ()))
+    if not estops and not ids:
+        carry_out(client, resume_request(), named, as_json=as_json)
+    outcomes = []
+    for car in named:
+        in_force = _in_force(client, car)
+        chosen = in_force if estops else [_the_one(car, begun, in_force) for begun in ids]
+        if chosen:
+            outcomes += client.ask(resume_request(chosen), [car])
+        elif car not in client.cars():
+            outcomes += client.ask(resume_request(), [car])  # which says that it is not there
+        else:
+            click.echo(f"{car}: no e-stop is in force", err=True)
+    end_with(outcomes, as_json=as_json)
+
+
+def _in_force(client: Fleet, car: str) -> list[str]:
+    """The ids of the e-stops in force on a car."""
+    return [estop.id for reading in client.get(f"{car}/state/safety") for estop in reading.value.estops]
+
+
+def _the_one(car: str, begun: str, in_force: list[str]) -> str:
+    """The id that begins so; what is no e-stop of this car is left to its gateway to refuse."""
+    found = [each for each in in_force if each.startswith(begun)]
+    if len(found) > 1 and begun not in found:
+        raise click.UsageError(f"--id {begun}: several e-stops of {car} begin so: {', '.join(found)}")
+    return begun if begun in found or not found else found[0]
+
+
+def _flat(cars: tuple[tuple[str, ...], ...]) -> list[str] | None:
+    return [car for some in cars for car in some] or None
+
+
+def _some(client: Fleet, outcomes: list[Outcome], *, as_json: bool) -> None:
+    if not outcomes:
+        raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
+    end_with(outcomes, as_json=as_json)

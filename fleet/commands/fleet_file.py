@@ -1,0 +1,220 @@
+"""`fleet init, check, schema`: a fleet file made, looked at, and described to an editor. Nothing here moves a car."""
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+import click
+
+from fleet.commands.options import explained, json_option
+from fleet.fleetfile.fleet_file import PALETTE, FleetFile, parse_fleet, read_fleet
+from fleet.fleetfile.link_check import look
+from fleet.fleetfile.models import checked_colour, checked_link, checked_name, checked_platform, schema
+from fleet.fleetfile.scan import LIKELY, Found, NewCar, ScanFailed, new_file, scan
+from schemas import bus
+from schemas.yaml_document.document import BadFile
+
+DEFAULT_FILE: Final = Path("fleet.yaml")
+NAMES: Final = ("red", "green", "blue", "yellow", "violet", "orange", "teal", "brown")
+"""In the order of the palette."""
+_AT_ONCE: Final = 16
+_SKIP: Final = "-"
+
+file_argument = click.argument(
+    "file", default=DEFAULT_FILE, type=click.Path(path_type=Path, dir_okay=False), metavar="[FILE]"
+)
+link_option = click.option(
+    "--link", "links", multiple=True, metavar="URL", help="Look at this link, and at no other; may be repeated."
+)
+seconds_option = click.option(
+    "--seconds", type=click.FloatRange(0.5, 120), help="How long to listen at each port (default 6)."
+)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet check
+  fleet check deploy/fleet.mixed.yaml --json
+
+Exit codes: 0 all is well, 1 a car cannot be reached as it stands, 2 the file is wrong."""
+)
+@file_argument
+@json_option
+def check(file: Path, *, as_json: bool) -> None:
+    """Check a fleet file, and whether its cars' ports are there, permitted and free; nothing is opened or moved."""
+    fleet = read(file, as_json=as_json)
+    served = _served(fleet)
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        found = list(pool.map(lambda car: look(car, served), fleet.cars.values()))
+    widest = max(len(each.car) for each in found)
+    for each in found:
+        if as_json:
+            click.echo(json.dumps(asdict(each)))
+        else:
+            click.echo(f"{each.car:{widest}}  {'ok ' if each.ok else 'NOT'}  {each.link}: {each.words}")
+    raise SystemExit(0 if all(each.ok for each in found) else 1)
+
+
+def read(file: Path, *, as_json: bool = False, unbound: bool = False) -> FleetFile:
+    """The fleet file; for a bad one every fault is told, one a line, and the command ends with code 2."""
+    try:
+        return read_fleet(file, unbound=unbound)
+    except BadFile as error:
+        tell(error, as_json=as_json)
+        if not file.exists():
+            click.echo("fleet: make one with `fleet init`", err=True)
+        raise SystemExit(2) from None
+
+
+def tell(error: BadFile, *, as_json: bool = False) -> None:
+    """Every fault of a file, one a line: for a person on stderr, for a script on stdout."""
+    if as_json:
+        for problem in error.problems:
+            click.echo(json.dumps({"file": error.source, **asdict(problem)}))
+    else:
+        click.echo(str(error), err=True)
+
+
+def _served(fleet: FleetFile) -> dict[str, tuple[str, str]]:
+    """State and reason of the link of every car that has a gateway now; none if no fleet runs."""
+    from fleet.client.client import Fleet
+
+    with explained():
+        if not bus.accepts(bus.resolve_endpoint(fleet.endpoint)):
+            return {}
+        with Fleet(fleet.endpoint, fleet.name, kind="person") as client:
+            return {each.value.car: (each.value.state, each.value.reason) for each in client.get("*/state/link")}
+
+
+@click.command("schema", epilog="\b\nexample:\n  fleet schema > fleet.schema.json")
+def print_schema() -> None:
+    """Print the JSON Schema of fleet files, with which an editor completes and checks them."""
+    click.echo(schema_text(), nl=False)
+
+
+def schema_text() -> str:
+    """The JSON Schema as it is checked in."""
+    return json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet init
+  fleet init --yes --out lab.yaml
+  fleet init --link /dev/ttyUSB0 --link tcp://192.168.1.7:8888"""
+)
+@click.option("--yes", is_flag=True, help="Take what speaks as a car does, ask nothing.")
+@click.option("--force", is_flag=True, help="Write over a file that is there.")
+@click.option("--out", default=DEFAULT_FILE, show_default=True, type=click.Path(path_type=Path, dir_okay=False))
+@link_option
+@seconds_option
+def init(*, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: float | None) -> None:
+    """Write a fleet file: look for cars, ask for their names."""
+    with explained():
+        for link in links:
+            checked_link(link)
+    if out.exists() and not force:
+        if yes:
+            raise click.UsageError(f"{out} is there already: give --force to write over it, or --out for another")
+        click.confirm(f"{out} is there already. Write over it?", abort=True)
+    if not out.absolute().parent.is_dir():
+        raise click.UsageError(f"{out}: there is no such directory")
+    found = look_for(links, seconds)
+    cars = _taken(found) if yes else _asked(found)
+    if not cars:
+        raise click.ClickException(
+            "no car was found: switch one on, plug it in or pair it, and see what `gateway scan` shows; a car that is "
+            "silent is asked for without --yes; a TCP car is named with --link tcp://HOST:8888; without cars there is "
+            "`fleet up --sim 3`"
+        )
+    text = new_file(cars, "fleet")
+    try:
+        parse_fleet(text, out)
+    except BadFile as error:
+        tell(error)
+        raise click.ClickException("nothing was written: two links may be one port") from None
+    write(out, text)
+    click.echo(f"wrote {out} with {', '.join(car.name for car in cars)}: fleet check {out}, then fleet up {out}")
+
+
+def look_for(links: tuple[str, ...], seconds: float | None) -> list[Found]:
+    """What may be a car, likely ones first; what is amiss becomes one line."""
+    try:
+        found = scan(links, seconds)
+    except ScanFailed as error:
+        raise click.ClickException(str(error)) from None
+    return sorted(found, key=lambda each: each.verdict not in LIKELY)
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file whole or not at all, over what is there; its line ends are the text's."""
+    path = path.resolve()
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+                file.write(text)
+            Path(name).chmod(path.stat().st_mode if path.exists() else 0o644)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise click.ClickException(f"{path} cannot be written: {error.strerror}") from None
+
+
+def _taken(found: list[Found]) -> list[NewCar]:
+    likely = [each for each in found if each.verdict in LIKELY]
+    cars = []
+    for index, each in enumerate(likely):
+        name = NAMES[index] if index < len(NAMES) else f"car{index + 1}"
+        cars.append(NewCar(name, each.url, each.platform, PALETTE[index % len(PALETTE)], each.words))
+    return cars
+
+
+def _asked(found: list[Found]) -> list[NewCar]:
+    cars: list[NewCar] = []
+    for each in found:
+        click.echo(f"\n{each.url}\n  {each.words}")
+        free = [name for name in NAMES if name not in {car.name for car in cars}] or [f"car{len(cars) + 1}"]
+        offered = free[0] if each.verdict in LIKELY else _SKIP
+        name = prompt_name(f"  its name ({_SKIP} to leave it out)", offered, {car.name for car in cars})
+        if name == _SKIP:
+            continue
+        platform = click.prompt("  its platform", default=each.platform, value_proc=_checked(checked_platform))
+        colour = PALETTE[NAMES.index(name) if name in NAMES else len(cars) % len(PALETTE)]
+        colour = click.prompt("  its colour", default=colour, value_proc=_checked(checked_colour))
+        cars.append(NewCar(name, each.url, platform, colour, each.words))
+    return cars
+
+
+def prompt_name(words: str, offered: str | None, taken: set[str]) -> str:
+    """Ask for a car's name that is not taken, or `-`."""
+
+    def proper(name: str) -> str:
+        name = name.strip()
+        if name in taken:
+            raise click.UsageError(f"{name} is another car's name already")
+        return name if name == _SKIP else _checked(checked_name)(name)
+
+    name: str = click.prompt(words, default=offered, value_proc=proper)
+    return name
+
+
+def _checked(rule: Callable[[str], str]) -> Callable[[str], str]:
+    """The rule for an answer: a prompt says again what is wrong, and asks again."""
+
+    def check_it(text: str) -> str:
+        try:
+            return rule(text.strip())
+        except ValueError as error:
+            raise click.UsageError(str(error)) from None
+
+    return check_it

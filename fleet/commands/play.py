@@ -1,0 +1,208 @@
+"""`fleet replay SESSION --to-bus`: its options, and what it says. What is published is to_bus.py's."""
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from schemas import keys
+from schemas.process import signals
+
+if TYPE_CHECKING:
+    from fleet.recording.reading.session import Recorded, Session
+    from fleet.recording.tools.summary import Overview
+
+TOLD_EVERY_S: Final = 0.5
+REMEMBERED_NS: Final = 300_000_000_000
+"""What was said so long before the beginning can be asked for: a battery that is not measured in a mode, a plan."""
+_DEFAULTS: Final = {"name": None, "rate": 1.0, "loop": False, "offset": None, "skip_gaps": None, "connect": None}
+_ONLY: Final = {
+    "name": "--as",
+    "rate": "--rate",
+    "loop": "--loop",
+    "offset": "--offset",
+    "skip_gaps": "--skip-gaps",
+    "cars_only": "--cars-only",
+    "connect": "--connect",
+}
+
+
+def to_bus_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add what `to_bus` takes."""
+    for option in (
+        click.option(
+            "--connect", metavar="ENDPOINT", help="With --to-bus: the bus (default: FLEET_ENDPOINT, or loopback)."
+        ),
+        click.option(
+            "--cars-only", is_flag=True, help="Leave out what coordinator, recorder and supervisor said then."
+        ),
+        click.option("--skip-gaps", metavar="TIME", help="A pause that is longer, as 5s, is made so long."),
+        click.option("--offset", metavar="TIME", help="Begin so far into it; with --loop the first time only."),
+        click.option("--loop", is_flag=True, help="Over and over."),
+        click.option("--rate", default=1.0, type=click.FloatRange(0.01, 1000.0), help="So many times as fast."),
+        click.option(
+            "--as", "name", metavar="NAME", help="The fleet's name then (default: the recorded one, -replay)."
+        ),
+        click.option("--to-bus", is_flag=True, help="Publish it again, as a fleet of another name, until Ctrl-C."),
+    ):
+        function = option(function)
+    return function
+
+
+def refuse_without(options: dict[str, Any]) -> None:
+    """What means something only with --to-bus is not to be overlooked."""
+    given = [_ONLY[name] for name, value in options.items() if value != _DEFAULTS.get(name, False)]
+    if given:
+        raise click.UsageError(f"{', '.join(given)}: only with --to-bus")
+
+
+def to_bus(
+    path: Path,
+    cars: tuple[str, ...],
+    start: str | None,
+    end: str | None,
+    *,
+    name: str | None,
+    rate: float,
+    loop: bool,
+    offset: str | None,
+    skip_gaps: str | None,
+    cars_only: bool,
+    connect: str | None,
+) -> None:
+    """Play a session on the bus."""
+    from fleet.commands.options import explained
+    from fleet.commands.sessions import part_of
+    from fleet.recording import time_spec
+    from fleet.recording.reading.session import NoSession, Session
+    from fleet.recording.tools.summary import of_session
+    from fleet.replay.player.player import PAUSE_NS, NameTaken, Player
+    from fleet.replay.player.schedule import Schedule
+    from schemas.bus import Bus
+
+    stop = threading.Event()
+    signals.calls(stop.set)
+    with explained():
+        try:
+            session = Session.open(path)
+            part = part_of(session, start, end, cars)
+            about = of_session(session)
+            begin_ns = about.start_ns if part.start_ns is None else part.start_ns
+            end_ns = about.end_ns if part.end_ns is None else part.end_ns
+            first_ns = begin_ns if offset is None else _time("--offset", offset, begin_ns, end_ns)
+            if not begin_ns <= first_ns < max(end_ns, begin_ns + 1):
+                length = time_spec.words((end_ns - begin_ns) / 1e9)
+                raise click.UsageError(f"--offset {offset} is not within what is played, which is {length} long")
+            gap_ns = None if skip_gaps is None else _time("--skip-gaps", skip_gaps, 0, 0)
+            if gap_ns is not None and gap_ns <= 0:
+                raise click.UsageError(f"--skip-gaps {skip_gaps}: a pause is longer than 0, as 5s")
+            fleets = _fleets(session, about)
+            name = keys.check_name(name or f"{fleets[0]}-replay", "fleet name (--as)")
+            if name in fleets:
+                raise click.UsageError(
+                    f"--as {name}: so the recorded fleet is called, and a recording is not to be taken for it: "
+                    f"choose another name, as {name[:25]}-replay"
+                )
+        except NoSession as error:
+            raise click.ClickException(str(error)) from None
+        if not any(keys.parse(key) for key in about.keys):
+            raise click.ClickException(f"{path} holds nothing that is a fleet's: no FLEET/CAR/... key")
+        wanted = _wanted(cars, cars_only=cars_only)
+        there = cars or tuple(about.cars)
+        words = f"fleet {name} is a replay of {session.name}: nothing in it takes commands"
+        schedule = Schedule(rate, gap_ns)
+        with Bus.open(connect, start_hub=True) as bus:
+            player = Player(bus, name, words, cars_only)
+            try:
+                player.begin(session.name, there)
+            except NameTaken as error:
+                raise click.UsageError(str(error)) from None
+            click.echo(
+                f"{session.name} as fleet {name} at {bus.endpoint}, {rate:g} times as fast: "
+                f"{', '.join(there) or 'no car'}; Ctrl-C ends"
+            )
+            player.remember(session.messages(wanted, first_ns - REMEMBERED_NS, first_ns))
+            # The earliest time is not the first message's if the clock went back.
+            from_ns = part.start_ns if offset is None else first_ns
+            told = _Progress((end_ns - begin_ns) / 1e9)
+            origin_s = time.monotonic()
+            while not stop.is_set():
+                recorded = session.messages(wanted, from_ns, part.end_ns)
+                player.play(_counted_from(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, told)
+                if not player.published and not stop.is_set():
+                    raise click.ClickException(f"{path} holds nothing there that is published again")
+                if not loop or stop.is_set():
+                    break
+                schedule.again(PAUSE_NS)
+                from_ns = part.start_ns
+            told.end()
+    took_s = time.monotonic() - origin_s
+    click.echo(f"{player.published} messages in {took_s:.1f} s")
+    notes = {
+        f"came over 0.25 s late: {rate:g} times as fast is too fast here": player.late,
+        "pauses were shortened": schedule.shortened,
+    }
+    for note, count in notes.items():
+        if count:
+            click.echo(f"{count} {note}", err=True)
+    if session.damage:
+        click.echo(f"what is whole was published: {session.damage_words}", err=True)
+
+
+def _counted_from(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:
+    """The time from where it is to begin until the first message is part of it, too."""
+    if from_ns is not None:
+        schedule.due_s(from_ns)
+    yield from recorded
+
+
+def _time(option: str, text: str, start_ns: int, end_ns: int) -> int:
+    from fleet.recording import time_spec
+
+    try:
+        return time_spec.at_ns(text, start_ns, end_ns)
+    except ValueError as error:
+        raise click.UsageError(f"{option}: {error}") from None
+
+
+def _fleets(session: "Session", about: "Overview") -> list[str]:
+    """The recorded fleet's name, then others that keys have."""
+    described = [session.description.fleet] if session.description is not None and session.description.fleet else []
+    of_keys = (key.fleet for key in map(keys.parse, about.keys) if key is not None)
+    return list(dict.fromkeys([*described, *of_keys])) or [keys.DEFAULT_FLEET]
+
+
+def _wanted(cars: tuple[str, ...], *, cars_only: bool) -> list[str]:
+    services = (keys.COORDINATOR, keys.RECORDER, keys.SUPERVISOR)
+    wanted = [f"*/{car}/**" for car in cars or ("*",)] + [f"*/{keys.SIMULATOR}/**"]
+    return wanted if cars_only else [*wanted, *(f"*/{service}/**" for service in services)]
+
+
+class _Progress:
+    """How far it is: one line of a terminal, which stays."""
+
+    def __init__(self, length_s: float) -> None:
+        self._length_s = length_s
+        self._shown = sys.stderr.isatty()
+        self._told_at = 0.0
+        self._start_ns: int | None = None
+
+    def __call__(self, one: "Recorded") -> None:
+        if not self._shown:
+            return
+        self._start_ns = one.recorded_ns if self._start_ns is None else min(self._start_ns, one.recorded_ns)
+        now = time.monotonic()
+        if now - self._told_at > TOLD_EVERY_S:
+            self._told_at = now
+            at_s = (one.recorded_ns - self._start_ns) / 1e9
+            sys.stderr.write(f"\r{at_s:8.1f} s of {self._length_s:.1f} s ")
+            sys.stderr.flush()
+
+    def end(self) -> None:
+        """Leave the line."""
+        if self._shown:
+            sys.stderr.write("\r" + " " * 40 + "\r")

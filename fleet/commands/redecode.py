@@ -1,0 +1,229 @@
+"""`fleet redecode` and `fleet sessions vector`: recorded frames against today's decoder, on the command line."""
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fleet.commands.options import Cars, from_option, json_option, to_option
+from schemas import keys
+
+if TYPE_CHECKING:
+    from fleet.recording.reading.session import Session
+    from fleet.replay.analysis.recorded_frames import Item
+    from fleet.replay.analysis.redecode import Counts, Difference
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet redecode sessions/20260314T151617Z-fleet
+  fleet redecode tests/vectors/recorded/tracking.jsonl
+Exit codes: 0 no difference, 1 some, or nothing to decode."""
+)
+@click.argument("session", type=click.Path(path_type=Path))
+@click.option("--car", "cars", type=Cars(), default=(), help="Only these cars.")
+@click.option("--platform", help="What the cars were, instead of what was recorded: arduino, raspberry_pi, stm32+imu.")
+@json_option
+def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_json: bool) -> None:
+    """Decode the raw frames of SESSION again and say everything that is otherwise than it was recorded.
+
+    SESSION may also be a vector that `fleet sessions vector` made. What is a measurement depends on the platform and
+    the mode that were known: the recorded ones are used.
+    """
+    from fleet.recording.reading.session import NoSession
+    from fleet.replay.analysis.redecode import NoPlatform
+    from fleet.replay.analysis.test_vector import ENDING, BadVector
+    from gateway.protocol.platforms import parse_platform
+
+    if platform is not None:
+        try:
+            parse_platform(platform)
+        except ValueError as error:
+            raise click.UsageError(f"--platform: {error}") from None
+    try:
+        found = _Redecoded(session, cars, platform)
+        if session.suffix == ENDING:
+            found.of_vector()
+        else:
+            found.of_session()
+        differences = 0
+        for each in found.differences():
+            differences += 1
+            click.echo(json.dumps(_fields(each, found.start_ns)) if as_json else _line(each, found.start_ns))
+    except (NoSession, NoPlatform, BadVector) as error:
+        raise click.ClickException(str(error)) from None
+    except OSError as error:
+        raise click.ClickException(f"{session} cannot be read: {error.strerror or error}") from None
+    found.report(differences, as_json=as_json)
+    raise SystemExit(1 if differences else 0)
+
+
+class _Redecoded:
+    """One run: where the frames come from, and what came of it."""
+
+    def __init__(self, path: Path, cars: tuple[str, ...], platform: str | None) -> None:
+        from fleet.replay.analysis.recorded_frames import Unread
+
+        self._path = path
+        self._cars = cars
+        self._platform = platform
+        self._items: Iterable[tuple[str, Item]] = ()
+        self._session: Session | None = None
+        self._unread: Unread = Unread()
+        self.counts: dict[str, Counts] = {}
+        self.start_ns = 0
+
+    def of_vector(self) -> None:
+        """Take a vector; raises BadVector, OSError."""
+        from fleet.replay.analysis.test_vector import read
+
+        car, items = read(self._path)
+        self._items = ((car, item) for item in items)
+
+    def of_session(self) -> None:
+        """Take a session; raises NoSession."""
+        from fleet.commands.sessions import part_of, watched
+        from fleet.recording.reading.session import Session
+        from fleet.recording.tools.summary import of_session as overview
+        from fleet.replay.analysis.recorded_frames import KEYS, of_session
+
+        self._session = session = Session.open(self._path)
+        part_of(session, None, None, self._cars)  # says what is not there
+        self.start_ns = overview(session).start_ns
+        wanted = [f"*/{car}/{key.split('/', 2)[2]}" for car in self._cars or ("*",) for key in KEYS]
+        self._items = of_session(watched("redecode", None)(session.messages(keys=wanted)), self._unread)
+
+    def differences(self) -> Iterator["Difference"]:
+        """As they are found; raises NoPlatform, and ClickException if there is nothing to decode."""
+        from fleet.replay.analysis.redecode import Redecoding
+
+        running: dict[str, Redecoding] = {}
+        for car, item in self._items:
+            if self._cars and car not in self._cars:
+                continue
+            if car not in running:
+                running[car] = Redecoding(car, self._platform)
+            yield from running[car].take(item)
+        for one in running.values():
+            yield from one.end()
+        self.counts = {car: one.counts for car, one in sorted(running.items()) if one.counts.frames}
+        if not self.counts:
+            whose = f" of {', '.join(self._cars)}" if self._cars else ""
+            damage = f" ({self._session.damage_words})" if self._session is not None and self._session.damage else ""
+            raise click.ClickException(
+                f"{self._path} holds no raw frames{whose} (keys FLEET/CAR/frame/rx): nothing to decode{damage}"
+            )
+
+    def report(self, differences: int, *, as_json: bool) -> None:
+        """What was compared, and what could not be."""
+        frames = sum(each.frames for each in self.counts.values())
+        readings = sum(each.readings for each in self.counts.values())
+        undecided = sum(each.undecided for each in self.counts.values())
+        absent = sum(each.absent for each in self.counts.values())
+        broken = sum(self._unread.broken.values())
+        damage = self._session.damage_words if self._session is not None else ""
+        if as_json:
+            summary: dict[str, Any] = {"differences": differences, "cars": list(self.counts), "frames": frames}
+            summary |= {"readings": readings, "undecided": undecided, "absent": absent}
+            click.echo(json.dumps(summary | {"unframed": self._unread.unframed, "broken": broken, "damage": damage}))
+            return
+        found = f"{differences} differences" if differences else "no difference"
+        click.echo(f"{self._path}: {frames} frames and {readings} readings of {', '.join(self.counts)}: {found}")
+        notes = {
+            "frames could have been several things, of which the recording does not tell one; what was recorded is one "
+            "of them": undecided,
+            "readings were published and are not in the recording (see fleet sessions verify): not compared": absent,
+            "readings have no raw frame in the recording: not compared": self._unread.unframed,
+            "messages do not parse as what they say they are: left out": broken,
+        }
+        for words, count in notes.items():
+            if count:
+                click.echo(f"{count} {words}", err=True)
+        if damage:
+            click.echo(f"what is whole was decoded: {damage}", err=True)
+
+
+def _line(each: "Difference", start_ns: int) -> str:
+    text = each.data.decode("latin-1").encode("unicode_escape").decode("ascii")
+    at = f"{(each.at_ns - start_ns) / 1e9:+.3f}s"
+    return f"{each.car} {at} {text}: {each.what} was {_shown(each.then)}, is now {_shown(each.now)}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return " ".join(map(str, value)) or "nothing"
+    return "not measured" if value is None else str(value)
+
+
+def _fields(each: "Difference", start_ns: int) -> dict[str, Any]:
+    return {
+        "car": each.car,
+        "at_s": (each.at_ns - start_ns) / 1e9,
+        "frame": each.data.decode("latin-1"),
+        "what": each.what,
+        "then": each.then,
+        "now": each.now,
+    }
+
+
+@click.command(
+    epilog="""\b
+example:
+  fleet sessions vector sessions/20260314T151617Z-fleet --car red --from 10s --to 20s --out tracking.jsonl
+""",
+)
+@click.argument("session", type=click.Path(path_type=Path))
+@click.option("--car", required=True, callback=lambda _ctx, _param, value: keys.check_name(value), help="Whose frames.")
+@from_option
+@to_option
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.jsonl",
+    help="The vector's file; a new one.",
+)
+@click.option("--source", metavar="TEXT", help="Where it is from, in words (default: the session and the car).")
+def vector(session: Path, car: str, start: str | None, end: str | None, out: Path, source: str | None) -> None:
+    """Write a stretch of SESSION as a test vector: raw frames with their times, and what they are decoded to.
+
+    `fleet redecode FILE.jsonl` holds it against today's decoder; tests/vectors/recorded has some.
+    """
+    from fleet.commands.sessions import part_of
+    from fleet.recording.reading.session import NoSession, Session
+    from fleet.recording.tools.summary import of_session as overview
+    from fleet.replay.analysis import test_vector as vectors
+    from fleet.replay.analysis.recorded_frames import KEYS, Rx, Unread, of_session
+
+    if out.suffix != vectors.ENDING:
+        raise click.UsageError(f"--out {out}: a vector's name ends in {vectors.ENDING}")
+    try:
+        found = Session.open(session)
+        part = part_of(found, start, end, (car,))
+        about = overview(found)
+    except NoSession as error:
+        raise click.ClickException(str(error)) from None
+    wanted = [f"*/{car}/{key.split('/', 2)[2]}" for key in KEYS]
+    before_ns = None if part.start_ns is None else part.start_ns - vectors.BEFORE_NS
+    after_ns = None if part.end_ns is None else part.end_ns + vectors.BEFORE_NS
+    recorded = of_session(found.messages(wanted, before_ns, after_ns), Unread())
+    items = [*vectors.stretch((item for _, item in recorded), part.start_ns or 0, part.end_ns)]
+    frames = sum(isinstance(item, Rx) for item in items)
+    if not frames:
+        raise click.ClickException(f"{session} holds no raw frames of {car} there: a vector would be empty")
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            file.writelines(
+                f"{line}\n"
+                for line in vectors.lines(items, part.start_ns or about.start_ns, car, source or f"{found.name}, {car}")
+            )
+    except FileExistsError:
+        raise click.UsageError(f"--out {out}: is there already: name a new file") from None
+    except OSError as error:
+        raise click.ClickException(f"{out} cannot be written: {error.strerror}") from None
+    click.echo(f"{out}: {frames} frames")
+    if found.damage:
+        click.echo(f"what is whole was taken: {found.damage_words}", err=True)

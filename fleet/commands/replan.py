@@ -1,0 +1,222 @@
+"""`fleet replan`: a plan on recorded readings, against what was decided then, on the command line."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from fleet.commands.options import explained, json_option
+
+if TYPE_CHECKING:
+    from fleet.policy.plan.plan import Plan
+    from fleet.policy.snapshot import CarPicture
+    from fleet.recording.reading.session import Session
+    from fleet.replay.analysis.recorded_decisions import Difference, Run, Said, Token
+    from fleet.replay.analysis.replan import Replanning
+
+TOLERANCE_S: Final = 2.0
+"""A car that went is missed up to a second later here: its states come once a second, its token went at once."""
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet replan sessions/20260314T151617Z-fleet
+  fleet replan sessions/20260314T151617Z-fleet --plan new.yaml
+Exit codes: 0 no difference, 1 some, or nothing to compare, 2 no plan."""
+)
+@click.argument("session", type=click.Path(path_type=Path))
+@click.option(
+    "--plan",
+    "path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="The plan to try; without one the session's own.",
+)
+@click.option(
+    "--fleet-file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="What the cars may do (default: the copy in the session, if there is one).",
+)
+@click.option(
+    "--tolerance",
+    default=TOLERANCE_S,
+    show_default=True,
+    type=click.FloatRange(0.1, 60.0),
+    help="s; the same decision so much sooner or later is no difference.",
+)
+@json_option
+def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance: float, *, as_json: bool) -> None:
+    """Give what cars said in SESSION to a plan, and say where it decides otherwise than was decided then, and why.
+
+    The cars do what they did then: what the plan would have made of them is not known. A person's stops and drives are
+    in what they said.
+    """
+    from fleet.coordinator.observer import listed_cars
+    from fleet.fleetfile.fleet_file import read_fleet
+    from fleet.policy.plan.parser import parse
+    from fleet.recording.reading.session import NoSession, Session
+    from fleet.recording.session_dir import FLEET_FILE
+    from schemas.yaml_document.document import read_text
+
+    with explained():
+        plan = None if path is None else parse(read_text(path), str(path))
+        try:
+            found = Session.open(session)
+            own = found.path / FLEET_FILE
+            listed: Mapping[str, CarPicture] = {}
+            if fleet_file is not None:
+                listed = listed_cars(read_fleet(fleet_file, unbound=True))
+            elif found.path.is_dir() and own.is_file():
+                # The session keeps the plan as plan.yaml, whatever name it has in the copied fleet file.
+                listed = listed_cars(read_fleet(own, unbound=True, moved=True))
+            compared = _Compared(found, plan, listed, round(tolerance * 1e9))
+            compared.go()
+        except NoSession as error:
+            raise click.ClickException(str(error)) from None
+    for each in compared.found:
+        click.echo(json.dumps(_fields(each, compared.origin_ns)) if as_json else _told(each, compared.origin_ns))
+    compared.report(as_json=as_json)
+    raise SystemExit(1 if compared.found else 0)
+
+
+class _Compared:
+    """Every coordinator of a session again, and where it decides otherwise."""
+
+    def __init__(
+        self, session: "Session", plan: "Plan | None", listed: "Mapping[str, CarPicture]", tolerance_ns: int
+    ) -> None:
+        self._session = session
+        self._plan = plan
+        self._listed = listed
+        self._tolerance_ns = tolerance_ns
+        self.found: list[Difference] = []
+        self.origin_ns = 0
+        self._runs: list[Run] = []
+        self._decisions = 0
+        self._late_ns: list[int] = []
+
+    def go(self) -> None:
+        """Compare; raises BadPlan, and ClickException if there is nothing to compare."""
+        from fleet.policy.state import Kept
+        from fleet.recording.tools.summary import of_session
+        from fleet.replay.analysis import recorded_decisions
+        from fleet.replay.analysis.replan import Replanning, plans_of
+        from schemas.yaml_document.document import read_text
+
+        about = of_session(self._session)
+        self.origin_ns = about.start_ns
+        self._runs = [
+            run for run in recorded_decisions.runs(self._session.messages(recorded_decisions.KEYS)) if run.said
+        ]
+        if not self._runs:
+            damage = f" ({self._session.damage_words})" if self._session.damage else ""
+            raise click.ClickException(
+                f"{self._session.path} has no decisions of a coordinator (FLEET/@coordinator/decision): "
+                f"there is nothing to compare a plan with{damage}"
+            )
+        self._refuse_without_cars()
+        tokens = recorded_decisions.presence(self._session.messages(recorded_decisions.STATES), about.end_ns)
+        kept = Kept()
+        for run in self._runs:
+            if not run.plans and (self._session.path / "plan.yaml").is_file():
+                run.plans.append((run.start_ns, read_text(self._session.path / "plan.yaml")))
+            recorded = plans_of(run) if self._plan is None else []
+            plans = (
+                [(at_ns, plan) for (at_ns, _), plan in zip(run.plans, recorded, strict=True)]
+                if self._plan is None
+                else [(run.start_ns, self._plan)]
+            )
+            if not plans:
+                raise click.ClickException(f"{self._session.path} has no plan: name one with --plan")
+            again = Replanning(run, plans, self._listed, kept)
+            kept = self._one(run, again, tokens)
+
+    def _refuse_without_cars(self) -> None:
+        """A session that was cut to some cars has not what the decisions were made of."""
+        from fleet.recording.tools.transform import origin_of
+
+        left = origin_of(self._session).get("cars")
+        if not left:
+            return
+        decided = {car for run in self._runs for car in (*run.roles, *(each for each in run.said if " " not in each))}
+        if others := sorted(decided - {*left, "phase"}):
+            raise click.ClickException(
+                f"{self._session.path} was cut to {', '.join(left)}: what was decided then was decided with "
+                f"{', '.join(others)} too, and what they said is not in it; replan the session it was cut from"
+            )
+
+    def _one(self, run: "Run", again: "Replanning", tokens: "list[Token]") -> Any:
+        from fleet.replay.analysis.recorded_decisions import differences
+        from fleet.replay.analysis.replan import BEFORE_NS, wanted_keys
+
+        wanted = wanted_keys(run.fleet, (plan for _, plan in again.plans))
+        messages = self._session.messages(wanted, run.start_ns - BEFORE_NS, run.end_ns + 1)
+        kept = again.go(messages, tokens)
+        self._decisions += sum(map(len, run.said.values()))
+        for each in differences(run.said, again.said, run.start_ns, run.end_ns):
+            if not run.whole and (each.then is None or (each.now is None and self._plan is None)):
+                continue  # said before the recording began
+            if each.to_ns - each.from_ns > self._tolerance_ns:
+                self.found.append(each)
+            else:
+                self._late_ns.append(each.to_ns - each.from_ns)
+        self.found.sort(key=lambda each: each.from_ns)
+        return kept
+
+    def report(self, *, as_json: bool) -> None:
+        """What was compared, and how exactly."""
+        late_s = max(self._late_ns, default=0) / 1e9
+        partly = sum(not run.whole for run in self._runs)
+        spans = [[(run.start_ns - self.origin_ns) / 1e9, (run.end_ns - self.origin_ns) / 1e9] for run in self._runs]
+        if as_json:
+            summary: dict[str, Any] = {"differences": len(self.found), "decisions": self._decisions, "spans_s": spans}
+            summary |= {"latest_s": late_s, "begun_before": partly, "damage": self._session.damage_words}
+            click.echo(json.dumps(summary))
+            return
+        found = f"{len(self.found)} differences" if self.found else "no difference"
+        times = ", ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
+        click.echo(f"{self._session.path}: {self._decisions} decisions from {times}: {found}")
+        click.echo(f"the same decisions came at most {late_s:.2f} s apart", err=True)
+        if partly:
+            click.echo("a coordinator began before the recording: what it knew then is not in it", err=True)
+        if self._session.damage:
+            click.echo(f"what is whole was taken: {self._session.damage_words}", err=True)
+
+
+def _told(each: "Difference", origin_ns: int) -> str:
+    start_s, length_s = (each.from_ns - origin_ns) / 1e9, (each.to_ns - each.from_ns) / 1e9
+    lines = [f"{each.subject} at +{start_s:.1f}s for {length_s:.1f} s:"]
+    for name, said in (("then", each.then), ("now", each.now)):
+        if said is None:
+            lines.append(f"  {name}: nothing was decided")
+            continue
+        lines.append(f"  {name}: {said}, because of {said.why}")
+        lines += [f"        with {reading}" for reading in said.readings]
+        if said.would_change:
+            lines.append(f"        would change with {said.would_change}")
+    return "\n".join(lines)
+
+
+def _fields(each: "Difference", origin_ns: int) -> dict[str, Any]:
+    return {
+        "subject": each.subject,
+        "from_s": (each.from_ns - origin_ns) / 1e9,
+        "to_s": (each.to_ns - origin_ns) / 1e9,
+        "then": _said(each.then),
+        "now": _said(each.now),
+    }
+
+
+def _said(said: "Said | None") -> dict[str, Any] | None:
+    if said is None:
+        return None
+    return {
+        "kind": said.kind,
+        "decided": said.decided,
+        "role": said.role,
+        "why": said.why,
+        "readings": list(said.readings),
+        "would_change": said.would_change,
+    }

@@ -1,0 +1,178 @@
+"""`fleet replay`: a session in Rerun, in its viewer or as a file that carries its layout."""
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from fleet.commands.options import Cars, from_option
+from fleet.commands.play import refuse_without, to_bus_options
+from fleet.commands.play import to_bus as play_to_bus
+from schemas.process import startup
+
+if TYPE_CHECKING:
+    from fleet.recording.reading.session import Session
+    from fleet.replay.rerun.export import Part
+
+BAR_AFTER_S: Final = 1.0
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet replay sessions/20260314T151617Z-fleet
+  fleet replay sessions/20260314T151617Z-fleet --car red --from=-60s --save red.rrd
+  fleet replay sessions/20260314T151617Z-fleet --to-bus --as rehearsal --rate 4 --loop"""
+)
+@click.argument("session", type=click.Path(path_type=Path))
+@click.option("--car", "--cars", "cars", type=Cars(), default=(), help="Only these cars, and the services.")
+@from_option
+@click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not shown.")
+@click.option(
+    "--save",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="OUT.rrd",
+    help="Write a file that carries its layout instead of opening the viewer: `rerun OUT.rrd` shows it.",
+)
+@to_bus_options
+def replay(
+    session: Path,
+    cars: tuple[str, ...],
+    start: str | None,
+    end: str | None,
+    save: Path | None,
+    *,
+    to_bus: bool,
+    **bus_options: Any,
+) -> None:
+    """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun, or play it on the bus again."""
+    if to_bus:
+        if save is not None:
+            raise click.UsageError("--save and --to-bus: give one of them")
+        play_to_bus(session, cars, start, end, **bus_options)
+        return
+    refuse_without(bus_options)
+    from fleet.recording.reading.session import NoSession, Session
+    from fleet.replay.rerun.viewer import has_display
+
+    try:
+        found = Session.open(session)
+        found.check()
+        if save is not None:
+            refuse_target(save, found.segments)
+        elif not has_display():
+            raise click.ClickException(
+                f"there is no display here to open Rerun on: write a file, fleet replay {session} --save out.rrd"
+            )
+        part = _part(found, cars, start, end)
+        with tempfile.TemporaryDirectory() as scratch:
+            if found.damage:
+                # What is whole is copied first: Rerun's own reader shows also what fails its checksum.
+                whole = _rescue(found, Path(scratch) / f"{found.name}.mcap")
+                click.echo(f"{found.damage_words}; showing what is whole", err=True)
+                found = whole
+            out = save if save is not None else Path(scratch) / f"{found.name}.rrd"
+            _export(found, out, part, cars)
+            if save is None:
+                sys.exit(_view(out))
+    except NoSession as error:
+        raise click.ClickException(str(error)) from None
+
+
+def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
+    """A recording or a device is not to be overwritten."""
+    if save.suffix != ".rrd":
+        raise click.UsageError(
+            f"--save {save}: Rerun opens files that end in .rrd: name it {save.stem.strip('.') or 'out'}.rrd"
+        )
+    if save.exists() and not save.is_file():
+        raise click.UsageError(f"--save {save}: this is no file: name one that ends in .rrd")
+    for segment in segments:
+        if save.exists() and save.samefile(segment):
+            raise click.UsageError(f"--save {save}: this is the recording itself: name another file")
+
+
+def _part(session: "Session", cars: tuple[str, ...], start: str | None, end: str | None) -> "Part":
+    quiet_rerun()
+    from fleet.replay.rerun.export import EVERYTHING, Part
+
+    if not cars and start is None and end is None:
+        return EVERYTHING
+    from fleet.commands.sessions import part_of
+
+    selection = part_of(session, start, end, cars)
+    return Part(cars, selection.start_ns, selection.end_ns)
+
+
+def _rescue(session: "Session", out: Path) -> "Session":
+    try:
+        return session.rescue(out)
+    except OSError as error:
+        raise click.ClickException(
+            f"what is whole of {session.path} cannot be copied to {out.parent}: {error.strerror}; "
+            "set TMPDIR to a directory with room"
+        ) from None
+
+
+def quiet_rerun() -> None:
+    """Rerun has a log of its own, which would stand between our lines; it reads this when it is imported."""
+    os.environ.setdefault("RUST_LOG", "off")
+
+
+def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) -> None:
+    from fleet.replay.rerun.export import ExportFailed, export
+
+    try:
+        with _bar(session) as seen:
+            held = export(session, out, part, tab=cars[0] if len(cars) == 1 else "", seen=seen)
+    except ExportFailed as error:
+        raise click.ClickException(str(error)) from None
+    except OSError as error:
+        raise click.ClickException(f"{out} cannot be written: {error.strerror}") from None
+    click.echo(f"{out}: {held.total()} messages on {len(held)} keys")
+
+
+@contextmanager
+def _bar(session: "Session") -> Iterator[Callable[[int], None]]:
+    """On a terminal a bar appears if it takes over a second; it is told how many messages have been read."""
+    from fleet.replay.rerun.export import count_of
+
+    count = count_of(session) if sys.stderr.isatty() else 0
+    bar: Any = None
+    began = time.monotonic()
+    done = 0
+
+    def seen(messages: int) -> None:
+        nonlocal bar, done
+        done += messages
+        if bar is not None:
+            bar.update(messages)
+        elif count and time.monotonic() - began > BAR_AFTER_S:
+            bar = click.progressbar(length=count, label="replay", file=sys.stderr).__enter__()
+            bar.update(done)
+
+    try:
+        yield seen
+    finally:
+        if bar is not None:
+            bar.render_finish()
+
+
+def _view(rrd: Path) -> int:
+    """Rerun's viewer until its window is closed; it listens on loopback only."""
+    from fleet.replay.rerun.viewer import Viewer
+
+    with Viewer("--port", "auto", str(rrd)) as viewer:
+        try:
+            code = viewer.wait() or 0
+        except KeyboardInterrupt:
+            return startup.INTERRUPTED
+        if code:
+            click.echo(f"fleet: Rerun's viewer ended with {code}: {viewer.last_words}", err=True)
+        return 1 if code else 0

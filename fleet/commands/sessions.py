@@ -1,0 +1,353 @@
+"""`fleet sessions`: what was recorded, on the command line. What each command does is beside this."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import click
+
+from fleet.commands.options import Cars, from_option, json_option, to_option
+from fleet.commands.redecode import vector
+
+if TYPE_CHECKING:
+    from fleet.recording.reading.session import Session
+    from fleet.recording.tools.summary import Overview
+
+DEFAULT_DIR: Final = "sessions"
+BAR_AFTER_S: Final = 1.0
+_LOOK: Final = 1024
+
+T = TypeVar("T")
+
+
+class _WithDefault(click.Group):
+    """`fleet sessions` and `fleet sessions DIR` are `fleet sessions list`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if not args or (args[0] not in self.commands and args[0] != "--help"):
+            args = ["list", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group(
+    cls=_WithDefault,
+    subcommand_metavar="[COMMAND | DIR]",
+    epilog="""\b
+examples:
+  fleet sessions
+  fleet sessions verify sessions/20260314T151617Z-fleet
+  fleet sessions export sessions/20260314T151617Z-fleet --csv tables
+""",
+)
+def sessions() -> None:
+    """List, look into, verify, recover, cut and export recordings; alone: list those of a directory."""
+
+
+sessions.add_command(vector)
+
+session_argument = click.argument("session", type=click.Path(path_type=Path))
+out_option = click.option(
+    "--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="The new session's directory."
+)
+
+
+@contextmanager
+def _explained(out: Path | None = None) -> Iterator[None]:
+    """What a user can cause becomes one line."""
+    from fleet.recording.reading.session import NoSession
+    from fleet.recording.tools.table_formats import FormatMissing
+    from fleet.recording.tools.transform import Exists
+
+    try:
+        yield
+    except Exists as error:
+        raise click.UsageError(str(error)) from None
+    except (NoSession, FormatMissing) as error:
+        raise click.ClickException(str(error)) from None
+    except OSError as error:
+        if out is None or isinstance(error, BrokenPipeError):
+            raise
+        raise click.ClickException(
+            f"{out} cannot be written: {error.strerror or error}; nothing was left there"
+        ) from None
+
+
+def _open(path: Path) -> "Session":
+    from fleet.recording.reading.session import Session
+
+    return Session.open(path)
+
+
+def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:
+    """Passes on; on a terminal a bar appears if it takes over a second, and how much there is is known."""
+
+    def watch(items: Iterable[T]) -> Iterator[T]:
+        if not total or not sys.stderr.isatty():
+            yield from items
+            return
+        began = time.monotonic()
+        bar: Any = None
+        seen = 0
+        try:
+            for item in items:
+                yield item
+                seen += 1
+                if seen % _LOOK:
+                    continue
+                if bar is None and time.monotonic() - began > BAR_AFTER_S:
+                    bar = click.progressbar(length=total, label=label, file=sys.stderr).__enter__()
+                    bar.update(seen)
+                elif bar is not None:
+                    bar.update(_LOOK)
+        finally:
+            if bar is not None:
+                bar.render_finish()
+
+    return watch
+
+
+@sessions.command(
+    "list",
+    epilog="""\b
+examples:
+  fleet sessions list
+  fleet sessions list /media/disk/sessions --json
+""",
+)
+@click.argument("directory", default=DEFAULT_DIR, type=click.Path(path_type=Path))
+@json_option
+def list_sessions(directory: Path, *, as_json: bool) -> None:
+    """The sessions in DIRECTORY: cars, length, size, what was lost, marks, and whether each is whole."""
+    from fleet.recording.tools.summary import overviews
+
+    try:
+        found = list(overviews(directory))
+    except OSError as error:
+        raise click.ClickException(f"{directory} cannot be listed: {error.strerror}; name another directory") from None
+    if as_json:
+        for one in found:
+            click.echo(json.dumps(one.to_dict()))
+        return
+    if not found:
+        click.echo(f"no session in {directory}", err=True)
+        return
+    rows = [("session", "state", "length", "size", "messages", "lost", "marks", "cars"), *map(_row, found)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        click.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    for one in found:
+        if one.words:
+            click.echo(f"{one.name}: {one.words}", err=True)
+
+
+def _row(one: "Overview") -> tuple[str, ...]:
+    from fleet.recording import time_spec
+
+    cars = ",".join(one.cars[:5]) + (f" and {len(one.cars) - 5} more" if len(one.cars) > 5 else "")
+    marks = str(len(one.marks)) + (" kept" if one.kept else "")
+    length = time_spec.words(one.length_s)
+    return one.name, one.state, length, _size(one.bytes), str(one.messages), str(one.lost), marks, cars
+
+
+def _size(count: int) -> str:
+    size = float(count)
+    for unit in ("B", "kB", "MB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} GB"
+
+
+@sessions.command(
+    epilog="""\b
+example:
+  fleet sessions info sessions/20260314T151617Z-fleet
+""",
+)
+@session_argument
+@json_option
+def info(session: Path, *, as_json: bool) -> None:
+    """What is in SESSION: versions, cars, keys with their rates, marks, what was lost."""
+    from fleet.recording.tools.summary import marks_of, of_session
+    from fleet.recording.tools.transform import origin_words
+
+    with _explained():
+        found = _open(session)
+        about = of_session(found)
+        about.marks = marks_of(found, about)
+        description = found.description
+    origin = description.origin if description is not None else {}
+    if as_json:
+        more = {"versions": dict(description.versions), "host": description.host} if description is not None else {}
+        click.echo(json.dumps({**about.to_dict(), **more, "origin": origin}))
+        return
+    click.echo(f"{about.name}: {about.state}{f' ({about.words})' if about.words else ''}")
+    if description is not None:
+        versions = ", ".join(f"{name} {version}" for name, version in description.versions.items())
+        click.echo(f"  fleet {description.fleet}, recorded on {description.host or 'an unknown host'}; {versions}")
+    if made := origin_words(origin):
+        click.echo(f"  made by {made}")
+    _say_contents(about)
+
+
+def _say_contents(about: "Overview") -> None:
+    from fleet.recording import time_spec
+
+    size = f"{about.messages} messages, {_size(about.bytes)}"
+    click.echo(
+        f"  from {about.started or 'an unknown time'}, {time_spec.words(about.length_s)}: {size}, {about.lost} lost"
+    )
+    if about.clock_back_s:
+        click.echo(f"  the recorder's clock went back by {about.clock_back_s:.1f} s: the length is what passed on it")
+    click.echo(f"  cars: {', '.join(about.cars) or 'none'}")
+    for mark in about.marks:
+        click.echo(f"  mark: {mark.get('time', '')} {mark.get('text', '')!r} by {mark.get('by') or 'somebody'}")
+    width = max((len(key) for key in about.keys), default=0)
+    for key, count in about.keys.items():
+        rate = f"  {count / about.length_s:7.2f} Hz" if about.length_s else ""
+        click.echo(f"  {key.ljust(width)}  {count:8}{rate}")
+
+
+@sessions.command(
+    epilog="""\b
+example:
+  fleet sessions verify sessions/20260314T151617Z-fleet
+""",
+)
+@session_argument
+@json_option
+def verify(session: Path, *, as_json: bool) -> None:
+    """Hold SESSION against its checksums, its publishers' numbers, today's schemas and the clocks.
+
+    Says exactly what is missing; ends with 1 if anything is.
+    """
+    from fleet.recording.tools.summary import growing, total
+    from fleet.recording.tools.verify import verify as look
+
+    with _explained():
+        found = _open(session)
+        verdict = look(found, watched("verify", total(found)), growing(found))
+    if as_json:
+        click.echo(json.dumps(verdict.to_dict()))
+    else:
+        for line in verdict.words():
+            click.echo(line)
+    raise SystemExit(0 if verdict.whole else 1)
+
+
+@sessions.command(
+    epilog="""\b
+example:
+  fleet sessions recover sessions/20260314T151617Z-fleet --out rescued
+""",
+)
+@session_argument
+@out_option
+def recover(session: Path, out: Path | None) -> None:
+    """Write every whole chunk of a cut or damaged SESSION into a whole session, which says so."""
+    from fleet.recording.tools.summary import total
+    from fleet.recording.tools.transform import recover as make
+
+    with _explained():
+        found = _open(session)
+    out = out or found.path.resolve().with_name(f"{found.name}-recovered")
+    with _explained(out):
+        count, words = make(found, out, watched("recover", total(found)))
+    click.echo(f"{out}: {count} messages{f'; could not be saved: {words}' if words else ', no message was damaged'}")
+
+
+@sessions.command(
+    epilog="""\b
+examples:
+  fleet sessions cut sessions/20260314T151617Z-fleet --from 30s --to -10s --out part
+  fleet sessions cut sessions/20260314T151617Z-fleet --cars red,blue --out part
+""",
+)
+@session_argument
+@from_option
+@to_option
+@click.option("--cars", type=Cars(), default=(), help="Only these cars, and the services.")
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="The new session's directory.",
+)
+def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...], out: Path) -> None:
+    """Write a part of SESSION as a session of its own."""
+    from fleet.recording.tools.transform import cut as make
+
+    with _explained():
+        found = _open(session)
+        selection = part_of(found, start, end, cars)
+    with _explained(out):
+        count = make(found, out, selection, cars, watched("cut", None))
+    click.echo(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
+
+
+def part_of(session: "Session", start: str | None, end: str | None, cars: Iterable[str]) -> Any:
+    """The part that is meant; a car or a time that is not there is said before anything is written."""
+    from fleet.recording import time_spec
+    from fleet.recording.selection import Selection
+    from fleet.recording.tools.summary import of_session
+
+    about = of_session(session)
+    if missing := sorted(set(cars) - set(about.cars)):
+        raise click.UsageError(
+            f"--cars: {', '.join(missing)} is not in {session.path}: there are {', '.join(about.cars) or 'none'}"
+        )
+    bounds: list[int | None] = []
+    for name, text in (("--from", start), ("--to", end)):
+        try:
+            bounds.append(None if text is None else time_spec.at_ns(text, about.start_ns, about.end_ns))
+        except ValueError as error:
+            raise click.UsageError(f"{name}: {error}") from None
+    selection = Selection(None, *bounds)
+    there = f"{session.path} goes from {time_spec.iso(about.start_ns)} to {time_spec.iso(about.end_ns)}"
+    if bounds[0] is not None and bounds[1] is not None and bounds[0] >= bounds[1]:
+        raise click.UsageError(f"--from {start} is not before --to {end}: {there}")
+    if not selection.overlaps(about.start_ns, about.end_ns):
+        raise click.UsageError(f"nothing lies there: {there}, {time_spec.words(about.length_s)}")
+    return selection
+
+
+@sessions.command(
+    epilog="""\b
+examples:
+  fleet sessions export sessions/20260314T151617Z-fleet --csv tables
+  fleet sessions export sessions/20260314T151617Z-fleet --parquet tables
+""",
+)
+@session_argument
+@click.option("--csv", "csv", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write CSV here.")
+@click.option(
+    "--parquet", "parquet", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write Parquet here."
+)
+def export(session: Path, csv: Path | None, parquet: Path | None) -> None:
+    """Write SESSION as tidy tables, one file for each type of message, into a new directory.
+
+    Columns: key, car, log_time, publish_time, sequence, then the fields. Times are UTC. Units stand in the columns'
+    names, in Parquet also in the fields' metadata. What is no protobuf message is in `other`.
+    """
+    from fleet.recording.tools.export import export as write
+    from fleet.recording.tools.summary import total
+    from fleet.recording.tools.table_formats import FORMATS
+    from fleet.recording.tools.transform import made_whole
+
+    wanted = {name: out for name, out in (("csv", csv), ("parquet", parquet)) if out is not None}
+    if not wanted or csv == parquet:
+        raise click.UsageError("say where to, and as what: --csv DIR, --parquet DIR, or both (two directories)")
+    for name, out in wanted.items():
+        with _explained(out), made_whole(out) as new:
+            found = _open(session)
+            done = write(watched(f"export {name}", total(found))(found.rows()), new, FORMATS[name])
+        click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")
+        if done.undecoded:
+            click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)
+        if found.damage:
+            click.echo(f"what is whole was exported: {found.damage_words}", err=True)

@@ -1,0 +1,138 @@
+"""`fleet view`: the fleet as it is now, in Rerun. What is shown and how it comes there is live.py's."""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from fleet.commands.options import bus_options
+from fleet.commands.replay import quiet_rerun, refuse_target
+from schemas import keys
+
+if TYPE_CHECKING:
+    from fleet.replay.rerun.viewer import Viewer
+
+MEMORY: Final = "1GiB"
+SETTLE_S: Final = 1.5
+"""What comes within this time is laid out at once, so that the tabs do not change under the user's hands."""
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet view
+  fleet view --web
+  fleet view --save now.rrd --for 30"""
+)
+@click.option("--web", is_flag=True, help="Serve the viewer as a web page on this machine only, and print its address.")
+@click.option(
+    "--save",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="OUT.rrd",
+    help="Write a file that carries its layout instead of opening the viewer.",
+)
+@click.option(
+    "--for", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="End after this."
+)
+@click.option(
+    "--memory",
+    default=MEMORY,
+    show_default=True,
+    metavar="SIZE",
+    help="What the viewer may hold: the oldest goes first.",
+)
+@bus_options
+def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, connect: str | None, fleet: str) -> None:
+    """See the fleet live in Rerun until its window is closed, or Ctrl-C. Cars and `fleet up` do not notice."""
+    import re
+
+    if web and save is not None:
+        raise click.UsageError("--web and --save do not go together: name one")
+    if not re.fullmatch(r"[1-9]\d*(\.\d+)?([KMG]i?B|%)", memory):
+        raise click.UsageError(f"--memory {memory} is not allowed: write 500MB, 1GiB or 25%")
+    keys.check_name(fleet, "fleet name")
+    if save is not None:
+        refuse_target(save)
+        if not save.resolve().parent.is_dir():
+            raise click.UsageError(f"--save {save}: there is no directory {save.parent}")
+    quiet_rerun()
+    from fleet.replay.rerun.viewer import NoViewer, has_display
+
+    if save is None and not web and not has_display():
+        raise click.ClickException(
+            "there is no display here to open Rerun on: --web serves it as a page, --save out.rrd writes a file"
+        )
+    try:
+        _follow(connect, fleet, save, memory, seconds, web=web)
+    except NoViewer as error:
+        raise click.ClickException(str(error)) from None
+    except OSError as error:
+        raise click.ClickException(f"{save or error.filename} cannot be written: {error.strerror}") from None
+
+
+def _follow(
+    connect: str | None, fleet: str, save: Path | None, memory: str, seconds: float | None, *, web: bool
+) -> None:
+    from fleet.replay.rerun.live import BATCH_S, SHOWN_S, Live
+    from schemas.bus import Bus
+
+    stop = threading.Event()
+    until = time.monotonic() + seconds if seconds is not None else None
+    with _signals(stop), Bus.open(connect) as bus, _sink(save, memory, web=web) as (viewer, sink):
+        live = Live(bus, fleet, sink, last_s=None if save is not None else SHOWN_S)
+        try:
+            live.start()
+            pause = SETTLE_S
+            while not stop.wait(pause) and (viewer is None or viewer.ended is None):
+                live.step()
+                if until is not None and time.monotonic() > until:
+                    break
+                pause = BATCH_S
+        finally:
+            live.close(send=viewer is None or viewer.ended is None)
+        lost = f"; {live.dropped} were left out, the viewer was too slow" if live.dropped else ""
+        words = f"{save}: " if save is not None else ""
+        click.echo(f"{words}{live.held} messages of {len(live.cars)} cars{lost}", err=save is None)
+
+
+@contextmanager
+def _signals(stop: threading.Event) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end it in order."""
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _sink(save: Path | None, memory: str, *, web: bool) -> "Iterator[tuple[Viewer | None, Callable[[Any], None]]]":
+    """Where it goes: a file, or a viewer that is up."""
+    from fleet.replay.rerun.viewer import LOOPBACK, Viewer, free_port
+
+    if save is not None:
+        yield None, lambda recording: recording.save(save)
+        return
+    port, page = free_port(), free_port()
+    bounded = ("--memory-limit", memory, "--server-memory-limit", memory)
+    if web:
+        arguments = ["--serve-web", "--web-viewer-port", str(page)]
+    else:
+        arguments = ["--expect-data-soon", "--hide-welcome-screen"]
+    with Viewer("--port", str(port), *bounded, *arguments) as viewer:
+        viewer.wait_until_it_listens(page if web else port)
+        url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+        if web:
+            click.echo(f"http://{LOOPBACK}:{page}/?url={url.replace('+', '%2B')}")
+        yield viewer, lambda recording: recording.connect_grpc(url)

@@ -1,0 +1,231 @@
+"""The fleet file: which cars there are, and what each is, may do and must not. Read whole, checked whole, resolved.
+
+A car overrides its type, a type the defaults; lists replace, `limits` merge. What is there and answers, `fleet check`
+finds out; nothing is opened here but the file.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from fleet.fleetfile.models import (
+    CAPABILITIES,
+    CRITICAL_V,
+    LONGEST_DRIVE_S,
+    LOW_V,
+    BatteryAction,
+    FileEntry,
+    LimitsEntry,
+)
+from fleet.links import BadLink, Link, LinkKind, parse_link, shared_ports
+from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_told
+from schemas.yaml_document.document import Document, read_text
+from schemas.yaml_document.messages import Where, meant, shown
+
+PALETTE: Final = ("#e01b24", "#33d17a", "#3584e4", "#f6d32d", "#9141ac", "#ff7800", "#2ec7c0", "#986a44")
+"""Colours of cars that are given none, in the order of the file."""
+PATHS: Final = ("plan", "recordings", "world")
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a car is kept within.
+
+    longest_drive_s: the longest `duration_s` of a drive, up to 3600. speed_max: 0 to 1 of its fastest. battery_*_v:
+    below this the level is low, critical; at rest.
+    """
+
+    longest_drive_s: float = LONGEST_DRIVE_S
+    speed_max: float = 1.0
+    battery_low_v: float = LOW_V
+    battery_critical_v: float = CRITICAL_V
+    on_battery_low: BatteryAction = BatteryAction.WARN
+    on_battery_critical: BatteryAction = BatteryAction.REFUSE
+
+
+@dataclass(frozen=True, slots=True)
+class CarSpec:
+    """One car, resolved: nothing is left to look up in its type or the defaults.
+
+    link: as `gateway run --link` takes it. platform: as `--platform` does. colour: #rrggbb. capabilities: modes and
+    parts by their words; with platform `auto` and none given, all that any platform has, until its gateway knows.
+    roles: those it may take; None: any.
+    """
+
+    name: str
+    link: str
+    platform: str
+    colour: str
+    capabilities: frozenset[str]
+    limits: Limits = Limits()
+    roles: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FleetFile:
+    """A fleet file, every car resolved, every path absolute.
+
+    endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. unlinked: cars without a link, where those are let through.
+    """
+
+    name: str
+    endpoint: str | None
+    cars: Mapping[str, CarSpec]
+    plan: Path | None
+    recordings: Path | None
+    record: bool
+    world: Path | None
+    text: str
+    path: Path
+    unlinked: Mapping[str, CarSpec] = field(default_factory=dict)
+
+    @property
+    def unbound(self) -> tuple[str, ...]:
+        """The cars without a link (`fleet bind`)."""
+        return tuple(self.unlinked)
+
+
+def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) -> FleetFile:
+    """The fleet in a file, every car resolved; raises BadFile. `unbound`: cars without a link are let through.
+
+    `moved`: it is a copy (a session's), so the plan and the world that it names need not be beside it.
+    """
+    path = Path(path)
+    return parse_fleet(read_text(path), path, unbound=unbound, moved=moved)
+
+
+def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = False) -> FleetFile:
+    """The fleet in a text, as if it stood in this file; raises BadFile."""
+    document = Document(text, str(path))
+    file = document.take(FileEntry)
+    tree = _mapping(document.tree)
+    for where, words in _contradictions(tree, path, unbound=unbound, moved=moved):
+        document.complain(where, words)
+    document.end()
+    assert file is not None  # else the document had ended
+    merged = {name: _merged(tree, car) for name, car in tree["cars"].items()}
+    places = {name: _beside(path, tree.get(name)) for name in PATHS}
+    cars = {name: _spec(name, car, index) for index, (name, car) in enumerate(merged.items())}
+    return FleetFile(
+        name=file.name,
+        endpoint=file.endpoint or None,
+        cars=MappingProxyType({name: car for name, car in cars.items() if car.link}),
+        record=file.record,
+        text=text,
+        path=path.absolute(),
+        unlinked=MappingProxyType({name: car for name, car in cars.items() if not car.link}),
+        **places,
+    )
+
+
+def profile_capabilities(platform: str) -> frozenset[str]:
+    """What a platform's cars have: parts and modes by their words; of `auto` what any has."""
+    _, auto = parse_told(platform)
+    kinds = [kind for kind in Platform if kind is not Platform.UNKNOWN] if auto else [platform.partition("+")[0]]
+    options = platform.partition("+")[1] + platform.partition("+")[2]
+    profiles = [parse_platform(f"{kind}{options}") for kind in kinds]
+    return frozenset(str(word) for profile in profiles for word in (*profile.capabilities, *profile.modes))
+
+
+def _spec(name: str, car: Mapping[str, Any], index: int) -> CarSpec:
+    platform = car.get("platform", AUTO)
+    limits = LimitsEntry.model_validate(car.get("limits", {}))
+    return CarSpec(
+        name=name,
+        link=car.get("link", ""),
+        platform=platform,
+        colour=car.get("colour", PALETTE[index % len(PALETTE)]).lower(),
+        capabilities=frozenset(car["capabilities"]) if "capabilities" in car else profile_capabilities(platform),
+        limits=Limits(**dict(limits)),
+        roles=tuple(car["roles"]) if "roles" in car else None,
+    )
+
+
+def _merged(tree: Mapping[str, Any], car: Mapping[str, Any]) -> dict[str, Any]:
+    """A car's fields: the defaults, over them its type's, over them its own."""
+    merged: dict[str, Any] = {}
+    limits: dict[str, Any] = {}
+    kind = car.get("type")
+    named = _mapping(tree.get("types")).get(kind) if isinstance(kind, str) else None
+    for layer in (tree.get("defaults"), named, car):
+        merged |= _mapping(layer)
+        limits |= _mapping(_mapping(layer).get("limits"))
+    return {**merged, "limits": limits}
+
+
+def _beside(path: Path, given: str | None) -> Path | None:
+    return None if given is None else (path.absolute().parent / Path(given).expanduser()).resolve()
+
+
+# What no field shows by itself. These look at the text as it is, so that they tell of it along with the fields' faults.
+
+
+def _contradictions(tree: Mapping[str, Any], path: Path, *, unbound: bool, moved: bool) -> Iterator[tuple[Where, str]]:
+    cars = {name: _mapping(car) for name, car in _mapping(tree.get("cars")).items()}
+    types = _mapping(tree.get("types"))
+    for name, car in cars.items():
+        kind = car.get("type")
+        if isinstance(kind, str) and kind not in types:
+            known = f"one of {', '.join(types)}" if types else "this file has no types"
+            yield ("cars", name, "type"), f"{shown(kind)} is not allowed: {known}{meant(kind, types)}"
+        if "link" not in car and not unbound:
+            words = "is missing: how the car is reached; `gateway scan` shows links, `fleet bind` finds out which it is"
+            yield ("cars", name, "link"), words
+        yield from _car_contradictions(tree, name, car)
+    yield from _one_port(cars)
+    for entry in () if moved else ("plan", "world"):
+        given = tree.get(entry)
+        if isinstance(given, str) and given and given.isprintable():
+            there = _beside(path, given)
+            if there is not None and not there.is_file():
+                yield (entry,), f"{shown(given)}: there is no such file beside this one"
+
+
+def _car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:
+    merged = _merged(tree, car)
+    layers: list[tuple[Where, Any]] = [(("cars", name), car), (("defaults",), tree.get("defaults"))]
+    if isinstance(car.get("type"), str):
+        layers.insert(1, (("types", car["type"]), _mapping(tree.get("types")).get(car["type"])))
+    limits = merged["limits"]
+    low, critical = limits.get("battery_low_v", LOW_V), limits.get("battery_critical_v", CRITICAL_V)
+    if isinstance(low, int | float) and isinstance(critical, int | float) and critical > low:
+        said = (
+            {"battery_low_v", "battery_critical_v"} & _mapping(_mapping(layer).get("limits")).keys()
+            for _, layer in layers
+        )
+        at = next(where for (where, _), there in zip(layers, said, strict=True) if there)
+        yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}: it is at most that"
+    platform, given = merged.get("platform", AUTO), merged.get("capabilities")
+    if car.get("link") == LinkKind.SIMULATED and str(platform).partition("+")[0] in (AUTO, Platform.UNKNOWN):
+        kinds = ", ".join(kind for kind in Platform if kind is not Platform.UNKNOWN)
+        yield ("cars", name, "platform"), f"a simulated car is of some platform: {kinds}, with +arm, +imu"
+    if not isinstance(platform, str) or not isinstance(given, list):
+        return
+    try:
+        had = profile_capabilities(platform)
+    except ValueError:
+        return  # the platform's own fault
+    if missing := [word for word in given if isinstance(word, str) and word in CAPABILITIES and word not in had]:
+        at = next(where for where, layer in layers if {"platform", "capabilities"} & _mapping(layer).keys())
+        words = f"{', '.join(missing)}: no {platform} car has it; allowed are {', '.join(sorted(had))}"
+        yield (*at, "capabilities") if "capabilities" in _mapping(dict(layers)[at]) else at, words
+
+
+def _one_port(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Where, str]]:
+    links: dict[str, Link] = {}
+    for name, car in cars.items():
+        given = car.get("link")
+        if isinstance(given, str):
+            try:
+                links[name] = parse_link(given)
+            except BadLink:
+                continue  # the link's own fault
+    for first, second in shared_ports(links):
+        words = f"{shown(cars[second]['link'])} may be the port of {first}: every car has a port of its own"
+        yield ("cars", second, "link"), words
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, dict) else {}

@@ -1,0 +1,1 @@
+"""Reading sessions and MCAP files, also damaged ones. Read `session` first."""

@@ -1,1 +1,0 @@
-"""What `fleet sessions` does: list, look into, verify, recover, cut and export recordings."""

@@ -1,0 +1,72 @@
+"""Readings of one type of message as one CSV table (RFC 4180): which columns, and each reading's row. Pure.
+
+Columns are the key, the time, and every field of the message with its unit in the name: always the same for a type,
+empty where nothing was measured. Numbers, times and truths are written as in JSON, whatever the locale.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from fleet.client.reading import Reading
+from schemas import topics
+
+_COMMON: Final = frozenset({"stamp", "timestamp", "boot_id"})
+_UNITS: Final = {"1": "", "B": "bytes"}
+
+
+def table(readings: Sequence[Reading], topic: topics.Topic) -> str:
+    """The whole table, header first; the readings must be of this topic."""
+    fields = list(_fields(readings))
+    lines = io.StringIO(newline="")
+    writer = csv.writer(lines)
+    writer.writerow(["time", "key", *(column_name(name, topic.units.get(name, ""), index) for name, index in fields)])
+    for reading in readings:
+        writer.writerow([iso(reading.time), reading.key, *(_cell(reading.value, *field) for field in fields)])
+    return lines.getvalue()
+
+
+def iso(time: datetime) -> str:
+    """A time in ISO 8601, UTC, with microseconds."""
+    return time.astimezone(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def _fields(readings: Sequence[Reading]) -> Iterable[tuple[str, int | None]]:
+    """The fields with a column each; a list of numbers has as many as its longest."""
+    for field in readings[0].value.DESCRIPTOR.fields:
+        if field.name in _COMMON:
+            continue
+        if field.is_repeated and field.cpp_type == field.CPPTYPE_DOUBLE:
+            longest = max(len(getattr(reading.value, field.name)) for reading in readings)
+            yield from ((field.name, index) for index in range(longest))
+        else:
+            yield field.name, None
+
+
+def column_name(name: str, unit: str, index: int | None = None) -> str:
+    """The name of a field's column: with its unit if it does not end in that; an item of a list has its number."""
+    unit = _UNITS.get(unit, unit).lower()
+    numbered = name if index is None else f"{name}_{index + 1}"
+    return numbered if not unit or name.endswith(f"_{unit}") or name == unit else f"{numbered}_{unit}"
+
+
+def _cell(message: Any, name: str, index: int | None) -> str:
+    field = message.DESCRIPTOR.fields_by_name[name]
+    if field.has_presence and not message.HasField(name):
+        return ""
+    value = getattr(message, name)
+    if index is not None:
+        return repr(value[index]) if index < len(value) else ""
+    if field.is_repeated or field.message_type is not None:
+        from google.protobuf import json_format
+
+        whole = json_format.MessageToDict(message, preserving_proto_field_name=True)
+        return json.dumps(whole[name]) if name in whole else ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, bytes):
+        return value.hex()
+    return value if isinstance(value, str) else repr(value)

@@ -1,0 +1,145 @@
+"""Tables as files: CSV with the standard library, Parquet with pyarrow, which is imported only for that.
+
+Times are UTC to the nanosecond without a zone, because readers differ in what they do with one: pandas, DuckDB and
+Polars all take `2026-03-14 15:16:17.123456789` for a time as it is.
+"""
+
+import csv
+import json
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, ClassVar, Final, Protocol
+
+from fleet.recording.tools.tables import Column, Kind, Values
+
+SECONDS: Final = 4096
+"""So many seconds are remembered as text."""
+
+
+class FormatMissing(Exception):
+    """A format whose package is not installed; its text says how to have it."""
+
+
+class Sink(Protocol):
+    """One table being written; every method may raise OSError."""
+
+    ending: ClassVar[str]
+
+    def __init__(self, path: Path, columns: Sequence[Column]) -> None: ...
+
+    def add(self, values: Sequence[Values]) -> None:
+        """Write rows: the values of each column."""
+
+    def close(self) -> None:
+        """End the file."""
+
+
+class CsvSink:
+    """RFC 4180, header first; nothing where nothing was measured. Lists and maps are JSON, bytes hexadecimal."""
+
+    ending: ClassVar[str] = ".csv"
+
+    def __init__(self, path: Path, columns: Sequence[Column]) -> None:
+        self._file = path.open("w", encoding="utf-8", newline="")
+        self._writer = csv.writer(self._file)
+        self._writer.writerow([column.name for column in columns])
+        self._texts = [_TEXTS.get(column.kind) for column in columns]
+
+    def add(self, values: Sequence[Values]) -> None:
+        """Write rows: the values of each column."""
+        columns = [column if text is None else text(column) for text, column in zip(self._texts, values, strict=True)]
+        self._writer.writerows(zip(*columns, strict=True))
+
+    def close(self) -> None:
+        """End the file."""
+        self._file.close()
+
+
+class _Seconds(dict[int, str]):
+    """Seconds since the epoch as text, as they are asked for; those met lately are remembered."""
+
+    def __missing__(self, second: int) -> str:
+        if len(self) >= SECONDS:
+            self.clear()
+        words = self[second] = datetime.fromtimestamp(second, UTC).strftime("%Y-%m-%d %H:%M:%S")
+        return words
+
+
+def _times(column: Values) -> Values:
+    seconds = _Seconds()
+    try:
+        return [None if ns is None else f"{seconds[ns // 1_000_000_000]}.{ns % 1_000_000_000:09d}" for ns in column]
+    except (OverflowError, ValueError, OSError):
+        return column  # somebody else's clock: no date, so numbers
+
+
+def _by(text: Callable[[Any], str]) -> Callable[[Values], Values]:
+    return lambda column: [None if value is None else text(value) for value in column]
+
+
+_TEXTS: Final[dict[Kind, Callable[[Values], Values]]] = {
+    Kind.BOOL: lambda column: [None if value is None else "true" if value else "false" for value in column],
+    Kind.BYTES: _by(bytes.hex),
+    Kind.TIME: _times,
+    Kind.LIST: _by(json.dumps),
+    Kind.MAP: _by(json.dumps),
+}
+"""What makes text of the values of a column; the csv module writes the others as they are to be."""
+
+
+class ParquetSink:
+    """Parquet, zstd; a column's unit is in the metadata of its field, as `unit`."""
+
+    ending: ClassVar[str] = ".parquet"
+
+    def __init__(self, path: Path, columns: Sequence[Column]) -> None:
+        try:
+            import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
+            import pyarrow.parquet as pq  # type: ignore[import-untyped]  # likewise
+        except ImportError:
+            raise FormatMissing(
+                "Parquet needs pyarrow, which is not installed: pip install 'zenoh-car-fleet[parquet]', or use --csv"
+            ) from None
+        kinds = {
+            Kind.FLOAT: pa.float64(),
+            Kind.INT: pa.int64(),
+            Kind.UINT: pa.uint64(),
+            Kind.BOOL: pa.bool_(),
+            Kind.BYTES: pa.binary(),
+            Kind.TIME: pa.timestamp("ns"),
+        }
+        made = {Kind.LIST: pa.list_, Kind.MAP: lambda item: pa.map_(pa.string(), item)}
+        self._types = [
+            made[column.kind](kinds.get(column.item, pa.string()))
+            if column.kind in made
+            else kinds.get(column.kind, pa.string())
+            for column in columns
+        ]
+        self._maps = [column.kind is Kind.MAP for column in columns]
+        self._array = pa.array
+        self._table = pa.Table.from_arrays
+        self._schema = pa.schema(
+            pa.field(column.name, kind, metadata={"unit": column.unit} if column.unit else None)
+            for column, kind in zip(columns, self._types, strict=True)
+        )
+        self._file = path.open("wb")
+        self._writer = pq.ParquetWriter(self._file, self._schema, compression="zstd")
+
+    def add(self, values: Sequence[Values]) -> None:
+        """Write rows: the values of each column."""
+        arrays = [
+            self._array([list(value.items()) for value in column] if is_map else column, kind)
+            for kind, is_map, column in zip(self._types, self._maps, values, strict=True)
+        ]
+        self._writer.write_table(self._table(arrays, schema=self._schema))
+
+    def close(self) -> None:
+        """End the file."""
+        try:
+            self._writer.close()
+        finally:
+            self._file.close()
+
+
+FORMATS: Final[dict[str, type[Sink]]] = {"csv": CsvSink, "parquet": ParquetSink}

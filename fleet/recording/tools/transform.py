@@ -1,0 +1,193 @@
+"""New sessions made of old ones: what is whole of a damaged one, or a part. The old one is never written to.
+
+Everything is written beside its place and put there at the end: who is interrupted leaves nothing that is half there.
+"""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from fleet.recording import session_dir, time_spec
+from fleet.recording.reading.mcap_reader import Row
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.selection import Selection
+from fleet.recording.tools.tables import car_of
+from fleet.recording.writing.mcap_copy import Copy
+
+COPIED: Final = ("fleet.yaml", "plan.yaml")
+SEGMENT_BYTES: Final = 256 << 20
+"""A new segment is begun after so many bytes of payloads."""
+
+
+class Exists(Exception):
+    """Something is where the new directory is to be; its text says what to do."""
+
+
+@contextmanager
+def made_whole(out: Path) -> Iterator[Path]:
+    """A directory to write to, which becomes `out` at the end, and nothing if there is none; raises Exists, OSError."""
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise Exists(f"{out} is there already: name a new directory")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".new", dir=out.parent))
+    try:
+        new = scratch / out.name
+        new.mkdir()  # with the rights that any new directory has: the one around it is only ours
+        yield new
+        if out.exists():
+            out.rmdir()
+        new.replace(out)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+Watched = Callable[[Iterable[Row]], Iterable[Row]]
+"""Passes messages on and looks at them: progress."""
+
+
+def recover(session: Session, out: Path, watched: Watched = iter) -> tuple[int, str]:
+    """Write every whole message as a whole session that says so; how many, and what could not be saved.
+
+    Raises Exists, OSError, and NoSession if no message is whole.
+    """
+    with made_whole(out) as new:
+        count = _copy(watched(session.rows()), new, session)
+        # After reading, which says what is lost with a time; a check of what lies between messages tells no more.
+        words = session.damage_words
+        if not count:
+            raise NoSession(f"{session.path} holds no message that is whole: {words or 'it is empty'}")
+        if session.lacking(count) or (session.description is not None and not session.description.closed):
+            words = "; ".join(filter(None, (words, session.lacking(count) or "its recorder did not close it")))
+        _describe(session, new, count, {"by": "recover", "lost": words, "missing": _missing(session, count, words)})
+    return count, words
+
+
+def _missing(session: Session, count: int, words: str) -> int | None:
+    """How many messages are known not to be among those that were had; None: not known."""
+    description = session.description
+    if not words:
+        return 0
+    if description is not None and description.closed and description.messages:
+        return max(description.messages - count, 0)
+    if description is not None and not description.closed:
+        return None
+    expected = _sum(session.expected().values())
+    return None if expected is None else max(expected - count, 0)
+
+
+def _sum(counts: Iterable[object]) -> int | None:
+    """None if one of them is not known."""
+    total = 0
+    for each in counts:
+        if not isinstance(each, int):
+            return None
+        total += each
+    return total
+
+
+def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), watched: Watched = iter) -> int:
+    """Write a part as a session of its own; how many messages. `cars`: only theirs, and the services'.
+
+    Raises Exists, OSError, and NoSession if the part is empty.
+    """
+    names = frozenset(cars)
+
+    def part() -> Iterator[Row]:
+        for row in session.rows(selection):
+            car = car_of(row[0].channel.topic)
+            if not names or car in names or car.startswith("@"):
+                yield row
+
+    with made_whole(out) as new:
+        count = _copy(watched(part()), new, session)
+        if not count:
+            raise NoSession(f"nothing of {session.path} lies there")
+        bounds = [None if ns is None else time_spec.iso(ns) for ns in (selection.start_ns, selection.end_ns)]
+        about = {"by": "cut", "from": bounds[0], "to": bounds[1], "cars": sorted(names), "lost": session.damage_words}
+        _describe(session, new, count, about)
+    return count
+
+
+def _copy(rows: Iterable[Row], new: Path, session: Session) -> int:
+    """Write segments; how many messages."""
+    description = session.description
+    about = {"made_from": session.name}
+    if description is not None:
+        about |= {"fleet": description.fleet, "started": description.started, "host": description.host}
+    coming = iter(rows)
+    number, count = 0, 0
+    row = next(coming, None)
+    while row is not None:
+        number += 1
+        size = 0
+        with Copy(session_dir.segment(new, number), {**about, "format": str(session_dir.FORMAT)}) as copy:
+            while row is not None and size < SEGMENT_BYTES:
+                copy.add(row)
+                size += len(row[4])
+                row = next(coming, None)
+        count += copy.messages
+    return count
+
+
+def _describe(session: Session, new: Path, count: int, origin: Mapping[str, object]) -> None:
+    """`session.json` and the other files of the session, as the old ones are."""
+    first = last = None
+    fleet = ""
+    for index in Session.open(new).indexes().values():
+        if index is not None and index.statistics is not None:
+            first = index.statistics.message_start_time if first is None else first
+            last = index.statistics.message_end_time
+            fleet = fleet or next((key.partition("/")[0] for key in index.counts), "")
+    assert first is not None
+    assert last is not None
+    old = session.description
+    before = origin_of(session)
+    if lost := before.get("lost"):  # what was missing before is missing still
+        origin = {**origin, "lost": "; ".join(str(each) for each in (origin["lost"], lost) if each)}
+        origin["missing"] = _sum((origin.get("missing"), before.get("missing")))
+    if not origin.get("cars") and before.get("cars"):
+        origin = {**origin, "cars": before["cars"]}
+    base = old if old is not None else session_dir.Description(fleet, time_spec.iso(first), "", {})
+    made = {"by": origin["by"], "of": session.name, **origin}
+    replace(
+        base,
+        started=time_spec.iso(first) if origin["by"] == "cut" else base.started,
+        ended=time_spec.iso(last),
+        closed=True,
+        messages=count,
+        error="",
+        format=session_dir.FORMAT,
+        origin=made,
+    ).write(new)
+    if session.path.is_dir():
+        for name in COPIED:
+            if (session.path / name).is_file():
+                shutil.copyfile(session.path / name, new / name)
+
+
+def origin_of(session: Session) -> Mapping[str, Any]:
+    """Of what a session was made, and what that lacked; empty if it was recorded."""
+    return session.description.origin if session.description is not None else {}
+
+
+def lost_words(session: Session) -> str:
+    """What is missing since before a session was made of another; empty if nothing is."""
+    origin = origin_of(session)
+    if not origin.get("lost") or origin.get("missing") == 0:
+        return ""
+    missing = origin.get("missing")
+    many = f"{missing} messages" if isinstance(missing, int) else "messages, it is not known how many,"
+    return f"made of {origin.get('of')} by {origin.get('by')}: {many} are missing ({origin['lost']})"
+
+
+def origin_words(origin: object) -> str:
+    """What a session was made of, in a line; empty if it was recorded."""
+    if not isinstance(origin, dict) or not origin:
+        return ""
+    parts = [f"{name} {json.dumps(value)}" for name, value in origin.items() if value and name not in ("by", "of")]
+    return f"{origin.get('by')} of {origin.get('of')}" + (f": {', '.join(parts)}" if parts else "")

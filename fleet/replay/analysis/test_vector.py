@@ -1,0 +1,122 @@
+"""A stretch of one car's wire as a file: raw frames with their times, and what they are to be decoded to.
+
+A text file of JSON objects, one a line. The first says where it is from; the others are what happened, in order, each
+with `at_us`, microseconds since the stretch began (before it below 0, for what was known then):
+
+    {"format": 1, "source": "...", "car": "red", "began": "2026-03-14T15:16:17.000Z"}
+    {"at_us": -400000, "platform": "arduino"}      what the car was treated as from now on
+    {"at_us": -20000, "mode": "tracking"}          the mode that was confirmed from now on; null: none
+    {"at_us": 1200, "tx": "$1,0,0,0,0,0,0,0,0#"}   bytes to the car, each a character of ISO 8859-1
+    {"at_us": 51000, "rx": "$4WD,...#", "verdict": "sensors", "readings": {"sensor/line": {"left_outer": false, ...}}}
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from fleet.recording import time_spec
+from fleet.replay.analysis.recorded_frames import Confirmed, Item, Rx, Treated, Tx
+from gateway.protocol.decoder import ECHO_S
+from gateway.protocol.enums import Mode
+
+ENDING: Final = ".jsonl"
+FORMAT: Final = 1
+BEFORE_NS: Final = 3_000_000_000
+"""How far before the stretch is looked for what was known at its beginning: states come once a second."""
+_ESTIMATED: Final = frozenset({"charge", "charge_error", "level"})
+"""Fields that the gateway adds to what was decoded."""
+
+
+class BadVector(Exception):
+    """A file that is no vector; the text says where and why."""
+
+
+def stretch(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterator[Item]:
+    """What belongs to a stretch, of items in order that begin `BEFORE_NS` before it: frames, and what was known."""
+    known: dict[type, Item] = {}
+    begun = False
+    for item in items:
+        if end_ns is not None and item.at_ns >= end_ns and isinstance(item, Rx | Tx):
+            continue  # the states after it are wanted
+        if item.at_ns < start_ns:
+            if isinstance(item, Tx) and item.at_ns >= start_ns - ECHO_S * 1e9:
+                yield item
+            elif isinstance(item, Confirmed | Treated):
+                known[type(item)] = item
+            continue
+        if not begun:
+            begun = True
+            yield from known.values()
+        yield item
+    if not begun:
+        yield from known.values()
+
+
+def lines(items: Iterable[Item], start_ns: int, car: str, source: str) -> Iterator[str]:
+    """A vector, line by line."""
+    head = {"format": FORMAT, "source": source, "car": car, "began": time_spec.iso(start_ns)}
+    yield json.dumps(head)
+    before: dict[type, Any] = {}
+    for item in sorted(items, key=lambda item: item.at_ns):
+        told = _told(item)
+        if isinstance(item, Confirmed | Treated):
+            if before.get(type(item)) == told:
+                continue  # said once a second; only a change matters
+            before[type(item)] = told
+        yield json.dumps({"at_us": (item.at_ns - start_ns) // 1000, **told})
+
+
+def _told(item: Item) -> dict[str, Any]:
+    match item:
+        case Treated():
+            return {"platform": item.platform}
+        case Confirmed():
+            return {"mode": item.mode}
+        case Tx():
+            return {"tx": item.data.decode("latin-1")}
+        case Rx():
+            readings = {
+                topic: {name: value for name, value in fields.items() if name not in _ESTIMATED}
+                for topic, fields in item.readings.items()
+            }
+            told = {"rx": item.data.decode("latin-1"), "verdict": item.verdict, "readings": readings}
+            return told if set(item.published) == set(readings) else {**told, "published": list(item.published)}
+
+
+def read(path: Path) -> tuple[str, list[Item]]:
+    """The car of a vector, and what happened; raises BadVector and OSError."""
+    objects = []
+    try:
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            objects.append((number, json.loads(line)))
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise BadVector(f"{path}, line {len(objects) + 1}: is no JSON in UTF-8: {error}") from None
+    head = objects[0][1] if objects else None
+    if not isinstance(head, dict) or not isinstance(head.get("format"), int) or not isinstance(head.get("car"), str):
+        raise BadVector(f"{path} is no vector: its first line has no format and car; `fleet sessions vector` makes one")
+    if head["format"] > FORMAT:
+        raise BadVector(f"{path} has format {head['format']}, this version reads up to {FORMAT}: update it")
+    items = []
+    for number, each in objects[1:]:
+        try:
+            items.append(_item(each))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise BadVector(f"{path}, line {number}: {type(error).__name__}: {error}") from None
+    return head["car"], items
+
+
+def _item(told: Mapping[str, Any]) -> Item:
+    at_ns = int(told["at_us"]) * 1000
+    if "platform" in told:
+        return Treated(at_ns, str(told["platform"]))
+    if "mode" in told:
+        return Confirmed(at_ns, None if told["mode"] is None else Mode(told["mode"]))
+    if "tx" in told:
+        return Tx(at_ns, told["tx"].encode("latin-1"))
+    readings = {
+        topic: {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
+        for topic, fields in told["readings"].items()
+    }
+    published = tuple(told.get("published", readings))
+    return Rx(at_ns, told["rx"].encode("latin-1"), str(told["verdict"]), published, readings)

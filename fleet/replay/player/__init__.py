@@ -1,0 +1,1 @@
+"""Plays a session on a bus, at its own pace."""

@@ -1,0 +1,146 @@
+"""What Rerun's lenses make of the messages, a batch at a time: lanes, lines of text, made curves, arrows for cars.
+
+Nothing here looks at single messages but where something rare is put into words.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
+import pyarrow.compute as pc  # type: ignore[import-untyped]  # likewise
+import rerun as rr
+import rerun.chunk as rrc
+
+from fleet.fleetfile.models import CRITICAL_V, LOW_V
+from fleet.replay import panels
+from fleet.replay.panels import Curve, How, Lane
+from schemas.topics import TOPICS
+
+MESSAGE: Final = ":message"
+"""How Rerun's reader names the component that holds a protobuf message."""
+
+_ARROW_M: Final = 0.25
+"""Length of the arrow that stands for a car."""
+_Pipe = Callable[[Any], Any]
+
+
+def component(topic: str) -> str:
+    """The component that holds the messages of a topic."""
+    return TOPICS[topic].message + MESSAGE
+
+
+def lenses() -> list[Any]:
+    """One lens per message type that has something drawn; what is drawn from the message itself needs none."""
+    made: dict[str, Any] = {}
+
+    def lens(topic: str) -> Any:
+        return made.get(topic) or rrc.DeriveLens(component(topic))
+
+    for part in panels.parts():
+        if (isinstance(part, Lane) and not part.drawn) or (isinstance(part, Curve) and part.how is not None):
+            made[part.topic] = lens(part.topic).to_component(part.name, _selector(part))
+    for words in panels.WORDS:
+        line = rrc.Selector(".").pipe(_line(words.fields, words.before))
+        made[words.topic] = lens(words.topic).to_component(rr.TextLog.descriptor_text(), line, cast_to="auto")
+        if words.alarm_field:
+            level = rrc.Selector(f".{words.alarm_field}").pipe(_level(words.calm))
+            made[words.topic] = made[words.topic].to_component(rr.TextLog.descriptor_level(), level, cast_to="auto")
+    made[panels.PLAN] = lens(panels.PLAN).to_component(rr.TextDocument.descriptor_text(), ".text", cast_to="auto")
+    made[panels.TRUTH] = (
+        lens(panels.TRUTH)
+        .to_component(rr.Arrows3D.descriptor_origins(), rrc.Selector(".").pipe(_origins), cast_to="auto")
+        .to_component(rr.Arrows3D.descriptor_vectors(), rrc.Selector(".").pipe(_vectors), cast_to="auto")
+    )
+    return list(made.values())
+
+
+def triples(x: Any, y: Any) -> Any:
+    """Points on the ground, one row of float32 for each."""
+    return np.stack([x, y, np.zeros(len(x))], axis=1).astype("float32")
+
+
+def numbers(messages: Any, name: str) -> Any:
+    """A field of a batch of messages as a numpy array."""
+    return messages.field(name).to_numpy(zero_copy_only=False)
+
+
+def _selector(part: Lane | Curve) -> Any:
+    selector = rrc.Selector(f".{part.field}")
+    if part.how is None:
+        return selector
+    return selector.pipe(_HOW[part.how])
+
+
+def _text_or_nothing(texts: Any) -> Any:
+    return pc.if_else(pc.equal(texts, ""), pa.scalar(None, pa.string()), texts)
+
+
+def _who_and_why(estops: Any) -> Any:
+    rows = [", ".join(f"{each['by']}: {each['why']}".rstrip(": ") for each in row or ()) for row in estops.to_pylist()]
+    return pa.array([row or None for row in rows], pa.string())
+
+
+def _total(maps: Any) -> Any:
+    return pa.array([float(sum(value for _, value in row or ())) for row in maps.to_pylist()], pa.float64())
+
+
+def _level_at(voltage_v: float) -> _Pipe:
+    return lambda voltages: pa.array(np.full(len(voltages), voltage_v))
+
+
+_HOW: Final[dict[How, _Pipe]] = {
+    How.TEXT_OR_NOTHING: _text_or_nothing,
+    How.WHO_AND_WHY: _who_and_why,
+    How.TOTAL: _total,
+    How.LOW: _level_at(LOW_V),
+    How.CRITICAL: _level_at(CRITICAL_V),
+}
+
+
+def _line(fields: Sequence[str], before: Mapping[str, str]) -> _Pipe:
+    def join(messages: Any) -> Any:
+        parts = [_words(messages.field(name)) for name in fields]
+        for place, name in enumerate(fields):
+            if name in before:
+                led = pc.binary_join_element_wise(before[name], parts[place], "")
+                parts[place] = pc.if_else(pc.equal(parts[place], ""), "", led)
+        joined = pc.binary_join_element_wise(*parts, "  ", null_handling="replace", null_replacement="")
+        return pc.utf8_trim_whitespace(pc.replace_substring_regex(joined, r" {3,}", "  "))
+
+    return join
+
+
+def _words(values: Any) -> Any:
+    """A field as text: bytes with escapes, roles with their cars."""
+    if pa.types.is_binary(values.type):
+        try:
+            return pc.cast(values, pa.string())
+        except pa.ArrowInvalid:
+            return pa.array([each.decode(errors="backslashreplace") for each in values.to_pylist()], pa.string())
+    if pa.types.is_list(values.type):
+        rows = [[f"{role['name']}: {', '.join(role['cars'] or ['nobody'])}" for role in row or ()]
+                for row in values.to_pylist()]  # fmt: skip
+        return pa.array(["; ".join(row) for row in rows], pa.string())
+    return pc.cast(values, pa.string())
+
+
+def _level(calm: frozenset[str]) -> _Pipe:
+    def level(values: Any) -> Any:
+        return pc.if_else(pc.is_in(values, pa.array(sorted(calm))), "INFO", "WARN")
+
+    return level
+
+
+def _fixed(points: Any) -> Any:
+    """As the fixed-size lists that Rerun's vectors are."""
+    return pa.FixedSizeListArray.from_arrays(pa.array(points.ravel()), 3)
+
+
+def _origins(truths: Any) -> Any:
+    return _fixed(triples(numbers(truths, "x_m"), numbers(truths, "y_m")))
+
+
+def _vectors(truths: Any) -> Any:
+    heading = numbers(truths, "heading_rad")
+    return _fixed(triples(_ARROW_M * np.cos(heading), _ARROW_M * np.sin(heading)))

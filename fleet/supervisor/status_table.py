@@ -1,0 +1,106 @@
+"""The live table of `fleet up` on a terminal: a row for each car, above it what happens. rich is imported only here."""
+
+import asyncio
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final, Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table as Grid
+from rich.text import Text
+
+from fleet.supervisor.car_status import Row
+from fleet.supervisor.restart_policy import State
+
+if TYPE_CHECKING:
+    from fleet.supervisor.supervisor import Happening, Supervisor
+
+DRAW_S: Final = 0.25
+SHARE: Final = 10.0
+"""Drawing takes at most a tenth of the time: a hundred rows take 50 ms."""
+_LINK: Final = {"online": "green", "quiet": "green", "stale": "yellow", "lost": "red"}
+_VERDICT: Final = {"confirmed": "green", "contradicted": "red"}
+_COLUMNS: Final = ("car", "link", "mode", "motion", "held, driven by", "battery", "Hz", "last event")
+_WHOLE: Final = frozenset({"car", "link", "motion", "battery", "Hz"})
+"""What is not cut in a narrow terminal."""
+
+
+class Table:
+    """The table of one supervisor; use it with `with`."""
+
+    def __init__(self, supervisor: "Supervisor", console: Console | None = None) -> None:
+        self._supervisor = supervisor
+        self._console = console or Console()
+        self._live = Live(console=self._console, auto_refresh=False, transient=False)
+        self._broken = False
+
+    def __enter__(self) -> Self:
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._safely(lambda: self._live.update(self.rendered(), refresh=True))
+        self._safely(self._live.stop)
+
+    def tell(self, happening: "Happening") -> None:
+        """A line above the table; what a car shows in its row is no line."""
+        if happening.what in ("process", "hold", "end"):
+            line = Text(f"{datetime.now(UTC):%H:%M:%S} {happening.name}: {happening.words}")
+            self._safely(lambda: self._console.print(line))
+
+    async def draw(self) -> None:
+        """Draw, at most four times a second, until cancelled."""
+        while True:
+            began = time.monotonic()
+            self._safely(lambda: self._live.update(self.rendered(), refresh=True))
+            await asyncio.sleep(max(DRAW_S, SHARE * (time.monotonic() - began)))
+
+    def rendered(self) -> Group:
+        """The table, and under it the processes that are not as they should be."""
+        grid = Grid(box=None, pad_edge=False, header_style="bold", expand=True)
+        for column in _COLUMNS:
+            grid.add_column(
+                column,
+                no_wrap=column in _WHOLE,
+                ratio=1 if column == "last event" else None,
+                min_width=16 if column == "last event" else None,
+            )
+        for name, row in self._supervisor.rows.items():
+            process = self._supervisor.crew.get(name)
+            running = process is not None and process.ward.state is State.RUNNING
+            state = "" if running else "starting" if process is None else str(process.ward.state)
+            grid.add_row(*_cells(row, state))
+        services = [
+            Text.assemble(
+                each.name, " ", (str(each.ward.state), "green" if each.ward.state is State.RUNNING else "yellow")
+            )
+            for each in self._supervisor.crew
+            if each.name.startswith("@")
+        ]
+        return Group(grid, Text("  ").join([*services, Text(f"logs in {self._supervisor.crew.directory}", "dim")]))
+
+    def _safely(self, write: "object") -> None:
+        """A terminal that was closed must not keep the cars from being stopped."""
+        if self._broken or not callable(write):
+            return
+        try:
+            write()
+        except OSError:
+            self._broken = True
+
+
+def _cells(row: Row, process: str) -> list[Text]:
+    link = process if process or not row.link else row.link
+    held = f"e-stop {row.estop}" if row.estop else f"hold {row.hold}" if row.hold else ""
+    rate = "" if row.rate_hz is None else f"{row.rate_hz:.1f}"
+    return [
+        Text(row.car, "bold"),
+        Text(link, _LINK.get(link, "yellow")),
+        Text.assemble(row.mode, " ", (row.verdict, _VERDICT.get(row.verdict, ""))),
+        Text(row.motion),
+        Text(held or row.lease, "red" if held else ""),
+        Text(row.battery, "red" if row.battery.endswith(("low", "critical")) else ""),
+        Text(rate, justify="right"),
+        Text(row.event, overflow="ellipsis", no_wrap=True),
+    ]

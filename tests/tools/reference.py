@@ -1,0 +1,146 @@
+"""fleet/REFERENCE.md: the SDK's public names with their docstrings; `python -m tests.tools.reference` writes it.
+
+Made of what the code says of itself: a docstring that is wrong there is wrong here, and mended in one place.
+"""
+
+import inspect
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from fleet import LeaseLost, NotCarriedOut, Outcome, Reading, aio, conditions
+from fleet.client import client, reading, wait
+from fleet.client.commands import Verbs
+from fleet.client.lease import Lease
+from schemas import bus, keys
+
+PATH = Path(client.__file__).parent.parent / "REFERENCE.md"
+_HEAD = """# The SDK
+
+Generated from the docstrings by `make readme`; examples that run are in [examples](examples). Times are seconds,
+distances meters, angles degrees unless a name says otherwise; what was not measured is None.
+
+```python
+from fleet import Fleet, LeaseLost, NotCarriedOut
+```
+
+`from fleet.aio import Fleet` has the same names for asyncio, each call awaited.
+"""
+_CLASSES: tuple[tuple[str, type], ...] = (
+    ("Fleet", client.Fleet),
+    ("Car", client.Car),
+    ("Lease", Lease),
+    ("Outcome", Outcome),
+    ("Reading", Reading),
+    ("Watch", reading.Watch),
+)
+_ERRORS = (
+    NotCarriedOut,
+    LeaseLost,
+    wait.NotInTime,
+    conditions.BadExpression,
+    keys.BadKey,
+    bus.BadEndpoint,
+    bus.NoFleet,
+    bus.BusError,
+)
+_HIDDEN = {"do", "ask", "call", "begin", "expression"}
+"""What the package's own parts use."""
+_INTERNAL = {(Lease, "check"), (Lease, "checked")}
+
+
+def reference() -> str:
+    """The whole file."""
+    parts = [_HEAD]
+    for name, each in _CLASSES:
+        parts.append(f"## {name}\n\n{_text(each)}\n")
+        if each is client.Fleet:
+            parts.append(f"### `Fleet{_signature(client.Fleet.__init__)}`\n")
+        parts.append("\n".join(_attributes(each)))
+        parts += [_method(each, method) for method in _methods(each)]
+    parts.append("## Errors\n\n" + "\n".join(f"- `{_module(each)}{each.__name__}`: {_text(each)}" for each in _ERRORS))
+    parts.append("\n## fleet.aio\n\n" + _text(aio) + "\n")
+    parts += [_async(name) for name in ("Fleet", "Car", "Lease", "Watch")]
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(parts)).rstrip() + "\n"
+
+
+def _text(of: object) -> str:
+    """A docstring, without its indentation."""
+    words = inspect.getdoc(of)
+    assert words, f"{of} has no docstring"
+    return words
+
+
+def _methods(of: type) -> list[str]:
+    """Public methods and properties, in the order in which they are written; those of `Verbs` last."""
+    found: dict[str, None] = {}
+    for base in (each for each in of.__mro__ if each in (of, Verbs)):
+        for name, member in vars(base).items():
+            callable_or_property = inspect.isfunction(member) or isinstance(member, property)
+            public = name == "__getitem__" or not name.startswith("_")
+            if callable_or_property and public and name not in _HIDDEN and (of, name) not in _INTERNAL:
+                found[name] = None
+    return list(found)
+
+
+def _method(of: type, name: str) -> str:
+    member = inspect.getattr_static(of, name)
+    if isinstance(member, property):
+        return f"### `{name}`\n\n{_text(member)}\n"
+    shown = "reading[field]" if name == "__getitem__" else f"{name}{_signature(getattr(of, name))}"
+    return f"### `{shown}`\n\n{_text(member)}\n"
+
+
+def _signature(function: Callable[..., object]) -> str:
+    """The parameters with their types as a reader writes them."""
+    signature = inspect.signature(function)
+    given = [each for each in signature.parameters.values() if each.name != "self"]
+    words = [_parameter(each) for each in given]
+    keyword_only = [each.kind is inspect.Parameter.KEYWORD_ONLY for each in given]
+    if any(keyword_only):
+        words.insert(keyword_only.index(True), "*")
+    gives = "" if function.__name__ == "__init__" else f" -> {_type(signature.return_annotation)}"
+    return f"({', '.join(words)}){gives}"
+
+
+def _parameter(each: inspect.Parameter) -> str:
+    default = "" if each.default is inspect.Parameter.empty else f" = {each.default!r}"
+    return f"{each.name}: {_type(each.annotation)}{default}"
+
+
+def _type(annotation: object) -> str:
+    """A type without the modules that its names come from."""
+    words = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    return "Outcome" if words == "~R" else re.sub(r"\b(?:\w+\.)+(?=\w)", "", words).strip("'")
+
+
+def _attributes(of: type) -> list[str]:
+    """The fields of a value, with the words that stand below each."""
+    source = inspect.getsource(of)
+    if not hasattr(of, "__dataclass_fields__"):
+        return []
+    found = re.findall(r'^    (\w+): ([^=\n]+?)(?: = [^\n]+)?\n(?:    """((?:.|\n)*?)""")?', source, flags=re.MULTILINE)
+    return [
+        f"- `{name}: {kind}`" + (f": {' '.join(words.split())}" if words else "") for name, kind, words in found
+    ] + [""]
+
+
+def _module(error: type) -> str:
+    return "" if error in (NotCarriedOut, LeaseLost) else f"{error.__module__}."
+
+
+def _async(name: str) -> str:
+    """What of a class is called otherwise than its blocking twin; the rest has the same names and parameters."""
+    each = getattr(aio, name)
+    awaited = [
+        f"`{method}`"
+        for method, member in vars(each).items()
+        if inspect.iscoroutinefunction(member) and not method.startswith("_") and method not in _HIDDEN
+    ]
+    verbs = ["every command"] if issubclass(each, Verbs) else []
+    extra = f" Awaited: {', '.join(awaited + verbs)}." if awaited or verbs else ""
+    return f"- `{name}`: {' '.join(_text(each).split())}{extra}"
+
+
+if __name__ == "__main__":
+    PATH.write_text(reference(), encoding="utf-8")

@@ -1,0 +1,196 @@
+"""Pictures of a session in Rerun's viewer, without a screen: `python -m tests.tools.screenshots SESSION DIRECTORY`.
+
+They are `fleet.png` (the fleet's tab), `car.png` (the first car's) and, of simulated cars, `world.png`. Needs a Vulkan
+driver that draws in software where there is no graphics card (Debian: `mesa-vulkan-drivers`).
+"""
+
+import contextlib
+import io
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from fleet.replay.rerun.viewer import LOOK_S, Viewer, free_port
+
+SIZE: Final = "1920x1080"
+AT: Final = 0.75
+"""Of the session's time: where the cursor is."""
+UP_WITHIN_S: Final = 30.0
+DRAWN_WITHIN_S: Final = 120.0
+SETTLE_S: Final = 1.0
+"""The viewer offers no sign that it has drawn everything: two pictures so far apart that are the same are one."""
+DRIVERS: Final = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+COLOURS: Final = 255
+WORLD: Final = "World, from above"
+
+
+class NoPicture(Exception):
+    """There is no picture; its text says what is missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What the viewer says that it shows."""
+
+    views: tuple[str, ...]
+    """Names of all views, on every tab."""
+    faults: tuple[str, ...]
+    """What it could not show, and why."""
+
+
+def software_driver() -> str | None:
+    """The installed driver that needs no card; without naming it a machine's broken card would be tried first."""
+    found = [str(each) for place in DRIVERS for each in sorted(Path(place).glob("lvp_icd*.json"))]
+    return found[0] if found else None
+
+
+def take(rrd: Path, out: Path, view: str = "") -> Shown:
+    """Draw `rrd` as its layout says into a PNG; of the view alone whose name begins so. Raises NoPicture."""
+    port = free_port()
+    with tempfile.TemporaryDirectory() as home, _viewer(port, Path(home)) as viewer:
+        try:
+            png, shown = _look(_connect(viewer, port), rrd, view)
+        except (RuntimeError, OSError, ValueError):  # its ways to say that nobody answers, or no more
+            viewer.wait(SETTLE_S)
+            raise NoPicture(
+                "Rerun's viewer cannot draw here: it needs a graphics driver, or one in software "
+                f"(Debian: apt install mesa-vulkan-drivers). It said: {viewer.last_words}"
+            ) from None
+    _write(png, out)
+    return shown
+
+
+def _look(client: Any, rrd: Path, view: str) -> tuple[bytes, Shown]:
+    client.open(str(rrd.resolve()))
+    state = _loaded(client)
+    recording = state.recordings[0]
+    times = next(each for each in recording.timelines if each.name == recording.current_timeline)
+    client.set_time(timestamp=(times.start + AT * (times.end - times.start)) / 1e9, play_state="paused")
+    wanted = [each.view_id for each in state.views if view and each.name.startswith(view)]
+    if view and not wanted:
+        raise NoPicture(f"{rrd} has no view {view}: there are {', '.join(each.name for each in state.views)}")
+    png = _drawn(client, wanted[0] if wanted else None)
+    views = client.get_state().views
+    faults = tuple(f"{each.name}: {report}" for each in views for report in each.reports)
+    return png, Shown(tuple(each.name for each in views), faults)
+
+
+def pictures(session: Path, folder: Path) -> dict[str, Shown]:
+    """Make those of a session; by file name what is shown. Raises NoPicture, NoSession and ExportFailed."""
+    from fleet.recording.reading.session import Session
+    from fleet.replay.rerun.export import export
+
+    found = Session.open(session)
+    made: dict[str, Shown] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        rrd = Path(scratch) / f"{found.name}.rrd"
+        held = export(found, rrd)
+        made["fleet.png"] = take(rrd, folder / "fleet.png")
+        if any(view.startswith(WORLD) for view in made["fleet.png"].views):
+            made["world.png"] = take(rrd, folder / "world.png", WORLD)
+        cars = sorted({key.split("/")[1] for key in held} - {key.split("/")[1] for key in held if "/@" in key})
+        if cars:
+            export(found, rrd, tab=cars[0])
+            made["car.png"] = take(rrd, folder / "car.png")
+    return made
+
+
+def _loaded(client: Any) -> Any:
+    """Its state once it has all: a recording is there, and its time has an end, as soon as it has some of it."""
+    deadline = time.monotonic() + UP_WITHIN_S
+    while (state := client.get_state()).loading or not (
+        state.recordings and state.recordings[0].timelines and state.views
+    ):
+        if time.monotonic() > deadline:
+            raise NoPicture("Rerun's viewer did not load the session")
+        time.sleep(0.1)
+    return state
+
+
+def _drawn(client: Any, view_id: str | None) -> bytes:
+    """A picture, once two in a row are the same."""
+    deadline = time.monotonic() + DRAWN_WITHIN_S
+    last = _screenshot(client, view_id, deadline)
+    while time.monotonic() < deadline:
+        time.sleep(SETTLE_S)
+        now = _screenshot(client, view_id, deadline)
+        if now == last:
+            break
+        last = now
+    return last
+
+
+def _screenshot(client: Any, view_id: str | None, deadline: float) -> bytes:
+    """A picture; the viewer gives one up after five seconds, which on a busy machine without a card is too soon."""
+    while True:
+        try:
+            png: bytes = client.take_screenshot(view_id)
+        except RuntimeError:
+            if time.monotonic() > deadline:
+                raise
+        else:
+            return png
+
+
+def _write(png: bytes, out: Path) -> None:
+    """With a palette: a third of the bytes, and nothing that one would see."""
+    from PIL import Image  # rerun-sdk depends on it
+
+    with Image.open(io.BytesIO(png)) as image:
+        image.convert("RGB").quantize(COLOURS).save(out, optimize=True)
+
+
+@contextlib.contextmanager
+def _viewer(port: int, home: Path) -> Iterator[Viewer]:
+    """Rerun's viewer without a window, with a home of its own: driver caches and settings stay out of the user's."""
+    own = {
+        name: str(home) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_RUNTIME_DIR")
+    }
+    driver = software_driver()
+    if driver and "VK_ICD_FILENAMES" not in os.environ:
+        own["VK_ICD_FILENAMES"] = driver
+    with Viewer("--headless", "--port", str(port), "--window-size", SIZE, extra=own) as viewer:
+        yield viewer
+
+
+def _connect(viewer: Viewer, port: int) -> Any:
+    from rerun.experimental import ViewerClient
+
+    deadline = time.monotonic() + UP_WITHIN_S
+    while True:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+        except (RuntimeError, OSError, ValueError):  # how it says that nothing answers yet
+            if viewer.wait(LOOK_S) is not None or time.monotonic() > deadline:
+                raise
+        else:
+            return client
+
+
+@click.command()
+@click.argument("session", type=click.Path(path_type=Path))
+@click.argument("directory", type=click.Path(exists=True, file_okay=False, path_type=Path))
+def main(session: Path, directory: Path) -> None:
+    """Draw SESSION's fleet tab, a car's tab and the simulated world into PNGs in DIRECTORY."""
+    from fleet.recording.reading.session import NoSession
+    from fleet.replay.rerun.export import ExportFailed
+
+    try:
+        made = pictures(session, directory)
+    except (NoPicture, NoSession, ExportFailed) as error:
+        raise click.ClickException(str(error)) from None
+    for name, shown in made.items():
+        click.echo(f"{directory / name}: {(directory / name).stat().st_size} bytes")
+        for fault in shown.faults:
+            click.echo(f"not shown: {fault}", err=True)
+
+
+if __name__ == "__main__":
+    main()
