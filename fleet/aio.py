@@ -14,11 +14,11 @@ from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from fleet.client import client
 from fleet.client import lease as leases
-from fleet.client.commands import Request, Verbs
-from fleet.client.condition import Condition
+from fleet.client.commands import CarCommands, CommandRequest
+from fleet.client.condition import KeyCondition
 from fleet.client.outcome import Outcome
 from fleet.client.reading import QUEUE_LIMIT, Reading, Wanted, reading_of
-from fleet.client.wait import Waiting
+from fleet.client.wait import ConditionWait
 from schemas import keys, messages
 from schemas.bus import Handover, Sample
 
@@ -88,7 +88,7 @@ class Fleet:
         Use it with `async with` if the fleet stays open longer: it takes readings until it, or the fleet, is closed.
         """
         written = self.sync.expression(expression)
-        watch = Watch(None if when is None else Condition.of(when, written).holds)
+        watch = Watch(None if when is None else KeyCondition.of(when, written).holds)
         watch.begin(self.sync.bus.subscribe(written, watch.hand_over).undeclare)
         self._watches.add(watch)
         return watch
@@ -96,7 +96,7 @@ class Fleet:
     async def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
         """Wait until `when` holds of a fresh reading, and return that; raises waiting.NotInTime."""
         written = self.sync.expression(expression)
-        waiting = Waiting(Condition.of(when, written), for_s)
+        waiting = ConditionWait(KeyCondition.of(when, written), for_s)
         try:
             async with asyncio.timeout(timeout_s), self.watch(expression) as stream:
                 for reading in await self.get(expression):
@@ -121,12 +121,12 @@ class Fleet:
         """End the e-stops of these ids; without ids, the hold."""
         return await self.call(self.sync.resume, cars, ids)
 
-    async def ask(self, request: Request, cars: Iterable[str] | None = None) -> list[Outcome]:
+    async def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Ask the cars and wait for what becomes of it."""
         return await self.call(self.sync.ask, request, cars)
 
 
-class Car(Verbs[Coroutine[Any, Any, Outcome]]):
+class Car(CarCommands[Coroutine[Any, Any, Outcome]]):
     """One car of a Fleet: `await fleet.car("red").drive("forward", 2.0)`. Made by `Fleet.car`."""
 
     def __init__(self, fleet: Fleet, name: str, leased: client.LeasedCar | None = None) -> None:
@@ -145,7 +145,7 @@ class Car(Verbs[Coroutine[Any, Any, Outcome]]):
         """
         return Lease(self._fleet, self.name, take=take)
 
-    async def do(self, request: Request) -> Outcome:
+    async def do(self, request: CommandRequest) -> Outcome:
         """Ask for one command and say what became of it."""
         return await self._fleet.call((self._leased or self._fleet.sync.car(self.name)).do, request)
 

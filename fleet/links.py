@@ -47,7 +47,7 @@ class BadLink(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class LinkUrl:
     """A link, taken apart. where: a device path, a host, a Bluetooth address in capitals, or empty.
 
     ids: what a USB device says of itself, or a Bluetooth device's name; of a TCP link its port.
@@ -81,12 +81,12 @@ class Link:
             for fewer in combinations(sorted(self.ids), count):
                 yield (kind, where, frozenset(fewer))
 
-    def may_be(self, other: "Link") -> bool:
+    def may_be(self, other: "LinkUrl") -> bool:
         """Return True if both can be one port: one device behind two paths, or one USB device described twice."""
         return self.port in set(other.descriptions()) or other.port in set(self.descriptions())
 
 
-def shared_ports(links: Mapping[str, Link]) -> Iterator[tuple[str, str]]:
+def shared_ports(links: Mapping[str, LinkUrl]) -> Iterator[tuple[str, str]]:
     """Yield (first car, second car) for each car whose link may name the port of a car before it.
 
     Each car is compared with what is known of all before it, not with each of them: 5,000 cars make 12 million pairs.
@@ -109,14 +109,14 @@ def shared_ports(links: Mapping[str, Link]) -> Iterator[tuple[str, str]]:
             by_description.setdefault(each, car)
 
 
-def parse_link(text: str) -> Link:
+def parse_link(text: str) -> LinkUrl:
     """The link that a text names; raises BadLink."""
     if not text.isprintable():
         raise BadLink("it has characters that cannot be printed")
     if text == LinkKind.SIMULATED:
-        return Link(LinkKind.SIMULATED)
+        return LinkUrl(LinkKind.SIMULATED)
     if text.startswith("/") or _WINDOWS_PORT.fullmatch(text):
-        return Link(LinkKind.DEVICE, text)
+        return LinkUrl(LinkKind.DEVICE, text)
     if text[:6].lower() == "ble://":
         return _ble(text[6:])
     try:
@@ -133,11 +133,11 @@ def parse_link(text: str) -> Link:
             raise BadLink("a host and a port from 1 to 65535 are needed")
         if parts.path or parts.query or parts.fragment or parts.username is not None:
             raise BadLink("nothing may follow the port")
-        return Link(LinkKind.TCP, parts.hostname, frozenset({("port", str(port))}))
+        return LinkUrl(LinkKind.TCP, parts.hostname, frozenset({("port", str(port))}))
     raise BadLink(f"{parts.scheme}:// is no kind of link" if parts.scheme else "it is neither a URL nor a device path")
 
 
-def _serial(netloc: str, path: str, query: str) -> Link:
+def _serial(netloc: str, path: str, query: str) -> LinkUrl:
     fields = parse_qs(query.replace("+", "%2B"), keep_blank_values=True)
     if unknown := sorted(fields.keys() - {"baud", *_USB_FIELDS}):
         raise BadLink(f"{', '.join(unknown)} is no option of a serial link")
@@ -154,7 +154,7 @@ def _serial(netloc: str, path: str, query: str) -> Link:
             raise BadLink("it names no device")
         if given:
             raise BadLink(f"it names a device path, and {', '.join(sorted(given))} too: one of the two")
-        return Link(LinkKind.DEVICE, path or netloc)
+        return LinkUrl(LinkKind.DEVICE, path or netloc)
     if not given:
         raise BadLink("it names no device")
     if given.get("serial") == "":
@@ -165,18 +165,18 @@ def _serial(netloc: str, path: str, query: str) -> Link:
             if found is None:
                 raise BadLink(f"{name}={given[name]} is not four hexadecimal digits")
             given[name] = found[1].lower()
-    return Link(LinkKind.USB, "", frozenset(given.items()))
+    return LinkUrl(LinkKind.USB, "", frozenset(given.items()))
 
 
-def _ble(rest: str) -> Link:
+def _ble(rest: str) -> LinkUrl:
     if rest.startswith("name="):
         name = unquote(rest[5:])
         if not name or not name.isprintable() or len(name.encode()) > _BLE_NAME_BYTES:
             raise BadLink(f"a name has 1 to {_BLE_NAME_BYTES} bytes, and can be printed")
-        return Link(LinkKind.BLE, "", frozenset({("name", name)}))
+        return LinkUrl(LinkKind.BLE, "", frozenset({("name", name)}))
     if _BLE_ADDRESS.fullmatch(rest.upper()) is None:
         raise BadLink("it names no Bluetooth address, and no name=")
-    return Link(LinkKind.BLE, rest.upper())
+    return LinkUrl(LinkKind.BLE, rest.upper())
 
 
 def _real(path: str) -> str:

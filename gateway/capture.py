@@ -21,14 +21,14 @@ class BadCapture(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class CapturedBytes:
     """Bytes as they came; `at`: seconds since the start of the capture, kept to the microsecond."""
 
     at: float
     data: bytes
 
 
-class Writer:
+class CaptureWriter:
     """Appends pieces to a new file; each is handed to the system at once, so that a killed monitor loses nothing.
 
     Raises OSError, FileExistsError among them: a capture is never written over.
@@ -39,7 +39,7 @@ class Writer:
         self._file: IO[str] = path.open("x", encoding="ascii", newline="\n")
         self._line({"format": FORMAT, "link": link, "started": started})
 
-    def add(self, piece: Piece) -> None:
+    def add(self, piece: CapturedBytes) -> None:
         """Keep one piece."""
         self._line({"t": round(piece.at, 6), "rx": piece.data.decode("latin-1")})
 
@@ -57,7 +57,7 @@ class Writer:
         self._file.flush()
 
 
-def read(path: Path) -> Iterator[Piece]:
+def read(path: Path) -> Iterator[CapturedBytes]:
     """The pieces of a capture, in order; a last line that was cut is left out. Raises BadCapture and OSError."""
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISFIFO(mode)):
@@ -81,11 +81,11 @@ def read(path: Path) -> Iterator[Piece]:
             yield piece
 
 
-def _piece(path: Path, number: int, content: dict[str, Any]) -> Piece:
+def _piece(path: Path, number: int, content: dict[str, Any]) -> CapturedBytes:
     at, text = content.get("t"), content.get("rx")
     if isinstance(at, int | float) and not isinstance(at, bool) and at >= 0 and isinstance(text, str):
         try:
-            piece = Piece(float(at), text.encode("latin-1"))
+            piece = CapturedBytes(float(at), text.encode("latin-1"))
         except (OverflowError, UnicodeEncodeError):
             pass
         else:

@@ -1,6 +1,6 @@
 """One car: its link, decoder, control and publications in one asyncio loop. Read this file first.
 
-Up: `_read` takes bytes from the link, the decoder makes events of them, `Publications` publishes what was measured,
+Up: `_read` takes bytes from the link, the decoder makes events of them, `CarPublisher` publishes what was measured,
 and control takes them as evidence. Down: a query on `@cmd` is handed over to the loop, parsed, given to control, and
 answered when control has had the chance to write. `_pump` is the only place that writes to the car: what control says,
 one frame at a time.
@@ -20,13 +20,13 @@ from typing import Final
 import zenoh
 
 from gateway.bus import requests
-from gateway.bus.estop_sync import Neighbours
-from gateway.bus.publisher import RAW_PER_S, STALLED_S, Publications
-from gateway.bus.service import Doors
+from gateway.bus.estop_sync import EstopSync
+from gateway.bus.publisher import RAW_PER_S, STALLED_S, CarPublisher
+from gateway.bus.service import CarService
 from gateway.control.backoff import Attempts
 from gateway.control.commands import Answer, Command, EmergencyStop, Level, LogRecord, Phase
 from gateway.control.controller import Controller
-from gateway.control.estimate.battery import Policy
+from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.executor import SHUTDOWN_S
 from gateway.control.safety import Estop
@@ -34,7 +34,7 @@ from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Echo, Event, Rejected
 from gateway.protocol.platforms import Profile
-from gateway.state_file import Store
+from gateway.state_file import SafetyStateFile
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
@@ -83,7 +83,7 @@ class Settings:
     state_dir: Path
     retry: bool
     """Keep trying when the first attempt to open the link fails."""
-    battery: Policy = field(default_factory=Policy)
+    battery: BatteryPolicy = field(default_factory=BatteryPolicy)
     speed_max: float = 1.0
     longest_drive_s: float = requests.LONGEST_DRIVE_S
     parent: int | None = None
@@ -91,7 +91,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class _PendingQuery:
     """A query that waits for its answer."""
 
     query: zenoh.Query
@@ -101,16 +101,16 @@ class _Asked:
     as_json: bool
 
 
-class Car:
+class CarGateway:
     """One car's gateway. `run` returns when it was told to stop and the car's stop is written."""
 
-    def __init__(self, settings: Settings, opened: bus.Bus, doors: Doors) -> None:
+    def __init__(self, settings: Settings, opened: bus.Bus, doors: CarService) -> None:
         self._settings = settings
         self._bus = opened
         self._doors = doors
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
-        self._store = Store(settings.state_dir, settings.fleet, settings.car)
+        self._store = SafetyStateFile(settings.state_dir, settings.fleet, settings.car)
         self._control = Controller(
             settings.car,
             settings.profile,
@@ -120,14 +120,14 @@ class Car:
             speed_max=settings.speed_max,
         )
         self._saved = self._control.safety.kept
-        self._neighbours = Neighbours(opened, settings.fleet, settings.car)
+        self._neighbours = EstopSync(opened, settings.fleet, settings.car)
         self._health = LinkHealth(since=now)
         self._decoder = Decoder()
         self._flood_until = now
         self._link: Link | None = None
         self._attempts = Attempts()
-        self._out = Publications(opened, settings.fleet, settings.car, self._control, str(settings.url))
-        self._asked: list[_Asked] = []
+        self._out = CarPublisher(opened, settings.fleet, settings.car, self._control, str(settings.url))
+        self._asked: list[_PendingQuery] = []
         self._sent: set[str] = set()
         """Ids of commands whose first frame went out since the last answers."""
         self._wake = asyncio.Event()
@@ -389,7 +389,7 @@ class Car:
             return
         longest_s = self._settings.longest_drive_s
         by_wildcard = "*" in expression
-        request = requests.Request(
+        request = requests.ParsedRequest(
             verb,
             payload,
             encoding,
@@ -405,13 +405,13 @@ class Car:
         elif isinstance(command.what, EmergencyStop) and command.what.fleet_wide:
             self._neighbours.ask_soon()  # what one gateway made of it, or did not hear, the others show
         key = keys.command_key(self._settings.fleet, self._settings.car, verb)
-        self._asked.append(_Asked(query, key, command.id, answer, as_json))
+        self._asked.append(_PendingQuery(query, key, command.id, answer, as_json))
         self._wake.set()
 
     def _streamed(self, sample: bus.Sample) -> None:
         """Take a drive that came as a publication."""
         if not sample.deleted:
-            request = requests.Request(
+            request = requests.ParsedRequest(
                 "drive",
                 sample.payload,
                 sample.encoding,
@@ -424,7 +424,7 @@ class Car:
             self._command(request)
             self._wake.set()
 
-    def _command(self, request: requests.Request) -> tuple[Command, Answer]:
+    def _command(self, request: requests.ParsedRequest) -> tuple[Command, Answer]:
         """Parse a request and give it to control; its first record carries the request as it came."""
         now = self._loop.time()
         try:
@@ -436,7 +436,7 @@ class Car:
         self._publish_records(command.id, request)
         return command, answer
 
-    def _reply(self, asked: _Asked, sent: set[str]) -> None:
+    def _reply(self, asked: _PendingQuery, sent: set[str]) -> None:
         answer = asked.answer
         status = Phase.SENT if asked.command_id in sent and answer.status is Phase.QUEUED else answer.status
         result = pb.Result(
@@ -478,7 +478,7 @@ class Car:
                 answer = replace(each.answer, words="; ".join(filter(None, (each.answer.words, f"not saved: {error}"))))
                 self._asked[index] = replace(each, answer=answer)
 
-    def _publish_records(self, command_id: str = "", request: requests.Request | None = None) -> None:
+    def _publish_records(self, command_id: str = "", request: requests.ParsedRequest | None = None) -> None:
         for record in self._control.take_records():
             if isinstance(record, LogRecord):
                 log.log(_LEVELS[record.level], "%s: %s", self._settings.car, record.words)
@@ -570,9 +570,9 @@ class Car:
                 self._log(Level.ERROR, "no_hub", str(error))
 
 
-async def serve(settings: Settings, opened: bus.Bus, doors: Doors) -> bool:
+async def serve(settings: Settings, opened: bus.Bus, doors: CarService) -> bool:
     """Serve one car until a signal ends it; False if it could not be stopped. Raises AlreadyServed or LinkError."""
-    car = Car(settings, opened, doors)
+    car = CarGateway(settings, opened, doors)
     # What was imported stays: the collector need not look at it again while readings wait.
     gc.freeze()
     loop = asyncio.get_running_loop()

@@ -110,7 +110,7 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 def _run(arguments: argparse.Namespace) -> int:
     parent = os.getppid() if arguments.with_parent else None
-    from gateway.bus.service import AlreadyServed, Doors
+    from gateway.bus.service import AlreadyServed, CarService
     from gateway.link import BadUrl, LinkError, parse_url
     from gateway.protocol.platforms import parse_told
     from schemas.bus import BadEndpoint, Bus, BusError
@@ -133,14 +133,14 @@ def _run(arguments: argparse.Namespace) -> int:
         return _failed(words, 2)
     try:
         with Bus.open(arguments.connect, start_hub=True) as opened:
-            doors = Doors(opened, fleet, car)
+            doors = CarService(opened, fleet, car)
             # The car is on the bus; what follows takes as long again to import.
             import asyncio
             import logging
             from pathlib import Path
 
             from gateway.car import Settings, serve
-            from gateway.control.estimate.battery import Action, Policy
+            from gateway.control.estimate.battery import BatteryPolicy, BatteryReaction
             from schemas.state_dir import directory_of
 
             logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
@@ -153,7 +153,12 @@ def _run(arguments: argparse.Namespace) -> int:
                 fleet,
                 state_dir,
                 arguments.retry,
-                battery=Policy(Action(arguments.battery_low), Action(arguments.battery_critical), low_v, critical_v),
+                battery=BatteryPolicy(
+                    BatteryReaction(arguments.battery_low),
+                    BatteryReaction(arguments.battery_critical),
+                    low_v,
+                    critical_v,
+                ),
                 speed_max=speed_max,
                 longest_drive_s=longest_s,
                 parent=parent,

@@ -12,7 +12,7 @@ TRIES: Final = 10
 """So often at most; of machines on which it never runs undisturbed the best counts."""
 
 
-class Wall:
+class WallClock:
     """One offset between the two clocks, kept until the wall clock is seen to have moved.
 
     Two moments keep their order and their distance, whenever they are asked for. With an offset taken anew for each

@@ -5,29 +5,29 @@ import os
 from pathlib import Path
 from typing import Any
 
-from gateway.control.safety import Estop, Hold, Kept
+from gateway.control.safety import Estop, Hold, PersistedSafety
 
 
-class Store:
+class SafetyStateFile:
     """The state file of one car."""
 
     def __init__(self, directory: Path, fleet: str, car: str) -> None:
         self.path = directory / f"{fleet}.{car}.json"
 
-    def load(self, now_ns: int) -> Kept:
+    def load(self, now_ns: int) -> PersistedSafety:
         """What was in force; a file that cannot be read counts as a hold: better held than driven off."""
         try:
             text = self.path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            return Kept()
+            return PersistedSafety()
         except (OSError, UnicodeDecodeError) as error:
-            return Kept(Hold(f"unreadable {self.path.name}: {error}", now_ns))
+            return PersistedSafety(Hold(f"unreadable {self.path.name}: {error}", now_ns))
         try:
             return _kept(json.loads(text), now_ns)
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-            return Kept(Hold(f"unreadable {self.path.name}", now_ns))
+            return PersistedSafety(Hold(f"unreadable {self.path.name}", now_ns))
 
-    def save(self, kept: Kept) -> None:
+    def save(self, kept: PersistedSafety) -> None:
         """Write the file whole or not at all; raises OSError."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         hold = kept.hold
@@ -47,10 +47,10 @@ class Store:
         scratch.replace(self.path)
 
 
-def _kept(content: Any, now_ns: int) -> Kept:
+def _kept(content: Any, now_ns: int) -> PersistedSafety:
     """Raises what a wrong type or a missing name raises. A file of an earlier version has only the hold."""
     hold = content["hold"]
-    return Kept(
+    return PersistedSafety(
         None if hold is None else Hold(_text(hold["by"]), _past(hold["since_ns"], now_ns)),
         tuple(_estop(each, now_ns) for each in content.get("estops", ())),
         tuple(_text(each) for each in content.get("ended", ())),

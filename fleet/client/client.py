@@ -19,13 +19,13 @@ from datetime import UTC, datetime
 from typing import Any, Final, Self
 
 from fleet.client import history
-from fleet.client.command_tracker import ANSWER_S, CLOSED, Asking, Over, Token
-from fleet.client.commands import Request, Verbs, estop_request, resume_request, stop_request
-from fleet.client.condition import Condition
+from fleet.client.command_tracker import ANSWER_S, CLOSED, PendingCommand, PresenceChange, QueryEnded
+from fleet.client.commands import CarCommands, CommandRequest, estop_request, resume_request, stop_request
+from fleet.client.condition import KeyCondition
 from fleet.client.lease import Lease
 from fleet.client.outcome import LATEST_ANSWER_S, Outcome
 from fleet.client.reading import Reading, Watch, reading_of
-from fleet.client.wait import Waiting
+from fleet.client.wait import ConditionWait
 from schemas import keys, messages, topics
 from schemas.bus import Bus, Failure, Sample, canon
 from schemas.topics import Qos
@@ -73,7 +73,7 @@ class Fleet:
         self.kind = kind
         token = keys.operator_token(self.name, self.sender)
         self.bus = Bus.open(endpoint, start_hub=start_hub)
-        self._askings: dict[str, Asking] = {}
+        self._askings: dict[str, PendingCommand] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
         self.dropped = 0
@@ -157,7 +157,7 @@ class Fleet:
         `when` is about the fields of one message, as `range_m < 0.3`; raises expression.BadExpression.
         """
         written = self.expression(expression)
-        wanted = None if when is None else Condition.of(when, written).holds
+        wanted = None if when is None else KeyCondition.of(when, written).holds
 
         def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
             return self.bus.subscribe(written, take).undeclare
@@ -173,7 +173,7 @@ class Fleet:
         TimeoutError) after `timeout_s` (None: never), and expression.BadExpression.
         """
         written = self.expression(expression)
-        waiting = Waiting(Condition.of(when, written), for_s)
+        waiting = ConditionWait(KeyCondition.of(when, written), for_s)
         began = time.monotonic()
 
         def left_s() -> float:
@@ -203,14 +203,14 @@ class Fleet:
         """End the e-stops of these ids; without ids, the hold."""
         return self.ask(resume_request(ids), cars)
 
-    def ask(self, request: Request, cars: Iterable[str] | None = None) -> list[Outcome]:
+    def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Ask the cars (None: all, with one wildcard query), wait, and say for each what became of it.
 
         A car that is missing or silent has an outcome of its own and keeps none of the others waiting to be asked.
         """
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._filled(request)
-        asking = Asking(request, self.cars(), named, lambda: self.bus.hubs)
+        asking = PendingCommand(request, self.cars(), named, lambda: self.bus.hubs)
         self._askings[command_id] = asking
         try:
             payload = message.SerializeToString()
@@ -223,7 +223,7 @@ class Fleet:
             del self._askings[command_id]
         return asking.outcomes()
 
-    def _filled(self, request: Request) -> tuple[Any, str]:
+    def _filled(self, request: CommandRequest) -> tuple[Any, str]:
         message = type(request.message)()
         message.CopyFrom(request.message)
         message.id = uuid.uuid4().hex
@@ -233,7 +233,7 @@ class Fleet:
         message.asked.seconds, message.asked.nanos = divmod(time.time_ns(), 1_000_000_000)
         return message, message.id
 
-    def _query(self, target: str, asking: Asking, payload: bytes) -> None:
+    def _query(self, target: str, asking: PendingCommand, payload: bytes) -> None:
         """Ask one car, or all; on a thread of the pool."""
         verb = asking.request.verb
         words = f"{target} gave no answer: its gateway went away or failed"
@@ -250,7 +250,7 @@ class Fleet:
                 else:
                     words = "" if answer.words == "Timeout" else answer.words
         finally:
-            asking.inbox.put((time.monotonic(), Over(target, words)))
+            asking.inbox.put((time.monotonic(), QueryEnded(target, words)))
 
     def _gateway(self, token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
         """A car's gateway came or went; on a Zenoh thread."""
@@ -258,7 +258,7 @@ class Fleet:
         for asking in list(self._askings.values()):
             if asking.concerns(car):
                 with suppress(queue.Full):
-                    asking.inbox.put_nowait((time.monotonic(), Token(car, alive=alive)))
+                    asking.inbox.put_nowait((time.monotonic(), PresenceChange(car, alive=alive)))
 
     def _event(self, sample: Sample) -> None:
         """A record of some command of somebody; on a Zenoh thread."""
@@ -276,7 +276,7 @@ class Fleet:
             self.dropped += 1
 
 
-class Car(Verbs[Outcome]):
+class Car(CarCommands[Outcome]):
     """One car of a Fleet: `fleet.car("red").drive("forward", 2.0)`. Made by `Fleet.car`."""
 
     def __init__(self, fleet: Fleet, name: str) -> None:
@@ -297,7 +297,7 @@ class Car(Verbs[Outcome]):
         """
         return Lease(self._fleet, self.name, take=take)
 
-    def do(self, request: Request) -> Outcome:
+    def do(self, request: CommandRequest) -> Outcome:
         """Ask for one command and say what became of it."""
         return self._fleet.ask(request, [self.name])[0]
 
@@ -309,7 +309,7 @@ class LeasedCar(Car):
         super().__init__(fleet, name)
         self._lease = lease
 
-    def do(self, request: Request) -> Outcome:
+    def do(self, request: CommandRequest) -> Outcome:
         """Ask for one command; raises NotCarriedOut, or LeaseLost once another has the car."""
         self._lease.check()
         return self._lease.checked(super().do(request))

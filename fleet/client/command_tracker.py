@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from fleet.client.commands import Request
+from fleet.client.commands import CommandRequest
 from fleet.client.outcome import Outcome, Progress
 from schemas import keys, messages, topics
 from schemas.bus import Sample
@@ -19,7 +19,7 @@ _QUEUE: Final = 4096  # answers and events of one command: a few for each of som
 log = logging.getLogger("fleet")
 
 
-class Over:
+class QueryEnded:
     """The query to a car, or to all, is over; without `words` nobody answered it in time."""
 
     def __init__(self, target: str, words: str) -> None:
@@ -27,7 +27,7 @@ class Over:
         self.words = words
 
 
-class Token:
+class PresenceChange:
     """The gateway of a car came onto the bus, or went."""
 
     def __init__(self, car: str, *, alive: bool) -> None:
@@ -35,17 +35,17 @@ class Token:
         self.alive = alive
 
 
-CLOSED: Final = Over("", "")
+CLOSED: Final = QueryEnded("", "")
 
 Item = tuple[float, Any]
 """When it came (monotonic s), and a Sample (an answer), a CommandEvent, Over, or Token."""
 
 
-class Asking:
+class PendingCommand:
     """One command on its way to some cars; `wait` runs on the thread that asked and takes what others put in."""
 
     def __init__(
-        self, request: Request, present: list[str], named: list[str] | None, hubs: Callable[[], tuple[str, ...]]
+        self, request: CommandRequest, present: list[str], named: list[str] | None, hubs: Callable[[], tuple[str, ...]]
     ) -> None:
         self.request = request
         self._hubs = hubs
@@ -107,7 +107,7 @@ class Asking:
             self._open = 0
             for progress in self._progress.values():
                 progress.give_up(at)
-        elif isinstance(item, Over):
+        elif isinstance(item, QueryEnded):
             self._open -= 1
             for progress in self._progress.values():
                 if item.target not in ("*", progress.car):
@@ -120,7 +120,7 @@ class Asking:
             key = keys.parse(item.key)
             if key is not None:
                 self._answer(self._of(key.car), item, at)
-        elif isinstance(item, Token):
+        elif isinstance(item, PresenceChange):
             if item.car in self._progress:
                 self._progress[item.car].token(at, alive=item.alive)
         else:

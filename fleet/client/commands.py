@@ -22,7 +22,7 @@ STOP_TTL_S: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class CommandRequest:
     """One command before it has a sender, an id and a time."""
 
     verb: str
@@ -35,7 +35,7 @@ class Request:
     """As a person, also if another person drives the car."""
 
 
-def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) -> Request:
+def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) -> CommandRequest:
     """Hold a motion for `duration_s` (at most 10 s, or what its gateway allows); `wait`: until the drive is over."""
     if not (math.isfinite(duration_s) and 0 < duration_s <= LONGEST_DRIVE_S):
         raise ValueError(
@@ -45,83 +45,83 @@ def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) ->
     message = pb.DriveCommand(motion=motion, duration_s=duration_s)
     if motion == "stop":
         message.ttl_s = STOP_TTL_S
-        return Request("drive", message, Until.STOPPED)
-    return Request("drive", message, Until.OVER if wait else Until.SENT, duration_s)
+        return CommandRequest("drive", message, Until.STOPPED)
+    return CommandRequest("drive", message, Until.OVER if wait else Until.SENT, duration_s)
 
 
-def mode_request(mode: str) -> Request:
+def mode_request(mode: str) -> CommandRequest:
     """Bring the car into a mode."""
-    return Request("mode", pb.ModeCommand(mode=mode))
+    return CommandRequest("mode", pb.ModeCommand(mode=mode))
 
 
-def led_request(r: int, g: int, b: int) -> Request:
+def led_request(r: int, g: int, b: int) -> CommandRequest:
     """The colour LED, 0..255 each."""
     for name, value in (("r", r), ("g", g), ("b", b)):
         _whole(name, value, 255)
-    return Request("led", pb.LedCommand(r=r, g=g, b=b))
+    return CommandRequest("led", pb.LedCommand(r=r, g=g, b=b))
 
 
-def servo_request(servo: str, action: str = "", deg: int | None = None) -> Request:
+def servo_request(servo: str, action: str = "", deg: int | None = None) -> CommandRequest:
     """Move a servo by an action, or the front one to `deg` (0..180)."""
     message = pb.ServoCommand(servo=servo, action=action)
     if deg is not None:
         _whole("deg", deg, 180)
         message.deg = deg
-    return Request("servo", message)
+    return CommandRequest("servo", message)
 
 
-def arm_request(joint_deg: Sequence[int]) -> Request:
+def arm_request(joint_deg: Sequence[int]) -> CommandRequest:
     """Six joints, 0..180 degrees each."""
     if len(joint_deg) != 6:
         raise ValueError(f"an arm has six joints, {len(joint_deg)} given")
     for number, value in enumerate(joint_deg, start=1):
         _whole(f"joint {number}", value, 180)
-    return Request("arm", pb.ArmCommand(joint_deg=joint_deg))
+    return CommandRequest("arm", pb.ArmCommand(joint_deg=joint_deg))
 
 
-def light_request(light: str) -> Request:
+def light_request(light: str) -> CommandRequest:
     """The light's colour, or off."""
-    return Request("light", pb.LightCommand(light=light))
+    return CommandRequest("light", pb.LightCommand(light=light))
 
 
-def whistle_request() -> Request:
+def whistle_request() -> CommandRequest:
     """Sound once."""
-    return Request("whistle", pb.WhistleCommand())
+    return CommandRequest("whistle", pb.WhistleCommand())
 
 
-def speed_request(step: str) -> Request:
+def speed_request(step: str) -> CommandRequest:
     """One step up or down."""
-    return Request("speed", pb.SpeedCommand(step=step))
+    return CommandRequest("speed", pb.SpeedCommand(step=step))
 
 
-def fan_request(state: str | None = None) -> Request:
+def fan_request(state: str | None = None) -> CommandRequest:
     """Toggle the fan, or bring it to a state."""
-    return Request("fan", pb.FanCommand(state=state or ""))
+    return CommandRequest("fan", pb.FanCommand(state=state or ""))
 
 
-def lease_request(*, take: bool = False, release: bool = False) -> Request:
+def lease_request(*, take: bool = False, release: bool = False) -> CommandRequest:
     """Have the car for 2 s, or give it back; `take`: as a person, also from another person."""
-    return Request("lease", pb.LeaseCommand(release=release), take=take)
+    return CommandRequest("lease", pb.LeaseCommand(release=release), take=take)
 
 
-def find_request() -> Request:
+def find_request() -> CommandRequest:
     """Blink and beep."""
-    return Request("find", pb.FindCommand())
+    return CommandRequest("find", pb.FindCommand())
 
 
-def stop_request() -> Request:
+def stop_request() -> CommandRequest:
     """Stop, and hold against the coordinator."""
-    return Request("stop", pb.StopCommand(), Until.STOPPED)
+    return CommandRequest("stop", pb.StopCommand(), Until.STOPPED)
 
 
-def estop_request(why: str, scope: str) -> Request:
+def estop_request(why: str, scope: str) -> CommandRequest:
     """Emergency stop; `scope` is car or fleet."""
-    return Request("estop", pb.EstopCommand(why=why, scope=scope), Until.STOPPED)
+    return CommandRequest("estop", pb.EstopCommand(why=why, scope=scope), Until.STOPPED)
 
 
-def resume_request(ids: Sequence[str] = ()) -> Request:
+def resume_request(ids: Sequence[str] = ()) -> CommandRequest:
     """End the e-stops of these ids; without ids, the hold."""
-    return Request("resume", pb.ResumeCommand(ids=ids))
+    return CommandRequest("resume", pb.ResumeCommand(ids=ids))
 
 
 def _whole(name: str, value: int, top: int) -> None:
@@ -129,7 +129,7 @@ def _whole(name: str, value: int, top: int) -> None:
         raise ValueError(f"{name} {value!r} is not allowed: a whole number, 0 to {top}")
 
 
-class Verbs(ABC, Generic[R]):
+class CarCommands(ABC, Generic[R]):
     """The commands of one car. R is `Outcome`, or an awaitable of it.
 
     Each waits until the car's gateway says what became of the command (a stop: until it is complete); none raises
@@ -140,7 +140,7 @@ class Verbs(ABC, Generic[R]):
         self.name = name
 
     @abstractmethod
-    def do(self, request: Request) -> R:
+    def do(self, request: CommandRequest) -> R:
         """Ask for one command; the methods below make the requests."""
 
     def drive(self, motion: str, duration_s: float = 0.5, *, wait: bool = True) -> R:

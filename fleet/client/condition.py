@@ -27,7 +27,7 @@ def topics_under(written: str) -> list[topics.Topic]:
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class KeyCondition:
     """What must hold of one reading; each type of message that has the fields has its own expression."""
 
     text: str

@@ -18,7 +18,7 @@ SERVICES: Final = (keys.COORDINATOR, keys.RECORDER)
 
 
 @dataclass(frozen=True, slots=True)
-class Alive:
+class KeyInfo:
     """One key."""
 
     key: str
@@ -38,7 +38,7 @@ class Alive:
         return [unit for unit in dict.fromkeys(self.topic.units.values()) if unit != "1"]
 
 
-class Survey:
+class KeySurvey:
     """Takes readings in any order and says what is alive."""
 
     def __init__(self, look_s: float = LOOK_S) -> None:
@@ -56,21 +56,21 @@ class Survey:
         if newest is None or reading.time >= newest.time:
             self._newest[reading.key] = reading
 
-    def found(self, silent: Iterable[str], now: datetime) -> list[Alive]:
+    def found(self, silent: Iterable[str], now: datetime) -> list[KeyInfo]:
         """Every key, sorted; `silent`: those that are alive even if nothing came."""
         return [self._one(key, now) for key in sorted({*self._newest, *silent})]
 
-    def _one(self, key: str, now: datetime) -> Alive:
+    def _one(self, key: str, now: datetime) -> KeyInfo:
         newest, first, topic = self._newest.get(key), self._first.get(key), topics.of_key(key)
         if newest is None:
-            return Alive(key, topic)
+            return KeyInfo(key, topic)
         rate = None
         if first is not None and newest.value.DESCRIPTOR.fields_by_name.get("seq") is not None:
             count = newest.value.seq - first.value.seq
             apart_s = (newest.time - first.time).total_seconds()
             # A few that came at once, after a change, say nothing of how many come.
             rate = count / (apart_s if apart_s >= self._look_s / 4 else self._look_s) if count > 0 else None
-        return Alive(key, topic, rate, newest.age_s(now), newest.stale(now))
+        return KeyInfo(key, topic, rate, newest.age_s(now), newest.stale(now))
 
 
 def _restarted(first: Reading, reading: Reading) -> bool:

@@ -1,6 +1,6 @@
 """A car that is one operator's for a while: `with fleet.car("red").lease() as car`. When the block ends, the car stops.
 
-`Ours` judges whether it still is, from what its gateway says: pure. `Lease` asks, renews and gives back.
+`LeaseMonitor` judges whether it still is, from what its gateway says: pure. `Lease` asks, renews and gives back.
 """
 
 import threading
@@ -21,7 +21,7 @@ _STOPPED_ANYWAY: Final = frozenset({"leased", "estopped", "superseded"})
 """Why the stop at the end is not carried out, and need not be: the car is another's, or is being stopped."""
 
 
-class Ours:
+class LeaseMonitor:
     """Whether the car is still ours: not once another has it, or has stopped it. What was lost stays lost."""
 
     def __init__(self, car: str, sender: str) -> None:
@@ -67,7 +67,7 @@ class Lease:
         self._fleet = fleet
         self._name = name
         self._take = take
-        self._ours = Ours(name, fleet.sender)
+        self._ours = LeaseMonitor(name, fleet.sender)
         self._hearing = threading.Lock()
         self._over = threading.Event()
         self._undeclare: Any = lambda: None

@@ -6,7 +6,7 @@ Readings and the time come in as arguments; nothing is asked here.
 from dataclasses import dataclass
 from datetime import datetime
 
-from fleet.client.condition import Condition
+from fleet.client.condition import KeyCondition
 from fleet.client.reading import Reading
 from schemas import topics
 
@@ -20,7 +20,7 @@ class NotInTime(TimeoutError):
 
 
 @dataclass(slots=True)
-class _Seen:
+class _LastMatch:
     """What is known of one key."""
 
     at: datetime
@@ -28,13 +28,13 @@ class _Seen:
     """The first of the readings of which it has held without a gap."""
 
 
-class Waiting:
+class ConditionWait:
     """One condition that is waited for. `for_s`: how long its readings must agree, by their own stamps."""
 
-    def __init__(self, condition: Condition, for_s: float = 0.0) -> None:
+    def __init__(self, condition: KeyCondition, for_s: float = 0.0) -> None:
         self._condition = condition
         self._for_s = for_s
-        self._seen: dict[str, _Seen] = {}
+        self._seen: dict[str, _LastMatch] = {}
         self.last: Reading | None = None
         """The newest reading of those of which the condition can be said to hold or not."""
         self._undecided: Reading | None = None
@@ -49,7 +49,7 @@ class Waiting:
             self._undecided = reading if self._condition.read(reading) else self._undecided
         elif self.last is None or self.last.time <= reading.time:
             self.last = reading
-        seen = self._seen[reading.key] = _Seen(reading.time)
+        seen = self._seen[reading.key] = _LastMatch(reading.time)
         if not holds or reading.stale(now):
             return False
         unbroken = before is not None and before.since is not None and not _gap(reading, before.at)

@@ -7,7 +7,7 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.client.commands import (
-    Request,
+    CommandRequest,
     arm_request,
     fan_request,
     find_request,
@@ -25,7 +25,7 @@ _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 _ARM_EXAMPLE: Final = "fleet arm red 90 90 45 120 90 30"
 
 
-class _Colour(click.ParamType[tuple[int, int, int]]):
+class _Color(click.ParamType[tuple[int, int, int]]):
     """Red, green and blue as `#rrggbb`."""
 
     name = "'#RRGGBB'"
@@ -46,7 +46,7 @@ class _Colour(click.ParamType[tuple[int, int, int]]):
         return "Six hexadecimal digits, in quotes: to a shell, what follows a bare # is a comment"
 
 
-def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> Request:
+def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> CommandRequest:
     """The request for what is asked of the servo named before; wrong use is found before anyone is asked."""
     servo = ctx.params["servo"]
     if action is None or not re.fullmatch("[0-9]+", action):
@@ -65,7 +65,7 @@ def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> Reques
         raise click.BadParameter(str(error)) from None
 
 
-def _arm(_: click.Context, __: click.Parameter, joints: tuple[str, ...]) -> Request:
+def _arm(_: click.Context, __: click.Parameter, joints: tuple[str, ...]) -> CommandRequest:
     """The request for six joints."""
     needed = f"6 are needed, 0 to 180 degrees each, as: {_ARM_EXAMPLE}"
     for number, joint in enumerate(joints, start=1):
@@ -78,7 +78,7 @@ def _arm(_: click.Context, __: click.Parameter, joints: tuple[str, ...]) -> Requ
 
 @click.command(epilog="\b\nexample:\n  fleet led red '#ff0010'")
 @cars_argument
-@click.argument("colour", type=_Colour())
+@click.argument("colour", type=_Color())
 @json_option
 @with_client
 def led(client: Fleet, cars: tuple[str, ...], colour: tuple[int, int, int], *, as_json: bool) -> None:
@@ -110,7 +110,7 @@ def servo(
     client: Fleet,
     cars: tuple[str, ...],
     servo: str,  # noqa: ARG001 - it is in the request already
-    request: Request,
+    request: CommandRequest,
     *,
     take: bool,
     as_json: bool,
@@ -128,7 +128,7 @@ def servo(
 @take_option
 @json_option
 @with_client
-def arm(client: Fleet, cars: tuple[str, ...], request: Request, *, take: bool, as_json: bool) -> None:
+def arm(client: Fleet, cars: tuple[str, ...], request: CommandRequest, *, take: bool, as_json: bool) -> None:
     """Move the arm's six joints to 0..180 degrees each."""
     carry_out(client, request, cars, take=take, as_json=as_json)
 

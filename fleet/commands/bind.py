@@ -29,7 +29,7 @@ from fleet.commands.options import explained
 from fleet.fleetfile.editor import CannotEdit, with_link
 from fleet.fleetfile.fleet_file import FleetFile
 from fleet.fleetfile.models import checked_link
-from fleet.fleetfile.scan import Found
+from fleet.fleetfile.scan import FoundLink
 from fleet.links import LinkKind, parse_link
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
 from schemas.process import signals
@@ -84,7 +84,7 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
     raise SystemExit(1 if left else 0)
 
 
-def _unknown(found: Found, fleet: FleetFile) -> bool:
+def _unknown(found: FoundLink, fleet: FleetFile) -> bool:
     link = parse_link(found.url)
     return link.kind is not LinkKind.TCP and not any(link.may_be(parse_link(car.link)) for car in fleet.cars.values())
 

@@ -8,8 +8,8 @@ from fleet.client.client import Fleet
 from fleet.client.commands import drive_request, estop_request, mode_request, resume_request, stop_request
 from fleet.client.outcome import Outcome
 from fleet.commands.options import (
-    Cars,
-    Seconds,
+    CarNames,
+    SecondsType,
     carry_out,
     cars_argument,
     end_with,
@@ -33,7 +33,7 @@ examples:
 @click.option(
     "--for",
     "duration_s",
-    type=Seconds(),
+    type=SecondsType(),
     default="500ms",
     show_default=True,
     help="How long; at most 10s, or what the car's gateway allows.",
@@ -74,7 +74,7 @@ examples:
   fleet stop
   fleet stop red blue"""
 )
-@click.argument("cars", type=Cars(), nargs=-1, metavar="[CAR...]")
+@click.argument("cars", type=CarNames(), nargs=-1, metavar="[CAR...]")
 @json_option
 @with_client
 def stop(client: Fleet, cars: tuple[tuple[str, ...], ...], *, as_json: bool) -> None:
@@ -88,7 +88,7 @@ examples:
   fleet estop
   fleet estop red --why 'someone is on the track'"""
 )
-@click.argument("cars", type=Cars(), nargs=-1, metavar="[CAR...]")
+@click.argument("cars", type=CarNames(), nargs=-1, metavar="[CAR...]")
 @click.option("--why", default="", help="What happened, for the record.")
 @json_option
 @with_client
@@ -105,7 +105,7 @@ examples:
   fleet resume red --estops
   fleet resume red blue --id 5f0c2e"""
 )
-@click.argument("cars", type=Cars(), nargs=-1, required=True, metavar="CAR...")
+@click.argument("cars", type=CarNames(), nargs=-1, required=True, metavar="CAR...")
 @click.option(
     "--id", "ids", multiple=True, metavar="ID", help="An e-stop to end, or its beginning; as often as needed."
 )

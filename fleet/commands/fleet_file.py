@@ -15,7 +15,7 @@ from fleet.commands.options import explained, json_option
 from fleet.fleetfile.fleet_file import PALETTE, FleetFile, parse_fleet, read_fleet
 from fleet.fleetfile.link_check import look
 from fleet.fleetfile.models import checked_colour, checked_link, checked_name, checked_platform, schema
-from fleet.fleetfile.scan import LIKELY, Found, NewCar, ScanFailed, new_file, scan
+from fleet.fleetfile.scan import LIKELY, FoundLink, NewCar, ScanFailed, new_file, scan
 from schemas import bus
 from schemas.yaml_document.document import BadFile
 
@@ -144,7 +144,7 @@ def init(*, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: 
     click.echo(f"wrote {out} with {', '.join(car.name for car in cars)}: fleet check {out}, then fleet up {out}")
 
 
-def look_for(links: tuple[str, ...], seconds: float | None) -> list[Found]:
+def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:
     """What may be a car, likely ones first; what is amiss becomes one line."""
     try:
         found = scan(links, seconds)
@@ -170,7 +170,7 @@ def write(path: Path, text: str) -> None:
         raise click.ClickException(f"{path} cannot be written: {error.strerror}") from None
 
 
-def _taken(found: list[Found]) -> list[NewCar]:
+def _taken(found: list[FoundLink]) -> list[NewCar]:
     likely = [each for each in found if each.verdict in LIKELY]
     cars = []
     for index, each in enumerate(likely):
@@ -179,7 +179,7 @@ def _taken(found: list[Found]) -> list[NewCar]:
     return cars
 
 
-def _asked(found: list[Found]) -> list[NewCar]:
+def _asked(found: list[FoundLink]) -> list[NewCar]:
     cars: list[NewCar] = []
     for each in found:
         click.echo(f"\n{each.url}\n  {each.words}")

@@ -9,11 +9,11 @@ import click
 
 from fleet.client import history
 from fleet.client.client import Fleet
-from fleet.client.condition import Condition, topics_under
+from fleet.client.condition import KeyCondition, topics_under
 from fleet.client.reading import Reading
 from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.output import json_text, line, show_table
-from fleet.commands.params import Span, warn_if_missing, what_there_is, written_out
+from fleet.commands.params import DurationType, warn_if_missing, what_there_is, written_out
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
 
@@ -115,7 +115,9 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
 )
 @click.argument("keyexpr")
 @click.option("--last", type=click.IntRange(1), metavar="N", help="The last N values of each key, oldest first.")
-@click.option("--since", type=Span(history.LONGEST_S), help="The values of the last so many seconds, as 30s or 5m.")
+@click.option(
+    "--since", type=DurationType(history.LONGEST_S), help="The values of the last so many seconds, as 30s or 5m."
+)
 @click.option("--csv", "as_csv", is_flag=True, help="One CSV table; KEYEXPR must mean one type of message.")
 @json_option
 @bus_options
@@ -187,7 +189,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     """
     written = written_out(keyexpr, fleet)
     if when is not None:
-        Condition.of(when, written)
+        KeyCondition.of(when, written)
     with Fleet(connect, fleet, kind="person") as client:
         warn_if_missing(written, client.cars())
         told = shown = 0

@@ -11,7 +11,7 @@ from typing import Any, Never
 import click
 
 from fleet.client.client import Fleet
-from fleet.client.commands import LONGEST_DRIVE_S, Request
+from fleet.client.commands import LONGEST_DRIVE_S, CommandRequest
 from fleet.client.outcome import Outcome
 from schemas import keys
 from schemas.bus import BadEndpoint, BusError
@@ -72,7 +72,7 @@ def explained() -> Iterator[None]:
         raise click.ClickException(str(error)) from None
 
 
-class Cars(click.ParamType[tuple[str, ...]]):
+class CarNames(click.ParamType[tuple[str, ...]]):
     """One car or several: `red`, or `red,blue`."""
 
     name = "CAR[,CAR...]"
@@ -87,7 +87,7 @@ class Cars(click.ParamType[tuple[str, ...]]):
             self.fail(str(error), param, ctx)
 
 
-class Seconds(click.ParamType[float]):
+class SecondsType(click.ParamType[float]):
     """A time: `2s`, `500ms`, or a number of seconds."""
 
     name = "TIME"
@@ -103,11 +103,13 @@ class Seconds(click.ParamType[float]):
         return seconds
 
 
-cars_argument = click.argument("cars", type=Cars(), metavar="CAR[,CAR...]")
+cars_argument = click.argument("cars", type=CarNames(), metavar="CAR[,CAR...]")
 take_option = click.option("--take", is_flag=True, help="Also if another person drives the car: it is yours then.")
 
 
-def carry_out(client: Fleet, request: Request, cars: Iterable[str], *, as_json: bool, take: bool = False) -> None:
+def carry_out(
+    client: Fleet, request: CommandRequest, cars: Iterable[str], *, as_json: bool, take: bool = False
+) -> None:
     """Ask the cars, say for each what became of it, and end with the exit code that says whether all was done."""
     end_with(client.ask(replace(request, take=take), cars), as_json=as_json)
 

@@ -14,7 +14,7 @@ from schemas.bus import canon
 _UNITS: Final = {"ms": 0.001, "": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
 
 
-class Span(click.ParamType[float]):
+class DurationType(click.ParamType[float]):
     """A time: `30s`, `500ms`, `5m`, `1h`, or a number of seconds; more than 0."""
 
     name = "TIME"

@@ -80,7 +80,7 @@ def check(file: Path, fleet_file: Path | None, *, as_json: bool) -> None:
     """Roles that no car can fill, rules that can never fire or that fight, phases nothing leads to."""
     from fleet.coordinator.observer import listed_cars
     from fleet.fleetfile.fleet_file import read_fleet
-    from fleet.policy.plan.lint import Gravity
+    from fleet.policy.plan.lint import Severity
     from fleet.policy.plan.lint import check as check_plan
     from fleet.policy.plan.parser import parse
     from schemas.yaml_document.document import read_text
@@ -89,7 +89,7 @@ def check(file: Path, fleet_file: Path | None, *, as_json: bool) -> None:
         read = parse(read_text(file), str(file))
         cars = None if fleet_file is None else listed_cars(read_fleet(fleet_file))
     findings = check_plan(read, cars)
-    errors = [each for each in findings if each.gravity is Gravity.ERROR]
+    errors = [each for each in findings if each.gravity is Severity.ERROR]
     for each in findings:
         if as_json:
             click.echo(json.dumps({"gravity": each.gravity, "part": each.part, "words": each.words}))

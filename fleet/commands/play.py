@@ -14,7 +14,7 @@ from schemas.process import signals
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Recorded, Session
-    from fleet.recording.tools.summary import Overview
+    from fleet.recording.tools.summary import SessionSummary
 
 TOLD_EVERY_S: Final = 0.5
 REMEMBERED_NS: Final = 300_000_000_000
@@ -169,7 +169,7 @@ def _time(option: str, text: str, start_ns: int, end_ns: int) -> int:
         raise click.UsageError(f"{option}: {error}") from None
 
 
-def _fleets(session: "Session", about: "Overview") -> list[str]:
+def _fleets(session: "Session", about: "SessionSummary") -> list[str]:
     """The recorded fleet's name, then others that keys have."""
     described = [session.description.fleet] if session.description is not None and session.description.fleet else []
     of_keys = (key.fleet for key in map(keys.parse, about.keys) if key is not None)

@@ -13,7 +13,7 @@ import click
 from click.core import ParameterSource
 
 from fleet.commands import record_control
-from fleet.commands.params import Span
+from fleet.commands.params import DurationType
 from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, ensure_hub
 from schemas.process import signals
@@ -28,7 +28,7 @@ _UNITS: Final = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10*
 _WEEK_S: Final = 7 * 86_400.0
 
 
-class Size(click.ParamType[int]):
+class SizeType(click.ParamType[int]):
     """An amount of data: `512MB`, `1.5GB`, or a number of bytes."""
 
     name = "SIZE"
@@ -67,10 +67,10 @@ What was marked is spared by the quota.""",
     help="Directory in which the session's own directory is made.",
 )
 @click.option(
-    "--segment-size", type=Size(10**6), default="512MB", show_default=True, help="A file has at most so much."
+    "--segment-size", type=SizeType(10**6), default="512MB", show_default=True, help="A file has at most so much."
 )
 @click.option(
-    "--segment-time", type=Span(_WEEK_S), default="10m", show_default=True, help="... and is at most so long."
+    "--segment-time", type=DurationType(_WEEK_S), default="10m", show_default=True, help="... and is at most so long."
 )
 @click.option(
     "--sync",
@@ -82,16 +82,18 @@ What was marked is spared by the quota.""",
 )
 @click.option(
     "--session-size",
-    type=Size(10**6),
+    type=SizeType(10**6),
     help="A session that has so much is closed, and the next one begins; with --quota half of it at "
     "most, and if this is not given a tenth.",
 )
 @click.option(
-    "--quota", type=Size(10**6), help="What all sessions in --out may have; the oldest that nobody marked are removed."
+    "--quota",
+    type=SizeType(10**6),
+    help="What all sessions in --out may have; the oldest that nobody marked are removed.",
 )
 @click.option(
     "--keep-free",
-    type=Size(0),
+    type=SizeType(0),
     default="50MB",
     show_default=True,
     help="With less than that on the disk, recording waits until there is room again.",

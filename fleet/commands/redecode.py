@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fleet.commands.options import Cars, from_option, json_option, to_option
+from fleet.commands.options import CarNames, from_option, json_option, to_option
 from schemas import keys
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
     from fleet.replay.analysis.recorded_frames import Item
-    from fleet.replay.analysis.redecode import Counts, Difference
+    from fleet.replay.analysis.redecode import Counts, ReadingDifference
 
 
 @click.command(
@@ -24,7 +24,7 @@ examples:
 Exit codes: 0 no difference, 1 some, or nothing to decode."""
 )
 @click.argument("session", type=click.Path(path_type=Path))
-@click.option("--car", "cars", type=Cars(), default=(), help="Only these cars.")
+@click.option("--car", "cars", type=CarNames(), default=(), help="Only these cars.")
 @click.option("--platform", help="What the cars were, instead of what was recorded: arduino, raspberry_pi, stm32+imu.")
 @json_option
 def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_json: bool) -> None:
@@ -44,7 +44,7 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
         except ValueError as error:
             raise click.UsageError(f"--platform: {error}") from None
     try:
-        found = _Redecoded(session, cars, platform)
+        found = _RedecodeReport(session, cars, platform)
         if session.suffix == ENDING:
             found.of_vector()
         else:
@@ -61,7 +61,7 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
     raise SystemExit(1 if differences else 0)
 
 
-class _Redecoded:
+class _RedecodeReport:
     """One run: where the frames come from, and what came of it."""
 
     def __init__(self, path: Path, cars: tuple[str, ...], platform: str | None) -> None:
@@ -96,7 +96,7 @@ class _Redecoded:
         wanted = [f"*/{car}/{key.split('/', 2)[2]}" for car in self._cars or ("*",) for key in KEYS]
         self._items = of_session(watched("redecode", None)(session.messages(keys=wanted)), self._unread)
 
-    def differences(self) -> Iterator["Difference"]:
+    def differences(self) -> Iterator["ReadingDifference"]:
         """As they are found; raises NoPlatform, and ClickException if there is nothing to decode."""
         from fleet.replay.analysis.redecode import Redecoding
 
@@ -146,7 +146,7 @@ class _Redecoded:
             click.echo(f"what is whole was decoded: {damage}", err=True)
 
 
-def _line(each: "Difference", start_ns: int) -> str:
+def _line(each: "ReadingDifference", start_ns: int) -> str:
     text = each.data.decode("latin-1").encode("unicode_escape").decode("ascii")
     at = f"{(each.at_ns - start_ns) / 1e9:+.3f}s"
     return f"{each.car} {at} {text}: {each.what} was {_shown(each.then)}, is now {_shown(each.now)}"
@@ -158,7 +158,7 @@ def _shown(value: Any) -> str:
     return "not measured" if value is None else str(value)
 
 
-def _fields(each: "Difference", start_ns: int) -> dict[str, Any]:
+def _fields(each: "ReadingDifference", start_ns: int) -> dict[str, Any]:
     return {
         "car": each.car,
         "at_s": (each.at_ns - start_ns) / 1e9,

@@ -11,9 +11,14 @@ from fleet.commands.options import explained, json_option
 
 if TYPE_CHECKING:
     from fleet.policy.plan.plan import Plan
-    from fleet.policy.snapshot import CarPicture
+    from fleet.policy.snapshot import CarSnapshot
     from fleet.recording.reading.session import Session
-    from fleet.replay.analysis.recorded_decisions import Difference, Run, Said, Token
+    from fleet.replay.analysis.recorded_decisions import (
+        CoordinatorRun,
+        DecisionDifference,
+        PresenceToken,
+        RecordedDecision,
+    )
     from fleet.replay.analysis.replan import Replanning
 
 TOLERANCE_S: Final = 2.0
@@ -65,13 +70,13 @@ def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance:
         try:
             found = Session.open(session)
             own = found.path / FLEET_FILE
-            listed: Mapping[str, CarPicture] = {}
+            listed: Mapping[str, CarSnapshot] = {}
             if fleet_file is not None:
                 listed = listed_cars(read_fleet(fleet_file, unbound=True))
             elif found.path.is_dir() and own.is_file():
                 # The session keeps the plan as plan.yaml, whatever name it has in the copied fleet file.
                 listed = listed_cars(read_fleet(own, unbound=True, moved=True))
-            compared = _Compared(found, plan, listed, round(tolerance * 1e9))
+            compared = _ReplanReport(found, plan, listed, round(tolerance * 1e9))
             compared.go()
         except NoSession as error:
             raise click.ClickException(str(error)) from None
@@ -81,25 +86,25 @@ def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance:
     raise SystemExit(1 if compared.found else 0)
 
 
-class _Compared:
+class _ReplanReport:
     """Every coordinator of a session again, and where it decides otherwise."""
 
     def __init__(
-        self, session: "Session", plan: "Plan | None", listed: "Mapping[str, CarPicture]", tolerance_ns: int
+        self, session: "Session", plan: "Plan | None", listed: "Mapping[str, CarSnapshot]", tolerance_ns: int
     ) -> None:
         self._session = session
         self._plan = plan
         self._listed = listed
         self._tolerance_ns = tolerance_ns
-        self.found: list[Difference] = []
+        self.found: list[DecisionDifference] = []
         self.origin_ns = 0
-        self._runs: list[Run] = []
+        self._runs: list[CoordinatorRun] = []
         self._decisions = 0
         self._late_ns: list[int] = []
 
     def go(self) -> None:
         """Compare; raises BadPlan, and ClickException if there is nothing to compare."""
-        from fleet.policy.state import Kept
+        from fleet.policy.state import PersistedPolicy
         from fleet.recording.tools.summary import of_session
         from fleet.replay.analysis import recorded_decisions
         from fleet.replay.analysis.replan import Replanning, plans_of
@@ -118,7 +123,7 @@ class _Compared:
             )
         self._refuse_without_cars()
         tokens = recorded_decisions.presence(self._session.messages(recorded_decisions.STATES), about.end_ns)
-        kept = Kept()
+        kept = PersistedPolicy()
         for run in self._runs:
             if not run.plans and (self._session.path / "plan.yaml").is_file():
                 run.plans.append((run.start_ns, read_text(self._session.path / "plan.yaml")))
@@ -147,7 +152,7 @@ class _Compared:
                 f"{', '.join(others)} too, and what they said is not in it; replan the session it was cut from"
             )
 
-    def _one(self, run: "Run", again: "Replanning", tokens: "list[Token]") -> Any:
+    def _one(self, run: "CoordinatorRun", again: "Replanning", tokens: "list[PresenceToken]") -> Any:
         from fleet.replay.analysis.recorded_decisions import differences
         from fleet.replay.analysis.replan import BEFORE_NS, wanted_keys
 
@@ -185,7 +190,7 @@ class _Compared:
             click.echo(f"what is whole was taken: {self._session.damage_words}", err=True)
 
 
-def _told(each: "Difference", origin_ns: int) -> str:
+def _told(each: "DecisionDifference", origin_ns: int) -> str:
     start_s, length_s = (each.from_ns - origin_ns) / 1e9, (each.to_ns - each.from_ns) / 1e9
     lines = [f"{each.subject} at +{start_s:.1f}s for {length_s:.1f} s:"]
     for name, said in (("then", each.then), ("now", each.now)):
@@ -199,7 +204,7 @@ def _told(each: "Difference", origin_ns: int) -> str:
     return "\n".join(lines)
 
 
-def _fields(each: "Difference", origin_ns: int) -> dict[str, Any]:
+def _fields(each: "DecisionDifference", origin_ns: int) -> dict[str, Any]:
     return {
         "subject": each.subject,
         "from_s": (each.from_ns - origin_ns) / 1e9,
@@ -209,7 +214,7 @@ def _fields(each: "Difference", origin_ns: int) -> dict[str, Any]:
     }
 
 
-def _said(said: "Said | None") -> dict[str, Any] | None:
+def _said(said: "RecordedDecision | None") -> dict[str, Any] | None:
     if said is None:
         return None
     return {

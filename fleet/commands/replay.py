@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from fleet.commands.options import Cars, from_option
+from fleet.commands.options import CarNames, from_option
 from fleet.commands.play import refuse_without, to_bus_options
 from fleet.commands.play import to_bus as play_to_bus
 from schemas.process import startup
@@ -31,7 +31,7 @@ examples:
   fleet replay sessions/20260314T151617Z-fleet --to-bus --as rehearsal --rate 4 --loop"""
 )
 @click.argument("session", type=click.Path(path_type=Path))
-@click.option("--car", "--cars", "cars", type=Cars(), default=(), help="Only these cars, and the services.")
+@click.option("--car", "--cars", "cars", type=CarNames(), default=(), help="Only these cars, and the services.")
 @from_option
 @click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not shown.")
 @click.option(

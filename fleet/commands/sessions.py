@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from fleet.commands.options import Cars, from_option, json_option, to_option
+from fleet.commands.options import CarNames, from_option, json_option, to_option
 from fleet.commands.redecode import vector
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
-    from fleet.recording.tools.summary import Overview
+    from fleet.recording.tools.summary import SessionSummary
 
 DEFAULT_DIR: Final = "sessions"
 BAR_AFTER_S: Final = 1.0
@@ -24,7 +24,7 @@ _LOOK: Final = 1024
 T = TypeVar("T")
 
 
-class _WithDefault(click.Group):
+class _DefaultCommandGroup(click.Group):
     """`fleet sessions` and `fleet sessions DIR` are `fleet sessions list`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -34,7 +34,7 @@ class _WithDefault(click.Group):
 
 
 @click.group(
-    cls=_WithDefault,
+    cls=_DefaultCommandGroup,
     subcommand_metavar="[COMMAND | DIR]",
     epilog="""\b
 examples:
@@ -144,7 +144,7 @@ def list_sessions(directory: Path, *, as_json: bool) -> None:
             click.echo(f"{one.name}: {one.words}", err=True)
 
 
-def _row(one: "Overview") -> tuple[str, ...]:
+def _row(one: "SessionSummary") -> tuple[str, ...]:
     from fleet.recording import time_spec
 
     cars = ",".join(one.cars[:5]) + (f" and {len(one.cars) - 5} more" if len(one.cars) > 5 else "")
@@ -194,7 +194,7 @@ def info(session: Path, *, as_json: bool) -> None:
     _say_contents(about)
 
 
-def _say_contents(about: "Overview") -> None:
+def _say_contents(about: "SessionSummary") -> None:
     from fleet.recording import time_spec
 
     size = f"{about.messages} messages, {_size(about.bytes)}"
@@ -270,7 +270,7 @@ examples:
 @session_argument
 @from_option
 @to_option
-@click.option("--cars", type=Cars(), default=(), help="Only these cars, and the services.")
+@click.option("--cars", type=CarNames(), default=(), help="Only these cars, and the services.")
 @click.option(
     "--out",
     required=True,

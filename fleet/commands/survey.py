@@ -9,13 +9,13 @@ from typing import Any, Final
 import click
 
 from fleet.client.client import Fleet
-from fleet.client.condition import Condition
-from fleet.client.key_survey import LOOK_S, SERVICES, Alive, Survey, spoken_of
+from fleet.client.condition import KeyCondition
+from fleet.client.key_survey import LOOK_S, SERVICES, KeyInfo, KeySurvey, spoken_of
 from fleet.client.reading import Watch
 from fleet.client.wait import NotInTime
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.output import json_text, line, show_table
-from fleet.commands.params import Span, warn_if_missing, what_there_is, written_out
+from fleet.commands.params import DurationType, warn_if_missing, what_there_is, written_out
 from schemas.bus import Sample, intersects
 
 _DAY_S: Final = 86_400.0
@@ -28,7 +28,12 @@ _COLUMNS: Final = ("key", "type", "unit", "rate", "age")
 )
 @click.argument("keyexpr", required=False)
 @click.option(
-    "--for", "look_s", type=Span(600.0), default=f"{LOOK_S:g}s", show_default=True, help="How long rates are measured."
+    "--for",
+    "look_s",
+    type=DurationType(600.0),
+    default=f"{LOOK_S:g}s",
+    show_default=True,
+    help="How long rates are measured.",
 )
 @json_option
 @bus_options
@@ -51,7 +56,7 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
         show_table(_COLUMNS, [_cells(each) for each in found])
 
 
-def _alive(client: Fleet, written: Sequence[str], look_s: float) -> list[Alive]:
+def _alive(client: Fleet, written: Sequence[str], look_s: float) -> list[KeyInfo]:
     """What was published before and within `look_s`."""
 
     def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
@@ -63,7 +68,7 @@ def _alive(client: Fleet, written: Sequence[str], look_s: float) -> list[Alive]:
 
         return end
 
-    survey, until = Survey(look_s), time.monotonic() + look_s
+    survey, until = KeySurvey(look_s), time.monotonic() + look_s
     with Watch().begin(subscribe) as stream:
         for each in written:
             for reading in client.get(each):
@@ -76,7 +81,7 @@ def _alive(client: Fleet, written: Sequence[str], look_s: float) -> list[Alive]:
     return survey.found(silent, datetime.now(UTC))
 
 
-def _row(alive: Alive) -> dict[str, Any]:
+def _row(alive: KeyInfo) -> dict[str, Any]:
     topic = alive.topic
     return {
         "key": alive.key,
@@ -89,7 +94,7 @@ def _row(alive: Alive) -> dict[str, Any]:
     }
 
 
-def _cells(alive: Alive) -> dict[str, str]:
+def _cells(alive: KeyInfo) -> dict[str, str]:
     stale = " (stale)" if alive.stale else ""
     return {
         "key": alive.key,
@@ -108,8 +113,8 @@ def _cells(alive: Alive) -> dict[str, str]:
 )
 @click.argument("keyexpr")
 @click.argument("condition", metavar="CONDITION")
-@click.option("--timeout", "timeout_s", type=Span(_DAY_S), help="Give up after this time (default: never).")
-@click.option("--for", "for_s", type=Span(_DAY_S), help="It must have held of every reading for so long.")
+@click.option("--timeout", "timeout_s", type=DurationType(_DAY_S), help="Give up after this time (default: never).")
+@click.option("--for", "for_s", type=DurationType(_DAY_S), help="It must have held of every reading for so long.")
 @json_option
 @bus_options
 def wait(
@@ -127,7 +132,7 @@ def wait(
     With a wildcard any key will do. CONDITION is as in `fleet watch --when`.
     """
     written = written_out(keyexpr, fleet)
-    Condition.of(condition, written)
+    KeyCondition.of(condition, written)
     if for_s is not None and timeout_s is not None and for_s >= timeout_s:
         raise click.UsageError(f"--for {for_s:g} s cannot be over within --timeout {timeout_s:g} s: give more time")
     with Fleet(connect, fleet, kind="person") as client:

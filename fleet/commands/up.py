@@ -20,15 +20,15 @@ from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.policy.plan.lint import faults
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.supervisor.service import AnotherSupervisor
-from fleet.supervisor.spec import MOST_SIMULATED, Asked, Wanted, listing, wanted
-from fleet.supervisor.supervisor import TRIES_S, Happening, Supervisor
+from fleet.supervisor.spec import MOST_SIMULATED, Asked, FleetSpec, listing, wanted
+from fleet.supervisor.supervisor import TRIES_S, Supervisor, SupervisorEvent
 from schemas import keys
 from schemas.bus import accepts, check_listening, resolve_endpoint
 from schemas.process import signals
 from schemas.yaml_document.document import BadFile, read_text
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
-_Tell = Callable[[Happening], None]
+_Tell = Callable[[SupervisorEvent], None]
 
 
 @click.command(
@@ -104,7 +104,7 @@ def up(
     raise SystemExit(0 if stopped else 1)
 
 
-def read(file: Path | None, asked: Asked) -> Wanted:
+def read(file: Path | None, asked: Asked) -> FleetSpec:
     """What is wanted, with a plan that can be read; raises ValueError."""
     wish = wanted(None if file is None else read_fleet(file, unbound=asked.simulated > 0), asked)
     for path, what in ((wish.plan, "the plan"), (wish.world, "the world")):
@@ -119,7 +119,7 @@ def read(file: Path | None, asked: Asked) -> Wanted:
     return wish
 
 
-def _with_plan(wish: Wanted, text: str) -> Wanted:
+def _with_plan(wish: FleetSpec, text: str) -> FleetSpec:
     """With this plan, if it can work; raises ValueError with all that cannot."""
     plan = parse_plan(text, str(wish.plan))
     cars = listed_cars(parse_fleet(listing(wish), Path("fleet.yaml"), unbound=True))  # as the coordinator will
@@ -129,12 +129,12 @@ def _with_plan(wish: Wanted, text: str) -> Wanted:
     return replace(wish, plan_text=text, doubts=tuple(f"{wish.plan}: {each}" for each in found.warnings))
 
 
-async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool) -> bool:
+async def _serve(wish: FleetSpec, file: Path | None, asked: Asked, *, as_json: bool) -> bool:
     loop = asyncio.get_running_loop()
     teller = _json if as_json else _plain
     live = sys.stdout.isatty() and not as_json
 
-    def tell(happening: Happening) -> None:
+    def tell(happening: SupervisorEvent) -> None:
         _written(teller, happening) if table is None else table.tell(happening)
 
     supervisor = Supervisor(wish, str(file) if file else "", lambda: read(file, asked), tell)
@@ -167,7 +167,7 @@ async def _serve(wish: Wanted, file: Path | None, asked: Asked, *, as_json: bool
             await asyncio.gather(drawing, return_exceptions=True)
 
 
-class _Lines(asyncio.Protocol):
+class _PlainStatus(asyncio.Protocol):
     """Lines as they come."""
 
     def __init__(self, take: Callable[[str], None]) -> None:
@@ -186,10 +186,10 @@ async def _pass_stdin(loop: asyncio.AbstractEventLoop, take: Callable[[str], Non
     """Whoever writes JSON to our stdin plays with the simulator; a terminal, a file or nothing does not."""
     mode = os.fstat(sys.stdin.fileno()).st_mode
     if stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode):
-        await loop.connect_read_pipe(lambda: _Lines(take), sys.stdin)
+        await loop.connect_read_pipe(lambda: _PlainStatus(take), sys.stdin)
 
 
-def _written(teller: _Tell, happening: Happening) -> None:
+def _written(teller: _Tell, happening: SupervisorEvent) -> None:
     """A reader that has gone (a pipe, a closed terminal) must not keep the cars from being stopped."""
     try:
         teller(happening)
@@ -197,10 +197,10 @@ def _written(teller: _Tell, happening: Happening) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _json(happening: Happening) -> None:
+def _json(happening: SupervisorEvent) -> None:
     told = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "what": happening.what}
     click.echo(json.dumps({**told, "name": happening.name, "words": happening.words}))
 
 
-def _plain(happening: Happening) -> None:
+def _plain(happening: SupervisorEvent) -> None:
     click.echo(f"{datetime.now(UTC):%H:%M:%S} {happening.name}: {happening.words}")

@@ -13,7 +13,7 @@ Lookup: TypeAlias = Callable[[str], object | None]
 """The value under a name; None: not measured."""
 
 
-class Kind(StrEnum):
+class ValueKind(StrEnum):
     """What a value is."""
 
     NUMBER = "a number"
@@ -21,7 +21,12 @@ class Kind(StrEnum):
     TRUTH = "yes or no"
 
 
-KINDS: Final[Mapping[type, Kind]] = {float: Kind.NUMBER, int: Kind.NUMBER, str: Kind.WORD, bool: Kind.TRUTH}
+KINDS: Final[Mapping[type, ValueKind]] = {
+    float: ValueKind.NUMBER,
+    int: ValueKind.NUMBER,
+    str: ValueKind.WORD,
+    bool: ValueKind.TRUTH,
+}
 
 
 class Op(StrEnum):
@@ -52,7 +57,7 @@ class Name:
     """A field."""
 
     name: str
-    kind: Kind
+    kind: ValueKind
 
     def __str__(self) -> str:
         return self.name
@@ -65,7 +70,7 @@ class Literal:
     value: Value
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> ValueKind:
         """What it is."""
         return KINDS[type(self.value)]
 
@@ -92,21 +97,21 @@ class Not:
     inner: "Node"
 
     def __str__(self) -> str:
-        return f"not {f'({self.inner})' if isinstance(self.inner, Every | Some) else self.inner}"
+        return f"not {f'({self.inner})' if isinstance(self.inner, And | Or) else self.inner}"
 
 
 @dataclass(frozen=True, slots=True)
-class Every:
+class And:
     """`and`, of two or more."""
 
     parts: tuple["Node", ...]
 
     def __str__(self) -> str:
-        return " and ".join(f"({part})" if isinstance(part, Some) else str(part) for part in self.parts)
+        return " and ".join(f"({part})" if isinstance(part, Or) else str(part) for part in self.parts)
 
 
 @dataclass(frozen=True, slots=True)
-class Some:
+class Or:
     """`or`, of two or more."""
 
     parts: tuple["Node", ...]
@@ -115,7 +120,7 @@ class Some:
         return " or ".join(map(str, self.parts))
 
 
-Node: TypeAlias = Name | Literal | Compare | Not | Every | Some
+Node: TypeAlias = Name | Literal | Compare | Not | And | Or
 
 
 def written(value: object) -> str:
@@ -142,7 +147,7 @@ class Expression:
 
     def __and__(self, other: "Expression") -> "Expression":
         """Both."""
-        return Expression(joined(Every, (self.root, other.root)))
+        return Expression(joined(And, (self.root, other.root)))
 
     def __invert__(self) -> "Expression":
         """Not."""
@@ -175,7 +180,7 @@ def _names(node: Node) -> Iterator[str]:
             yield from _names(right)
         case Not(inner):
             yield from _names(inner)
-        case Every(parts) | Some(parts):
+        case And(parts) | Or(parts):
             for part in parts:
                 yield from _names(part)
 
@@ -185,9 +190,9 @@ def _truth(node: Node, lookup: Lookup) -> bool | None:
     if isinstance(node, Compare):
         one, other = _value(node.left, lookup), _value(node.right, lookup)
         return None if one is None or other is None else _TESTS[node.op](one, other)
-    if isinstance(node, Every):
+    if isinstance(node, And):
         return _first(node.parts, lookup, decisive=False)
-    if isinstance(node, Some):
+    if isinstance(node, Or):
         return _first(node.parts, lookup, decisive=True)
     if isinstance(node, Not):
         held = _truth(node.inner, lookup)
@@ -219,7 +224,7 @@ def _value(node: Node, lookup: Lookup) -> Value | None:
     return None if isinstance(found, float) and math.isnan(found) else found
 
 
-def joined(join: type[Every] | type[Some], parts: Sequence[Node]) -> Node:
+def joined(join: type[And] | type[Or], parts: Sequence[Node]) -> Node:
     """One node of these; `a and (b and c)` is `a and b and c`."""
     flat: list[Node] = []
     for part in parts:
@@ -227,6 +232,6 @@ def joined(join: type[Every] | type[Some], parts: Sequence[Node]) -> Node:
     return flat[0] if len(flat) == 1 else join(tuple(flat))
 
 
-def kind_of(node: Node) -> Kind:
+def kind_of(node: Node) -> ValueKind:
     """What its value is."""
-    return node.kind if isinstance(node, Name | Literal) else Kind.TRUTH
+    return node.kind if isinstance(node, Name | Literal) else ValueKind.TRUTH

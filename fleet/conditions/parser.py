@@ -14,16 +14,16 @@ from typing import Final, Never
 
 from fleet.conditions.expression import (
     KINDS,
+    And,
     Compare,
-    Every,
     Expression,
-    Kind,
     Literal,
     Name,
     Node,
     Not,
     Op,
-    Some,
+    Or,
+    ValueKind,
     joined,
     kind_of,
 )
@@ -133,12 +133,12 @@ class _Parser:
         return token
 
     def _any(self) -> Node:
-        return self._several("or", Some, self._all)
+        return self._several("or", Or, self._all)
 
     def _all(self) -> Node:
-        return self._several("and", Every, self._not)
+        return self._several("and", And, self._not)
 
-    def _several(self, word: str, join: type[Every] | type[Some], part: Callable[[], Node]) -> Node:
+    def _several(self, word: str, join: type[And] | type[Or], part: Callable[[], Node]) -> Node:
         at, parts = [self._next], [part()]
         while self._take(word):
             at.append(self._next)
@@ -210,7 +210,7 @@ class _Parser:
             self._fail(token, f"{token.text} is beyond what a number can be")
         return number
 
-    def _kind(self, token: _Token) -> Kind:
+    def _kind(self, token: _Token) -> ValueKind:
         if token.text in self._names:
             return KINDS[self._names[token.text]]
         if token.text in ("and", "or", "not"):
@@ -225,7 +225,7 @@ class _Parser:
         """Names that may have been meant, of the kind that is compared here: first those that have it as a part."""
         wanted, able = self._compared_with(), self._able()
         parts = [name for name in able if text in name.split(".")]
-        others = able if wanted not in (None, Kind.TRUTH) else [*able, *_KEYWORDS]
+        others = able if wanted not in (None, ValueKind.TRUTH) else [*able, *_KEYWORDS]
         return list(dict.fromkeys([*parts, *difflib.get_close_matches(text, others, n=2)]))[:2]
 
     def _able(self) -> list[str]:
@@ -233,19 +233,19 @@ class _Parser:
         wanted = self._compared_with()
         return [name for name, kind in self._names.items() if wanted in (None, KINDS[kind])] or list(self._names)
 
-    def _compared_with(self) -> Kind | None:
+    def _compared_with(self) -> ValueKind | None:
         """What the name before the next token must be, by what stands beside it; None: that does not tell."""
         before, after = self._at - 2, self._at
         for sign, other in ((after, after + 1), (before, before - 1)):
             if 0 <= sign < len(self._tokens) and self._tokens[sign].text in tuple(Op):
                 token = self._tokens[other]
                 if self._tokens[sign].text not in (Op.EQ, Op.NE) or token.what == "number":
-                    return Kind.NUMBER
+                    return ValueKind.NUMBER
                 if token.what == "word":
-                    return Kind.WORD
+                    return ValueKind.WORD
                 named = self._names.get(token.text)
-                return Kind.TRUTH if token.text in ("true", "false") else None if named is None else KINDS[named]
-        return Kind.TRUTH
+                return ValueKind.TRUTH if token.text in ("true", "false") else None if named is None else KINDS[named]
+        return ValueKind.TRUTH
 
     def _there_are(self, names: Sequence[str] | None = None) -> str:
         listed = list(self._names if names is None else names)
@@ -255,8 +255,8 @@ class _Parser:
     def _condition(self, token: _Token, node: Node) -> None:
         """A number or a word is no condition."""
         kind = kind_of(node)
-        if kind is not Kind.TRUTH:
-            example = f"{node} < 0.3" if kind is Kind.NUMBER else f"{node} == 'low'"
+        if kind is not ValueKind.TRUTH:
+            example = f"{node} < 0.3" if kind is ValueKind.NUMBER else f"{node} == 'low'"
             self._fail(token, f"{node} is {kind}, not a condition: compare it, as {example}")
 
     def _comparable(self, sign: _Token, left: tuple[_Token, Node], right: tuple[_Token, Node]) -> None:
@@ -264,8 +264,8 @@ class _Parser:
         if sign.text not in ("==", "!="):
             for token, node in (left, right):
                 kind = kind_of(node)
-                if kind is not Kind.NUMBER:
-                    bare = ", or stands alone" if kind is Kind.TRUTH else ""
+                if kind is not ValueKind.NUMBER:
+                    bare = ", or stands alone" if kind is ValueKind.TRUTH else ""
                     self._fail(token, f"{node} is {kind}: {sign.text} compares numbers, this takes == or !={bare}")
         if one is not other:
             self._fail(sign, f"{left[1]} is {one}, {right[1]} is {other}: they are never the same")

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
-from fleet.conditions.expression import Compare, Every, Expression, Kind, Literal, Name, Node, Not, Op, Some
+from fleet.conditions.expression import And, Compare, Expression, Literal, Name, Node, Not, Op, Or, ValueKind
 
 _WAYS: Final = 512
 """With more ways than this, nothing is said."""
@@ -41,10 +41,10 @@ def _ways(node: Node, *, wanted: bool) -> list[_Way]:
             return [(Compare(node, Op.EQ, Literal(wanted)),)]
         case Not(inner):
             return _ways(inner, wanted=not wanted)
-        case Every(parts):
+        case And(parts):
             each = [_ways(part, wanted=wanted) for part in parts]
             return _all_of(each) if wanted else _one_of(each)
-        case Some(parts):
+        case Or(parts):
             each = [_ways(part, wanted=wanted) for part in parts]
             return _one_of(each) if wanted else _all_of(each)
         case Compare(left, op, right):
@@ -77,7 +77,7 @@ def _one_of(several: Iterable[list[_Way]]) -> list[_Way]:
 
 
 @dataclass(slots=True)
-class _Asked:
+class _Constraint:
     """What is asked of one field."""
 
     least: float = float("-inf")
@@ -114,7 +114,7 @@ class _Asked:
 
 def _open(way: _Way) -> bool:
     """Whether all of it can be so at once, as far as is seen."""
-    asked: dict[str, _Asked] = {}
+    asked: dict[str, _Constraint] = {}
     between: dict[tuple[str, str], set[str]] = {}
     for atom in way:
         match atom:
@@ -123,12 +123,12 @@ def _open(way: _Way) -> bool:
                 if stands not in _STANDS[op]:
                     return False
             case Compare(Name(name), op, Literal(value)):
-                asked.setdefault(name, _Asked()).take(op, value)
+                asked.setdefault(name, _Constraint()).take(op, value)
             case Compare(Literal(value), op, Name(name)):
-                asked.setdefault(name, _Asked()).take(_TURNED[op], value)
+                asked.setdefault(name, _Constraint()).take(_TURNED[op], value)
             case Compare(Name(name=one), op, Name(name=other, kind=kind)):
                 op = op if one <= other else _TURNED[op]
-                able = "=" if one == other else "<=>" if kind is Kind.NUMBER else "<="
+                able = "=" if one == other else "<=>" if kind is ValueKind.NUMBER else "<="
                 between.setdefault((min(one, other), max(one, other)), set(able)).intersection_update(_STANDS[op])
             case _:
                 pass

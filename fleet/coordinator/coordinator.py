@@ -20,15 +20,15 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from fleet.client.client import Fleet
 from fleet.client.commands import led_request, mode_request
 from fleet.client.outcome import Outcome
-from fleet.coordinator.observer import Hearing
-from fleet.coordinator.state_file import Keeper
-from fleet.policy.decide import Ask, Step, step
+from fleet.coordinator.observer import FleetObserver
+from fleet.coordinator.state_file import CoordinatorStateFile
+from fleet.policy.decide import Ask, DecisionStep, step
 from fleet.policy.decision import LEFT_ALONE, Decision
 from fleet.policy.plan.lint import faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
-from fleet.policy.snapshot import CarPicture, Refused, topic_of
-from fleet.policy.state import Memory, carried, hub_back, restarted, restored, to_keep
+from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
+from fleet.policy.state import PolicyState, carried, hub_back, restarted, restored, to_keep
 from schemas import keys, messages, topics
 from schemas.bus import BusError, Latest, Publisher, Sample, ensure_hub, reply, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
@@ -88,12 +88,12 @@ class Coordinator:
     plan: Plan
     decided: Callable[[Decision], None]
     failed: Callable[[str], None]
-    listed: Mapping[str, CarPicture] = field(default_factory=dict)
+    listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
     run_name: str = ""
     """Of the `fleet up` that it belongs to: with a new one the plan begins anew."""
     dropped: int = 0
     """Samples that found the queue full."""
-    _memory: Memory = field(default_factory=Memory)
+    _memory: PolicyState = field(default_factory=PolicyState)
     _running: "dict[str, tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=dict)
     _colouring: "list[tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=list)
     _told: dict[str, str] = field(default_factory=dict)
@@ -119,8 +119,8 @@ class Coordinator:
         if bus.tokens(token):
             raise AnotherCoordinator(self._named(self._others()))
         bus.token(token)
-        hearing = Hearing(self.listed)
-        keeper = Keeper(fleet, bus.endpoint, self.run_name)
+        hearing = FleetObserver(self.listed)
+        keeper = CoordinatorStateFile(fleet, bus.endpoint, self.run_name)
         self._subscribe(f"{fleet}/*/state/*")
         bus.watch_tokens(keys.car_token(fleet, "*"), lambda key, alive: self._tokens(key.rpartition("/")[2], alive))
         self._follow(self.plan)
@@ -169,7 +169,7 @@ class Coordinator:
 
     # ------------------------------------------------------------------ one turn
 
-    def _turn(self, hearing: Hearing, pool: ThreadPoolExecutor, now: float) -> None:
+    def _turn(self, hearing: FleetObserver, pool: ThreadPoolExecutor, now: float) -> None:
         for car, (ask, future) in list(self._running.items()):
             if future.done():
                 del self._running[car]
@@ -204,9 +204,9 @@ class Coordinator:
             self._published.pop(("decision", subject), None)
             self._told.pop(subject, None)
 
-    def _outcome(self, hearing: Hearing, car: str, ask: Ask, outcome: Outcome, now: float) -> None:
+    def _outcome(self, hearing: FleetObserver, car: str, ask: Ask, outcome: Outcome, now: float) -> None:
         assert ask.mode is not None
-        refusal = None if outcome.ok else Refused(ask.mode, outcome.reason, outcome.words, now)
+        refusal = None if outcome.ok else Refusal(ask.mode, outcome.reason, outcome.words, now)
         hearing.refused(car, refusal)
         words = "" if outcome.ok else f"{car}: {outcome.reason or outcome.phase}: {outcome.words}"
         if words and words != self._told.get(car):
@@ -223,7 +223,7 @@ class Coordinator:
                 self._subscribe(f"{self.client.name}/*/{topic}")
         self._publish("plan", pb.Plan(text=plan.text, version=plan.version))
 
-    def _replace(self, query: zenoh.Query, hearing: Hearing) -> None:
+    def _replace(self, query: zenoh.Query, hearing: FleetObserver) -> None:
         """Take another plan, wholly; or refuse it with all that is wrong with it."""
         result = pb.Result(status="sent")
         try:
@@ -290,7 +290,7 @@ class Coordinator:
                 if isinstance(answer, Sample):
                     self._put(_Answer(answer))
 
-    def _listen(self, hearing: Hearing, pool: ThreadPoolExecutor, wait_s: float = TURN_S) -> None:
+    def _listen(self, hearing: FleetObserver, pool: ThreadPoolExecutor, wait_s: float = TURN_S) -> None:
         """Take what came, waiting a turn's length for the first."""
         for _ in range(_QUEUE):  # what comes meanwhile is for the next turn
             try:
@@ -307,7 +307,7 @@ class Coordinator:
             except Exception as error:  # noqa: BLE001 - nothing that comes over the bus may end a coordinator
                 self._unforeseen("handling what came over the bus", error)
 
-    def _take_item(self, item: _Item, hearing: Hearing) -> None:
+    def _take_item(self, item: _Item, hearing: FleetObserver) -> None:
         now = time.monotonic()
         if isinstance(item, zenoh.Query):
             self._questions.release()
@@ -317,7 +317,7 @@ class Coordinator:
         else:
             hearing.take(item, now, None)
 
-    def _look_at_tokens(self, hearing: Hearing, pool: ThreadPoolExecutor) -> None:
+    def _look_at_tokens(self, hearing: FleetObserver, pool: ThreadPoolExecutor) -> None:
         """Note who came and went, and ask who came how it is."""
         now = time.monotonic()
         for car, alive in self._tokens.taken().items():
@@ -331,7 +331,7 @@ class Coordinator:
             cars, self._came = sorted(self._came), set()
             self._asked += [pool.submit(self._ask_all, car) for car in (cars if len(cars) <= _APIECE else ["*"])]
 
-    def _answer(self, query: zenoh.Query, hearing: Hearing) -> None:
+    def _answer(self, query: zenoh.Query, hearing: FleetObserver) -> None:
         with query:
             try:
                 self._reply(query, hearing)
@@ -341,7 +341,7 @@ class Coordinator:
                 words = self._unforeseen(f"answering {query.key_expr}", error)
                 query.reply_err(words, encoding="text/plain")
 
-    def _reply(self, query: zenoh.Query, hearing: Hearing) -> None:
+    def _reply(self, query: zenoh.Query, hearing: FleetObserver) -> None:
         if str(query.key_expr).endswith(f"/@cmd/{PLAN_VERB}"):
             self._replace(query, hearing)
             return
@@ -442,7 +442,7 @@ def _message(decision: Decision, since_s: float) -> pb.Decision:
     )
 
 
-def _assignment(plan: Plan, result: Step) -> pb.Assignment:
+def _assignment(plan: Plan, result: DecisionStep) -> pb.Assignment:
     roles: dict[str, list[str]] = {}
     for car, role in sorted(result.roles.items()):
         roles.setdefault(role, []).append(car)

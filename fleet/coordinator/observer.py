@@ -6,7 +6,7 @@ from itertools import islice
 from typing import Any, Final
 
 from fleet.fleetfile.fleet_file import FleetFile
-from fleet.policy.snapshot import CarPicture, Picture, Refused, Seen
+from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation, Refusal
 from schemas import keys, messages, topics
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
@@ -23,12 +23,12 @@ MOST_UNHEARD: Final = 256
 
 
 @dataclass(slots=True)
-class Hearing:
+class FleetObserver:
     """The cars as they were last heard. `listed`: what the fleet file says of them, if there is one."""
 
-    listed: Mapping[str, CarPicture] = field(default_factory=dict)
-    cars: dict[str, CarPicture] = field(default_factory=dict)
-    readings: dict[str, dict[str, Seen]] = field(default_factory=dict)
+    listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
+    cars: dict[str, CarSnapshot] = field(default_factory=dict)
+    readings: dict[str, dict[str, Observation]] = field(default_factory=dict)
     _gone_since: dict[str, float] = field(default_factory=dict)
     """Cars without a gateway on the bus that no fleet file lists; who went first stands first."""
     _met: set[str] = field(default_factory=set)
@@ -47,14 +47,14 @@ class Hearing:
         """Those of them of which not all that could forbid a command is known."""
         return frozenset(car for car in self.present if not _all_known(self.readings.get(car, {})))
 
-    def picture(self, busy: Iterable[str]) -> Picture:
+    def picture(self, busy: Iterable[str]) -> FleetSnapshot:
         """What is known now; `busy`: the cars that something was asked of, with no outcome yet."""
         # A name that no file lists is a car once it has said how it is: until then few count, and only while there.
         cars = {car: known for car, known in self.cars.items() if known.listed or car in self._met}
         unheard = (each for each in self.cars.items() if each[1].present and each[0] not in cars)
         cars.update(list(islice(unheard, MOST_UNHEARD)))
         cars.update({car: replace(cars[car], busy=True) for car in busy if car in cars})
-        return Picture(cars, {car: dict(seen) for car, seen in self.readings.items() if car in cars})
+        return FleetSnapshot(cars, {car: dict(seen) for car, seen in self.readings.items() if car in cars})
 
     def token(self, car: str, now: float, *, alive: bool) -> None:
         """A gateway came or went: what was known of its car may no longer be so, a hold above all."""
@@ -69,7 +69,7 @@ class Hearing:
                 self._forget(car)
                 return
             self._gone_since.setdefault(car, now)
-        self.cars[car] = replace(self.listed.get(car, CarPicture()), present=alive)
+        self.cars[car] = replace(self.listed.get(car, CarSnapshot()), present=alive)
         for topic in (*NEEDED, _HEALTH):
             self.readings.get(car, {}).pop(topic, None)
 
@@ -86,7 +86,7 @@ class Hearing:
         for each in (self.cars, self.readings, self._gone_since):
             each.pop(car, None)
 
-    def refused(self, car: str, refusal: Refused | None) -> None:
+    def refused(self, car: str, refusal: Refusal | None) -> None:
         """A command was not carried out, or (None) one was."""
         if car in self.cars:
             self.cars[car] = replace(self.cars[car], refused=refusal)
@@ -101,7 +101,7 @@ class Hearing:
             value: Any = messages.parse(topic.message, sample.payload, sample.encoding)
         except messages.BadPayload:
             return  # not of this fleet's gateways: nothing to decide on
-        if key.car not in self.listed and not self.cars.get(key.car, CarPicture()).present:
+        if key.car not in self.listed and not self.cars.get(key.car, CarSnapshot()).present:
             self._gone_since.setdefault(key.car, now)
         at = now
         if wall_s is not None:
@@ -115,12 +115,12 @@ class Hearing:
             for each in value.DESCRIPTOR.fields
             if not each.has_presence or each.name in measured
         }
-        seen[key.topic] = Seen(fields, at)
+        seen[key.topic] = Observation(fields, at)
         if key.topic in NEEDED or key.topic == _HEALTH:
             self._states(key.car, seen)
 
-    def _states(self, car: str, seen: Mapping[str, Seen]) -> None:
-        before = self.cars.get(car, CarPicture())
+    def _states(self, car: str, seen: Mapping[str, Observation]) -> None:
+        before = self.cars.get(car, CarSnapshot())
         health = seen.get(_HEALTH)
         if health is not None:
             capabilities: Any = health.fields["capabilities"]
@@ -152,14 +152,14 @@ class Hearing:
         )
 
 
-def _all_known(seen: Mapping[str, Seen]) -> bool:
+def _all_known(seen: Mapping[str, Observation]) -> bool:
     return all(topic in seen for topic in NEEDED)
 
 
-def listed_cars(file: FleetFile) -> Mapping[str, CarPicture]:
+def listed_cars(file: FleetFile) -> Mapping[str, CarSnapshot]:
     """What a fleet file says of its cars."""
     return {
-        name: CarPicture(
+        name: CarSnapshot(
             platform="" if car.platform.startswith("auto") else car.platform,
             capabilities=car.capabilities,
             roles=None if car.roles is None else frozenset(car.roles),

@@ -9,36 +9,36 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fleet.policy.state import Kept
+from fleet.policy.state import PersistedPolicy
 from schemas.state_dir import directory_of
 
 
-class Keeper:
+class CoordinatorStateFile:
     """The file of one fleet at one endpoint. `run`: the `fleet up` that it belongs to; empty: none."""
 
     def __init__(self, fleet: str, endpoint: str, run: str) -> None:
         self._endpoint = endpoint
         self._run = run
-        self._last = Kept()
+        self._last = PersistedPolicy()
         self.path: Path | None = None
         with contextlib.suppress(RuntimeError):  # a user without a home
             self.path = directory_of(endpoint) / f"{fleet}.@coordinator.json"
 
-    def load(self) -> Kept:
+    def load(self) -> PersistedPolicy:
         """What the last one left; nothing, if it cannot be read or was of another bus.
 
         Phase and rules count within one `fleet up`: with a new one the plan begins anew, and only the roles are kept.
         """
         if self.path is None:
-            return Kept()
+            return PersistedPolicy()
         try:
             content: Any = json.loads(self.path.read_text(encoding="utf-8"))
             if content["endpoint"] != self._endpoint:
-                return Kept()
+                return PersistedPolicy()
             roles = {str(car): str(role) for car, role in content["roles"].items()}
             if content.get("run", "") != self._run:
-                return Kept(roles=roles)
-            return Kept(
+                return PersistedPolicy(roles=roles)
+            return PersistedPolicy(
                 str(content["version"]),
                 roles,
                 str(content["phase"]),
@@ -46,9 +46,9 @@ class Keeper:
                 {int(index): str(that) for index, that in content["rules"].items()},
             )
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            return Kept()
+            return PersistedPolicy()
 
-    def save(self, kept: Kept) -> None:
+    def save(self, kept: PersistedPolicy) -> None:
         """Write it, whole or not at all, if it has changed."""
         if self.path is None or _same(kept, self._last):
             return
@@ -69,6 +69,6 @@ class Keeper:
             scratch.replace(self.path)
 
 
-def _same(one: Kept, other: Kept) -> bool:
+def _same(one: PersistedPolicy, other: PersistedPolicy) -> bool:
     """Whether nothing but the clock's last digit has changed."""
     return (one.version, one.roles, one.phase, one.rules) == (other.version, other.roles, other.phase, other.rules)

@@ -19,7 +19,7 @@ from fleet.fleetfile.models import (
     FileEntry,
     LimitsEntry,
 )
-from fleet.links import BadLink, Link, LinkKind, parse_link, shared_ports
+from fleet.links import BadLink, LinkKind, LinkUrl, parse_link, shared_ports
 from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_told
 from schemas.yaml_document.document import Document, read_text
 from schemas.yaml_document.messages import Where, meant, shown
@@ -46,7 +46,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class CarSpec:
+class FleetCar:
     """One car, resolved: nothing is left to look up in its type or the defaults.
 
     link: as `gateway run --link` takes it. platform: as `--platform` does. colour: #rrggbb. capabilities: modes and
@@ -72,14 +72,14 @@ class FleetFile:
 
     name: str
     endpoint: str | None
-    cars: Mapping[str, CarSpec]
+    cars: Mapping[str, FleetCar]
     plan: Path | None
     recordings: Path | None
     record: bool
     world: Path | None
     text: str
     path: Path
-    unlinked: Mapping[str, CarSpec] = field(default_factory=dict)
+    unlinked: Mapping[str, FleetCar] = field(default_factory=dict)
 
     @property
     def unbound(self) -> tuple[str, ...]:
@@ -129,10 +129,10 @@ def profile_capabilities(platform: str) -> frozenset[str]:
     return frozenset(str(word) for profile in profiles for word in (*profile.capabilities, *profile.modes))
 
 
-def _spec(name: str, car: Mapping[str, Any], index: int) -> CarSpec:
+def _spec(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
     platform = car.get("platform", AUTO)
     limits = LimitsEntry.model_validate(car.get("limits", {}))
-    return CarSpec(
+    return FleetCar(
         name=name,
         link=car.get("link", ""),
         platform=platform,
@@ -214,7 +214,7 @@ def _car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, An
 
 
 def _one_port(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Where, str]]:
-    links: dict[str, Link] = {}
+    links: dict[str, LinkUrl] = {}
     for name, car in cars.items():
         given = car.get("link")
         if isinstance(given, str):

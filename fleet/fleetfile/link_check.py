@@ -16,8 +16,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-from fleet.fleetfile.fleet_file import CarSpec
-from fleet.links import Link, LinkKind, parse_link
+from fleet.fleetfile.fleet_file import FleetCar
+from fleet.links import LinkKind, LinkUrl, parse_link
 from gateway.protocol.platforms import Platform
 
 PATIENCE_S: Final = 3.0
@@ -30,7 +30,7 @@ _BRIDGED: Final = (Platform.ARDUINO, Platform.STM32)
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class LinkCheck:
     """What was found of one car's link."""
 
     car: str
@@ -39,18 +39,18 @@ class Reach:
     words: str
 
 
-def look(car: CarSpec, served: Mapping[str, tuple[str, str]]) -> Reach:
+def look(car: FleetCar, served: Mapping[str, tuple[str, str]]) -> LinkCheck:
     """Look at a car's link, for about `PATIENCE_S`. `served`: state and reason of the links of cars with a gateway."""
     if car.name in served:
         state, reason = served[car.name]
         ok = state in ("online", "quiet")
         words = f"its gateway runs, the link is {state}" + (f": {reason}" if reason and not ok else "")
-        return Reach(car.name, car.link, ok, words)
+        return LinkCheck(car.name, car.link, ok, words)
     ok, words = _look(parse_link(car.link), car.platform)
-    return Reach(car.name, car.link, ok, words)
+    return LinkCheck(car.name, car.link, ok, words)
 
 
-def _look(link: Link, platform: str) -> tuple[bool, str]:
+def _look(link: LinkUrl, platform: str) -> tuple[bool, str]:
     match link.kind:
         case LinkKind.SIMULATED:
             return True, "`fleet up` simulates it"
@@ -118,7 +118,7 @@ def _ports() -> list[str]:
     return [str(port.device) for port in list_ports.comports()]
 
 
-def _usb(link: Link) -> tuple[bool, str]:
+def _usb(link: LinkUrl) -> tuple[bool, str]:
     from serial.tools import list_ports
 
     asked = dict(link.ids)
@@ -137,7 +137,7 @@ def _usb(link: Link) -> tuple[bool, str]:
     return ok, f"{fit[0]}: {words}"
 
 
-def _tcp(link: Link, platform: str) -> tuple[bool, str]:
+def _tcp(link: LinkUrl, platform: str) -> tuple[bool, str]:
     bridge = platform.partition("+")[0] in _BRIDGED
     port = int(dict(link.ids)["port"])
     try:

@@ -23,7 +23,7 @@ class ScanFailed(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundLink:
     """A link that may be a car's. verdict: of `POSSIBLE`. platform: as it was told from readings, else `auto`."""
 
     url: str
@@ -43,13 +43,13 @@ class NewCar:
     words: str = ""
 
 
-def scan(links: Sequence[str], seconds: float | None) -> list[Found]:
+def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
     """What may be a car: of these links, or of all ports and Bluetooth devices; raises ScanFailed.
 
     TCP and Bluetooth links are taken as they are given: where a TCP connection ends, a car's program may end, too.
     """
     given = [link for link in links if parse_link(link).kind not in (LinkKind.DEVICE, LinkKind.USB)]
-    taken = [Found(link, "given", "not listened to") for link in dict.fromkeys(given)]
+    taken = [FoundLink(link, "given", "not listened to") for link in dict.fromkeys(given)]
     links = [link for link in links if link not in given]
     if taken and not links:
         return taken
@@ -65,12 +65,12 @@ def scan(links: Sequence[str], seconds: float | None) -> list[Found]:
     return [*(each for each in found if each.verdict in POSSIBLE), *taken]
 
 
-def _found(fields: Mapping[str, Any]) -> Found:
+def _found(fields: Mapping[str, Any]) -> FoundLink:
     if fields["kind"] == "ble":
         words = f"Bluetooth device {_printable(fields['name']) or 'without a name'}, {fields['rssi']} dBm"
-        return Found(fields["url"], "ble" if fields["uart"] else "other", words)
+        return FoundLink(fields["url"], "ble" if fields["uart"] else "other", words)
     settled = fields["platform"] if fields["platform"] in set(Platform) - {Platform.UNKNOWN} else AUTO
-    return Found(fields["url"], fields["verdict"], _printable(fields["words"]), settled)
+    return FoundLink(fields["url"], fields["verdict"], _printable(fields["words"]), settled)
 
 
 def _printable(text: str | None) -> str:

@@ -12,7 +12,7 @@ from fleet.conditions import Expression
 from fleet.policy.assignment import assign
 from fleet.policy.debounce import Settled, settle
 from fleet.policy.plan.plan import Plan, Role
-from fleet.policy.snapshot import CONTRADICTED, NOBODY, CarPicture, Picture
+from fleet.policy.snapshot import CONTRADICTED, NOBODY, CarSnapshot, FleetSnapshot
 
 REFUSED_S: Final = 10.0
 """So long a car that refused a mode is not asked for it again."""
@@ -37,11 +37,11 @@ class Barrier:
 
 
 @dataclass(frozen=True, slots=True)
-class Staff:
+class Candidates:
     """The cars to be given roles, and what is known of each."""
 
     plan: Plan
-    picture: Picture
+    picture: FleetSnapshot
     free: tuple[str, ...]
     reserved: Mapping[str, str]
     """Cars that cannot be asked just now, and the role that is kept for each."""
@@ -74,7 +74,7 @@ class Staff:
         known = self.picture.cars.get(car, NOBODY)
         return unfit(known, role, self.now) or self._needy(car, role, known)
 
-    def _needy(self, car: str, role: Role, known: CarPicture) -> Barrier | None:
+    def _needy(self, car: str, role: Role, known: CarSnapshot) -> Barrier | None:
         if role.needs is None:
             return None
         settled = self.needs.get((car, role.name))
@@ -89,7 +89,7 @@ class Staff:
         return Barrier(why, change, role.needs)
 
 
-def unfit(known: CarPicture, role: Role, now: float) -> Barrier | None:
+def unfit(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
     """What a car is, or has said, that keeps it from a role whatever its readings."""
     if known.roles is not None and role.name not in known.roles:
         return Barrier("the fleet file does not let it take this role", "the fleet file")
@@ -118,7 +118,7 @@ def unfit(known: CarPicture, role: Role, now: float) -> Barrier | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Staffing:
+class RoleAllocation:
     """Who has which role, and the places that there are."""
 
     roles: Mapping[str, str]
@@ -132,7 +132,7 @@ class Staffing:
 
 
 def follow_needs(
-    plan: Plan, picture: Picture, cars: tuple[str, ...], before: Mapping[tuple[str, str], Settled], now: float
+    plan: Plan, picture: FleetSnapshot, cars: tuple[str, ...], before: Mapping[tuple[str, str], Settled], now: float
 ) -> dict[tuple[str, str], Settled]:
     """Whether each car has what each role needs; a value that nothing measures now counts as it was."""
     found = {}
@@ -152,7 +152,7 @@ def follow_needs(
     return found
 
 
-def fill(staff: Staff) -> Staffing:
+def fill(staff: Candidates) -> RoleAllocation:
     """Give the roles in force to cars; a role with a fallback that cannot be filled opens as many places there."""
     plan, cars = staff.plan, (*staff.free, *staff.reserved)
     wanted = {name: _wanted(staff, plan.roles[name], len(cars)) for name in plan.roles if name in staff.in_force}
@@ -172,13 +172,13 @@ def fill(staff: Staff) -> Staffing:
                 stands_in[role.fallback] = name
         more = {name: max(count, places.get(name, 0)) for name, count in more.items()}
         if more == places:
-            return Staffing(
+            return RoleAllocation(
                 roles, places, {name: of for name, of in stands_in.items() if places[name] > wanted.get(name, 0)}
             )
         places = more
 
 
-def _wanted(staff: Staff, role: Role, cars: int) -> int:
+def _wanted(staff: Candidates, role: Role, cars: int) -> int:
     count = cars if role.count is None else role.count
     if not role.on_call:
         return count
@@ -211,7 +211,7 @@ def _stand_in_ranks(plan: Plan) -> dict[str, tuple[int, bool, int]]:
     return found
 
 
-def _costs(staff: Staff) -> dict[str, dict[str, int]]:
+def _costs(staff: Candidates) -> dict[str, dict[str, int]]:
     """What each car costs in each role that it may have."""
     plan = staff.plan
     cars = sorted({*staff.free, *staff.reserved})

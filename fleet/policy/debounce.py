@@ -10,7 +10,7 @@ BLIND_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Steady:
+class Debounced:
     """Something that is so, or (not `on`) is about to be."""
 
     on: bool
@@ -19,13 +19,13 @@ class Steady:
     otherwise_since: float | None = None
 
 
-def follow(before: Steady | None, so: bool | None, for_s: float, now: float) -> Steady | None:  # noqa: FBT001 - the fact itself
+def follow(before: Debounced | None, so: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001 - the fact itself
     """It counts once it was so for `for_s`, until it was not for HYSTERESIS_S or unknown for BLIND_S: then None."""
     if before is None or not before.on:
         if not so:
             return None
         since = now if before is None else before.since
-        return Steady(now - since >= for_s, since)
+        return Debounced(now - since >= for_s, since)
     if so:
         return before if before.otherwise_since is None else replace(before, otherwise_since=None)
     since = now if before.otherwise_since is None else before.otherwise_since

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from fleet.policy import explain
-from fleet.policy.allocation import Barrier, Staff, Staffing, fill, follow_needs
+from fleet.policy.allocation import Barrier, Candidates, RoleAllocation, fill, follow_needs
 from fleet.policy.debounce import HYSTERESIS_S
-from fleet.policy.decision import Decision, Kind
+from fleet.policy.decision import Decision, DecisionKind
 from fleet.policy.explain import Override
 from fleet.policy.plan.plan import Effect, Plan, Rule
-from fleet.policy.rules import Cars, RuleState, follow_phase, follow_rules, targets
-from fleet.policy.snapshot import CONTRADICTED, LOST, NOBODY, CarPicture, Picture
-from fleet.policy.state import HUB_BACK_S, Coloured, Held, Memory, Tried
+from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
+from fleet.policy.snapshot import CONTRADICTED, LOST, NOBODY, CarSnapshot, FleetSnapshot
+from fleet.policy.state import HUB_BACK_S, HeldRole, LinkColor, ModeAttempts, PolicyState
 from gateway.protocol.enums import Mode
 
 LONGEST_WAIT_S: Final = 30.0
@@ -37,10 +37,10 @@ class Ask:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class DecisionStep:
     """What follows from one picture; `memory` is for the next step."""
 
-    memory: Memory
+    memory: PolicyState
     decisions: tuple[Decision, ...] = ()
     """One for each car of the plan, each role, and the phase."""
     changed: tuple[Decision, ...] = ()
@@ -51,7 +51,7 @@ class Step:
     roles: Mapping[str, str] = field(default_factory=dict)
 
 
-def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
+def step(plan: Plan, picture: FleetSnapshot, memory: PolicyState, now: float) -> DecisionStep:
     """Decide; the same arguments give the same answer."""
     memory = memory if memory.began is not None else replace(memory, began=now)
     subjects = _subjects(plan, picture)
@@ -66,7 +66,7 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
         if barrier is not None and not barrier[1] and car in has and car in lately
     }
     free = tuple(car for car in subjects if car not in barriers)
-    cars = Cars(subjects, frozenset(free), frozenset({*free, *lately}), has)
+    cars = CarSets(subjects, frozenset(free), frozenset({*free, *lately}), has)
     phase = memory.phase
     if not phase.name:  # it begins before the rules are looked at: some count only in it
         phase = follow_phase(plan, picture, cars, phase, {}, now, ready=False)
@@ -77,10 +77,10 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
     assert memory.began is not None
     if now - memory.began < HEARD_WITHIN_S and any(_unheard(picture.cars.get(car, NOBODY)) for car in subjects):
-        return Step(memory)
+        return DecisionStep(memory)
 
     roles_in_force = plan.phases[phase.name].roles if phase.name else None
-    staff = Staff(
+    staff = Candidates(
         plan=plan,
         picture=picture,
         free=free,
@@ -111,7 +111,7 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
     decisions = [each.after(memory.said.get(each.subject), now) for each in decisions]
     tried, asks = _asks(decisions, picture, memory.tried, now)
     coloured, colours = _leds(plan, picture, rules, staff, staffing, memory)
-    return Step(
+    return DecisionStep(
         replace(
             memory,
             held=held,
@@ -130,20 +130,20 @@ def step(plan: Plan, picture: Picture, memory: Memory, now: float) -> Step:
 # ---------------------------------------------------------------------- which cars
 
 
-def _subjects(plan: Plan, picture: Picture) -> tuple[str, ...]:
+def _subjects(plan: Plan, picture: FleetSnapshot) -> tuple[str, ...]:
     """The cars that something is decided of: those that the plan names or, if it is for any, all."""
     return tuple(sorted({*plan.named, *picture.cars})) if plan.open else tuple(sorted(plan.named))
 
 
-def _unheard(known: CarPicture) -> bool:
+def _unheard(known: CarSnapshot) -> bool:
     return known.present and not known.mode
 
 
-def _recovers(known: CarPicture) -> bool:
+def _recovers(known: CarSnapshot) -> bool:
     return known.motors == _UNKNOWN and known.verdict != CONTRADICTED
 
 
-def _ready(picture: Picture, found: Mapping[str, tuple[Barrier, bool] | None], memory: Memory) -> bool:
+def _ready(picture: FleetSnapshot, found: Mapping[str, tuple[Barrier, bool] | None], memory: PolicyState) -> bool:
     """Return True if every car that could be asked is known and in the mode that was decided last.
 
     A car that a person has, that is lost or that is not there is not waited for, unless no car is there yet.
@@ -155,14 +155,14 @@ def _ready(picture: Picture, found: Mapping[str, tuple[Barrier, bool] | None], m
                 return False
             continue
         decision = memory.said.get(car)
-        if decision is None or decision.kind is Kind.ALONE:  # it can be asked since this step
+        if decision is None or decision.kind is DecisionKind.ALONE:  # it can be asked since this step
             return False
         if decision.mode is not None and (known.mode != decision.mode or known.verdict == CONTRADICTED or known.busy):
             return False
     return any(picture.cars.get(car, NOBODY).present for car in found)
 
 
-def _barrier(car: str, known: CarPicture) -> tuple[Barrier, bool] | None:
+def _barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
     """Why the car is left alone, and whether that is a person's word, for which its role is not kept."""
     if not known.present:
         return Barrier(f"{car} is not on the bus", "its gateway coming up"), False
@@ -206,7 +206,7 @@ def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...
 
 def _overrides(
     plan: Plan,
-    picture: Picture,
+    picture: FleetSnapshot,
     rules: Mapping[int, RuleState],
     subjects: tuple[str, ...],
     roles: Mapping[str, str],
@@ -233,14 +233,14 @@ def _overrides(
 
 
 def _held(
-    staff: Staff, staffing: Staffing, before: Mapping[str, Held], barriers: Mapping[str, Barrier]
-) -> dict[str, Held]:
+    staff: Candidates, staffing: RoleAllocation, before: Mapping[str, HeldRole], barriers: Mapping[str, Barrier]
+) -> dict[str, HeldRole]:
     """Who has which role, and how each came by it."""
     lost = {
         name: [car for car, held in before.items() if held.role == name and staffing.roles.get(car) != name]
         for name in staff.plan.roles
     }
-    found: dict[str, Held] = {}
+    found: dict[str, HeldRole] = {}
     for car, name in sorted(staffing.roles.items()):
         held = before.get(car)
         if held is not None and held.role == name:
@@ -253,7 +253,7 @@ def _held(
     return found
 
 
-def _lost(car: str, name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> str:
+def _lost(car: str, name: str, staff: Candidates, staffing: RoleAllocation, barriers: Mapping[str, Barrier]) -> str:
     """Why this car no longer has this role."""
     role = staff.plan.roles[name]
     barrier = barriers.get(car) or staff.barrier(car, role)
@@ -265,7 +265,7 @@ def _lost(car: str, name: str, staff: Staff, staffing: Staffing, barriers: Mappi
     return f"{car} has role {other} now" if other is not None else f"{car} fits it less"
 
 
-def _places(staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier], phase: str) -> list[Decision]:
+def _places(staff: Candidates, staffing: RoleAllocation, barriers: Mapping[str, Barrier], phase: str) -> list[Decision]:
     found = []
     for name in staff.plan.roles:
         if not staffing.places.get(name):
@@ -282,7 +282,7 @@ def _places(staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier], p
 # ---------------------------------------------------------------------- what is asked
 
 
-def _doubted(decision: Decision, picture: Picture) -> Decision:
+def _doubted(decision: Decision, picture: FleetSnapshot) -> Decision:
     known = picture.cars.get(decision.subject, NOBODY)
     if decision.mode is None or known.mode != decision.mode or known.verdict != CONTRADICTED:
         return decision
@@ -290,45 +290,52 @@ def _doubted(decision: Decision, picture: Picture) -> Decision:
 
 
 def _asks(
-    decisions: Iterable[Decision], picture: Picture, before: Mapping[str, Tried], now: float
-) -> tuple[dict[str, Tried], list[Ask]]:
+    decisions: Iterable[Decision], picture: FleetSnapshot, before: Mapping[str, ModeAttempts], now: float
+) -> tuple[dict[str, ModeAttempts], list[Ask]]:
     """Ask each car that is not as it should be for its mode; again and again, ever more slowly."""
-    found: dict[str, Tried] = {}
+    found: dict[str, ModeAttempts] = {}
     asks = []
     for decision in decisions:
         car, mode = decision.car, decision.mode
         if car is None or mode is None:
             continue  # a car that is left alone: what was tried is over
         known = picture.cars.get(car, NOBODY)
-        tried = before.get(car, Tried(mode))
+        tried = before.get(car, ModeAttempts(mode))
         if tried.mode != mode:
-            tried = Tried(mode)
+            tried = ModeAttempts(mode)
         if known.mode == mode and known.verdict != CONTRADICTED:
             fine_since = now if tried.fine_since is None else tried.fine_since
-            found[car] = Tried(mode) if now - fine_since >= LONGEST_WAIT_S else replace(tried, fine_since=fine_since)
+            found[car] = (
+                ModeAttempts(mode) if now - fine_since >= LONGEST_WAIT_S else replace(tried, fine_since=fine_since)
+            )
             continue
-        if decision.kind is Kind.IDLE and known.mode == _UNKNOWN:
+        if decision.kind is DecisionKind.IDLE and known.mode == _UNKNOWN:
             found[car] = tried  # its gateway brings it to rest
         elif known.busy or now < tried.again_at:
             found[car] = replace(tried, fine_since=None)
         else:
             wait_s = min(LONGEST_WAIT_S, 2.0**tried.attempts)
-            found[car] = Tried(mode, tried.attempts + 1, now + wait_s)
+            found[car] = ModeAttempts(mode, tried.attempts + 1, now + wait_s)
             asks.append(Ask(car, mode))
     return found, asks
 
 
 def _leds(
-    plan: Plan, picture: Picture, rules: Mapping[int, RuleState], staff: Staff, staffing: Staffing, memory: Memory
-) -> tuple[frozenset[Coloured], list[Ask]]:
+    plan: Plan,
+    picture: FleetSnapshot,
+    rules: Mapping[int, RuleState],
+    staff: Candidates,
+    staffing: RoleAllocation,
+    memory: PolicyState,
+) -> tuple[frozenset[LinkColor], list[Ask]]:
     """A colour is set once while its rule is in force, as soon as the car is in mode manual: in no other it obeys."""
     subjects = tuple(sorted({*staff.free, *staff.reserved}))
-    found, asks = set[Coloured](), []
+    found, asks = set[LinkColor](), []
     for index, state in rules.items():
         for position, effect in enumerate(plan.rules[index].effects):
             if not state.on or effect.led is None:
                 continue
-            before = Coloured(index, position, state.that, None)
+            before = LinkColor(index, position, state.that, None)
             if before in memory.coloured:
                 found.add(before)
                 continue
@@ -342,5 +349,5 @@ def _leds(
     return frozenset(found), asks
 
 
-def _obeys_a_colour(known: CarPicture) -> bool:
+def _obeys_a_colour(known: CarSnapshot) -> bool:
     return known.mode == Mode.MANUAL and known.verdict != CONTRADICTED and not known.busy

@@ -9,7 +9,7 @@ from gateway.protocol.enums import Mode
 LEFT_ALONE: Final = "left alone"
 
 
-class Kind(StrEnum):
+class DecisionKind(StrEnum):
     """What a decision is about."""
 
     ROLE = "role"
@@ -28,7 +28,7 @@ class Decision:
     """What was decided of one subject: a car, `role NAME`, or `phase`."""
 
     subject: str
-    kind: Kind
+    kind: DecisionKind
     decided: str
     """In a word or two: the mode, `left alone`, `1 of 2`, the phase."""
     cause: str

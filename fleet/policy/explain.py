@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from fleet.policy.allocation import Barrier, Staff, Staffing
+from fleet.policy.allocation import Barrier, Candidates, RoleAllocation
 from fleet.policy.debounce import HYSTERESIS_S
-from fleet.policy.decision import LEFT_ALONE, Decision, Kind
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Plan, Role, Rule
+from fleet.policy.decision import LEFT_ALONE, Decision, DecisionKind
+from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanCondition, Quantifier, Role, Rule
 from fleet.policy.plan.reachability import blind
 from fleet.policy.rules import PhaseState, RuleState
-from fleet.policy.snapshot import NOBODY, CarPicture, Picture
-from fleet.policy.state import Held
+from fleet.policy.snapshot import NOBODY, CarSnapshot, FleetSnapshot
+from fleet.policy.state import HeldRole
 
 _NAMED: Final = 4
 """So many roles or cars are gone into."""
@@ -29,7 +29,7 @@ class Override:
     effect: Effect
 
 
-def of_phase(plan: Plan, state: PhaseState, picture: Picture) -> Decision:
+def of_phase(plan: Plan, state: PhaseState, picture: FleetSnapshot) -> Decision:
     """The phase, and what ends it."""
     phase, ends = plan.phases[state.name], list[str]()
     if phase.until is not None:
@@ -44,7 +44,7 @@ def of_phase(plan: Plan, state: PhaseState, picture: Picture) -> Decision:
     ]
     return Decision(
         "phase",
-        Kind.PHASE,
+        DecisionKind.PHASE,
         state.name,
         f"{state.name} since {state.since}",
         state.why,
@@ -53,7 +53,7 @@ def of_phase(plan: Plan, state: PhaseState, picture: Picture) -> Decision:
     )
 
 
-def _unseen(condition: Condition, picture: Picture) -> str:
+def _unseen(condition: PlanCondition, picture: FleetSnapshot) -> str:
     """What of a condition no car measures that is there; empty if one can."""
     cars = [known for car, known in picture.cars.items() if known.present and condition.car in (None, car)]
     return blind(condition.expression, [(known, known.mode) for known in cars])
@@ -62,7 +62,7 @@ def _unseen(condition: Condition, picture: Picture) -> str:
 def alone(car: str, barrier: Barrier, kept: str | None, kept_s: float) -> Decision:
     """A car that cannot, or may not, be asked for anything."""
     why = f"{barrier.why}; its role {kept} is kept for {kept_s:g} s" if kept else barrier.why
-    return Decision(car, Kind.ALONE, LEFT_ALONE, barrier.why, why, (), barrier.change, car=car, role=kept)
+    return Decision(car, DecisionKind.ALONE, LEFT_ALONE, barrier.why, why, (), barrier.change, car=car, role=kept)
 
 
 def ruled(car: str, override: Override, role: str | None) -> Decision:
@@ -81,7 +81,16 @@ def ruled(car: str, override: Override, role: str | None) -> Decision:
         why += f" (it is so of {override.state.that})"
     assert mode is not None
     return Decision(
-        car, Kind.RULE, mode, f"{rule.name} {mode}", why, override.state.used, end, car=car, role=role, mode=mode
+        car,
+        DecisionKind.RULE,
+        mode,
+        f"{rule.name} {mode}",
+        why,
+        override.state.used,
+        end,
+        car=car,
+        role=role,
+        mode=mode,
     )
 
 
@@ -97,7 +106,7 @@ def reworded(decision: Decision, said: Mapping[str, Decision]) -> bool:
 
 
 def in_role(
-    car: str, held: Held, staff: Staff, staffing: Staffing, phase: str, told: Mapping[str, Decision]
+    car: str, held: HeldRole, staff: Candidates, staffing: RoleAllocation, phase: str, told: Mapping[str, Decision]
 ) -> Decision:
     """A role gives the car its mode; `told`: what was decided in this phase, which needs no new words."""
     plan, name = staff.plan, held.role
@@ -125,7 +134,7 @@ def in_role(
     changes.append("a person's stop or drive")
     return Decision(
         car,
-        Kind.ROLE,
+        DecisionKind.ROLE,
         role.mode,
         cause,
         why,
@@ -137,7 +146,7 @@ def in_role(
     )
 
 
-def _rules_for(car: str, known: CarPicture, role: Role, plan: Plan, phase: str) -> list[str]:
+def _rules_for(car: str, known: CarSnapshot, role: Role, plan: Plan, phase: str) -> list[str]:
     """The rules that could give the car something else than this role."""
     told = []
     for rule in plan.rules:
@@ -155,7 +164,7 @@ def _could(effect: Effect, rule: Rule, car: str, role: Role, plan: Plan) -> bool
             return False
     elif effect.mode in (None, role.mode):
         return False
-    of = rule.when.car if rule.when.of is Of.CAR else None
+    of = rule.when.car if rule.when.of is Quantifier.CAR else None
     match effect.who:
         case who if who == THAT:
             return of in (None, car) and rule.when.role in (None, role.name)
@@ -165,7 +174,7 @@ def _could(effect: Effect, rule: Rule, car: str, role: Role, plan: Plan) -> bool
             return who in (ALL, car, role.name)
 
 
-def idle(car: str, staff: Staff, staffing: Staffing) -> Decision:
+def idle(car: str, staff: Candidates, staffing: RoleAllocation) -> Decision:
     """A car that no role is left for."""
     plan = staff.plan
     whys: list[str] = []
@@ -194,7 +203,7 @@ def idle(car: str, staff: Staff, staffing: Staffing) -> Decision:
     mode = plan.idle
     return Decision(
         car,
-        Kind.IDLE,
+        DecisionKind.IDLE,
         mode or LEFT_ALONE,
         cause,
         f"no role for it: {'; '.join(whys)}" if whys else "the plan has no role for it now",
@@ -215,7 +224,7 @@ def repaired(decision: Decision, evidence: str) -> Decision:
     )
 
 
-def _count(role: Role, staffing: Staffing) -> str:
+def _count(role: Role, staffing: RoleAllocation) -> str:
     """How many cars have it, of how many that it wants."""
     return f"{len(staffing.holders(role.name))} of {'all' if role.count is None else staffing.places[role.name]}"
 
@@ -233,7 +242,7 @@ class _Others:
     """Whether one could have it."""
 
 
-def _others(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> _Others:
+def _others(name: str, staff: Candidates, staffing: RoleAllocation, barriers: Mapping[str, Barrier]) -> _Others:
     role, kinds, whys, used, able = staff.plan.roles[name], list[str](), list[str](), list[str](), False
     for car in sorted({*staff.free, *barriers}):
         if staffing.roles.get(car) == name or not staff.plan.may(car, role):
@@ -249,7 +258,7 @@ def _others(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
     return _Others(tuple(kinds), "; ".join(whys) + more, tuple(dict.fromkeys(used)), able)
 
 
-def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> Decision:
+def vacancy(name: str, staff: Candidates, staffing: RoleAllocation, barriers: Mapping[str, Barrier]) -> Decision:
     """A role with fewer cars than it wants."""
     role, holders = staff.plan.roles[name], staffing.holders(name)
     decided, others = _count(role, staffing), _others(name, staff, staffing, barriers)
@@ -263,7 +272,7 @@ def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
         why, change = f"no{' other' if holders else ''} car is there", "another car coming up"
     return Decision(
         f"role {name}",
-        Kind.VACANT,
+        DecisionKind.VACANT,
         decided,
         f"{decided}: {'; '.join(others.kinds)}",
         f"{why}{instead}",
@@ -273,7 +282,7 @@ def vacancy(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, 
     )
 
 
-def filled(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, Barrier]) -> Decision:
+def filled(name: str, staff: Candidates, staffing: RoleAllocation, barriers: Mapping[str, Barrier]) -> Decision:
     """A role that has the cars it wants."""
     role, holders = staff.plan.roles[name], staffing.holders(name)
     why, change, used = f"its places are taken: {', '.join(holders)}", "one of them dropping out", tuple[str, ...]()
@@ -287,25 +296,25 @@ def filled(name: str, staff: Staff, staffing: Staffing, barriers: Mapping[str, B
             why += "the plan gives it to no other car that is there" if more else "no other car is there"
         change, used = f"another car being left for it, or {change}", others.used
     return Decision(
-        f"role {name}", Kind.FILLED, _count(role, staffing), "filled", why, used, would_change=change, role=name
+        f"role {name}", DecisionKind.FILLED, _count(role, staffing), "filled", why, used, would_change=change, role=name
     )
 
 
-def out(name: str, staff: Staff, phase: str) -> Decision:
+def out(name: str, staff: Candidates, phase: str) -> Decision:
     """A role that no car is to have now."""
     if name not in staff.in_force:
         why, change = f"it does not count in phase {phase}", f"the end of phase {phase}"
     else:
         why, change = "no rule gives it to a car now, nor does it stand in for another", "such a rule coming true"
-    return Decision(f"role {name}", Kind.OUT, "not wanted", f"out: {why}", why, would_change=change, role=name)
+    return Decision(f"role {name}", DecisionKind.OUT, "not wanted", f"out: {why}", why, would_change=change, role=name)
 
 
-def came_by(car: str, name: str, staff: Staff, before: str | None, lost: str) -> Held:
+def came_by(car: str, name: str, staff: Candidates, before: str | None, lost: str) -> HeldRole:
     """Why this car has this role from now on; `before`: who had it and lost it, `lost`: why."""
     role = staff.plan.roles[name]
     used = staff.picture.used(role.needs, car, staff.now) if role.needs is not None else ()
     if before is not None:
-        return Held(name, f"in place of {before}: {lost}", used)
+        return HeldRole(name, f"in place of {before}: {lost}", used)
     if staff.picture.cars.get(car, NOBODY).mode == role.mode:
-        return Held(name, f"it is in mode {role.mode} already", used)
-    return Held(name, f"it has {role.needs_text}" if role.needs is not None else "", used)
+        return HeldRole(name, f"it is in mode {role.mode} already", used)
+    return HeldRole(name, f"it has {role.needs_text}" if role.needs is not None else "", used)

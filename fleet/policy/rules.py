@@ -5,15 +5,15 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
-from fleet.policy.debounce import HYSTERESIS_S, Steady, follow
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Phase, Plan, Rule
-from fleet.policy.snapshot import Picture
+from fleet.policy.debounce import HYSTERESIS_S, Debounced, follow
+from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanCondition, PlanPhase, Quantifier, Rule
+from fleet.policy.snapshot import FleetSnapshot
 
 SETTLES_WITHIN_S: Final = 15.0
 """Maximum wait for a phase's cars before its time-out counts. Recovery and opening take 4.9 + 3.5 s (protocol.md)."""
 _WHOLE: Final = ""
 """Under this name stands a condition over all cars."""
-_NONE: Final[Mapping[str, Steady]] = MappingProxyType({})
+_NONE: Final[Mapping[str, Debounced]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,9 +21,9 @@ class RuleState:
     """How far one rule is."""
 
     on: bool = False
-    when: Mapping[str, Steady] = field(default_factory=dict)
+    when: Mapping[str, Debounced] = field(default_factory=dict)
     """By car: since when its condition is so of it."""
-    until: Mapping[str, Steady] = field(default_factory=dict)
+    until: Mapping[str, Debounced] = field(default_factory=dict)
     that: str | None = None
     """The car that made it true."""
     since: float = 0.0
@@ -37,7 +37,7 @@ class PhaseState:
 
     name: str = ""
     since: float = 0.0
-    until: Mapping[str, Steady] = field(default_factory=dict)
+    until: Mapping[str, Debounced] = field(default_factory=dict)
     why: str = ""
     """What began it."""
     used: tuple[str, ...] = ()
@@ -48,7 +48,7 @@ class PhaseState:
 
 
 @dataclass(frozen=True, slots=True)
-class Cars:
+class CarSets:
     """Which cars a rule may speak of."""
 
     subjects: tuple[str, ...]
@@ -60,7 +60,7 @@ class Cars:
 
 
 def follow_rules(
-    plan: Plan, picture: Picture, cars: Cars, phase: str, before: Mapping[int, RuleState], now: float
+    plan: Plan, picture: FleetSnapshot, cars: CarSets, phase: str, before: Mapping[int, RuleState], now: float
 ) -> dict[int, RuleState]:
     """How far each rule is now; one that is not left out is in force or about to be."""
     found = {}
@@ -73,7 +73,7 @@ def follow_rules(
     return found
 
 
-def _follow_rule(rule: Rule, picture: Picture, cars: Cars, before: RuleState, now: float) -> RuleState:
+def _follow_rule(rule: Rule, picture: FleetSnapshot, cars: CarSets, before: RuleState, now: float) -> RuleState:
     when = _follow(rule.when, picture, cars, before.when, now)
     true = [car for car, steady in when.items() if steady.on]
     until = _NONE if rule.until is None else _follow(rule.until, picture, cars, before.until, now)
@@ -85,7 +85,7 @@ def _follow_rule(rule: Rule, picture: Picture, cars: Cars, before: RuleState, no
         on = bool(true) and not ended
     if not on:
         return RuleState(when=when, until=until)
-    if that is None and rule.when.of is not Of.ALL:
+    if that is None and rule.when.of is not Quantifier.ALL:
         that = min(true, key=lambda car: (car not in cars.free, when[car].since, car), default=None)
     if before.on and that == before.that:
         return replace(before, when=when, until=until)
@@ -94,9 +94,9 @@ def _follow_rule(rule: Rule, picture: Picture, cars: Cars, before: RuleState, no
 
 
 def _follow(
-    condition: Condition, picture: Picture, cars: Cars, before: Mapping[str, Steady], now: float
-) -> Mapping[str, Steady]:
-    if condition.of is Of.ALL:
+    condition: PlanCondition, picture: FleetSnapshot, cars: CarSets, before: Mapping[str, Debounced], now: float
+) -> Mapping[str, Debounced]:
+    if condition.of is Quantifier.ALL:
         so = _of_all([picture.holds(condition.expression, car, now) for car in _watched(condition, cars, before)])
         steady = follow(before.get(_WHOLE), so, condition.for_s, now)
         return _NONE if steady is None else {_WHOLE: steady}
@@ -108,7 +108,7 @@ def _follow(
     return found
 
 
-def _watched(condition: Condition, cars: Cars, before: Mapping[str, Steady]) -> list[str]:
+def _watched(condition: PlanCondition, cars: CarSets, before: Mapping[str, Debounced]) -> list[str]:
     """The cars it speaks of; who made it true stays among them, whatever role that gave it."""
     if condition.car is not None:
         return [condition.car]
@@ -116,7 +116,7 @@ def _watched(condition: Condition, cars: Cars, before: Mapping[str, Steady]) -> 
     return [
         car
         for car in cars.subjects
-        if (role is None and (condition.of is Of.ANY or car in cars.there))
+        if (role is None and (condition.of is Quantifier.ANY or car in cars.there))
         or (role is not None and cars.roles.get(car) == role)
         or (car in before and before[car].on)
     ]
@@ -129,7 +129,9 @@ def _of_all(each: list[bool | None]) -> bool | None:
     return False if False in each else None if None in each else True
 
 
-def _used(condition: Condition, picture: Picture, cars: Cars, that: str | None, now: float) -> tuple[str, ...]:
+def _used(
+    condition: PlanCondition, picture: FleetSnapshot, cars: CarSets, that: str | None, now: float
+) -> tuple[str, ...]:
     of = [that] if that is not None else _watched(condition, cars, _NONE)
     return tuple(told for car in of for told in picture.used(condition.expression, car, now))
 
@@ -154,8 +156,8 @@ def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: 
 
 def follow_phase(
     plan: Plan,
-    picture: Picture,
-    cars: Cars,
+    picture: FleetSnapshot,
+    cars: CarSets,
     before: PhaseState,
     rules: Mapping[int, RuleState],
     now: float,
@@ -186,7 +188,7 @@ def follow_phase(
 
 
 def _by_itself(
-    phase: Phase, picture: Picture, cars: Cars, before: PhaseState, lasted_s: float, now: float
+    phase: PlanPhase, picture: FleetSnapshot, cars: CarSets, before: PhaseState, lasted_s: float, now: float
 ) -> PhaseState:
     until = _NONE if phase.until is None else _follow(phase.until, picture, cars, before.until, now)
     true = [car for car, steady in until.items() if steady.on]

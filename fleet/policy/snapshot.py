@@ -53,7 +53,7 @@ def topic_of(name: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class Observation:
     """The fields of one reading that were measured, and when it came."""
 
     fields: Mapping[str, object]
@@ -61,7 +61,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class Refusal:
     """What a car's gateway said no to."""
 
     mode: str
@@ -71,7 +71,7 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
-class CarPicture:
+class CarSnapshot:
     """What is known of one car."""
 
     present: bool = False
@@ -94,7 +94,7 @@ class CarPicture:
     """The roles that the fleet file lets it take; None: any."""
     listed: bool = False
     """It stands in the fleet file."""
-    refused: Refused | None = None
+    refused: Refusal | None = None
     busy: bool = False
     """Something was asked of it, and there is no outcome yet."""
 
@@ -117,15 +117,15 @@ def _profile(platform: str) -> Profile | None:
         return None
 
 
-NOBODY: Final = CarPicture()
+NOBODY: Final = CarSnapshot()
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class FleetSnapshot:
     """What the coordinator knows."""
 
-    cars: Mapping[str, CarPicture] = field(default_factory=dict)
-    readings: Mapping[str, Mapping[str, Seen]] = field(default_factory=dict)
+    cars: Mapping[str, CarSnapshot] = field(default_factory=dict)
+    readings: Mapping[str, Mapping[str, Observation]] = field(default_factory=dict)
     """By car and topic."""
 
     def holds(self, expression: Expression, car: str, now: float, *, old: bool = False) -> bool | None:

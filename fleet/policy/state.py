@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from fleet.policy.debounce import HYSTERESIS_S, Settled, Steady
+from fleet.policy.debounce import HYSTERESIS_S, Debounced, Settled
 from fleet.policy.decision import Decision
 from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
-from fleet.policy.snapshot import NOBODY, Picture
+from fleet.policy.snapshot import NOBODY, FleetSnapshot
 from gateway.protocol.enums import Mode
 
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
@@ -20,7 +20,7 @@ IN_PHASE: Final = "it was so before the coordinator was started again"
 
 
 @dataclass(frozen=True, slots=True)
-class Tried:
+class ModeAttempts:
     """How often a car was asked for one mode, and when it may be asked again."""
 
     mode: str = ""
@@ -30,7 +30,7 @@ class Tried:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldRole:
     """A role that a car has, and how it came by it."""
 
     role: str
@@ -39,7 +39,7 @@ class Held:
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class PersistedPolicy:
     """What outlives a coordinator: the roles, the phase, the rules in force and the car that made each so."""
 
     version: str = ""
@@ -52,7 +52,7 @@ class Kept:
 
 
 @dataclass(frozen=True, slots=True)
-class Coloured:
+class LinkColor:
     """A car that was asked for the colour of a rule since that came into force."""
 
     rule: int
@@ -64,7 +64,7 @@ class Coloured:
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class PolicyState:
     """Everything that the next decision needs besides the picture. Times are seconds on one monotonic clock."""
 
     began: float | None = None
@@ -72,12 +72,12 @@ class Memory:
     phase: PhaseState = field(default_factory=PhaseState)
     rules: Mapping[int, RuleState] = field(default_factory=dict)
     """By position in the plan."""
-    held: Mapping[str, Held] = field(default_factory=dict)
+    held: Mapping[str, HeldRole] = field(default_factory=dict)
     """The role that each car has; it is kept for a moment for one that cannot be asked."""
     gone_since: Mapping[str, float] = field(default_factory=dict)
     needs: Mapping[tuple[str, str], Settled] = field(default_factory=dict)
-    tried: Mapping[str, Tried] = field(default_factory=dict)
-    coloured: frozenset["Coloured"] = frozenset()
+    tried: Mapping[str, ModeAttempts] = field(default_factory=dict)
+    coloured: frozenset["LinkColor"] = frozenset()
     said: Mapping[str, Decision] = field(default_factory=dict)
     """The last decision of each subject."""
 
@@ -87,12 +87,12 @@ class Memory:
         return {car: held.role for car, held in self.held.items()}
 
 
-def hub_back(memory: Memory, now: float) -> Memory:
+def hub_back(memory: PolicyState, now: float) -> PolicyState:
     """What counts when there is a hub again: without one nobody could be heard, and nobody was lost for that."""
     return replace(memory, gone_since=dict.fromkeys(memory.held, now + HUB_BACK_S - HYSTERESIS_S))
 
 
-def carried(memory: Memory, before: Plan, after: Plan) -> Memory:
+def carried(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:
     """What still counts under another plan: roles, rules and the phase that it has, too."""
     places = {rule: index for index, rule in enumerate(after.rules)}
     rules = {
@@ -114,12 +114,12 @@ def carried(memory: Memory, before: Plan, after: Plan) -> Memory:
     )
 
 
-def restarted(memory: Memory) -> Memory:
+def restarted(memory: PolicyState) -> PolicyState:
     """Return what still counts when the plan begins anew: who has which role, but no phase and no rule in force."""
     return replace(memory, phase=PhaseState(), rules={}, coloured=frozenset())
 
 
-def restored(plan: Plan, picture: Picture, kept: Kept, now: float, wall_s: float) -> Memory:
+def restored(plan: Plan, picture: FleetSnapshot, kept: PersistedPolicy, now: float, wall_s: float) -> PolicyState:
     """What a coordinator that begins takes over from the one before, as far as the cars are still as it left them.
 
     What was kept under another plan counts only for the roles that both have; a car that is in the mode of another
@@ -131,27 +131,27 @@ def restored(plan: Plan, picture: Picture, kept: Kept, now: float, wall_s: float
         role = plan.roles.get(name)
         mode = picture.cars.get(car, NOBODY).mode
         if role is not None and plan.may(car, role) and (mode == role.mode or mode not in modes):
-            held[car] = Held(name, TAKEN_OVER)
+            held[car] = HeldRole(name, TAKEN_OVER)
     if kept.version != plan.version or (kept.phase and kept.phase not in plan.phases):
-        return Memory(held=held)
+        return PolicyState(held=held)
     rules = {
-        index: RuleState(on=True, when={that: Steady(on=True, since=now)}, that=that or None, since=now)
+        index: RuleState(on=True, when={that: Debounced(on=True, since=now)}, that=that or None, since=now)
         for index, that in kept.rules.items()
         if index < len(plan.rules)
     }
     age_s = max(0.0, wall_s - kept.phase_since_s)
     phase = PhaseState(kept.phase, now - age_s, why=IN_PHASE) if kept.phase else PhaseState()
     coloured = frozenset(
-        Coloured(index, position, state.that, None)
+        LinkColor(index, position, state.that, None)
         for index, state in rules.items()
         for position in range(len(plan.rules[index].effects))
     )
-    return Memory(held=held, rules=rules, phase=phase, coloured=coloured)
+    return PolicyState(held=held, rules=rules, phase=phase, coloured=coloured)
 
 
-def to_keep(plan: Plan, memory: Memory, now: float, wall_s: float) -> Kept:
+def to_keep(plan: Plan, memory: PolicyState, now: float, wall_s: float) -> PersistedPolicy:
     """What the next coordinator should know."""
-    return Kept(
+    return PersistedPolicy(
         plan.version,
         memory.roles,
         memory.phase.name,

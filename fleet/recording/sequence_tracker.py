@@ -16,7 +16,7 @@ _WRAP: Final = 1 << 32
 _BACKWARDS: Final = 1 << 31
 
 
-class Numbers:
+class SequenceTracker:
     """One key's. Who writes each message looks at `last` first: a number that follows the last one needs no more."""
 
     __slots__ = ("_first", "_holes", "_late", "_lost", "last")

@@ -41,7 +41,7 @@ def versions() -> dict[str, str]:
 
 
 @dataclass(slots=True)
-class Description:
+class SessionInfo:
     """What `session.json` says."""
 
     fleet: str
@@ -160,13 +160,13 @@ def iso(now: datetime) -> str:
     return now.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def plan(root: Path, fleet: str, now: datetime) -> tuple[Path, Description]:
+def plan(root: Path, fleet: str, now: datetime) -> tuple[Path, SessionInfo]:
     """Where a new session is to be, and its description; nothing is made."""
     stem = f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{fleet}"
-    return _unused(root / stem), Description(fleet, iso(now), socket.gethostname(), versions())
+    return _unused(root / stem), SessionInfo(fleet, iso(now), socket.gethostname(), versions())
 
 
-def create(directory: Path, description: Description) -> Path:
+def create(directory: Path, description: SessionInfo) -> Path:
     """Make a session's directory, under another name if that one is taken by now; raises OSError, and leaves none."""
     directory.parent.mkdir(parents=True, exist_ok=True)
     while True:

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from fleet.replay import panels as mapping
 from fleet.replay.colors import colour
-from fleet.replay.panels import Curve, How, Lane, Panel
+from fleet.replay.panels import Curve, How, Panel, StateTrack
 from schemas import keys
 from schemas.topics import TOPICS
 
@@ -25,7 +25,7 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9_/]+")
 """Names of topics that need no quotes in a message path."""
 
 
-class _Layout:
+class _FoxgloveLayout:
     """Panels by id, as they are made."""
 
     def __init__(self, fleet: str) -> None:
@@ -43,7 +43,7 @@ class _Layout:
         """The key of a topic: a service's has its own name in front."""
         return f"{self._fleet}/{topic}" if topic.startswith("@") else keys.topic_key(self._fleet, car, topic)
 
-    def path(self, car: str, part: Curve | Lane) -> str:
+    def path(self, car: str, part: Curve | StateTrack) -> str:
         """Foxglove's path of a field."""
         key = self.key(car, part.topic)
         return f"{key if _PLAIN.fullmatch(key) else json.dumps(key)}.{part.field.rstrip('!')}"
@@ -58,7 +58,7 @@ class _Layout:
         ]
         return self.add("Plot", name, {"paths": paths, "showLegend": True, "isSynced": True, "xAxisVal": "timestamp"})
 
-    def states(self, name: str, lanes: Iterable[tuple[str, Lane, str]]) -> str:
+    def states(self, name: str, lanes: Iterable[tuple[str, StateTrack, str]]) -> str:
         """States over time, of (car, lane, what it is called)."""
         paths = [_shown(self.path(car, lane), label) for car, lane, label in lanes]
         return self.add("StateTransitions", name, {"paths": paths, "isSynced": True})
@@ -86,7 +86,7 @@ class _Layout:
 
 def layout(cars: Sequence[str] = CARS, fleet: str = keys.DEFAULT_FLEET) -> dict[str, Any]:
     """The layout of a fleet of these cars: a tab for the fleet, one for each car, one for the services."""
-    made = _Layout(fleet)
+    made = _FoxgloveLayout(fleet)
     glance = [
         made.states(name, [(car, lane, f"{car} {lane.name}") for car in cars for lane in lanes if plain(lane)])
         for name, lanes in mapping.FLEET_LANES
@@ -108,9 +108,9 @@ def layout(cars: Sequence[str] = CARS, fleet: str = keys.DEFAULT_FLEET) -> dict[
     }
 
 
-def plain(part: Curve | Lane) -> bool:
+def plain(part: Curve | StateTrack) -> bool:
     """Whether it is a field as it is."""
-    return part.how in (None, How.TEXT_OR_NOTHING) and not (isinstance(part, Lane) and part.drawn)
+    return part.how in (None, How.TEXT_OR_NOTHING) and not (isinstance(part, StateTrack) and part.drawn)
 
 
 def _shown(path: str, label: str) -> dict[str, Any]:

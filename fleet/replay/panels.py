@@ -42,7 +42,7 @@ class How(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Lane:
+class StateTrack:
     """One state of a topic; `name` is its component in the .rrd, and what the lane is called."""
 
     topic: str
@@ -72,7 +72,7 @@ class Panel:
 
     name: str
     curves: tuple[Curve, ...] = ()
-    lanes: tuple[Lane, ...] = ()
+    lanes: tuple[StateTrack, ...] = ()
     texts: tuple[str, ...] = ()
     """Topics whose lines of text are shown together."""
 
@@ -88,8 +88,8 @@ def _unit(topic: str, field: str) -> str:
     return TOPICS[topic].units[field.rstrip("!")]
 
 
-def _lanes(topic: str, what: str, *fields: str) -> tuple[Lane, ...]:
-    return tuple(Lane(topic, field, f"{what} {field.replace('_', ' ')}".strip()) for field in fields)
+def _lanes(topic: str, what: str, *fields: str) -> tuple[StateTrack, ...]:
+    return tuple(StateTrack(topic, field, f"{what} {field.replace('_', ' ')}".strip()) for field in fields)
 
 
 TRUTH: Final = "sim/truth"
@@ -102,26 +102,34 @@ DISTANCE: Final = Curve("sensor/range", "range_m!", f"distance ({_unit('sensor/r
 BATTERY: Final = Curve("sensor/battery", "voltage_v", f"battery ({_unit('sensor/battery', 'voltage_v')})")
 LOW: Final = Curve("sensor/battery", "voltage_v", f"low, by default {LOW_V:g} V", How.LOW)
 CRITICAL: Final = Curve("sensor/battery", "voltage_v", f"critical, by default {CRITICAL_V:g} V", How.CRITICAL)
-MODE_ASKED: Final = Lane("state/mode", "asked", "mode asked")
-MODE_INFERRED: Final = Lane("state/mode", "inferred", "mode inferred")
-MODE_TRUE: Final = Lane(TRUTH, "mode", "mode true")
-VERDICT: Final = Lane("state/mode", "verdict", "verdict")
-MOTION: Final = Lane("state/motion", "motion", "motion")
-LINK: Final = Lane("state/link", "state", "link")
-ESTOPS: Final = Lane("state/safety", "estops", "e-stop", How.WHO_AND_WHY)
-HOLD: Final = Lane("state/safety", "hold.by", "hold", How.TEXT_OR_NOTHING)
-LEASE: Final = Lane("state/safety", "lease.holder", "driven by", How.TEXT_OR_NOTHING)
-MARKS: Final = Lane(COMMANDS, "verb", "commands", drawn=True)
-LED_ASKED: Final = Lane(COMMANDS, "request", "LED asked", drawn=True)
-LED_TRUE: Final = Lane(TRUTH, "led", "LED true")
-ROLE: Final = Lane(ASSIGNMENT, "roles", "role", drawn=True)
+MODE_ASKED: Final = StateTrack("state/mode", "asked", "mode asked")
+MODE_INFERRED: Final = StateTrack("state/mode", "inferred", "mode inferred")
+MODE_TRUE: Final = StateTrack(TRUTH, "mode", "mode true")
+VERDICT: Final = StateTrack("state/mode", "verdict", "verdict")
+MOTION: Final = StateTrack("state/motion", "motion", "motion")
+LINK: Final = StateTrack("state/link", "state", "link")
+ESTOPS: Final = StateTrack("state/safety", "estops", "e-stop", How.WHO_AND_WHY)
+HOLD: Final = StateTrack("state/safety", "hold.by", "hold", How.TEXT_OR_NOTHING)
+LEASE: Final = StateTrack("state/safety", "lease.holder", "driven by", How.TEXT_OR_NOTHING)
+MARKS: Final = StateTrack(COMMANDS, "verb", "commands", drawn=True)
+LED_ASKED: Final = StateTrack(COMMANDS, "request", "LED asked", drawn=True)
+LED_TRUE: Final = StateTrack(TRUTH, "led", "LED true")
+ROLE: Final = StateTrack(ASSIGNMENT, "roles", "role", drawn=True)
 """On the assignment's entity, one lane per car: `role red`."""
-PHASE: Final = Lane(ASSIGNMENT, "phase", "phase of the plan", How.TEXT_OR_NOTHING)
+PHASE: Final = StateTrack(ASSIGNMENT, "phase", "phase of the plan", How.TEXT_OR_NOTHING)
 
 MAIN_PANELS: Final = (
     Panel(
         "Mode, motion, link",
-        lanes=(MODE_ASKED, MODE_INFERRED, MODE_TRUE, VERDICT, MOTION, Lane("state/safety", "motors", "motors"), LINK),
+        lanes=(
+            MODE_ASKED,
+            MODE_INFERRED,
+            MODE_TRUE,
+            VERDICT,
+            MOTION,
+            StateTrack("state/safety", "motors", "motors"),
+            LINK,
+        ),
     ),
     Panel("Distance", curves=(DISTANCE,)),
     Panel(
@@ -168,10 +176,10 @@ MORE_PANELS: Final = (
     Panel(
         "Battery, fan, bumps, platform",
         lanes=(
-            Lane("sensor/battery", "level", "battery level"),
-            Lane("state/motion", "fan", "fan"),
-            Lane(TRUTH, "blocked", "blocked in truth"),
-            Lane("state/health", "platform", "platform"),
+            StateTrack("sensor/battery", "level", "battery level"),
+            StateTrack("state/motion", "fan", "fan"),
+            StateTrack(TRUTH, "blocked", "blocked in truth"),
+            StateTrack("state/health", "platform", "platform"),
         ),
     ),
     Panel("Raw frames", texts=("frame/rx", "frame/tx")),
@@ -197,9 +205,9 @@ SERVICE_PANELS: Final = (
         "Plan, recorder, supervisor",
         lanes=(
             PHASE,
-            Lane("@recorder/status", "state", "recorder"),
-            Lane("@recorder/status", "error", "recorder's error", How.TEXT_OR_NOTHING),
-            Lane("@supervisor/status", "state", "fleet up"),
+            StateTrack("@recorder/status", "state", "recorder"),
+            StateTrack("@recorder/status", "error", "recorder's error", How.TEXT_OR_NOTHING),
+            StateTrack("@supervisor/status", "state", "fleet up"),
         ),
     ),
     Panel("Recorded", curves=(Curve("@recorder/status", "messages", "messages"),)),
@@ -266,9 +274,9 @@ def contents(recorded: frozenset[str]) -> Contents:
     )
 
 
-def parts() -> Iterator[Curve | Lane]:
+def parts() -> Iterator[Curve | StateTrack]:
     """Every curve and lane of the tables, each once."""
-    every: list[Curve | Lane] = [curve for _, curve in FLEET_CURVES]
+    every: list[Curve | StateTrack] = [curve for _, curve in FLEET_CURVES]
     for _, lanes in FLEET_LANES:
         every += lanes
     for panel in (*CAR_PANELS, *SERVICE_PANELS):

@@ -9,7 +9,7 @@ RATE_OVER_S: Final = 2.0
 
 
 @dataclass(slots=True)
-class Row:
+class CarStatus:
     """One car as it was last heard."""
 
     car: str

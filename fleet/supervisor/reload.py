@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from fleet.supervisor.spec import SIMULATED, Listed, Wanted, WantedCar
+from fleet.supervisor.spec import SIMULATED, CarProcessSpec, FleetSpec, Listed
 
 _FIXED: Final[Mapping[str, str]] = {
     "fleet": "the fleet's name",
@@ -20,7 +20,7 @@ _FIXED: Final[Mapping[str, str]] = {
 class Change:
     """From one wish to the next; `words` tell of it, one line each."""
 
-    wish: Wanted
+    wish: FleetSpec
     """What can be had now."""
     gone: tuple[str, ...]
     begun: tuple[str, ...]
@@ -28,14 +28,14 @@ class Change:
     words: tuple[str, ...]
 
 
-def change(old: Wanted, new: Wanted) -> Change:
+def change(old: FleetSpec, new: FleetSpec) -> Change:
     """What becomes of `old` when `new` is wanted."""
     words = [
         f"{what} cannot be changed while running (fleet down, fleet up)"
         for name, what in _FIXED.items()
         if getattr(old, name) != getattr(new, name)
     ]
-    cars: dict[str, WantedCar] = {}
+    cars: dict[str, CarProcessSpec] = {}
     begun = []
     for name, car in new.cars.items():
         before = old.cars.get(name)

@@ -25,7 +25,7 @@ HUNG: Final = "hung"
 """How the words begin on a process that was killed for its silence."""
 
 
-class State(StrEnum):
+class RunState(StrEnum):
     """What is so of one process."""
 
     WAITING = "waiting"
@@ -37,7 +37,7 @@ class State(StrEnum):
     ELSEWHERE = "elsewhere"
 
 
-class Act(StrEnum):
+class RestartAction(StrEnum):
     """What is to be done now."""
 
     NOTHING = "nothing"
@@ -62,13 +62,13 @@ def delay_s(falls: int, chance: float) -> float:
 
 
 @dataclass(slots=True)
-class Ward:
+class ProcessState:
     """One process, from the first start to the last; `turn` says what to do, the rest tells what happened."""
 
     patience: Patience
     due: float
     """When it is to be started."""
-    state: State = State.WAITING
+    state: RunState = RunState.WAITING
     since: float = 0.0
     heard_at: float = -inf
     restarts: int = 0
@@ -87,44 +87,44 @@ class Ward:
     @property
     def alive(self) -> bool:
         """Whether there is a process."""
-        return self.state in (State.STARTING, State.RUNNING, State.ENDING)
+        return self.state in (RunState.STARTING, RunState.RUNNING, RunState.ENDING)
 
     def silent_s(self, now: float, listening_since: float | None) -> float:
         """How long it could have been heard and was not; 0 while nothing is expected of it."""
         if listening_since is None or self._killed or not self.alive:
             return 0.0
-        if self.state is State.ENDING and not self.patience.to_the_end:
+        if self.state is RunState.ENDING and not self.patience.to_the_end:
             return 0.0
-        heard_at = self.heard_at if self.state is State.RUNNING else max(self.heard_at, self.since)
+        heard_at = self.heard_at if self.state is RunState.RUNNING else max(self.heard_at, self.since)
         return max(0.0, now - max(listening_since, heard_at))
 
-    def turn(self, now: float, listening_since: float | None, leave_s: float = 0.0) -> Act:
+    def turn(self, now: float, listening_since: float | None, leave_s: float = 0.0) -> RestartAction:
         """What to do; `listening_since`: since when it could have been heard without a gap, None if it cannot be.
 
         leave_s: silence that is allowed even if the patience is less (hang.py).
         """
-        if self.state in (State.WAITING, State.REFUSED) and now >= self.due:
-            return Act.START
-        if self.state is State.ENDING and now >= self._kill_at and not self._killed:
+        if self.state in (RunState.WAITING, RunState.REFUSED) and now >= self.due:
+            return RestartAction.START
+        if self.state is RunState.ENDING and now >= self._kill_at and not self._killed:
             return self._kill("did not end in time and was killed")
         silent = self.silent_s(now, listening_since)
-        allowed = self.patience.start_s if self.state is State.STARTING else self.patience.silence_s
+        allowed = self.patience.start_s if self.state is RunState.STARTING else self.patience.silence_s
         if silent > max(allowed, leave_s):
             return self._kill(f"{HUNG}: not heard for {silent:.1f} s")
-        return Act.NOTHING
+        return RestartAction.NOTHING
 
     def started(self, now: float) -> None:
         """It was started."""
         if self.since or self.restarts:
             self.restarts += 1
-        self._set(State.STARTING, now)
+        self._set(RunState.STARTING, now)
         self._killed = False
 
     def heard(self, now: float) -> bool:
         """A sign of life; whether it is the first."""
-        first = self.state is State.STARTING
+        first = self.state is RunState.STARTING
         if first:
-            self._set(State.RUNNING, now)
+            self._set(RunState.RUNNING, now)
         self.heard_at = now
         return first
 
@@ -133,58 +133,58 @@ class Ward:
 
         `chance` in 0..1 spreads the restart.
         """
-        if self.state is State.ENDING:
-            self._set(State.WAITING if self._again else State.ENDED, now)
+        if self.state is RunState.ENDING:
+            self._set(RunState.WAITING if self._again else RunState.ENDED, now)
             self.due = now
             return
         if not self._killed:
             said = f": {why}" if why and code > 0 else ""
             self.words = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}{said}"
         if code == WRONG_USE:
-            self._set(State.REFUSED, now)
+            self._set(RunState.REFUSED, now)
             self.due = now + WRONG_USE_RETRY_S
             return
         self._falls = 1 if self.alive and now - self.since >= STEADY_S else self._falls + 1
-        self._set(State.WAITING, now)
+        self._set(RunState.WAITING, now)
         self.due = now + delay_s(self._falls, chance)
 
     def not_started(self, words: str, now: float, chance: float) -> None:
         """The system would not start it."""
         self._falls += 1
         self.words = words
-        self._set(State.WAITING, now)
+        self._set(RunState.WAITING, now)
         self.due = now + delay_s(self._falls, chance)
 
     def end(self, now: float, grace_s: float, *, again: bool = False) -> bool:
         """It is told to end, and then to be started anew if `again`; whether there is a process to tell."""
         self._again = again
-        if self.state is State.ENDING:
+        if self.state is RunState.ENDING:
             return False
         if not self.alive:
-            self._set(State.WAITING if again else State.ENDED, now)
+            self._set(RunState.WAITING if again else RunState.ENDED, now)
             self.due, self._falls = now, 0
             return False
-        self._set(State.ENDING, now)
+        self._set(RunState.ENDING, now)
         self._kill_at = now + grace_s
         self._falls = 0
         return True
 
     def elsewhere(self, now: float, words: str) -> None:
         """Somebody else does what it is for."""
-        if self.state is not State.ELSEWHERE:
-            self._set(State.ELSEWHERE, now)
+        if self.state is not RunState.ELSEWHERE:
+            self._set(RunState.ELSEWHERE, now)
         self.words = words
 
     def wanted(self, now: float, delay_s: float = 0.0) -> None:
         """It is to be started after this delay: nobody else does it any more, or it did not do what it was to do."""
-        self._set(State.WAITING, now)
+        self._set(RunState.WAITING, now)
         self.due = now + delay_s
 
-    def _kill(self, words: str) -> Act:
+    def _kill(self, words: str) -> RestartAction:
         self._killed = True
         self.words = words
-        return Act.KILL
+        return RestartAction.KILL
 
-    def _set(self, state: State, now: float) -> None:
-        if state is not self.state or state is State.STARTING:
+    def _set(self, state: RunState, now: float) -> None:
+        if state is not self.state or state is RunState.STARTING:
             self.state, self.since = state, now

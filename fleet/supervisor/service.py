@@ -31,7 +31,7 @@ class AnotherSupervisor(Exception):
     """The fleet has a supervisor; the text names it."""
 
 
-class Refused(Exception):
+class ReloadRefused(Exception):
     """What was asked cannot be done; the text says why, and that nothing was changed."""
 
 
@@ -40,7 +40,7 @@ Service = Callable[[str], Awaitable[str]]
 """Does what its sender asked for; what it says of it. Raises Refused."""
 
 
-class Desk:
+class SupervisorService:
     """One session, declared from `open` to `close`; all callbacks come on the loop."""
 
     def __init__(self, bus: Bus, fleet: str) -> None:
@@ -137,7 +137,7 @@ class Desk:
             command = self._command(query, verb, encoding)
             result.id = command.id
             result.words = await services[verb](command.sender or "anonymous")
-        except (Refused, messages.BadPayload) as error:
+        except (ReloadRefused, messages.BadPayload) as error:
             result.status, result.reason, result.words = "rejected", "bad_value", str(error)
         except Exception as error:  # noqa: BLE001 - whoever asks gets an answer, also of what nobody thought of
             result.status, result.words = "rejected", f"it went wrong: {type(error).__name__}: {error}"
@@ -154,9 +154,9 @@ class Desk:
 
     def _command(self, query: zenoh.Query, verb: str, encoding: str) -> Any:
         if verb not in SERVICES:
-            raise Refused(f"there is no {verb}: allowed are {', '.join(SERVICES)}")
+            raise ReloadRefused(f"there is no {verb}: allowed are {', '.join(SERVICES)}")
         if query.payload is None:
-            raise Refused("there is no payload: send a message, {} is enough")
+            raise ReloadRefused("there is no payload: send a message, {} is enough")
         return messages.parse(SERVICES[verb], query.payload.to_bytes(), encoding)
 
     def _others(self) -> list[Any]:

@@ -7,9 +7,9 @@ is crew.py's part, when is supervisor.py's.
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from fleet.supervisor.car_status import Row
-from fleet.supervisor.processes import Crew, Process
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, WRONG_USE, State, delay_s
+from fleet.supervisor.car_status import CarStatus
+from fleet.supervisor.processes import ManagedProcess, ProcessSet
+from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, WRONG_USE, RunState, delay_s
 
 NOT_STOPPED: Final = "not stopped"
 """How the words begin on a car that may be moving."""
@@ -21,7 +21,7 @@ LINK_S: Final = 8.0
 """How long then until it has reached its car."""
 
 
-class Farewell:
+class GatewayShutdown:
     """Gateways that are to end.
 
     A gateway that is killed before its car is stopped, or that fell before it was told to end, is replaced once in any
@@ -32,8 +32,8 @@ class Farewell:
 
     def __init__(
         self,
-        crew: Crew,
-        rows: Mapping[str, Row],
+        crew: ProcessSet,
+        rows: Mapping[str, CarStatus],
         tell: Callable[[str, str], None],
         exists: Callable[[str], bool] = lambda _: True,
     ) -> None:
@@ -42,7 +42,7 @@ class Farewell:
         self._tell = tell
         self._exists = exists
         self._hurried = False
-        self._going: dict[str, Process] = {}
+        self._going: dict[str, ManagedProcess] = {}
         self._awaited: set[str] = set()
         """Gateways that are told to end when they have reached their car."""
         self._tries: dict[str, int] = {}
@@ -60,7 +60,7 @@ class Farewell:
         """Cars that may be moving."""
         return sorted(car for car, words in self.became.items() if words.startswith(NOT_STOPPED))
 
-    def begin(self, process: Process) -> None:
+    def begin(self, process: ManagedProcess) -> None:
         """See that this one stops its car and ends."""
         if process.name in self._going:
             return
@@ -71,7 +71,7 @@ class Farewell:
             self._end(process)
         elif process.child is None:
             self._became(process, "nothing was sent to it: its gateway had not been started")
-        elif process.ward.state is State.REFUSED:
+        elif process.ward.state is RunState.REFUSED:
             self._became(process, f"{NOT_STOPPED}: no gateway was running ({process.ward.words})")
         else:
             self._replace(process, process.ward.words or "no gateway was running")
@@ -101,12 +101,12 @@ class Farewell:
         self._awaited.discard(name)
         self._tries.pop(name, None)
 
-    def ended(self, process: Process) -> None:
+    def ended(self, process: ManagedProcess) -> None:
         """A gateway has ended."""
         if process.name not in self._going or process.code is None:
             return
         words = f"{NOT_STOPPED}: {_why(process)}"
-        fell = process.code < 0 or process.ward.state is State.WAITING
+        fell = process.code < 0 or process.ward.state is RunState.WAITING
         if process.code == 0:
             self._became(process, "stopped")
         elif process.name not in self._tries and fell:
@@ -122,33 +122,33 @@ class Farewell:
         """Tell those to end that have reached their car now, or did not in time."""
         for name in sorted(self._awaited):
             process = self._going[name]
-            overdue = now - process.ward.since > (LINK_S if process.ward.state is State.RUNNING else START_S)
+            overdue = now - process.ward.since > (LINK_S if process.ward.state is RunState.RUNNING else START_S)
             match process.ward.state:
-                case State.RUNNING if overdue or self._reached(process):
+                case RunState.RUNNING if overdue or self._reached(process):
                     self._end(process)
-                case State.STARTING if overdue:
+                case RunState.STARTING if overdue:
                     self._end(process)
-                case State.WAITING if now - process.ward.due > START_S:
+                case RunState.WAITING if now - process.ward.due > START_S:
                     self._became(process, f"{NOT_STOPPED}: {process.ward.words}")
 
-    def _is_retried(self, process: Process) -> bool:
+    def _is_retried(self, process: ManagedProcess) -> bool:
         """Return True if another gateway may do what this one could not. A car that was off all the time stands."""
         row = self._rows.get(process.name)
         reached = row is not None and row.reached and self._exists(process.name)
         return reached and not self._hurried and not process.leaving and process.code != WRONG_USE
 
-    def _reached(self, process: Process) -> bool:
+    def _reached(self, process: ManagedProcess) -> bool:
         row = self._rows.get(process.name)
         if process.name in self._tries:
             return row is not None and row.link not in ("", "lost")
         return not self._undecided(process)
 
-    def _undecided(self, process: Process) -> bool:
+    def _undecided(self, process: ManagedProcess) -> bool:
         """Whether it has not yet tried to reach its car."""
         row = self._rows.get(process.name)
-        return process.ward.state is State.STARTING or row is None or not row.link or row.reason == NOT_TRIED
+        return process.ward.state is RunState.STARTING or row is None or not row.link or row.reason == NOT_TRIED
 
-    def _replace(self, process: Process, why: str) -> None:
+    def _replace(self, process: ManagedProcess, why: str) -> None:
         tried = self._tries[process.name] = self._tries.get(process.name, 0) + 1
         until = "" if tried == 1 else " until Ctrl-C is pressed or fleet down is called again"
         self._tell(process.name, f"{why}. A fresh gateway tries to stop the car{until}.")
@@ -156,11 +156,11 @@ class Farewell:
         process.urgent = True
         process.ward.wanted(self._crew.now, 0.0 if tried == 1 else delay_s(tried, 0.5))
 
-    def _end(self, process: Process) -> None:
+    def _end(self, process: ManagedProcess) -> None:
         self._awaited.discard(process.name)
         self._crew.end(process, GATEWAY_GRACE_S)
 
-    def _became(self, process: Process, words: str) -> None:
+    def _became(self, process: ManagedProcess, words: str) -> None:
         self._forget(process.name)
         self._crew.end(process, 0.0)  # it has ended: it is not started again
         if not process.leaving:
@@ -168,7 +168,7 @@ class Farewell:
         self._tell(process.name, words)
 
 
-def _why(process: Process) -> str:
+def _why(process: ManagedProcess) -> str:
     if process.code is not None and process.code < 0:
         return "its gateway was killed: the car may be moving"
     return process.why.removeprefix(f"{process.name}: ") or f"its gateway ended with exit code {process.code}"

@@ -12,7 +12,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from fleet.fleetfile.fleet_file import CarSpec, FleetFile, profile_capabilities
+from fleet.fleetfile.fleet_file import FleetCar, FleetFile, profile_capabilities
 from fleet.supervisor.restart_policy import Patience
 from schemas.keys import DEFAULT_FLEET
 
@@ -32,7 +32,7 @@ SELF: Final = "@supervisor"
 """Names of processes; all others are a car's gateway, and no car's name begins with @."""
 
 
-class Kind(StrEnum):
+class ProcessKind(StrEnum):
     """What a process is for."""
 
     HUB = "hub"
@@ -42,18 +42,18 @@ class Kind(StrEnum):
     RECORDER = "recorder"
 
 
-PATIENCE: Final[Mapping[Kind, Patience]] = {
+PATIENCE: Final[Mapping[ProcessKind, Patience]] = {
     # A client is linked again after half a second, a lease is 2 s. A hub that stood for 6 s need not be replaced.
-    Kind.HUB: Patience(start_s=10.0, silence_s=8.0),
-    Kind.SIMULATOR: Patience(start_s=20.0, silence_s=5.0),  # asked each second
-    Kind.GATEWAY: Patience(start_s=20.0, silence_s=4.0, to_the_end=True),  # state/health comes each second
-    Kind.COORDINATOR: Patience(start_s=20.0, silence_s=6.0),  # asked each second
-    Kind.RECORDER: Patience(start_s=20.0, silence_s=10.0),  # each second, from a thread that waits for the disk
+    ProcessKind.HUB: Patience(start_s=10.0, silence_s=8.0),
+    ProcessKind.SIMULATOR: Patience(start_s=20.0, silence_s=5.0),  # asked each second
+    ProcessKind.GATEWAY: Patience(start_s=20.0, silence_s=4.0, to_the_end=True),  # state/health comes each second
+    ProcessKind.COORDINATOR: Patience(start_s=20.0, silence_s=6.0),  # asked each second
+    ProcessKind.RECORDER: Patience(start_s=20.0, silence_s=10.0),  # each second, from a thread that waits for the disk
 }
 
 
 @dataclass(frozen=True, slots=True)
-class WantedCar:
+class CarProcessSpec:
     """One car: its link, or SIMULATED, and what its gateway is told besides."""
 
     name: str
@@ -74,12 +74,12 @@ class Listed:
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class FleetSpec:
     """All that is to run."""
 
     fleet: str = DEFAULT_FLEET
     endpoint: str | None = None
-    cars: Mapping[str, WantedCar] = field(default_factory=dict)
+    cars: Mapping[str, CarProcessSpec] = field(default_factory=dict)
     plan: Path | None = None
     plan_text: str = ""
     """As it was read and checked: a file that is changed counts when it is reloaded."""
@@ -96,7 +96,7 @@ class Wanted:
     """What is hardly meant so, a line each."""
 
     @property
-    def simulated(self) -> list[WantedCar]:
+    def simulated(self) -> list[CarProcessSpec]:
         """The cars that the simulator plays."""
         return [car for car in self.cars.values() if car.link == SIMULATED]
 
@@ -115,18 +115,18 @@ class Asked:
     insecure_lan: bool = False
 
 
-def wanted(file: FleetFile | None, asked: Asked) -> Wanted:
+def wanted(file: FleetFile | None, asked: Asked) -> FleetSpec:
     """Unite file and command line, which wins. Of `asked.simulated` cars the file's come first, whatever their link."""
     specs = {} if file is None else {**file.cars, **file.unlinked}
     cars = {name: _car(spec) for name, spec in specs.items()}
     names = _names(list(cars), asked.simulated)
     cars = {name: car for name, car in cars.items() if car.link or name in names}
     for index, name in enumerate(names):
-        car = cars.get(name) or WantedCar(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
+        car = cars.get(name) or CarProcessSpec(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
         # A simulated car must be of some platform, one of a real car may be found out.
         platform = "arduino" if car.platform in ("auto", "unknown") else car.platform
-        cars[name] = WantedCar(name, SIMULATED, platform, car.arguments)
-    return Wanted(
+        cars[name] = CarProcessSpec(name, SIMULATED, platform, car.arguments)
+    return FleetSpec(
         fleet=asked.fleet or (file.name if file else DEFAULT_FLEET),
         endpoint=asked.connect or (file.endpoint if file else None),
         cars=cars,
@@ -152,9 +152,9 @@ def _names(known: Sequence[str], count: int) -> list[str]:
     return names
 
 
-def _car(spec: CarSpec) -> WantedCar:
+def _car(spec: FleetCar) -> CarProcessSpec:
     limits = spec.limits
-    return WantedCar(
+    return CarProcessSpec(
         spec.name,
         spec.link,
         spec.platform,
@@ -172,14 +172,14 @@ def _car(spec: CarSpec) -> WantedCar:
     )
 
 
-def _listed(spec: CarSpec | None, platform: str) -> Listed:
+def _listed(spec: FleetCar | None, platform: str) -> Listed:
     if spec is None:
         return Listed(platform)
     fewer = spec.capabilities != profile_capabilities(spec.platform)
     return Listed(spec.platform, tuple(sorted(spec.capabilities)) if fewer else None, spec.roles)
 
 
-def listing(wish: Wanted) -> str:
+def listing(wish: FleetSpec) -> str:
     """A fleet file for the coordinator, of what was accepted.
 
     The user's own may be wrong, or gone, when the coordinator is started again.
@@ -200,20 +200,20 @@ def module(name: str, *arguments: str) -> tuple[str, ...]:
     return (sys.executable, "-m", name, *arguments)
 
 
-def hub_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
+def hub_command(wish: FleetSpec, endpoint: str) -> tuple[str, ...]:
     """The hub."""
     open_to_lan = ("--insecure-lan",) if wish.insecure_lan else ()
     return module("schemas.bus.hub", "--endpoint", endpoint, *open_to_lan)
 
 
-def gateway_command(wish: Wanted, car: WantedCar, link: str, endpoint: str) -> tuple[str, ...]:
+def gateway_command(wish: FleetSpec, car: CarProcessSpec, link: str, endpoint: str) -> tuple[str, ...]:
     """The gateway of a car, which keeps trying when its car is off."""
     where = ("--fleet", wish.fleet, "--connect", endpoint, "--retry", "--with-parent")
     told = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
     return module("gateway.cli", "run", *told, *where)
 
 
-def simulator_command(wish: Wanted, directory: Path, endpoint: str) -> tuple[str, ...]:
+def simulator_command(wish: FleetSpec, directory: Path, endpoint: str) -> tuple[str, ...]:
     """One simulator for all simulated cars; a named terminal is found again by a gateway when it was away."""
     cars = [f"{car.name}:{car.platform}:{_terminal(directory, car.name)}" for car in wish.simulated]
     world = () if wish.world is None else ("--world", str(wish.world))
@@ -225,7 +225,7 @@ def _terminal(directory: Path, car: str) -> str:
     return f"pty:{directory / car}.tty" if os.name == "posix" else "tcp"
 
 
-def recorder_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
+def recorder_command(wish: FleetSpec, endpoint: str) -> tuple[str, ...]:
     """The recorder."""
     where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
     files = {"--fleet-file": wish.file, "--plan": wish.plan}
@@ -233,7 +233,7 @@ def recorder_command(wish: Wanted, endpoint: str) -> tuple[str, ...]:
     return module("fleet.cli", "record", "--out", str(wish.recordings), "--json", *kept, *where)
 
 
-def coordinator_command(wish: Wanted, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
+def coordinator_command(wish: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
     """The coordinator, with copies of the plan and of what is said of the cars, both in the directory of this run."""
     where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent", "--run", plan.parent.name)
     return module("fleet.cli", "coordinate", "--plan", str(plan), "--fleet-file", str(listed), "--json", *where)

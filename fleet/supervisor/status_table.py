@@ -10,11 +10,11 @@ from rich.live import Live
 from rich.table import Table as Grid
 from rich.text import Text
 
-from fleet.supervisor.car_status import Row
-from fleet.supervisor.restart_policy import State
+from fleet.supervisor.car_status import CarStatus
+from fleet.supervisor.restart_policy import RunState
 
 if TYPE_CHECKING:
-    from fleet.supervisor.supervisor import Happening, Supervisor
+    from fleet.supervisor.supervisor import Supervisor, SupervisorEvent
 
 DRAW_S: Final = 0.25
 SHARE: Final = 10.0
@@ -43,7 +43,7 @@ class Table:
         self._safely(lambda: self._live.update(self.rendered(), refresh=True))
         self._safely(self._live.stop)
 
-    def tell(self, happening: "Happening") -> None:
+    def tell(self, happening: "SupervisorEvent") -> None:
         """A line above the table; what a car shows in its row is no line."""
         if happening.what in ("process", "hold", "end"):
             line = Text(f"{datetime.now(UTC):%H:%M:%S} {happening.name}: {happening.words}")
@@ -68,12 +68,12 @@ class Table:
             )
         for name, row in self._supervisor.rows.items():
             process = self._supervisor.crew.get(name)
-            running = process is not None and process.ward.state is State.RUNNING
+            running = process is not None and process.ward.state is RunState.RUNNING
             state = "" if running else "starting" if process is None else str(process.ward.state)
             grid.add_row(*_cells(row, state))
         services = [
             Text.assemble(
-                each.name, " ", (str(each.ward.state), "green" if each.ward.state is State.RUNNING else "yellow")
+                each.name, " ", (str(each.ward.state), "green" if each.ward.state is RunState.RUNNING else "yellow")
             )
             for each in self._supervisor.crew
             if each.name.startswith("@")
@@ -90,7 +90,7 @@ class Table:
             self._broken = True
 
 
-def _cells(row: Row, process: str) -> list[Text]:
+def _cells(row: CarStatus, process: str) -> list[Text]:
     link = process if process or not row.link else row.link
     held = f"e-stop {row.estop}" if row.estop else f"hold {row.hold}" if row.hold else ""
     rate = "" if row.rate_hz is None else f"{row.rate_hz:.1f}"

@@ -17,14 +17,14 @@ from math import inf
 from typing import Any, Final
 
 from fleet.supervisor import spec
-from fleet.supervisor.car_status import Row, left_from_before
+from fleet.supervisor.car_status import CarStatus, left_from_before
 from fleet.supervisor.child import copied, new_run, remove_links
-from fleet.supervisor.processes import TURN_S, Crew, Process
+from fleet.supervisor.processes import TURN_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import change
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, State
-from fleet.supervisor.service import Desk, Refused
-from fleet.supervisor.shutdown import Farewell
-from fleet.supervisor.spec import COORDINATOR, HUB, RECORDER, SELF, SIMULATOR, Kind, Wanted, WantedCar
+from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, RunState
+from fleet.supervisor.service import ReloadRefused, SupervisorService
+from fleet.supervisor.shutdown import GatewayShutdown
+from fleet.supervisor.spec import COORDINATOR, HUB, RECORDER, SELF, SIMULATOR, CarProcessSpec, FleetSpec, ProcessKind
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import DEFAULT_FLEET
@@ -44,7 +44,7 @@ RECORDER_END_S: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Happening:
+class SupervisorEvent:
     """Something that is worth a line. what: `process`, `car`, `hold`, `log`, `decision`, ..."""
 
     what: str
@@ -59,18 +59,20 @@ class Supervisor:
     """
 
     def __init__(
-        self, wish: Wanted, source: str, read: Callable[[], Wanted], tell: Callable[[Happening], None]
+        self, wish: FleetSpec, source: str, read: Callable[[], FleetSpec], tell: Callable[[SupervisorEvent], None]
     ) -> None:
         self.endpoint = resolve_endpoint(wish.endpoint)
-        self.rows: dict[str, Row] = {}
-        self.crew = Crew(lambda name, words: self._say("process", name, words), self._said, self._ended)
+        self.rows: dict[str, CarStatus] = {}
+        self.crew = ProcessSet(lambda name, words: self._say("process", name, words), self._said, self._ended)
         self._wish = wish
         self._source = source
         self._read = read
         self._tell = tell
         self._state = "starting"
-        self._farewell = Farewell(self.crew, self.rows, lambda car, words: self._say("end", car, words), self._exists)
-        self._desk: Desk | None = None
+        self._farewell = GatewayShutdown(
+            self.crew, self.rows, lambda car, words: self._say("end", car, words), self._exists
+        )
+        self._desk: SupervisorService | None = None
         self._began = time.monotonic()
         self._began_wall_s = time.time()
         self._unlinked_since = self.crew.now
@@ -115,7 +117,7 @@ class Supervisor:
             if bus is None:
                 self._say("end", SELF, "no car had been started")
                 return True
-            desk = self._desk = Desk(bus, self._wish.fleet)
+            desk = self._desk = SupervisorService(bus, self._wish.fleet)
             await desk.open(self._heard, {"down": self._down, "reload": self._reload}, self.status)
             if not self._end_asked.is_set():
                 self._populate()
@@ -141,7 +143,7 @@ class Supervisor:
 
     async def _bus(self) -> Bus | None:
         """A session; the hub is started if there is none. None if it is to end before. Raises BusError."""
-        self.crew.add(HUB, Kind.HUB, spec.hub_command(self._wish, self.endpoint))
+        self.crew.add(HUB, ProcessKind.HUB, spec.hub_command(self._wish, self.endpoint))
         deadline = self.crew.now + HUB_UP_S
         while not self._end_asked.is_set():
             await self._turn()
@@ -161,11 +163,11 @@ class Supervisor:
         if linked:
             self.crew.heard(HUB)
         gone = self._desk is not None and not linked and now - self._unlinked_since >= HUB_GONE_S
-        due = hub.ward.state is State.WAITING and now >= hub.ward.due
-        refused = hub.ward.state is State.REFUSED  # on a network that is not to be opened: the router there is back
+        due = hub.ward.state is RunState.WAITING and now >= hub.ward.due
+        refused = hub.ward.state is RunState.REFUSED  # on a network that is not to be opened: the router there is back
         if (refused and linked) or (due and await asyncio.to_thread(accepts, self.endpoint)):
             hub.ward.elsewhere(now, f"somebody else's listens at {self.endpoint}")
-        elif hub.ward.state is State.ELSEWHERE and gone and not await asyncio.to_thread(accepts, self.endpoint):
+        elif hub.ward.state is RunState.ELSEWHERE and gone and not await asyncio.to_thread(accepts, self.endpoint):
             hub.ward.wanted(now)
 
     async def _leave(self) -> None:
@@ -181,25 +183,25 @@ class Supervisor:
 
     def _populate(self) -> None:
         if self._wish.record:
-            self.crew.add(RECORDER, Kind.RECORDER, spec.recorder_command(self._wish, self.endpoint))
+            self.crew.add(RECORDER, ProcessKind.RECORDER, spec.recorder_command(self._wish, self.endpoint))
             self._gateways_from = self.crew.now + RECORDER_FIRST_S
         if self._wish.simulated:
             command = spec.simulator_command(self._wish, self.crew.directory, self.endpoint)
-            self.crew.add(SIMULATOR, Kind.SIMULATOR, command)
+            self.crew.add(SIMULATOR, ProcessKind.SIMULATOR, command)
         for car in self._wish.cars.values():
             self._add_car(car)
         if command := self._coordinator(self._wish):
-            self.crew.add(COORDINATOR, Kind.COORDINATOR, command)
+            self.crew.add(COORDINATOR, ProcessKind.COORDINATOR, command)
 
-    def _add_car(self, car: WantedCar) -> None:
+    def _add_car(self, car: CarProcessSpec) -> None:
         """Start its gateway, or do it anew with what is wanted now; a simulated car's as soon as its link is known."""
-        self.rows.setdefault(car.name, Row(car.name))
+        self.rows.setdefault(car.name, CarStatus(car.name))
         link = self._sim_links.get(car.name) if car.link == spec.SIMULATED else car.link
         if link is not None:
             self._farewell.recall(car.name)
-            self.crew.add(car.name, Kind.GATEWAY, spec.gateway_command(self._wish, car, link, self.endpoint))
+            self.crew.add(car.name, ProcessKind.GATEWAY, spec.gateway_command(self._wish, car, link, self.endpoint))
 
-    def _coordinator(self, wish: Wanted) -> tuple[str, ...]:
+    def _coordinator(self, wish: FleetSpec) -> tuple[str, ...]:
         """Its command; empty without a plan. Raises OSError.
 
         It gets copies of plan and fleet file: what is changed there counts when it is reloaded and checked.
@@ -208,7 +210,7 @@ class Supervisor:
             return ()
         return self._coordinator_of(wish, wish.plan_text)
 
-    def _coordinator_of(self, wish: Wanted, text: str) -> tuple[str, ...]:
+    def _coordinator_of(self, wish: FleetSpec, text: str) -> tuple[str, ...]:
         plan = copied(self.crew.directory, "plan", text)
         listed = copied(self.crew.directory, "fleet", spec.listing(wish))
         return spec.coordinator_command(wish, plan, listed, self.endpoint)
@@ -217,7 +219,7 @@ class Supervisor:
         """A plan that was given over the bus outlives the coordinator that took it, until a reload."""
         coordinator = self.crew.get(COORDINATOR)
         # The last words of one that is to begin anew say what was, and a reload sees to the command itself.
-        if coordinator is None or coordinator.ward.state is not State.RUNNING or self._reloading.locked():
+        if coordinator is None or coordinator.ward.state is not RunState.RUNNING or self._reloading.locked():
             return
         given = plan.text != self._wish.plan_text
         try:
@@ -233,19 +235,19 @@ class Supervisor:
                 words = f"plan {plan.version} was given over the bus: it is in force until a reload"
                 self._say("process", COORDINATOR, words)
 
-    async def _set_plan(self, desk: Desk, old: Wanted, command: tuple[str, ...]) -> str:
+    async def _set_plan(self, desk: SupervisorService, old: FleetSpec, command: tuple[str, ...]) -> str:
         """See that the coordinator does what is wanted now; what is new about its plan."""
         coordinator = self.crew.get(COORDINATOR)
         if not command or coordinator is None:
             if command:
-                self.crew.add(COORDINATOR, Kind.COORDINATOR, command)
+                self.crew.add(COORDINATOR, ProcessKind.COORDINATOR, command)
                 return "there is a plan now"
             self.crew.remove(COORDINATOR, END_S)
             return "there is no plan any more: cars keep their modes" if coordinator is not None else ""
         text = self._wish.plan_text
         words = "" if text == old.plan_text else "the plan is changed"
         in_force = None
-        if coordinator.ward.state is State.RUNNING:
+        if coordinator.ward.state is RunState.RUNNING:
             in_force = await asyncio.to_thread(desk.plan_in_force)
         if in_force is not None and in_force.text not in (text, old.plan_text):
             words = f"plan {in_force.version}, which was given over the bus, is replaced by {self._wish.plan}"
@@ -258,7 +260,7 @@ class Supervisor:
             coordinator.command = command
         else:
             # One that was given up has another chance.
-            self.crew.add(COORDINATOR, Kind.COORDINATOR, command, anew=not has_it and in_force is not None)
+            self.crew.add(COORDINATOR, ProcessKind.COORDINATOR, command, anew=not has_it and in_force is not None)
         return words
 
     # ------------------------------------------------------------------ one turn
@@ -278,15 +280,15 @@ class Supervisor:
             self._shown = shown
             self._desk.publish(self.status())
 
-    def _listening_since(self, process: Process) -> float | None:
-        if process.kind is Kind.HUB:
+    def _listening_since(self, process: ManagedProcess) -> float | None:
+        if process.kind is ProcessKind.HUB:
             return 0.0 if self._desk is not None else None
         return self._linked_since
 
-    def _may_move(self, process: Process) -> bool:
+    def _may_move(self, process: ManagedProcess) -> bool:
         """Return True if a gateway's car may move: only a gateway that was heard can say that it does not."""
         row = self.rows.get(process.name)
-        return process.kind is Kind.GATEWAY and (row is None or row.motors != "off")
+        return process.kind is ProcessKind.GATEWAY and (row is None or row.motors != "off")
 
     def _exists(self, car: str) -> bool:
         """Return True unless the car is simulated and its simulator has ended."""
@@ -295,10 +297,10 @@ class Supervisor:
         simulated = wish is not None and wish.link == spec.SIMULATED
         return not simulated or (simulator is not None and simulator.ward.alive)
 
-    def _may_start(self, process: Process) -> bool:
-        if process.kind is Kind.HUB or self._farewell.may_start(process.name):
+    def _may_start(self, process: ManagedProcess) -> bool:
+        if process.kind is ProcessKind.HUB or self._farewell.may_start(process.name):
             return True
-        waits = process.kind is Kind.GATEWAY and self.crew.now < self._gateways_from
+        waits = process.kind is ProcessKind.GATEWAY and self.crew.now < self._gateways_from
         return not waits and not self._end_asked.is_set()
 
     # ------------------------------------------------------------------ what is heard
@@ -309,11 +311,11 @@ class Supervisor:
         name = "" if self._wish.fleet == DEFAULT_FLEET else f" --fleet {self._wish.fleet}"
         return name if self.endpoint == resolve_endpoint() else f"{name} --connect {self.endpoint}"
 
-    def _ended(self, process: Process, told: bool) -> None:  # noqa: FBT001 - the crew calls it so
-        if process.kind is Kind.SIMULATOR:
+    def _ended(self, process: ManagedProcess, told: bool) -> None:  # noqa: FBT001 - the crew calls it so
+        if process.kind is ProcessKind.SIMULATOR:
             self._sim_asked.clear()
             remove_links(self.crew.directory)
-        if process.kind is not Kind.GATEWAY:
+        if process.kind is not ProcessKind.GATEWAY:
             return
         row = self.rows.get(process.name)
         if row is not None:
@@ -323,7 +325,7 @@ class Supervisor:
             return
         if process.leaving:
             self.rows.pop(process.name, None)
-        elif told and process.code != 0 and process.ward.state is State.WAITING:
+        elif told and process.code != 0 and process.ward.state is RunState.WAITING:
             self._say("process", process.name, f"ended without stopping its car: {process.why or process.ward.words}")
 
     def _heard(self, car: str, topic: str, value: Any) -> None:
@@ -346,17 +348,17 @@ class Supervisor:
             if topic == "event/log":
                 self._say("log", car, row.event)
 
-    def _said(self, process: Process, line: str) -> None:
+    def _said(self, process: ManagedProcess, line: str) -> None:
         """A line of a process's stdout."""
         try:
             told = json.loads(line)
         except ValueError:
             return  # it is in the log
-        if process.kind is Kind.RECORDER:
+        if process.kind is ProcessKind.RECORDER:
             self._say("process", RECORDER, _recording(told))
-        elif process.kind is Kind.COORDINATOR:
+        elif process.kind is ProcessKind.COORDINATOR:
             self._say("decision", told["subject"], f"{told['decided']}, because {told['why']}")
-        if process.kind is not Kind.SIMULATOR:
+        if process.kind is not ProcessKind.SIMULATOR:
             return
         self.crew.heard(SIMULATOR)
         if "link" in told and told.get("car") in self._wish.cars:
@@ -366,7 +368,7 @@ class Supervisor:
         elif "ok" in told and self._sim_asked and self._sim_asked.popleft():
             self._say("simulator", SIMULATOR, line)
 
-    async def _each_second(self, desk: Desk) -> None:
+    async def _each_second(self, desk: SupervisorService) -> None:
         """Ask who says nothing by itself for a sign of life, and say how things are."""
         question = json.dumps({"car": next((car.name for car in self._wish.simulated), ""), "ask": "truth"})
         asking: asyncio.Future[bool] | None = None
@@ -386,19 +388,19 @@ class Supervisor:
 
     # ------------------------------------------------------------------ the end
 
-    async def _end_all(self, desk: Desk) -> None:
+    async def _end_all(self, desk: SupervisorService) -> None:
         """The coordinator first, so that it opens nothing again; every car; the recording; the simulated cars."""
         self._state = "ending"
         desk.publish(self.status())
-        gateways = self.crew.of(Kind.GATEWAY)
-        for process in self.crew.of(Kind.COORDINATOR):
+        gateways = self.crew.of(ProcessKind.GATEWAY)
+        for process in self.crew.of(ProcessKind.COORDINATOR):
             self.crew.end(process, END_S)
         asked = asyncio.ensure_future(asyncio.to_thread(desk.stop_all))
         await asyncio.wait([asked], timeout=STOP_ASKED_S)
         for process in gateways:
             self._farewell.begin(process)
-        await self._until_ended([*gateways, *self.crew.of(Kind.COORDINATOR)])
-        for kind, grace in ((Kind.RECORDER, RECORDER_END_S), (Kind.SIMULATOR, END_S)):
+        await self._until_ended([*gateways, *self.crew.of(ProcessKind.COORDINATOR)])
+        for kind, grace in ((ProcessKind.RECORDER, RECORDER_END_S), (ProcessKind.SIMULATOR, END_S)):
             for process in self.crew.of(kind):
                 self.crew.end(process, grace)
                 await self._until_ended([process])
@@ -407,7 +409,7 @@ class Supervisor:
         words = "every car that was started is stopped" if self._farewell.became else "no car had been started"
         self._say("end", SELF, f"not stopped: {left}: look whether they drive" if left else words)
 
-    async def _until_ended(self, processes: list[Process]) -> None:
+    async def _until_ended(self, processes: list[ManagedProcess]) -> None:
         while self._farewell.going or any(process.ward.alive for process in processes):
             if self.crew.now > self._tries_until:
                 self._tries_until = inf
@@ -450,15 +452,15 @@ class Supervisor:
         try:
             new = await asyncio.to_thread(self._read)
         except ValueError as error:
-            raise Refused(f"nothing was changed: {error}") from None
+            raise ReloadRefused(f"nothing was changed: {error}") from None
         if self._end_asked.is_set():
-            raise Refused("nothing was changed: the fleet is ending")
+            raise ReloadRefused("nothing was changed: the fleet is ending")
         old, found = self._wish, change(self._wish, new)
         try:
             command = self._coordinator(found.wish)  # what may fail comes first
         except OSError as error:
             why = f"the coordinator's copies cannot be written in {self.crew.directory}: {error.strerror}"
-            raise Refused(f"nothing was changed: {why}") from None
+            raise ReloadRefused(f"nothing was changed: {why}") from None
         words = list(found.words)
         self._wish = found.wish
         for name in found.gone:
@@ -479,7 +481,7 @@ class Supervisor:
         return "\n".join([*(words or ["nothing has changed"]), *found.wish.doubts])
 
     def _say(self, what: str, name: str, words: str) -> None:
-        self._tell(Happening(what, name, words))
+        self._tell(SupervisorEvent(what, name, words))
 
 
 def _recording(told: Mapping[str, Any]) -> str:

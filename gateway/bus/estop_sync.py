@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from gateway.control.commands import Command, EmergencyStop, Resume
-from gateway.control.safety import Estop, Kept
+from gateway.control.safety import Estop, PersistedSafety
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -42,7 +42,7 @@ Unite = Callable[[Sequence[Estop], Sequence[str], str], object]
 """Hears e-stops in force, ids of those that ended, and the car whose gateway knows them."""
 
 
-class Neighbours:
+class EstopSync:
     """Asks the other gateways of `fleet`; made and used in the loop, the bus is asked on threads."""
 
     def __init__(self, opened: bus.Bus, fleet: str, car: str) -> None:
@@ -73,7 +73,7 @@ class Neighbours:
         self._due |= self._alive
         self._came.set()
 
-    def pass_on(self, command: Command, before: Kept, now: Kept) -> None:
+    def pass_on(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
         """What was asked of this car alone and is meant for the fleet: ask all, under the same id."""
         fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
         payload: pb.EstopCommand | pb.ResumeCommand

@@ -43,7 +43,7 @@ class Value:
     payload: bytes
 
 
-class Ring:
+class HistoryBuffer:
     """The last values of one key, oldest first."""
 
     def __init__(self, size: int) -> None:

@@ -14,14 +14,14 @@ from typing import Any, Final
 
 import zenoh
 
-from gateway.bus.history import BadRange, Ring
-from gateway.clock import Wall
-from gateway.control.commands import CommandRecord, Level, LogRecord, Phase, Write
+from gateway.bus.history import BadRange, HistoryBuffer
+from gateway.clock import WallClock
+from gateway.control.commands import CommandRecord, Level, LogRecord, OutgoingFrame, Phase
 from gateway.control.controller import Controller
 from gateway.control.estimate import battery
 from gateway.control.estimate.link_health import LinkHealth
-from gateway.control.estimate.platform import PlatformTruth
-from gateway.control.rate_limit import Allowance
+from gateway.control.estimate.platform import PlatformDetector
+from gateway.control.rate_limit import TokenBucket
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
 from gateway.protocol.measurements import measured, verdict_of
@@ -54,7 +54,7 @@ _ON_ARRIVAL: Final = frozenset({Phase.ASKED, Phase.QUEUED, Phase.REJECTED})
 _LEVELS: Final = {Level.DEBUG: 1, Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4}  # foxglove.Log.Level
 
 
-class Publications:
+class CarPublisher:
     """Publishers, latest values and rings of one car."""
 
     def __init__(self, opened: bus.Bus, fleet: str, car: str, control: Controller, url: str) -> None:
@@ -65,7 +65,7 @@ class Publications:
         self._battery = control.battery
         self._url = url
         self._publishers: dict[str, bus.Publisher] = {}
-        self._rings: dict[str, Ring] = {}
+        self._rings: dict[str, HistoryBuffer] = {}
         self._told: dict[str, tuple[object, ...]] = {}
         self._told_at: dict[str, float] = {}
         for topic in topics.CAR_TOPICS:
@@ -74,10 +74,10 @@ class Publications:
             key = keys.topic_key(fleet, car, topic.name)
             self._publishers[topic.name] = opened.publisher(key, topic, car)
             if topic.kept:
-                self._rings[topic.name] = Ring(topic.kept)
-        self._wall = Wall()
-        self._raw = Allowance(RAW_PER_S, RAW_AT_ONCE)
-        self._process = _Process()
+                self._rings[topic.name] = HistoryBuffer(topic.kept)
+        self._wall = WallClock()
+        self._raw = TokenBucket(RAW_PER_S, RAW_AT_ONCE)
+        self._process = _ProcessStats()
         self._away_at = float("-inf")
         """When the bus was away last."""
         self._kept: deque[tuple[bus.Publisher, Any, int]] = deque()
@@ -120,7 +120,7 @@ class Publications:
 
     # ------------------------------------------------------------------ frames out, records
 
-    def written(self, write: Write, at: float, *, whole: bool) -> None:
+    def written(self, write: OutgoingFrame, at: float, *, whole: bool) -> None:
         """Publish a frame that was written, or was not."""
         frame = _CLASSES["frame/tx"]()
         frame.data = write.data
@@ -223,7 +223,7 @@ class Publications:
                 _fill_safety(message, control, now)
         self._put_state(name, message, now)
 
-    def health(self, now: float, *, loop_lag_s: float, bus_drops: int, platform: PlatformTruth) -> None:
+    def health(self, now: float, *, loop_lag_s: float, bus_drops: int, platform: PlatformDetector) -> None:
         """Publish what the gateway's process does, and what the car is treated as."""
         message = _CLASSES["state/health"]()
         self._process.fill(message, now)
@@ -344,7 +344,7 @@ def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
     message.worst_stop_s = control.worst_stop_s(now)
 
 
-class _Process:
+class _ProcessStats:
     """CPU, memory and age of this process."""
 
     def __init__(self) -> None:

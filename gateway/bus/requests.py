@@ -12,21 +12,21 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from gateway.control.commands import (
-    Act,
+    Action,
     ChangeSpeed,
     Command,
     Drive,
     EmergencyStop,
     Fan,
     Find,
-    Kind,
+    OneShot,
     Reason,
     Resume,
     Sender,
+    SenderKind,
     SetMode,
     Stop,
     TakeLease,
-    What,
 )
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
@@ -48,7 +48,7 @@ BY_WILDCARD: Final = ("stop", "estop", "resume")
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ParsedRequest:
     """What came: the verb, the payload, and how old it is."""
 
     verb: str
@@ -80,7 +80,7 @@ class BadRequest(ValueError):
         self.command = command
 
 
-def parse(request: Request) -> Command:
+def parse(request: ParsedRequest) -> Command:
     """The command in a request; raises BadRequest."""
     verb = request.verb
     blank = Command(_id(request), verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
@@ -105,13 +105,13 @@ def parse(request: Request) -> Command:
         return _stopped_though(error.command, error.words, request)
 
 
-def _stopped_though(command: Command, words: str, request: Request) -> Command:
+def _stopped_though(command: Command, words: str, request: ParsedRequest) -> Command:
     """Whatever is wrong with its words: somebody wants this car to stop."""
     what = Stop() if request.verb == "stop" else _readable_estop(request)
     return replace(command, what=what, note=f"stopped, though: {words}")
 
 
-def _id(request: Request) -> str:
+def _id(request: ParsedRequest) -> str:
     """An id for who gave none. An e-stop asked of all with one query is one e-stop: every gateway makes the same."""
     if request.verb != "estop" or not request.by_wildcard:
         return uuid.uuid4().hex
@@ -119,7 +119,7 @@ def _id(request: Request) -> str:
     return hashlib.sha256(query).hexdigest()[:32]
 
 
-def _readable_estop(request: Request) -> EmergencyStop:
+def _readable_estop(request: ParsedRequest) -> EmergencyStop:
     """What can be read of an e-stop in which something is wrong: its scope and its reason, if nothing else."""
     try:
         given = json.loads(request.payload or b"{}")
@@ -135,7 +135,7 @@ def _readable_estop(request: Request) -> EmergencyStop:
     return EmergencyStop(_why(why) if isinstance(why, str) else "", given.get("scope") == "fleet")
 
 
-def _filled(blank: Command, request: Request) -> Command:
+def _filled(blank: Command, request: ParsedRequest) -> Command:
     verb = blank.verb
     try:
         message: Any = messages.parse(COMMANDS[verb], request.payload or b"", _encoding(request))
@@ -145,7 +145,7 @@ def _filled(blank: Command, request: Request) -> Command:
     try:
         command = replace(command, id=_text("id", message.id) or blank.id)
         command = replace(command, sender=Sender(_text("sender", message.sender, "/*$#?") or "anonymous"))
-        kind: Kind = _word("kind", message.kind or Kind.SCRIPT, Kind)
+        kind: SenderKind = _word("kind", message.kind or SenderKind.SCRIPT, SenderKind)
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
         what = _drive(message, request.longest_drive_s) if verb == "drive" else _WHAT[verb](message)
@@ -159,13 +159,13 @@ def _filled(blank: Command, request: Request) -> Command:
     )
 
 
-def _encoding(request: Request) -> str:
+def _encoding(request: ParsedRequest) -> str:
     if request.payload:
         return request.encoding
     return PROTOBUF  # zero bytes are a message without fields
 
 
-def _age_s(message: Any, request: Request) -> float | None:
+def _age_s(message: Any, request: ParsedRequest) -> float | None:
     """Return the seconds since it was asked, None if unknown; a clock that is ahead of ours gives 0, not a bonus."""
     if message.HasField("asked"):
         asked_ns = message.asked.seconds * 1_000_000_000 + message.asked.nanos
@@ -202,26 +202,26 @@ def _seconds(field: str, value: float, top: float) -> float:
     return value
 
 
-def _drive(message: Any, longest_s: float) -> What:
+def _drive(message: Any, longest_s: float) -> Action:
     duration_s = 0.5
     if message.HasField("duration_s"):
         duration_s = _seconds("duration_s", message.duration_s, longest_s)
     return Drive(_word("motion", message.motion, Motion), duration_s)
 
 
-def _mode(message: Any) -> What:
+def _mode(message: Any) -> Action:
     return SetMode(_word("mode", message.mode, Mode))
 
 
-def _led(message: Any) -> What:
+def _led(message: Any) -> Action:
     missing = [name for name in "rgb" if not message.HasField(name)]
     if missing:
         raise ValueError(f"no {', '.join(missing)} given: r, g and b are needed, 0..255 each")
     return _checked(ColorLed(message.r, message.g, message.b))
 
 
-def _light(message: Any) -> What:
-    return Act(General(Motion.STOP, light=_word("light", message.light, Light)))
+def _light(message: Any) -> Action:
+    return OneShot(General(Motion.STOP, light=_word("light", message.light, Light)))
 
 
 _SERVO_ACTIONS: Final = {
@@ -231,7 +231,7 @@ _SERVO_ACTIONS: Final = {
 }
 
 
-def _servo(message: Any) -> What:
+def _servo(message: Any) -> Action:
     servo = message.servo or "front"
     if servo not in _SERVO_ACTIONS:
         raise ValueError(f"servo {servo!r}: allowed are {', '.join(_SERVO_ACTIONS)}")
@@ -244,20 +244,20 @@ def _servo(message: Any) -> What:
             f"action {message.action!r} of servo {servo}: allowed are {', '.join(_SERVO_ACTIONS[servo])}"
             + (", or deg 0..180" if servo == "front" else "")
         )
-    return Act(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
+    return OneShot(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
 
 
-def _arm(message: Any) -> What:
+def _arm(message: Any) -> Action:
     return _checked(ArmSet(tuple(message.joint_deg)))
 
 
-def _fan(message: Any) -> What:
+def _fan(message: Any) -> Action:
     if message.state not in ("", "on", "off"):
         raise ValueError(f"state {message.state!r}: allowed are on, off, or none to toggle")
     return Fan(None if not message.state else message.state == "on")
 
 
-def _estop(message: Any) -> What:
+def _estop(message: Any) -> Action:
     if message.scope not in ("", "car", "fleet"):
         raise ValueError(f"scope {message.scope!r}: allowed are car (the default) and fleet")
     return EmergencyStop(_why(message.why), message.scope == "fleet")
@@ -267,18 +267,18 @@ def _why(text: str) -> str:
     return "".join(each if each.isprintable() else " " for each in text)[:LONGEST_WHY]
 
 
-def _checked(frame: ColorLed | Ptz | ArmSet) -> Act:
+def _checked(frame: ColorLed | Ptz | ArmSet) -> OneShot:
     encode(frame)  # raises EncodeError with the field and its range
-    return Act(frame)
+    return OneShot(frame)
 
 
-_WHAT: Final[dict[str, Callable[[Any], What]]] = {
+_WHAT: Final[dict[str, Callable[[Any], Action]]] = {
     "mode": _mode,
     "led": _led,
     "light": _light,
     "servo": _servo,
     "arm": _arm,
-    "whistle": lambda _: Act(General(Motion.STOP, whistle=True)),
+    "whistle": lambda _: OneShot(General(Motion.STOP, whistle=True)),
     "speed": lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
     "fan": _fan,
     "stop": lambda _: Stop(),

@@ -39,7 +39,7 @@ class AlreadyServed(Exception):
     """Another gateway serves this car; the text names it."""
 
 
-class Doors:
+class CarService:
     """What one gateway has declared. Raises AlreadyServed if another gateway answers for the car."""
 
     def __init__(self, opened: bus.Bus, fleet: str, car: str) -> None:

@@ -7,22 +7,22 @@ from dataclasses import dataclass
 from typing import Final
 
 from gateway.control.commands import (
-    Act,
+    Action,
     ChangeSpeed,
     Command,
     Drive,
     EmergencyStop,
     Fan,
     Find,
-    Kind,
+    OneShot,
     Reason,
     Resume,
+    SenderKind,
     SetMode,
     Stop,
     TakeLease,
-    What,
 )
-from gateway.control.safety import Estop, Lease
+from gateway.control.safety import Estop, LeaseState
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ArmSet, General, Ptz
 from gateway.protocol.platforms import Profile
@@ -32,7 +32,7 @@ QUEUE_LIMIT: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class CommandContext:
     """What the arbiter looks at."""
 
     car: str
@@ -51,7 +51,7 @@ class Situation:
     estops: tuple[Estop, ...]
     ended: tuple[str, ...]
     """Ids of e-stops that were ended."""
-    lease: Lease | None
+    lease: LeaseState | None
     battery: str
     """Why the battery allows no new drive, in words; empty if it does."""
     fan: bool | None
@@ -87,14 +87,14 @@ RELEASE: Final = Needs(lease=True)
 """A drive with motion stop: it moves nothing."""
 CLOSE: Final = Needs(lease=True)
 """Mode manual: it stops the car."""
-TABLE: Final[dict[type[What], Needs]] = {
+TABLE: Final[dict[type[Action], Needs]] = {
     Stop: _ANYTIME,
     EmergencyStop: _ANYTIME,
     Resume: _ANYTIME,
     TakeLease: Needs(lease=True, link=False),
     Drive: _MOVES,
     SetMode: Needs(lease=True, battery=True),
-    Act: _ACTS,
+    OneShot: _ACTS,
     ChangeSpeed: _TURNS,
     Fan: _TURNS,
     Find: _ACTS,
@@ -103,7 +103,7 @@ TABLE: Final[dict[type[What], Needs]] = {
 Refusal = tuple[Reason, str]
 
 
-def needs(what: What) -> Needs:
+def needs(what: Action) -> Needs:
     """What this command needs."""
     match what:
         case Drive(Motion.STOP):
@@ -112,15 +112,15 @@ def needs(what: What) -> Needs:
             return CLOSE
         case TakeLease(release=True):
             return _ANYTIME
-        case Act(Ptz() | ArmSet()):
+        case OneShot(Ptz() | ArmSet()):
             return _TURNS
-        case Act(General() as frame) if frame.servo is not None:
+        case OneShot(General() as frame) if frame.servo is not None:
             return _TURNS
         case _:
             return TABLE[type(what)]
 
 
-def refuse(command: Command, situation: Situation) -> Refusal | None:
+def refuse(command: Command, situation: CommandContext) -> Refusal | None:
     """Why the command is refused, or None. The words name the car, the state, and what to do."""
     what = command.what
     if isinstance(what, Stop | EmergencyStop):
@@ -135,14 +135,14 @@ def refuse(command: Command, situation: Situation) -> Refusal | None:
     return _unmet(command, needs(what), situation)
 
 
-def _unknown(what: What, situation: Situation) -> str | None:
+def _unknown(what: Action, situation: CommandContext) -> str | None:
     """Why this car could never do it, or must not."""
     profile = situation.profile
     match what:
         case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
             known = ", ".join(sorted(profile.modes))
             return f"a {profile.name} car does not know mode {mode}; it knows: {known}"
-        case Act(frame):
+        case OneShot(frame):
             return profile.refusal(frame)
         case ChangeSpeed(step):
             after = profile.speed.step(situation.speed, step)
@@ -166,8 +166,8 @@ def _unknown(what: What, situation: Situation) -> str | None:
             return None
 
 
-def _resume(resume: Resume, kind: Kind, situation: Situation) -> Refusal | None:
-    if kind is Kind.COORDINATOR:
+def _resume(resume: Resume, kind: SenderKind, situation: CommandContext) -> Refusal | None:
+    if kind is SenderKind.COORDINATOR:
         return Reason.HELD, "a coordinator may not resume a car: a person or a script does"
     in_force = [estop.id for estop in situation.estops]
     if resume.ids and not set(resume.ids) & {*in_force, *situation.ended}:
@@ -176,7 +176,7 @@ def _resume(resume: Resume, kind: Kind, situation: Situation) -> Refusal | None:
     return None
 
 
-def _unmet(command: Command, needed: Needs, situation: Situation) -> Refusal | None:
+def _unmet(command: Command, needed: Needs, situation: CommandContext) -> Refusal | None:
     """The first need that is not met."""
     car, sender = situation.car, command.sender
     if needed.not_estopped and situation.estops:
@@ -184,15 +184,17 @@ def _unmet(command: Command, needed: Needs, situation: Situation) -> Refusal | N
         why = f": {first.why}" if first.why else ""
         ids = " ".join(estop.id for estop in situation.estops)
         return Reason.ESTOPPED, f"{car} is e-stopped by {first.by}{why}; a person or script ends it: resume {ids}"
-    if needed.not_held and sender.kind is Kind.COORDINATOR and situation.held_by is not None:
+    if needed.not_held and sender.kind is SenderKind.COORDINATOR and situation.held_by is not None:
         ends = "a drive, mode or resume by a person or script ends it"
         return Reason.HELD, f"{car} is on hold ({situation.held_by} stopped it): {ends}"
     lease, now = situation.lease, situation.now
     if needed.lease and lease is not None and lease.refuses(sender, now, take=command.take):
         words = f"{car} is driven by {lease.holder.name} ({lease.holder.kind}), for {lease.until - now:.1f} s more"
-        if sender.kind is lease.holder.kind is Kind.PERSON:
+        if sender.kind is lease.holder.kind is SenderKind.PERSON:
             return Reason.LEASED, f"{words}: wait, or take it"
-        return Reason.LEASED, f"{words}: wait" + (", or ask as a person" if sender.kind is not Kind.PERSON else "")
+        return Reason.LEASED, f"{words}: wait" + (
+            ", or ask as a person" if sender.kind is not SenderKind.PERSON else ""
+        )
     if needed.battery and situation.battery:
         return Reason.BATTERY_LOW, situation.battery
     if needed.link:
@@ -210,7 +212,7 @@ def _unmet(command: Command, needed: Needs, situation: Situation) -> Refusal | N
     return None
 
 
-def _unreachable(situation: Situation, *, fan: bool) -> Refusal | None:
+def _unreachable(situation: CommandContext, *, fan: bool) -> Refusal | None:
     car = situation.car
     if situation.closing:
         return Reason.LINK_DOWN, f"the gateway of {car} is ending"

@@ -5,12 +5,12 @@
 
 from dataclasses import dataclass, field, replace
 
-from gateway.control.command_log import Ledger
+from gateway.control.command_log import CommandLog
 from gateway.control.commands import Level
-from gateway.control.estimate.battery import Battery, Policy
-from gateway.control.estimate.mode import ModeTruth, Verdict
-from gateway.control.estimate.outputs import Believed
-from gateway.control.estimate.platform import PlatformTruth
+from gateway.control.estimate.battery import Battery, BatteryPolicy
+from gateway.control.estimate.mode import ModeEstimator, Verdict
+from gateway.control.estimate.outputs import StateEstimate
+from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import Basis, CarTrust, TrustEvent, TrustState
 from gateway.control.pacing import AWAKE_S, FLIGHT_S, Pacing
 from gateway.control.stops import sequences, stopping
@@ -29,13 +29,13 @@ class CarModel:
     name: str
     profile: Profile
     auto: bool
-    ledger: Ledger
-    battery_policy: Policy
-    platform: PlatformTruth = field(init=False)
-    mode: ModeTruth = field(init=False)
+    ledger: CommandLog
+    battery_policy: BatteryPolicy
+    platform: PlatformDetector = field(init=False)
+    mode: ModeEstimator = field(init=False)
     battery: Battery = field(init=False)
     pacing: Pacing = field(init=False)
-    believed: Believed = field(init=False)
+    believed: StateEstimate = field(init=False)
     evidence: StopEvidence = field(default_factory=StopEvidence)
     trust: TrustState = field(default_factory=TrustState)
     rest: StopCase = StopCase.SOFT
@@ -44,11 +44,11 @@ class CarModel:
     link_reason: str = "not connected yet"
 
     def __post_init__(self) -> None:
-        self.platform = PlatformTruth(self.profile, auto=self.auto)
-        self.mode = ModeTruth(self.profile)
+        self.platform = PlatformDetector(self.profile, auto=self.auto)
+        self.mode = ModeEstimator(self.profile)
         self.battery = Battery(self.battery_policy)
         self.pacing = Pacing(self.profile)
-        self.believed = Believed(self.profile)
+        self.believed = StateEstimate(self.profile)
 
     def treat_as(self, profile: Profile) -> None:
         """Use another platform's profile from now on."""
@@ -111,11 +111,11 @@ class CarModel:
         """Return the motion that was sent last; None if the state is unknown or the car moves by itself."""
         return self.believed.motion if self.known and self.manual else None
 
-    def for_stop(self, now: float) -> stopping.Situation:
+    def for_stop(self, now: float) -> stopping.StopContext:
         """Return what the choice of a stop looks at."""
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
         clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
-        return stopping.Situation(
+        return stopping.StopContext(
             self.profile, self.known, self.mode.asked, contradicted, clear, blocked, self.platform.doubted
         )
 

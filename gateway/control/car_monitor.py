@@ -6,11 +6,11 @@ It changes `CarModel`, and tells `Executor` when the car must be stopped.
 from typing import Final
 
 from gateway.control.car_model import CarModel
-from gateway.control.command_log import Ledger
-from gateway.control.commands import Level, Phase, Reason, SetMode, Why
-from gateway.control.estimate.battery import Action, BatteryLevel
+from gateway.control.command_log import CommandLog
+from gateway.control.commands import FrameOrigin, Level, Phase, Reason, SetMode
+from gateway.control.estimate.battery import BatteryLevel, BatteryReaction
 from gateway.control.estimate.mode import MANUAL_SILENCE_S, Verdict
-from gateway.control.estimate.platform import PlatformTruth
+from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
 from gateway.control.executor import Executor
 from gateway.control.pacing import FLIGHT_S
@@ -30,7 +30,7 @@ FAN_SETTLED_S: Final = 2.0
 class CarMonitor:
     """Readings, silence, and the loop's own stalls."""
 
-    def __init__(self, model: CarModel, executor: Executor, ledger: Ledger) -> None:
+    def __init__(self, model: CarModel, executor: Executor, ledger: CommandLog) -> None:
         self.model = model
         self.lost_frames = 0
         """How often the car's reports have shown that a `MODE00` did not arrive."""
@@ -43,7 +43,7 @@ class CarMonitor:
         model = self.model
         self._not_obeyed_logged = False
         if model.platform.auto:  # another car may have been plugged in
-            model.platform = PlatformTruth(model.platform.told, auto=True)
+            model.platform = PlatformDetector(model.platform.told, auto=True)
             model.treat_as(model.platform.told)
 
     def heard(self, event: Event, now: float) -> None:
@@ -114,10 +114,10 @@ class CarMonitor:
         level, words = model.battery.level, f"{model.name}: {model.battery.words}"
         grave = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
         self._ledger.log(grave.get(level or BatteryLevel.OK, Level.INFO), f"battery_{level}", words, now)
-        if model.battery.action is Action.STOP and not model.at_rest:
+        if model.battery.action is BatteryReaction.STOP and not model.at_rest:
             executor.halt(words, now)
             if model.link_open and not executor.closing:
-                executor.begin(executor.full(now), Why.STOP, now)
+                executor.begin(executor.full(now), FrameOrigin.STOP, now)
 
     def tick(self, now: float) -> None:
         """Weigh silence; called a few times a second."""

@@ -22,7 +22,7 @@ class Pending:
     """How many commands of a stream it stands for."""
 
 
-class Ledger:
+class CommandLog:
     """Records transitions; of a stream only its start, its end, and where a refusal begins."""
 
     def __init__(self) -> None:

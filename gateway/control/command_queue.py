@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from gateway.control.command_log import Ledger, Pending
+from gateway.control.command_log import CommandLog, Pending
 from gateway.control.commands import Phase, Reason, Sender
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
@@ -18,7 +18,7 @@ PATIENCE_S: Final = 10.0
 
 
 @dataclass(slots=True)
-class Held:
+class HeldMotion:
     """The motion that is held, for whom, and until when."""
 
     motion: Motion
@@ -34,13 +34,13 @@ class Held:
 
 
 @dataclass(slots=True)
-class Waiting:
+class CommandQueue:
     """One motion at most, one mode at most, a queue of what acts once. Times: s, monotonic."""
 
-    ledger: Ledger
+    ledger: CommandLog
     senders: Senders
     safety: Safety
-    held: Held | None = None
+    held: HeldMotion | None = None
     opening: Pending | None = None
     acts: deque[Pending] = field(default_factory=deque)
 

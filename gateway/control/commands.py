@@ -7,7 +7,7 @@ from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import Frame
 
 
-class Kind(StrEnum):
+class SenderKind(StrEnum):
     """What a sender is; a person outranks a script, a script the coordinator."""
 
     PERSON = "person"
@@ -55,7 +55,7 @@ class Sender:
     """Who asks."""
 
     name: str = "anonymous"
-    kind: Kind = Kind.SCRIPT
+    kind: SenderKind = SenderKind.SCRIPT
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class SetMode:
 
 
 @dataclass(frozen=True, slots=True)
-class Act:
+class OneShot:
     """A frame that acts once: light, servo, whistle, arm. A general frame's motion is filled in when it is sent."""
 
     frame: Frame
@@ -126,7 +126,7 @@ class Find:
     """Make the car blink and beep, without moving it."""
 
 
-What = Drive | SetMode | Act | ChangeSpeed | Fan | Stop | EmergencyStop | Resume | TakeLease | Find
+Action = Drive | SetMode | OneShot | ChangeSpeed | Fan | Stop | EmergencyStop | Resume | TakeLease | Find
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class Command:
     id: str
     verb: str
     sender: Sender
-    what: What
+    what: Action
     age_s: float | None = None
     """Seconds from asking to arrival; None if the command does not say when it was asked, which counts as fresh."""
     ttl_s: float = 2.0
@@ -199,7 +199,7 @@ class LogRecord:
 Record = CommandRecord | LogRecord
 
 
-class Why(StrEnum):
+class FrameOrigin(StrEnum):
     """Why a frame was sent."""
 
     COMMAND = "command"
@@ -210,10 +210,10 @@ class Why(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Write:
+class OutgoingFrame:
     """One frame to be written now, in one write."""
 
     frame: Frame
     data: bytes
-    why: Why
+    why: FrameOrigin
     command_id: str = ""

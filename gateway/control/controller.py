@@ -10,10 +10,10 @@ from collections.abc import Iterable
 from gateway.control import arbiter
 from gateway.control.car_model import CarModel
 from gateway.control.car_monitor import CarMonitor
-from gateway.control.command_log import Ledger, Pending
-from gateway.control.command_queue import Held
+from gateway.control.command_log import CommandLog, Pending
+from gateway.control.command_queue import HeldMotion
 from gateway.control.commands import (
-    Act,
+    Action,
     Answer,
     ChangeSpeed,
     Command,
@@ -21,31 +21,31 @@ from gateway.control.commands import (
     EmergencyStop,
     Fan,
     Find,
-    Kind,
+    FrameOrigin,
     Level,
+    OneShot,
+    OutgoingFrame,
     Phase,
     Reason,
     Record,
     Resume,
     Sender,
+    SenderKind,
     SetMode,
     Stop,
     TakeLease,
-    What,
-    Why,
-    Write,
 )
-from gateway.control.estimate.battery import Battery, Policy
-from gateway.control.estimate.mode import ModeTruth, Verdict
-from gateway.control.estimate.outputs import Believed
-from gateway.control.estimate.platform import PlatformTruth
+from gateway.control.estimate.battery import Battery, BatteryPolicy
+from gateway.control.estimate.mode import ModeEstimator, Verdict
+from gateway.control.estimate.outputs import StateEstimate
+from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.control.executor import Executor
 from gateway.control.pacing import Pacing
-from gateway.control.safety import LEASE_S, Estop, Hold, Kept, Safety
+from gateway.control.safety import LEASE_S, Estop, Hold, PersistedSafety, Safety
 from gateway.control.senders import PAUSE_S
 from gateway.control.stops import sequences
-from gateway.control.stops.stopping import Running
+from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
@@ -55,7 +55,7 @@ from gateway.protocol.platforms import Profile
 class Controller:
     """One car's control. See the module's docstring for how it is driven.
 
-    It holds small objects that share one `CarModel`: `CarMonitor` takes what is heard, `Executor` sends, `Ledger` keeps
+    It holds small objects that share one `CarModel`: `CarMonitor` takes readings, `Executor` sends, `CommandLog` keeps
     the records. The controller itself takes commands.
     """
 
@@ -65,14 +65,14 @@ class Controller:
         profile: Profile,
         *,
         auto: bool = False,
-        kept: Kept | None = None,
-        battery_policy: Policy | None = None,
+        kept: PersistedSafety | None = None,
+        battery_policy: BatteryPolicy | None = None,
         speed_max: float = 1.0,
     ) -> None:
         self.car = car
-        self.safety = Safety.restored(kept or Kept())
-        self._ledger = Ledger()
-        self.model = CarModel(car, profile, auto, self._ledger, battery_policy or Policy())
+        self.safety = Safety.restored(kept or PersistedSafety())
+        self._ledger = CommandLog()
+        self.model = CarModel(car, profile, auto, self._ledger, battery_policy or BatteryPolicy())
         self._executor = Executor(self.model, self._ledger, self.safety)
         self._monitor = CarMonitor(self.model, self._executor, self._ledger)
         self._senders = self._executor.senders
@@ -89,12 +89,12 @@ class Controller:
         return self.model.profile
 
     @property
-    def platform(self) -> PlatformTruth:
+    def platform(self) -> PlatformDetector:
         """Return what the car's bytes show of its platform."""
         return self.model.platform
 
     @property
-    def mode(self) -> ModeTruth:
+    def mode(self) -> ModeEstimator:
         """Return what is known of the car's mode."""
         return self.model.mode
 
@@ -109,7 +109,7 @@ class Controller:
         return self.model.pacing
 
     @property
-    def believed(self) -> Believed:
+    def believed(self) -> StateEstimate:
         """Return what was written to the car, as a state."""
         return self.model.believed
 
@@ -119,7 +119,7 @@ class Controller:
         return self.model.known
 
     @property
-    def running(self) -> Running | None:
+    def running(self) -> StopInProgress | None:
         """Return the stop that goes on, if one does."""
         return self._executor.running
 
@@ -200,11 +200,11 @@ class Controller:
         """Take that the frame of `poll` did not go out whole: the caller closes the link and opens it again."""
         self._executor.link_down(reason, now, cause=Reason.WRITE_FAILED)
 
-    def poll(self, now: float) -> Write | None:
+    def poll(self, now: float) -> OutgoingFrame | None:
         """Return the frame to write now, if any."""
         return self._executor.poll(now)
 
-    def wrote(self, write: Write, now: float) -> None:
+    def wrote(self, write: OutgoingFrame, now: float) -> None:
         """Take that the frame of `poll` was handed to the link."""
         self._executor.wrote(write, now)
 
@@ -272,7 +272,7 @@ class Controller:
         if arbiter.needs(what).lease:
             self._lease(command, now)
         moves = isinstance(what, SetMode) or (isinstance(what, Drive) and what.motion is not Motion.STOP)
-        if moves and command.sender.kind is not Kind.COORDINATOR:  # letting go hands the car to nobody
+        if moves and command.sender.kind is not SenderKind.COORDINATOR:  # letting go hands the car to nobody
             self._end_hold(command.sender, now)
         match what:
             case Drive(Motion.STOP):
@@ -291,7 +291,7 @@ class Controller:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
             case Fan():
                 pending.frames.append(General(Motion.STOP, fan=True))
-            case Act(frame):
+            case OneShot(frame):
                 pending.frames.append(frame)
             case ChangeSpeed(step):
                 pending.frames.append(General(Motion.STOP, speed=step))
@@ -337,7 +337,7 @@ class Controller:
         self._ledger.log(Level.ERROR, "estop_joined", words, now)
         self._executor.halt(words, now)
         if self.model.link_open and not self._executor.closing:
-            self._executor.begin(self._executor.full(now), Why.STOP, now)
+            self._executor.begin(self._executor.full(now), FrameOrigin.STOP, now)
 
     # ------------------------------------------------------------------ one by one
 
@@ -350,7 +350,7 @@ class Controller:
             why = f": {estop.why}" if estop.why else ""
             self._ledger.log(Level.ERROR, "estop", f"{self.car}: e-stop by {sender.name}{why}; {until}", now)
             latched = f"{until}; {command.note}" if command.note else until
-        elif sender.kind is not Kind.COORDINATOR:
+        elif sender.kind is not SenderKind.COORDINATOR:
             self.safety.held_by(sender.name, command.asked_ns)
         self._executor.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
         if not self.model.link_open or self._executor.closing:
@@ -362,7 +362,7 @@ class Controller:
             latched = f"{silent}; {latched}" if latched else silent
         worst = self.worst_stop_s(now)
         self._ledger.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
-        self._executor.begin(self._executor.full(now), Why.STOP, now, pending)
+        self._executor.begin(self._executor.full(now), FrameOrigin.STOP, now, pending)
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
 
     def _has_let_go(self, command: Command, drive: Drive, now: float) -> bool:
@@ -420,7 +420,7 @@ class Controller:
             self._executor.release(Phase.COMPLETE, None, f"released by {sender.name}", now)
         return self._done(pending, f"{self.car} is free", now)
 
-    def _too_busy(self, what: What, now: float) -> str:
+    def _too_busy(self, what: Action, now: float) -> str:
         """Why a drive would be over before it could begin; empty if it would not."""
         free_at = self._executor.free_at(now)
         if not isinstance(what, Drive) or what.motion is Motion.STOP or now + what.duration_s > free_at:
@@ -433,7 +433,7 @@ class Controller:
             return self._drive_on(held, pending, now + drive.duration_s, now)
         words = f"{drive.motion} by {sender.name}"
         self._waiting.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        self._waiting.held = Held(drive.motion, pending, now + drive.duration_s)
+        self._waiting.held = HeldMotion(drive.motion, pending, now + drive.duration_s)
         if held is not None and held.motion is drive.motion and held.pending.sent:
             self._ledger.sent(pending, now, "the motion is held on")
             return Answer(Phase.SENT, words="the motion is held on")
@@ -445,7 +445,7 @@ class Controller:
                 self._ledger.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
         return self._queued(pending, now)
 
-    def _drive_on(self, held: Held, pending: Pending, expires_at: float, now: float) -> Answer:
+    def _drive_on(self, held: HeldMotion, pending: Pending, expires_at: float, now: float) -> Answer:
         """The same sender wants the same motion for longer: nothing is written again."""
         held.expires_at = expires_at
         held.pending.count += 1
@@ -469,13 +469,15 @@ class Controller:
         worst = self.worst_stop_s(now)
         if not pending.command.streamed:
             self._ledger.record(pending, Phase.QUEUED, now, worst_case_s=worst)
-        self._executor.begin(self._executor.soft(now), Why.STOP, now, None if pending.command.streamed else pending)
+        self._executor.begin(
+            self._executor.soft(now), FrameOrigin.STOP, now, None if pending.command.streamed else pending
+        )
         return Answer(Phase.QUEUED, worst_case_s=worst)
 
     def _close_mode(self, pending: Pending, now: float) -> Answer:
         self._waiting.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {pending.command.sender.name}", now)
         answer = self._queued(pending, now)
-        self._executor.begin(self._executor.full(now), Why.COMMAND, now, pending)
+        self._executor.begin(self._executor.full(now), FrameOrigin.COMMAND, now, pending)
         return answer
 
     def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
@@ -509,8 +511,8 @@ class Controller:
             self._ledger.log(Level.INFO, "hold_ended", words, now)
             self.safety.hold = None
 
-    def _situation(self, now: float) -> arbiter.Situation:
-        return arbiter.Situation(
+    def _situation(self, now: float) -> arbiter.CommandContext:
+        return arbiter.CommandContext(
             car=self.car,
             profile=self.profile,
             now=now,

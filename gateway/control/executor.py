@@ -6,17 +6,17 @@
 from typing import Final
 
 from gateway.control.car_model import CarModel
-from gateway.control.command_log import Ledger, Pending
-from gateway.control.command_queue import Held, Waiting
-from gateway.control.commands import Fan, Level, Phase, Reason, SetMode, Why, Write
+from gateway.control.command_log import CommandLog, Pending
+from gateway.control.command_queue import CommandQueue, HeldMotion
+from gateway.control.commands import Fan, FrameOrigin, Level, OutgoingFrame, Phase, Reason, SetMode
 from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders
 from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import CLOSED_S, EVIDENCE, Finding, StopCase
-from gateway.control.stops.sequences import Gate, Recipe
-from gateway.control.stops.stopping import Running
+from gateway.control.stops.sequences import Gate, StopSequence
+from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen, encode
 from gateway.protocol.platforms import StopStyle
@@ -42,12 +42,12 @@ _STOP: Final = General(Motion.STOP)
 class Executor:
     """What waits for the car and how it gets there: one frame in flight, a stop ahead of everything."""
 
-    def __init__(self, model: CarModel, ledger: Ledger, safety: Safety) -> None:
+    def __init__(self, model: CarModel, ledger: CommandLog, safety: Safety) -> None:
         self.model = model
         self.safety = safety
         self.senders = Senders()
-        self.waiting = Waiting(ledger, self.senders, safety)
-        self.running: Running | None = None
+        self.waiting = CommandQueue(ledger, self.senders, safety)
+        self.running: StopInProgress | None = None
         self.mode_sent: tuple[Pending, float] | None = None
         """A mode whose effect has not been seen yet, and when its frame went out."""
         self.left_at = self.left_until = float("-inf")
@@ -56,7 +56,7 @@ class Executor:
         """Why the gateway ends without a stop of the car; empty if it does not."""
         self.closing = False
         self._ledger = ledger
-        self._source: Running | Held | Pending | None = None
+        self._source: StopInProgress | HeldMotion | Pending | None = None
         """Whose frame `poll` returned last; None for a repetition."""
         self._closing_until = float("inf")
         self._renewals = 0
@@ -75,7 +75,7 @@ class Executor:
         model.evidence.begin_link()
         model.pacing.reset()
         model.learn(TrustEvent.LINK_OPENED, now)
-        self._begin_recovery(Why.RECOVERY, now, [])
+        self._begin_recovery(FrameOrigin.RECOVERY, now, [])
 
     def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
         """Fail all that waits: the link is gone, and the car may do anything."""
@@ -105,7 +105,7 @@ class Executor:
             return self.running is None  # a drive took the place of a soft stop
         return state in (CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE, CarTrust.UNPROVEN)
 
-    def poll(self, now: float) -> Write | None:
+    def poll(self, now: float) -> OutgoingFrame | None:
         """Return the frame to write now, if any."""
         if not self.model.link_open:
             return None
@@ -123,11 +123,11 @@ class Executor:
             return self._toggle_fan(now)
         return self._next_command(now)
 
-    def _leaves_gap(self, running: Running, now: float) -> bool:
+    def _leaves_gap(self, running: StopInProgress, now: float) -> bool:
         """Return True if other frames may go out between two tries of a stop that the car does not show."""
         return running.overdue and running.frames_sent and running.next_try_at > now + GAP_S
 
-    def _toggle_fan(self, now: float) -> Write | None:
+    def _toggle_fan(self, now: float) -> OutgoingFrame | None:
         """Send the fan's toggle to a car that is silent: the fan may be why."""
         acts = self.waiting.acts
         if self.model.trust.state is not CarTrust.UNHEARD or not acts or not isinstance(acts[0].command.what, Fan):
@@ -135,23 +135,23 @@ class Executor:
         running = self.running
         if now < self.ready_at or (running is not None and not running.frames_sent):
             return None
-        return self._write(acts[0].frames[0], Why.COMMAND, acts[0], acts[0])
+        return self._write(acts[0].frames[0], FrameOrigin.COMMAND, acts[0], acts[0])
 
-    def _next_command(self, now: float) -> Write | None:
+    def _next_command(self, now: float) -> OutgoingFrame | None:
         model, waiting = self.model, self.waiting
         if now < self.ready_at:
             return None
         held = waiting.held
         if held is not None and not held.pending.sent:
             self._give_way(now)
-            return self._write(General(held.motion), Why.COMMAND, held, held.pending)
+            return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
         if waiting.opening is not None and not (waiting.acts and model.at_rest) and self.running is None:
             return self._open_mode(waiting.opening, now)
         if waiting.acts and now >= model.pacing.act_at(waiting.acts[0].frames[0]):
             pending = waiting.acts[0]  # asked before the mode, in which the car would ignore it
-            return self._write(model.believed.with_motion(pending.frames[0]), Why.COMMAND, pending, pending)
+            return self._write(model.believed.with_motion(pending.frames[0]), FrameOrigin.COMMAND, pending, pending)
         if model.believed.repeat and now >= model.pacing.repeat_at:
-            return self._write(General(model.believed.motion), Why.REPEAT, None, held.pending if held else None)
+            return self._write(General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None)
         return self._renew(now)
 
     def _give_way(self, now: float) -> None:
@@ -161,21 +161,21 @@ class Executor:
         for pending in running.commands if running is not None else ():
             self._ledger.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
 
-    def _renew(self, now: float) -> Write | None:
+    def _renew(self, now: float) -> OutgoingFrame | None:
         """Send the stop of a car at rest again if nothing has shown it: the frames may have been lost."""
         model = self.model
         if now < self._renewal_at or not model.at_rest or model.trust.shown or self.running is not None:
             return None
         if self._general_stop_follows:
             self._general_stop_follows = False
-            return self._write(_STOP, Why.REPEAT, None, None)
+            return self._write(_STOP, FrameOrigin.REPEAT, None, None)
         if model.rest is StopCase.FAN and self._left_mode:
             self._schedule_renewal(now)
-            return self._begin_now(self.full(now), Why.REPEAT, now)
+            return self._begin_now(self.full(now), FrameOrigin.REPEAT, now)
         clears = self._renewal_clears()
         self._schedule_renewal(now)
         self._general_stop_follows = clears
-        return self._write(ModeClose() if clears else _STOP, Why.REPEAT, None, None)
+        return self._write(ModeClose() if clears else _STOP, FrameOrigin.REPEAT, None, None)
 
     @property
     def _renewal_at(self) -> float:
@@ -193,7 +193,7 @@ class Executor:
         self._renew_at = now + RENEW_S[min(self._renewals, len(RENEW_S) - 1)]
         self._renewals += 1
 
-    def wrote(self, write: Write, now: float) -> None:
+    def wrote(self, write: OutgoingFrame, now: float) -> None:
         """Note that the frame that `poll` returned was handed to the link."""
         source, self._source = self._source, None
         model, frame = self.model, write.frame
@@ -206,9 +206,9 @@ class Executor:
         model.pacing.wrote(frame, now)
         self._note_frame(frame, now)
         match source:
-            case Running():
+            case StopInProgress():
                 self._stepped(source, now)
-            case Held():
+            case HeldMotion():
                 source.began_at = now
                 self._ledger.sent(source.pending, now)
             case Pending() if source is self.waiting.opening:
@@ -239,7 +239,7 @@ class Executor:
             times.append(max(self.ready_at, now + FLIGHT_S))
         return max(now, min(times, default=float("inf")))
 
-    def _running_times(self, running: Running, now: float) -> list[float]:
+    def _running_times(self, running: StopInProgress, now: float) -> list[float]:
         times = [running.due_at(self.model.pacing)] if not running.frames_sent else self._waiting_times(running, now)
         times += [pending.asked_at + running.patience_s for pending in running.commands]
         if not running.overdue:
@@ -248,7 +248,7 @@ class Executor:
             times.append(self._closing_until)
         return times
 
-    def _waiting_times(self, running: Running, now: float) -> list[float]:
+    def _waiting_times(self, running: StopInProgress, now: float) -> list[float]:
         times = [max(running.next_try_at, self.model.pacing.flight_until)]
         if running.obeyed_at > now:
             times.append(running.obeyed_at)
@@ -268,18 +268,20 @@ class Executor:
             times.append(max(self._renewal_at, self.ready_at))
         return times
 
-    def _write(self, frame: Frame, why: Why, source: Running | Held | Pending | None, by: Pending | None) -> Write:
+    def _write(
+        self, frame: Frame, why: FrameOrigin, source: StopInProgress | HeldMotion | Pending | None, by: Pending | None
+    ) -> OutgoingFrame:
         self._source = source
-        return Write(frame, encode(frame), why, by.command.id if by is not None else "")
+        return OutgoingFrame(frame, encode(frame), why, by.command.id if by is not None else "")
 
-    def _open_mode(self, pending: Pending, now: float) -> Write | None:
+    def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
         """Open a mode, from a sure rest only: opening while driving leaves the motors as they were, blind."""
         assert isinstance(pending.command.what, SetMode)
         if not self.model.rest_is_sure:
-            return self._begin_now(self.full(now), Why.STOP, now)
+            return self._begin_now(self.full(now), FrameOrigin.STOP, now)
         if now < self.model.pacing.open_at(now):
             return None
-        return self._write(ModeOpen(pending.command.what.mode), Why.COMMAND, pending, pending)
+        return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
 
     def _note_frame(self, frame: Frame, now: float) -> None:
         """Note what a written frame does to what is believed of the car."""
@@ -339,7 +341,7 @@ class Executor:
         if not self.model.link_open:
             self._end_unstopped(f"cannot be reached ({self.model.link_reason})", now)
         elif not (self.model.at_rest and self.model.trust.shown) or self.running is not None:
-            self.begin(self.full(now), Why.SHUTDOWN, now)
+            self.begin(self.full(now), FrameOrigin.SHUTDOWN, now)
 
     @property
     def finished(self) -> bool:
@@ -352,7 +354,7 @@ class Executor:
         self.not_stopped = why
         self._ledger.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at it.", now)
 
-    def _give_up(self, running: Running, now: float) -> None:
+    def _give_up(self, running: StopInProgress, now: float) -> None:
         """End without a stop that the car showed."""
         self.running = None
         self._end_unstopped("did not show that it stopped", now)
@@ -365,15 +367,15 @@ class Executor:
         self.safety.driven_no_more(now)
         self.senders.halt(now, by)
 
-    def soft(self, now: float) -> Recipe:
+    def soft(self, now: float) -> StopSequence:
         """Return the stop of a drive's end."""
         return stopping.soft(self.model.for_stop(now))
 
-    def full(self, now: float) -> Recipe:
+    def full(self, now: float) -> StopSequence:
         """Return the stop that `stop`, `estop` and a shutdown send."""
         return stopping.full(self.model.for_stop(now))
 
-    def begin(self, recipe: Recipe, why: Why, now: float, pending: Pending | None = None) -> None:
+    def begin(self, recipe: StopSequence, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
         """Carry out a stop, or join the one that runs if that is no weaker."""
         model = self.model
         model.believed.repeat = False
@@ -383,7 +385,7 @@ class Executor:
             self._start(recipe, why, now, [*(running.commands if running is not None else ()), *joining])
             return
         running.commands.extend(joining)
-        if why is Why.SHUTDOWN:
+        if why is FrameOrigin.SHUTDOWN:
             running.why = why
         # Whoever asks for a stop need not wait for the next try, but silence makes that certain.
         if pending is not None and running.frames_sent and now >= running.closed_at + sequences.SILENCE_S:
@@ -393,11 +395,11 @@ class Executor:
 
     def stop_again(self, now: float) -> None:
         """Send general stops to a car that had shown that it stands, and is silent now."""
-        self._start(self.soft(now), Why.RECOVERY, now, [])
+        self._start(self.soft(now), FrameOrigin.RECOVERY, now, [])
         assert self.running is not None
         self.running.at_rest = True
 
-    def _begin_now(self, recipe: Recipe, why: Why, now: float) -> Write | None:
+    def _begin_now(self, recipe: StopSequence, why: FrameOrigin, now: float) -> OutgoingFrame | None:
         """Begin a stop. Return its first frame, if that may be written now."""
         self.begin(recipe, why, now)
         assert self.running is not None
@@ -414,23 +416,23 @@ class Executor:
     def recover(self, now: float, words: str) -> None:
         """Bring the car to a known state, whatever runs. Commands that wait for a stop wait for this one."""
         before = self.running
-        why, commands = (before.why, before.commands) if before is not None else (Why.RECOVERY, [])
+        why, commands = (before.why, before.commands) if before is not None else (FrameOrigin.RECOVERY, [])
         self.model.learn(TrustEvent.DOUBTED, now, words)
         self._begin_recovery(why, now, commands)
 
-    def _begin_recovery(self, why: Why, now: float, commands: list[Pending]) -> None:
+    def _begin_recovery(self, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
         self._start(stopping.recovery(self.model.for_stop(now)), why, now, commands)
 
-    def _start(self, recipe: Recipe, why: Why, now: float, commands: list[Pending]) -> None:
+    def _start(self, recipe: StopSequence, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
         model = self.model
         worst_s = stopping.worst_s(recipe, model.for_stop(now), model.pacing, now)
         patience_s = min(worst_s, stopping.LONGEST_WORST_S) + stopping.SHOW_S
-        self.running = Running(
+        self.running = StopInProgress(
             recipe, why, now, now, commands, worst_at=now + worst_s, patience_s=patience_s, case=self._case(recipe)
         )
         model.learn(TrustEvent.STOP_BEGUN, now, f"{recipe.name} stop ({why})")
 
-    def _case(self, recipe: Recipe) -> StopCase:
+    def _case(self, recipe: StopSequence) -> StopCase:
         """Return what this stop rests on if nothing shows it."""
         model = self.model
         if model.for_stop_style is StopStyle.RASPBERRY_PI:
@@ -441,7 +443,7 @@ class Executor:
             return StopCase.UNKNOWN_PLATFORM
         return StopCase.MANUAL
 
-    def _step(self, running: Running, now: float) -> Write | None:
+    def _step(self, running: StopInProgress, now: float) -> OutgoingFrame | None:
         if running.frames_sent:
             self._await(running, now)
             if self.running is not running or running.frames_sent:
@@ -450,7 +452,7 @@ class Executor:
             return None
         return self._write(running.frame, running.why, running, running.commands[0] if running.commands else None)
 
-    def _stepped(self, running: Running, now: float) -> None:
+    def _stepped(self, running: StopInProgress, now: float) -> None:
         if running.stepped(now):
             for pending in running.commands:
                 self._ledger.sent(pending, now)
@@ -481,7 +483,7 @@ class Executor:
             running.probes += 1
             running.again(sequences.PROBE, now)
 
-    def _may_probe(self, running: Running) -> bool:
+    def _may_probe(self, running: StopInProgress) -> bool:
         """Return True if a `MODE00` now would show something: not to a car that may not know that frame."""
         if running.case is StopCase.SOFT or running.case is StopCase.RASPBERRY_PI:
             return False
@@ -490,20 +492,20 @@ class Executor:
         # First the `#` that ends half a frame: `MODE00` behind one would open a mode.
         return running.recipe is not sequences.RECOVERY or running.index > RESETTING_STEPS
 
-    def _lost(self, running: Running, now: float) -> None:
+    def _lost(self, running: StopInProgress, now: float) -> None:
         """Send the stop again: the reports came on as before. A Raspberry Pi does the same."""
         running.probes += 1
         unknown = running.case is StopCase.UNKNOWN_PLATFORM
         if not unknown and running.tries == 1 and (running.frames_sent or running.recipe is sequences.PROBE):
             self._try_again(running, now)
 
-    def _try_again(self, running: Running, now: float) -> None:
+    def _try_again(self, running: StopInProgress, now: float) -> None:
         running.tries += 1
         situation = self.model.for_stop(now)
         running.again(stopping.soft(situation) if running.at_rest else stopping.recovery(situation), now)
         self.model.evidence.tried_again()
 
-    def _await(self, running: Running, now: float) -> None:
+    def _await(self, running: StopInProgress, now: float) -> None:
         """Wait for evidence: end a stop that can show nothing, send one again that could have."""
         case = self._ends_as_sent(running, now)
         if case is not None:
@@ -512,7 +514,7 @@ class Executor:
         if now >= max(running.next_try_at, self.model.pacing.flight_until):
             self._try_again(running, now)
 
-    def _ends_as_sent(self, running: Running, now: float) -> StopCase | None:
+    def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
         """Return why the stop ends without evidence; None if the car may still show it."""
         model = self.model
         if running.at_rest or model.trust.state is CarTrust.UNHEARD:
@@ -534,7 +536,7 @@ class Executor:
             return StopCase.UNKNOWN_PLATFORM
         return None
 
-    def _fail_late(self, running: Running, now: float) -> None:
+    def _fail_late(self, running: StopInProgress, now: float) -> None:
         """Fail the commands that have waited too long for evidence. The stop goes on."""
         car = self.model.name
         words = f"{car} has not shown that it stopped. The gateway goes on stopping it. Look whether it moves."
@@ -555,7 +557,9 @@ class Executor:
                 self.model.learn(TrustEvent.SILENT, now, words)
                 self._ledger.log(Level.WARNING, "unheard", words, now)
 
-    def _finish(self, running: Running, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL) -> None:
+    def _finish(
+        self, running: StopInProgress, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL
+    ) -> None:
         """End the stop: the car showed it, or can show nothing."""
         model = self.model
         self.running = None
@@ -606,7 +610,7 @@ class Executor:
         else:
             self.waiting.close_held(phase, reason, words, now)
         if self.model.link_open and self.running is None and not self.model.at_rest:
-            self.begin(self.soft(now), Why.STOP, now)
+            self.begin(self.soft(now), FrameOrigin.STOP, now)
 
     @property
     def ready_at(self) -> float:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(slots=True)
-class Allowance:
+class TokenBucket:
     """Up to `at_once` at any moment, and `per_s` in the long run. Times are seconds on one monotonic clock."""
 
     per_s: float

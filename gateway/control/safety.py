@@ -1,19 +1,19 @@
 """Who may move the car: the hold, the e-stops, and the lease. Values and small rules; what is sent is not decided here.
 
-What must survive a restart is `Kept`; `gateway.state_file` writes it to disk.
+What must survive a restart is `PersistedSafety`; `gateway.state_file` writes it to disk.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gateway.control.commands import Kind, Sender
+from gateway.control.commands import Sender, SenderKind
 
 LEASE_S: Final = 2.0
 """How long a lease outlives the driving (design.md, "Commands")."""
 REMEMBERED_ENDED: Final = 64
 """Ended e-stops that are remembered, and shown in `state/safety` once a second: the newest."""
-_RANK: Final = {Kind.PERSON: 2, Kind.SCRIPT: 1, Kind.COORDINATOR: 0}
+_RANK: Final = {SenderKind.PERSON: 2, SenderKind.SCRIPT: 1, SenderKind.COORDINATOR: 0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Estop:
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class PersistedSafety:
     """What survives a restart."""
 
     hold: Hold | None = None
@@ -45,7 +45,7 @@ class Kept:
 
 
 @dataclass(frozen=True, slots=True)
-class Lease:
+class LeaseState:
     """Who drives the car, and until when (monotonic) it is theirs."""
 
     holder: Sender
@@ -58,7 +58,7 @@ class Lease:
         if now >= self.until or sender == self.holder:
             return False
         mine, theirs = _RANK[sender.kind], _RANK[self.holder.kind]
-        return mine < theirs or (mine == theirs and not self.gone and not (take and sender.kind is Kind.PERSON))
+        return mine < theirs or (mine == theirs and not self.gone and not (take and sender.kind is SenderKind.PERSON))
 
 
 @dataclass(slots=True)
@@ -66,20 +66,20 @@ class Safety:
     """Hold, e-stops and lease of one car."""
 
     hold: Hold | None = None
-    lease: Lease | None = None
+    lease: LeaseState | None = None
     _estops: dict[str, Estop] = field(default_factory=dict)
     _ended: dict[str, None] = field(default_factory=dict)
 
     @classmethod
-    def restored(cls, kept: Kept) -> "Safety":
+    def restored(cls, kept: PersistedSafety) -> "Safety":
         """As it was before a restart."""
         estops = {estop.id: estop for estop in kept.estops}
         return cls(kept.hold, None, estops, dict.fromkeys(kept.ended))
 
     @property
-    def kept(self) -> Kept:
+    def kept(self) -> PersistedSafety:
         """What must survive a restart, as it is now."""
-        return Kept(self.hold, self.estops, self.ended)
+        return PersistedSafety(self.hold, self.estops, self.ended)
 
     @property
     def estops(self) -> tuple[Estop, ...]:
@@ -97,7 +97,7 @@ class Safety:
         """Put the car on hold, which the coordinator then has no more; the first who did keeps it."""
         if self.hold is None:
             self.hold = Hold(name, at_ns)
-        if self.lease is not None and self.lease.holder.kind is Kind.COORDINATOR:
+        if self.lease is not None and self.lease.holder.kind is SenderKind.COORDINATOR:
             self.lease = None
 
     def latch(self, estop: Estop) -> Estop:
@@ -130,13 +130,13 @@ class Safety:
 
     # ------------------------------------------------------------------ lease
 
-    def leased(self, now: float) -> Lease | None:
+    def leased(self, now: float) -> LeaseState | None:
         """The lease, while it lasts."""
         return self.lease if self.lease is not None and now < self.lease.until else None
 
     def grant(self, sender: Sender, until: float) -> None:
         """The car is the sender's until then, and `LEASE_S` longer."""
-        self.lease = Lease(sender, until + LEASE_S)
+        self.lease = LeaseState(sender, until + LEASE_S)
 
     def driven_no_more(self, now: float) -> None:
         """The holder's motion has ended: what is left of the lease is `LEASE_S`."""

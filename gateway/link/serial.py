@@ -18,7 +18,7 @@ import serial
 
 from gateway.link.base import CLOSE_S, Busy, CannotOpen, Link, LinkLost
 from gateway.link.url import SerialUrl, UsbUrl
-from gateway.link.usb import Plugged, at, choose, plugged, refuse_another
+from gateway.link.usb import UsbSerialPort, at, choose, plugged, refuse_another
 
 WRITE_TIMEOUT_S: Final = 0.25
 """Only where the port cannot be written without waiting (Windows)."""
@@ -45,7 +45,7 @@ _UNPLUGGED: Final = frozenset({errno.EIO, errno.ENXIO, errno.ENODEV})
 
 _opening: Final[set[str]] = set()
 """Ports that a thread is opening now."""
-_first: Final[dict[str, Plugged]] = {}
+_first: Final[dict[str, UsbSerialPort]] = {}
 """The device that each URL led to first. A path is soon another's: its car would be given what this one was to do."""
 # The system tells nothing of a pseudo terminal; `gateway run` starts faster without the lists.
 _PSEUDO: Final = re.compile(r"/dev/(pts/|ttys)\d+")
@@ -215,7 +215,7 @@ class SerialLink(Link):
     def _open_port(self) -> serial.Serial:
         """Find the port, each time again, and open it; raises CannotOpen."""
         first = _first.get(str(self._url))
-        found: Plugged | None
+        found: UsbSerialPort | None
         if isinstance(self._url, SerialUrl):
             path = self._url.path
             found = _device(path, needed=first is not None)
@@ -316,7 +316,7 @@ def _cause(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _device(path: str, *, needed: bool) -> Plugged | None:
+def _device(path: str, *, needed: bool) -> UsbSerialPort | None:
     """What is at this path; None if the system does not tell, or, unless `needed`, does not list its ports now."""
     if _PSEUDO.fullmatch(path):
         return None

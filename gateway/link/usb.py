@@ -17,7 +17,7 @@ LIST_AGAIN_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Plugged:
+class UsbSerialPort:
     """A serial port that is there. vid, pid and serial only if it is a USB device that tells them."""
 
     device: str
@@ -36,9 +36,9 @@ class Plugged:
         return f"{self.device} ({ids}{number})"
 
 
-def plugged() -> list[Plugged]:
+def plugged() -> list[UsbSerialPort]:
     """The serial ports of this computer; raises CannotOpen. It reads the system's lists, which can take a while."""
-    return [Plugged(port.device, port.vid, port.pid, port.serial_number) for port in listed()]
+    return [UsbSerialPort(port.device, port.vid, port.pid, port.serial_number) for port in listed()]
 
 
 def listed() -> "list[ListPortInfo]":
@@ -57,7 +57,7 @@ def listed() -> "list[ListPortInfo]":
     raise CannotOpen(f"the serial ports cannot be listed ({words}): is a device just being unplugged?")
 
 
-def choose(url: UsbUrl, ports: Iterable[Plugged]) -> Plugged:
+def choose(url: UsbUrl, ports: Iterable[UsbSerialPort]) -> UsbSerialPort:
     """The one port that fits; raises CannotOpen, which says what was asked and what is there."""
     there = sorted(ports, key=lambda port: port.device)
     fit = [
@@ -75,7 +75,7 @@ def choose(url: UsbUrl, ports: Iterable[Plugged]) -> Plugged:
     raise CannotOpen(f"{url}: no such USB device is plugged in; {found}")
 
 
-def at(path: str, ports: Iterable[Plugged]) -> Plugged | None:
+def at(path: str, ports: Iterable[UsbSerialPort]) -> UsbSerialPort | None:
     """The port that a device path, or a symlink, leads to; None if the system does not list it."""
     try:
         real = os.path.realpath(path)
@@ -84,7 +84,7 @@ def at(path: str, ports: Iterable[Plugged]) -> Plugged | None:
     return next((port for port in ports if os.path.realpath(port.device) == real), None)
 
 
-def refuse_another(url: SerialUrl | UsbUrl, path: str, first: Plugged | None, now: Plugged | None) -> None:
+def refuse_another(url: SerialUrl | UsbUrl, path: str, first: UsbSerialPort | None, now: UsbSerialPort | None) -> None:
     """Raise CannotOpen if there is another device than the first time, as far as they say which they are."""
     if first is None or first.vid is None or (now is not None and now.ids == first.ids):
         return
@@ -97,6 +97,6 @@ def refuse_another(url: SerialUrl | UsbUrl, path: str, first: Plugged | None, no
     )
 
 
-def _named(ports: list[Plugged]) -> str:
+def _named(ports: list[UsbSerialPort]) -> str:
     """For one line, without what a device has chosen to be called that cannot be printed."""
     return "".join(each if each.isprintable() else "?" for each in ", ".join(map(str, ports)))

@@ -17,14 +17,14 @@ class BadSpec(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class PtyLink:
+class PtyPath:
     """A pseudo terminal; `path`: a symlink to it that stays the same when the link comes back."""
 
     path: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class TcpLink:
+class TcpListen:
     """A listening TCP port; 0 lets the system choose."""
 
     host: str = "127.0.0.1"
@@ -38,7 +38,7 @@ class CarSpec:
     name: str
     platform: str
     options: frozenset[str]
-    link: PtyLink | TcpLink
+    link: PtyPath | TcpListen
 
     @property
     def platform_words(self) -> str:
@@ -52,7 +52,7 @@ class ReplaySpec:
 
     name: str
     path: str
-    link: PtyLink | TcpLink
+    link: PtyPath | TcpListen
 
 
 def parse_car(text: str) -> CarSpec:
@@ -88,16 +88,16 @@ def parse_replay(text: str) -> ReplaySpec:
     return ReplaySpec(name, match["file"], _parse_link(f"replay {text!r}", match["link"] or "pty"))
 
 
-def _parse_link(what: str, link: str) -> PtyLink | TcpLink:
+def _parse_link(what: str, link: str) -> PtyPath | TcpListen:
     if link == "pty":
-        return PtyLink()
+        return PtyPath()
     if link.startswith("pty:") and len(link) > 4:
-        return PtyLink(link[4:])
+        return PtyPath(link[4:])
     match = _TCP.fullmatch(link)
     if match and match["host"] is None:
-        return TcpLink()
+        return TcpListen()
     if match and int(match["port"]) < 65536:
-        return TcpLink(match["host"].strip("[]"), int(match["port"]))
+        return TcpListen(match["host"].strip("[]"), int(match["port"]))
     raise BadSpec(
         f"{what}: link {link!r} is not allowed: use pty, pty:PATH (a symlink is made there) or "
         "tcp://HOST:PORT with port 0 to 65535 (0: any free one)"
@@ -114,8 +114,8 @@ def parse_cars(texts: Sequence[str]) -> list[CarSpec]:
 def refuse_twins(cars: Sequence[CarSpec | ReplaySpec]) -> None:
     """Raises BadSpec for two cars of one name, port or path."""
     _refuse("name", [car.name for car in cars])
-    _refuse("path", [car.link.path for car in cars if isinstance(car.link, PtyLink) and car.link.path])
-    tcp = [car.link for car in cars if isinstance(car.link, TcpLink)]
+    _refuse("path", [car.link.path for car in cars if isinstance(car.link, PtyPath) and car.link.path])
+    tcp = [car.link for car in cars if isinstance(car.link, TcpListen)]
     _refuse("port", [f"{link.host}:{link.port}" for link in tcp if link.port])
 
 

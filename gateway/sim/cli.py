@@ -15,9 +15,9 @@ from typing import Final
 from gateway import capture
 from gateway.sim.car_spec import BadSpec, CarSpec, ReplaySpec, parse_cars, parse_replay, refuse_twins
 from gateway.sim.control_channel import obey, say
-from gateway.sim.endpoints import LinkError, Taken
+from gateway.sim.endpoints import EndpointError, Taken
 from gateway.sim.faults import Fault, Scheduled, parse_fault, parse_press, targets
-from gateway.sim.model.capture_car import Played
+from gateway.sim.model.capture_car import CaptureCar
 from gateway.sim.model.world import World
 from gateway.sim.simulation import SimCar, Simulation
 from schemas import keys
@@ -131,12 +131,12 @@ def run(args: argparse.Namespace) -> int:
         return _fail(str(error), 2)
     try:
         asyncio.run(_serve(specs, captures, world, scheduled, args, endpoint))
-    except LinkError as error:
+    except EndpointError as error:
         return _fail(str(error), 2 if isinstance(error, Taken) else 1)
     return 0
 
 
-def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[tuple[ReplaySpec, Played]]:
+def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[tuple[ReplaySpec, CaptureCar]]:
     """The files, read whole: what is wrong with one is said before anything is opened. Raises BadSpec."""
     if not replays and not args.car:
         raise BadSpec("nothing to simulate: give --car NAME:PLATFORM:LINK or --replay FILE")
@@ -157,7 +157,7 @@ def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[t
             raise BadSpec(f"{spec.path!r} is no path: {error}") from None
         if not pieces:
             raise BadSpec(f"{spec.path}: the capture has no bytes to play")
-        found.append((spec, Played(pieces, rate=rate, loop=args.loop)))
+        found.append((spec, CaptureCar(pieces, rate=rate, loop=args.loop)))
     return found
 
 
@@ -206,7 +206,7 @@ def _endpoint(argument: str | None) -> str:
 
 async def _serve(
     specs: Sequence[CarSpec],
-    replays: Sequence[tuple[ReplaySpec, Played]],
+    replays: Sequence[tuple[ReplaySpec, CaptureCar]],
     world: World,
     scheduled: Sequence[Scheduled],
     args: argparse.Namespace,
@@ -269,7 +269,7 @@ async def _strike(simulation: Simulation, scheduled: Scheduled) -> None:
         return
     try:
         await simulation.inflict(scheduled.act)
-    except LinkError as error:
+    except EndpointError as error:
         _complain(str(error))
 
 

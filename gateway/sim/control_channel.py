@@ -9,9 +9,9 @@ import threading
 from typing import Final
 
 from gateway.sim.car_spec import BadSpec
-from gateway.sim.endpoints import LinkError
+from gateway.sim.endpoints import EndpointError
 from gateway.sim.faults import fault_of, press_of
-from gateway.sim.model.capture_car import Played
+from gateway.sim.model.capture_car import CaptureCar
 from gateway.sim.simulation import Simulation
 from gateway.sim.world_commands import change_of
 from schemas.process import stdio
@@ -86,7 +86,7 @@ async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
         words = str(error) if isinstance(error, BadSpec) else f"no JSON: {error}"
     except RecursionError:
         words = "no JSON: it is nested too deep"
-    except LinkError as error:
+    except EndpointError as error:
         words = str(error)
     return {"ok": False, "error": words}
 
@@ -97,7 +97,7 @@ def _truth(simulation: Simulation, name: object) -> dict[str, object]:
         raise BadSpec(f"car {name!r} is not simulated here: use {', '.join(simulation.cars)}")
     truth, pose = car.truth, car.pose
     if truth is None or pose is None:
-        assert isinstance(car.firmware, Played)
+        assert isinstance(car.firmware, CaptureCar)
         sent, ignored, rounds = car.firmware.sent_bytes, car.firmware.ignored_bytes, car.firmware.rounds
         return {
             "ok": True,

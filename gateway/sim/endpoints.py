@@ -21,11 +21,11 @@ _CLOCKS_S = 2.0
 """A file system may keep whole seconds only."""
 
 
-class LinkError(Exception):
+class EndpointError(Exception):
     """A link cannot be opened; its text says why and what to do."""
 
 
-class Taken(LinkError):
+class Taken(EndpointError):
     """Something else is at the path that a link was to have: wrong use."""
 
 
@@ -91,7 +91,7 @@ class PtySimLink:
             import termios
             import tty
         except ImportError:
-            raise LinkError(
+            raise EndpointError(
                 "a pty link needs Linux or macOS, this system has no pseudo terminals: use tcp://127.0.0.1:0"
             ) from None
         self._openpty: Callable[[], tuple[int, int]] = pty.openpty
@@ -121,7 +121,7 @@ class PtySimLink:
         if self._path is not None:
             try:
                 self._point(self._path)
-            except LinkError:
+            except EndpointError:
                 await self.down()
                 raise
         self._held = False
@@ -132,7 +132,7 @@ class PtySimLink:
         try:
             return self._openpty()
         except OSError as error:
-            raise LinkError(f"no pseudo terminal to be had: {error.strerror}") from None
+            raise EndpointError(f"no pseudo terminal to be had: {error.strerror}") from None
 
     def _point(self, path: Path) -> None:
         """What a killed simulator has left may be replaced, anything else may not."""
@@ -148,7 +148,7 @@ class PtySimLink:
                     what += ", which is in use, perhaps by another simulator"
             raise Taken(f"{path} {what}: name another path, or remove it") from None
         except OSError as error:
-            raise LinkError(f"no symlink can be made at {path}: {error.strerror}") from None
+            raise EndpointError(f"no symlink can be made at {path}: {error.strerror}") from None
 
     def _left_over(self, path: Path) -> bool:
         """Whether this symlink's terminal is gone, or its number another's by now, opened after the link was made."""
@@ -199,9 +199,9 @@ class PtySimLink:
         if path is not None:
             new = Path(path)
             if new != self._path and (new.exists() or new.is_symlink()):
-                raise LinkError(f"{path} is there already: name another path")
+                raise EndpointError(f"{path} is there already: name another path")
             if not new.parent.is_dir():
-                raise LinkError(f"no symlink can be made at {path}: its directory is not there")
+                raise EndpointError(f"no symlink can be made at {path}: its directory is not there")
         if self._next is None:
             self._next = self._open()
         if path is not None:
@@ -270,14 +270,14 @@ class TcpSimLink:
             raise self._cannot_listen(self._port, error) from None
         self._port = self._server.sockets[0].getsockname()[1]
 
-    def _cannot_listen(self, port: int, error: OSError) -> LinkError:
+    def _cannot_listen(self, port: int, error: OSError) -> EndpointError:
         words = error.strerror or str(error)
-        return LinkError(f"cannot listen on {self._host}:{port}: {words}; name another port, or 0 for any free one")
+        return EndpointError(f"cannot listen on {self._host}:{port}: {words}; name another port, or 0 for any free one")
 
     def rename(self, path: str | None) -> None:
         """Another port, taken while this one is still in use."""
         if path is not None:
-            raise LinkError(f"{path} is not for a TCP link: it has no path")
+            raise EndpointError(f"{path} is not for a TCP link: it has no path")
         if self._next is None:
             family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
             self._next = socket.socket(family, socket.SOCK_STREAM)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from gateway.sim.car_spec import BadSpec, CarSpec, PtyLink, ReplaySpec
-from gateway.sim.model.faulty_link import Flood, Way
+from gateway.sim.car_spec import BadSpec, CarSpec, PtyPath, ReplaySpec
+from gateway.sim.model.faulty_link import Direction, Flood
 from gateway.sim.model.ir_remote import Button
 
 GARBAGE_LIMIT: Final = 100_000
@@ -47,7 +47,7 @@ class Fault:
     """How long, s; 0 ends it now; None: until the same kind comes with 0 (a link that is gone: link_drop)."""
     bytes: int = 0
     """How many bytes of garbage, or of the next frame before the cut."""
-    ways: tuple[Way, ...] = tuple(Way)
+    ways: tuple[Direction, ...] = tuple(Direction)
     """Which ways of the link `lossy` and `garbage` hit."""
     factor: float = 1.0
     """Speed of a slow link as a part of 960 bytes/s."""
@@ -89,18 +89,18 @@ def targets(cars: Sequence[CarSpec | ReplaySpec], act: Fault | Press) -> list[st
             raise BadSpec(f"{what} needs a simulated car, a replay only repeats its bytes")
         return simulated
     if act.path is not None:
-        if act.car is None or not isinstance(chosen[0].link, PtyLink) or chosen[0].link.path is None:
+        if act.car is None or not isinstance(chosen[0].link, PtyPath) or chosen[0].link.path is None:
             raise BadSpec(f"path {act.path!r} is not allowed: only with the name of a car whose link is pty:PATH")
-        others = [car.name for car in cars if isinstance(car.link, PtyLink) and car.link.path == act.path]
+        others = [car.name for car in cars if isinstance(car.link, PtyPath) and car.link.path == act.path]
         if [name for name in others if name != act.car]:
             raise BadSpec(f"path {act.path!r} is not allowed: car {others[0]} has it")
     return [car.name for car in chosen]
 
 
-_WAYS: Final[Mapping[str, tuple[Way, ...]]] = {
-    "host": (Way.TO_HOST,),
-    "car": (Way.TO_CAR,),
-    "both": tuple(Way),
+_WAYS: Final[Mapping[str, tuple[Direction, ...]]] = {
+    "host": (Direction.TO_HOST,),
+    "car": (Direction.TO_CAR,),
+    "both": tuple(Direction),
 }
 _FIELDS: Final[Mapping[FaultKind, Mapping[str, object]]] = {
     FaultKind.LINK_DROP: {"for_s": None},

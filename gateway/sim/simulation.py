@@ -9,12 +9,12 @@ from collections.abc import Callable, Coroutine, Sequence
 from math import inf
 from typing import Final, Protocol
 
-from gateway.sim.car_spec import CarSpec, PtyLink, ReplaySpec
-from gateway.sim.endpoints import LinkError, PtySimLink, SimLink, TcpSimLink
+from gateway.sim.car_spec import CarSpec, PtyPath, ReplaySpec
+from gateway.sim.endpoints import EndpointError, PtySimLink, SimLink, TcpSimLink
 from gateway.sim.faults import Fault, FaultKind, Press, targets
-from gateway.sim.model.capture_car import Played
+from gateway.sim.model.capture_car import CaptureCar
 from gateway.sim.model.factory import build
-from gateway.sim.model.faulty_link import Line, Way
+from gateway.sim.model.faulty_link import Direction, FaultyLink
 from gateway.sim.model.firmware import Firmware, Pose, Truth
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.model.raspberry_pi import BOOT_S, RaspberryPiCar, Transport
@@ -73,7 +73,7 @@ class SimCar:
         self.firmware = firmware
         # Of their own, so that a fault changes nothing of what the car itself does by chance.
         self._rng = _rng(f"{seed}:faults")
-        self._line = Line(_rng(f"{seed}:to_car"), _rng(f"{seed}:to_host"))
+        self._line = FaultyLink(_rng(f"{seed}:to_car"), _rng(f"{seed}:to_host"))
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._held = False
@@ -93,10 +93,10 @@ class SimCar:
         """Called when the link has come back under another name."""
         self.ended: Watcher = lambda _: None
         """Called when a capture has played to its end and will not begin again."""
-        self.failed: Callable[[SimCar, LinkError], None] = lambda *_: None
+        self.failed: Callable[[SimCar, EndpointError], None] = lambda *_: None
         """Called when a link that was to come back cannot."""
         self._link: SimLink
-        if isinstance(spec.link, PtyLink):
+        if isinstance(spec.link, PtyPath):
             self._link = PtySimLink(self, spec.link.path)
         else:
             self._link = TcpSimLink(self, spec.link.host, spec.link.port)
@@ -126,7 +126,7 @@ class SimCar:
         """Open the link and let the program run; raises LinkError."""
         await self._link.up()
         self._known_as = self.url
-        if isinstance(self.firmware, Played) and isinstance(self.spec.link, PtyLink):
+        if isinstance(self.firmware, CaptureCar) and isinstance(self.spec.link, PtyPath):
             self.firmware.begin(self._loop.time())  # a terminal does not tell when a host comes
         self._pump()
 
@@ -151,7 +151,7 @@ class SimCar:
         """A TCP host has come."""
         if isinstance(self.firmware, RaspberryPiCar):
             self.firmware.connected(self._loop.time())
-        elif isinstance(self.firmware, Played):
+        elif isinstance(self.firmware, CaptureCar):
             self.firmware.begin(self._loop.time())
             self._pump()
 
@@ -196,7 +196,7 @@ class SimCar:
         if was_alive and not self._alive and isinstance(self._link, TcpSimLink):
             # The program's sockets die with it: the connection ends and a new one is refused.
             self._later(self._link.down())
-        if isinstance(self.firmware, Played) and self.firmware.done and not self._ended:
+        if isinstance(self.firmware, CaptureCar) and self.firmware.done and not self._ended:
             self._ended = True
             self.ended(self)
 
@@ -209,7 +209,7 @@ class SimCar:
         async def told() -> None:
             try:
                 await work
-            except LinkError as error:
+            except EndpointError as error:
                 self.failed(self, error)
 
         task = self._loop.create_task(told())
@@ -247,17 +247,17 @@ class SimCar:
             case FaultKind.STUCK:
                 self._stick(fault.for_s)
             case FaultKind.DEAF:
-                self._line.close(Way.TO_CAR, until)
+                self._line.close(Direction.TO_CAR, until)
             case FaultKind.MUTE:
-                self._line.close(Way.TO_HOST, until)
+                self._line.close(Direction.TO_HOST, until)
             case FaultKind.ECHO:
                 self._line.echo(until)
             case FaultKind.FIREHOSE:
                 self._line.flood(fault.flood, fault.rate, now, until)
             case FaultKind.GARBAGE:
-                if Way.TO_CAR in fault.ways:
+                if Direction.TO_CAR in fault.ways:
                     self.received(self._rng.randbytes(fault.bytes))
-                if Way.TO_HOST in fault.ways and not self._dropped:
+                if Direction.TO_HOST in fault.ways and not self._dropped:
                     self._link.send(self._rng.randbytes(fault.bytes))
             case FaultKind.BROWNOUT:
                 await self._brown_out()
@@ -321,7 +321,7 @@ class Simulation:
         *,
         seed: int = 0,
         world: World | None = None,
-        replays: Sequence[tuple[ReplaySpec, Played]] = (),
+        replays: Sequence[tuple[ReplaySpec, CaptureCar]] = (),
     ) -> None:
         self.world = world or World.room()
         self.cars: dict[str, SimCar] = {}
@@ -329,7 +329,7 @@ class Simulation:
         for index, spec in enumerate(specs):
             # Seeded by the name too, so that a car behaves the same whatever other cars there are.
             seeded = f"{seed}:{spec.name}"
-            transport = Transport.SERIAL if isinstance(spec.link, PtyLink) else Transport.TCP
+            transport = Transport.SERIAL if isinstance(spec.link, PtyPath) else Transport.TCP
             rng, options = _rng(seeded), spec.options
             firmware = build(
                 spec.platform, self.world, index, rng, options=options, transport=transport, now=now, name=spec.name
@@ -343,7 +343,7 @@ class Simulation:
         for name, car in self.cars.items():
             try:
                 await car.start()
-            except LinkError as error:
+            except EndpointError as error:
                 await self.stop()
                 raise type(error)(f"car {name}: {error}") from None
 

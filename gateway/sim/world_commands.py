@@ -8,7 +8,7 @@ from typing import Any, Final, TypeVar
 
 from gateway.sim.car_spec import BadSpec
 from gateway.sim.faults import number
-from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, Thing
+from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import World
 
 Change = Callable[[World, float], None]
@@ -16,7 +16,7 @@ Change = Callable[[World, float], None]
 Said = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """`lamps` and `things`: by name, their fields."""
 
-_Kind = TypeVar("_Kind", Lamp, Thing)
+_Kind = TypeVar("_Kind", Lamp, MovingObject)
 _PLACE: Final = {"x_m": (-FAR_M, FAR_M), "y_m": (-FAR_M, FAR_M)}
 _LAMP: Final = {**_PLACE, "brightness": (0.0, 100.0), "reach_m": (0.01, FAR_M)}
 _THING: Final = {**_PLACE, "speed_m_s": (0.0, FASTEST_M_S)}
@@ -39,7 +39,7 @@ def _lamp_change(fields: Mapping[str, object], lamp: Lamp) -> Change:
     return lambda world, _: world.change_lamp(lamp.name, **given)
 
 
-def _thing_change(fields: Mapping[str, object], thing: Thing) -> Change:
+def _thing_change(fields: Mapping[str, object], thing: MovingObject) -> Change:
     given = _numbers("thing", fields, _THING, ())
     speed = given.pop("speed_m_s", None)
     if speed is not None and (not thing.path or given):

@@ -14,9 +14,9 @@ import yaml
 
 from gateway.sim.model.firmware import Pose
 from gateway.sim.model.geometry import Point, Segment, box, distance, loop
-from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, Thing
+from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
-from gateway.sim.yaml_reader import Marks
+from gateway.sim.yaml_reader import MarkedYaml
 from schemas import keys
 
 SMALLEST_M: Final = 0.02
@@ -52,7 +52,7 @@ class WorldSpec:
     walls: tuple[Segment, ...]
     line: tuple[Point, ...]
     lamps: tuple[Lamp, ...]
-    things: tuple[Thing, ...]
+    things: tuple[MovingObject, ...]
     starts: Mapping[str, Pose]
     cars_meet: bool
 
@@ -68,11 +68,11 @@ def read_world(text: str, source: str, cars: Sequence[str] | None = None) -> Wor
 
     `source`: its name in errors. `cars`: who can carry something; None: any car.
     """
-    return _Reader(Marks(text, source), cars).read()
+    return _WorldParser(MarkedYaml(text, source), cars).read()
 
 
-class _Reader:
-    def __init__(self, marks: Marks, cars: Sequence[str] | None) -> None:
+class _WorldParser:
+    def __init__(self, marks: MarkedYaml, cars: Sequence[str] | None) -> None:
         self._marks = marks
         self._cars = cars
         self._walls: list[Segment] = []
@@ -129,7 +129,7 @@ class _Reader:
             )
         return tuple(loop(width / 2, depth / 2, radius))
 
-    def _thing(self, name: str, node: yaml.Node) -> Thing:
+    def _thing(self, name: str, node: yaml.Node) -> MovingObject:
         marks, field = self._marks, f"things.{name}"
         parts = marks.fields(node, field, _THING)
         disc, boxed = "radius_m" in parts, {"width_m", "depth_m"} <= parts.keys()
@@ -157,7 +157,7 @@ class _Reader:
             marks.number(parts[each], f"{field}.{each}", 0, most) if each in parts else 0.0
             for each, most in (("speed_m_s", FASTEST_M_S), ("waits_for_m", FAR_M))
         )
-        return Thing(
+        return MovingObject(
             name,
             self._place(parts, "x_m", field),
             self._place(parts, "y_m", field),
@@ -171,7 +171,7 @@ class _Reader:
             carried_by=self._carrier(parts["carried_by"], f"{field}.carried_by") if "carried_by" in parts else "",
         )
 
-    def _lamp(self, name: str, node: yaml.Node, things: Mapping[str, Thing]) -> Lamp:
+    def _lamp(self, name: str, node: yaml.Node, things: Mapping[str, MovingObject]) -> Lamp:
         marks, field = self._marks, f"lamps.{name}"
         parts = marks.fields(node, field, _LAMP)
         carried_by = ""
@@ -196,7 +196,7 @@ class _Reader:
             carried_by=carried_by,
         )
 
-    def _starts(self, top: Mapping[str, yaml.Node], things: tuple[Thing, ...], *, meet: bool) -> dict[str, Pose]:
+    def _starts(self, top: Mapping[str, yaml.Node], things: tuple[MovingObject, ...], *, meet: bool) -> dict[str, Pose]:
         marks, found, nodes = self._marks, {}, self._named(top, "cars")
         for name, node in nodes.items():
             field = f"cars.{name}"

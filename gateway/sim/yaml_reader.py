@@ -22,7 +22,7 @@ class BadWorld(ValueError):
     """A world file that cannot be used; its text has every fault, one a line: `file:line:column: field: what`."""
 
 
-class Marks:
+class MarkedYaml:
     """The document, and the faults found so far. What is asked of a faulty value is answered, so that all are found."""
 
     def __init__(self, text: str, source: str) -> None:

@@ -22,7 +22,7 @@ _START_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Port:
+class SerialPort:
     """A serial port, as the system knows it. `url`: the most lasting that names it; vid and pid: four hex digits."""
 
     device: str
@@ -50,7 +50,7 @@ class NoBluetooth(Exception):
     """Bluetooth cannot be looked at; the text is one line: why, what to do."""
 
 
-def serial_ports() -> list[Port]:
+def serial_ports() -> list[SerialPort]:
     """The serial ports of this computer, by name; raises CannotOpen if the system does not list them."""
     return described(listed(), by_id(BY_ID))
 
@@ -63,7 +63,7 @@ def by_id(directory: Path) -> dict[str, str]:
         return {}
 
 
-def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> list[Port]:
+def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> list[SerialPort]:
     """The ports that pyserial found, each with the URL that names it best; `lasting` as `by_id` gives it."""
     ports = sorted(found)
     same = Counter((port.vid, port.serial_number) for port in ports)
@@ -74,7 +74,7 @@ def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> li
         if port.vid is not None and port.serial_number and same[port.vid, port.serial_number] == 1:
             url = UsbUrl(vid=port.vid, serial=port.serial_number)
         result.append(
-            Port(
+            SerialPort(
                 device=port.device,
                 url=str(url),
                 description="" if port.description in (None, "n/a", port.name) else port.description,

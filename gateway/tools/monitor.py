@@ -1,6 +1,6 @@
 """`gateway monitor`: what a car says, decoded beside the raw bytes, live or from a file. It only listens.
 
-How an event is shown is in `Lines`; what it says, and what is counted, in `heard`.
+How an event is shown is in `MonitorOutput`; what it says, and what is counted, in `heard`.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Event, Rejected
 from gateway.protocol.platforms import Profile
 from gateway.tools import cli_support
-from gateway.tools.statistics import Tally, describe
+from gateway.tools.statistics import LinkStatistics, describe
 
 DESCRIPTION: Final = "What a car says, decoded beside the raw bytes. It only listens; Ctrl-C ends it."
 EPILOG: Final = """\
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    lines = Lines(cli_support.profile_of(arguments.platform), as_json=arguments.json)
+    lines = MonitorOutput(cli_support.profile_of(arguments.platform), as_json=arguments.json)
     if arguments.file is None:
         _run_live(parse_url(arguments.link), arguments.raw, lines)
         return
@@ -63,7 +63,7 @@ def _run(arguments: argparse.Namespace) -> None:
     lines.end()
 
 
-def _pieces(path: Path) -> Iterator[capture.Piece]:
+def _pieces(path: Path) -> Iterator[capture.CapturedBytes]:
     pieces = capture.read(path)
     while True:
         try:
@@ -75,7 +75,7 @@ def _pieces(path: Path) -> Iterator[capture.Piece]:
         yield piece
 
 
-def _run_live(url: LinkUrl, raw: Path | None, lines: "Lines") -> None:
+def _run_live(url: LinkUrl, raw: Path | None, lines: "MonitorOutput") -> None:
     keep = None if raw is None else _new_capture(raw, url)
     cli_support.warn_of(url)
     origin = time.monotonic()
@@ -92,16 +92,16 @@ def _run_live(url: LinkUrl, raw: Path | None, lines: "Lines") -> None:
             cli_support.note(f"the bytes are in {keep.path}")
 
 
-def _new_capture(path: Path, url: LinkUrl) -> capture.Writer:
+def _new_capture(path: Path, url: LinkUrl) -> capture.CaptureWriter:
     try:
-        return capture.Writer(path, str(url), datetime.now(UTC).isoformat(timespec="milliseconds"))
+        return capture.CaptureWriter(path, str(url), datetime.now(UTC).isoformat(timespec="milliseconds"))
     except FileExistsError:
         raise cli_support.WrongUse(f"{path} exists already and is not overwritten: name another file") from None
     except OSError as error:
         raise cli_support.WrongUse(f"{path}: the file cannot be made: {error.strerror}") from None
 
 
-async def _live(url: LinkUrl, lines: "Lines", keep: capture.Writer | None, origin: float) -> None:
+async def _live(url: LinkUrl, lines: "MonitorOutput", keep: capture.CaptureWriter | None, origin: float) -> None:
     link = await open_link(url)
     try:
         lines.begin(time.monotonic() - origin)
@@ -110,7 +110,7 @@ async def _live(url: LinkUrl, lines: "Lines", keep: capture.Writer | None, origi
         await link.close()
 
 
-async def _listen(link: Link, lines: "Lines", keep: capture.Writer | None, origin: float) -> None:
+async def _listen(link: Link, lines: "MonitorOutput", keep: capture.CaptureWriter | None, origin: float) -> None:
     reading = asyncio.ensure_future(link.read())
     try:
         while True:
@@ -121,7 +121,7 @@ async def _listen(link: Link, lines: "Lines", keep: capture.Writer | None, origi
             if not done:
                 lines.tick(now)
                 continue
-            piece = capture.Piece(now, reading.result())
+            piece = capture.CapturedBytes(now, reading.result())
             reading = asyncio.ensure_future(link.read())
             if keep is not None:
                 _add(keep, piece)
@@ -130,14 +130,14 @@ async def _listen(link: Link, lines: "Lines", keep: capture.Writer | None, origi
         reading.cancel()
 
 
-def _add(keep: capture.Writer, piece: capture.Piece) -> None:
+def _add(keep: capture.CaptureWriter, piece: capture.CapturedBytes) -> None:
     try:
         keep.add(piece)
     except OSError as error:
         raise cli_support.Failed(f"{keep.path}: the file cannot be written: {error.strerror}") from None
 
 
-class Lines:
+class MonitorOutput:
     """A line for each event of one link's bytes, as text or JSON, and a summary at the end."""
 
     def __init__(self, profile: Profile, *, as_json: bool) -> None:
@@ -145,13 +145,13 @@ class Lines:
         self._as_json = as_json
         self._decoder = Decoder()
         self._paint = cli_support.Paint(sys.stdout)
-        self.tally = Tally()
+        self.tally = LinkStatistics()
 
     def begin(self, at: float) -> None:
         """The link is open; seconds since the start, as all times here."""
         self.tally.since = at
 
-    def feed(self, piece: capture.Piece) -> None:
+    def feed(self, piece: capture.CapturedBytes) -> None:
         """Show what these bytes complete; raises OSError of the output."""
         self.tally.bytes += len(piece.data)
         self.tally.until = piece.at

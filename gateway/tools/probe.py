@@ -14,11 +14,11 @@ from gateway.protocol.events import Event, Sensors
 from gateway.protocol.frames import encode
 from gateway.protocol.platforms import Profile
 from gateway.tools import cli_support
-from gateway.tools.discovery import Port
-from gateway.tools.statistics import Tally
+from gateway.tools.discovery import SerialPort
+from gateway.tools.statistics import LinkStatistics
 
 
-class Verdict(StrEnum):
+class LinkVerdict(StrEnum):
     """What a link is, by what came over it."""
 
     CAR = "car"
@@ -29,13 +29,13 @@ class Verdict(StrEnum):
 
 
 @dataclass(slots=True)
-class Ear:
+class LinkProbe:
     """One link that is listened to, and what was heard."""
 
     url: LinkUrl
-    port: Port | None = None
+    port: SerialPort | None = None
     link: Link | None = None
-    tally: Tally = field(default_factory=Tally)
+    tally: LinkStatistics = field(default_factory=LinkStatistics)
     trouble: str | None = None
     busy: bool = False
     probed: bool = False
@@ -97,15 +97,15 @@ class Ear:
         self._count(self._decoder.end())
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> LinkVerdict:
         """What it is, so far."""
         if self.link is None:
-            return Verdict.BUSY if self.busy else Verdict.FAILED
+            return LinkVerdict.BUSY if self.busy else LinkVerdict.FAILED
         if self.tally.readings:
-            return Verdict.CAR
+            return LinkVerdict.CAR
         if self.trouble is not None:
-            return Verdict.FAILED
-        return Verdict.OTHER if self.tally.bytes else Verdict.SILENT
+            return LinkVerdict.FAILED
+        return LinkVerdict.OTHER if self.tally.bytes else LinkVerdict.SILENT
 
     def _count(self, events: Sequence[Event]) -> None:
         for event in events:

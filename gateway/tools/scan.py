@@ -17,7 +17,7 @@ from gateway.link import parse_url
 from gateway.protocol.frames import encode
 from gateway.tools import cli_support
 from gateway.tools.discovery import BleDevice, NoBluetooth, ble_devices, serial_ports
-from gateway.tools.probe import Ear, Verdict
+from gateway.tools.probe import LinkProbe, LinkVerdict
 
 DESCRIPTION: Final = "The serial ports and Bluetooth LE devices there are, and which of them speak as a car does."
 EPILOG: Final = """\
@@ -60,9 +60,9 @@ def _run(arguments: argparse.Namespace) -> None:
     if not _LEAST_S <= arguments.seconds <= _MOST_S:
         raise cli_support.WrongUse(f"--seconds {arguments.seconds:g}: a number from {_LEAST_S:g} to {_MOST_S:g}")
     if arguments.link:
-        ears = [Ear(url) for url in dict.fromkeys(map(parse_url, arguments.link))]
+        ears = [LinkProbe(url) for url in dict.fromkeys(map(parse_url, arguments.link))]
     else:
-        ears = [Ear(parse_url(port.device), port) for port in serial_ports()]
+        ears = [LinkProbe(parse_url(port.device), port) for port in serial_ports()]
     for ear in ears:
         cli_support.warn_of(ear.url)
     scan = _Scan(ears, arguments.seconds, probe=arguments.probe, bluetooth=not arguments.link)
@@ -73,7 +73,7 @@ def _run(arguments: argparse.Namespace) -> None:
     else:
         for line in scan.lines(cli_support.Paint(sys.stdout)):
             sys.stdout.write(line + "\n")
-    failed = [ear for ear in ears if ear.verdict is Verdict.FAILED]
+    failed = [ear for ear in ears if ear.verdict is LinkVerdict.FAILED]
     if arguments.link and failed:
         sys.stdout.flush()
         raise cli_support.Failed(f"could not listen to {', '.join(str(ear.url) for ear in failed)}")
@@ -82,7 +82,7 @@ def _run(arguments: argparse.Namespace) -> None:
 class _Scan:
     """All links at once, and Bluetooth meanwhile."""
 
-    def __init__(self, ears: Sequence[Ear], seconds: float, *, probe: bool, bluetooth: bool) -> None:
+    def __init__(self, ears: Sequence[LinkProbe], seconds: float, *, probe: bool, bluetooth: bool) -> None:
         self._ears = ears
         self._seconds = seconds
         self._probe = probe
@@ -107,7 +107,7 @@ class _Scan:
             if self._bluetooth:
                 tasks.create_task(self._look_for_devices())
 
-    async def _hear(self, ear: Ear) -> None:
+    async def _hear(self, ear: LinkProbe) -> None:
         await ear.open()
         if ear.link is not None:
             await ear.listen(self._seconds)
@@ -120,7 +120,9 @@ class _Scan:
 
     async def _probe_silent(self) -> None:
         # A car in mode 0, too: its readings do not tell whether it drives.
-        asked = [ear for ear in self._ears if ear.trouble is None and ear.verdict in (Verdict.SILENT, Verdict.CAR)]
+        asked = [
+            ear for ear in self._ears if ear.trouble is None and ear.verdict in (LinkVerdict.SILENT, LinkVerdict.CAR)
+        ]
         if not asked:
             cli_support.note("nothing to probe: nothing is open, or what is sends something else")
             return
@@ -189,7 +191,7 @@ async def _all(probing: "asyncio.Future[list[None]]") -> None:
     await probing
 
 
-def _name(ear: Ear) -> str:
+def _name(ear: LinkProbe) -> str:
     if ear.port is None:
         return str(ear.url)
     usb = f"{ear.port.vid}:{ear.port.pid}" if ear.port.vid else ""
@@ -203,20 +205,20 @@ def _safe(text: str | None) -> str:
     return "".join(each for each in text or "" if each.isprintable())
 
 
-def _words(ear: Ear) -> str:
+def _words(ear: LinkProbe) -> str:
     """What a link is, for a person."""
     match ear.verdict:
-        case Verdict.CAR:
+        case LinkVerdict.CAR:
             after = "; it answered the probe in mode 0" if ear.probed and ear.answered else ""
             gone = f"; then: {ear.trouble}" if ear.trouble else ""
             return f"a car: {ear.tally.words()}{after}{gone}"
-        case Verdict.OTHER:
+        case LinkVerdict.OTHER:
             return f"no car: {ear.tally.words()}"
-        case Verdict.SILENT if ear.probed:
+        case LinkVerdict.SILENT if ear.probed:
             return "silent, also when probed: no car, one that is off or wedged, or its fan runs"
-        case Verdict.SILENT:
+        case LinkVerdict.SILENT:
             return "silent: no car, one that is off, in a silent mode, or with its fan on (--probe asks it)"
-        case Verdict.BUSY:
+        case LinkVerdict.BUSY:
             return "in use by another program (its gateway?): not listened to"
-        case Verdict.FAILED:
+        case LinkVerdict.FAILED:
             return str(ear.trouble)

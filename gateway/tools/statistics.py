@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gateway.control.estimate.platform import PlatformTruth
+from gateway.control.estimate.platform import PlatformDetector
 from gateway.protocol.events import ArmReading, Echo, Event, ImuReading, Reject, Rejected, Sensors
 from gateway.protocol.platforms import Profile, parse_platform
 
 
 @dataclass(slots=True)
-class Tally:
+class LinkStatistics:
     """What has come over one link. Times in seconds since the start."""
 
     since: float | None = None
@@ -21,7 +21,7 @@ class Tally:
     rejects: Counter[str] = field(default_factory=Counter)
     modes: Counter[str] = field(default_factory=Counter)
     contradictions: Counter[str] = field(default_factory=Counter)
-    looked_for: PlatformTruth = field(default_factory=lambda: PlatformTruth(parse_platform("unknown"), auto=True))
+    looked_for: PlatformDetector = field(default_factory=lambda: PlatformDetector(parse_platform("unknown"), auto=True))
 
     def count(self, event: Event, profile: Profile) -> None:
         """Take an event in; `profile`: what the car was said to be."""

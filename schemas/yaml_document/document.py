@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from yamlcore import CoreLoader  # type: ignore[import-untyped]  # has no stubs
 
 from schemas.yaml_document.messages import Where, fault, shown, spelled
-from schemas.yaml_document.partial import Sound
+from schemas.yaml_document.partial import PartialTree
 
 LARGEST_BYTES: Final = 256 * 1024
 """A fleet of a hundred cars has 20 kB; PyYAML reads about 100 kB in a second."""
@@ -119,7 +119,7 @@ class Document:
         self._problems: list[Problem] = []
         self._faulty: set[Where] = set()
         self._places: dict[Where, tuple[yaml.Mark | None, yaml.Node]] = {}
-        self._sound = Sound(None)
+        self._sound = PartialTree(None)
         self._values = 0
         if len(text.encode(errors="surrogatepass")) > LARGEST_BYTES:
             raise BadFile(source, [_too_large()])
@@ -161,7 +161,7 @@ class Document:
         """
         dropped, added = set(self._faulty), dict[Where, object]()
         for _ in range(DEEPEST):
-            self._sound = Sound(self.tree, dropped, added)
+            self._sound = PartialTree(self.tree, dropped, added)
             try:
                 return model.model_validate_json(json.dumps(self._sound.tree), strict=True)
             except ValidationError as error:

@@ -6,7 +6,7 @@ from typing import Any
 from schemas.yaml_document.messages import Where
 
 
-class Sound:
+class PartialTree:
     """A tree of plain data without some places, and with others added: what `marked` looks at for more faults."""
 
     def __init__(self, tree: Any, dropped: Collection[Where] = (), added: Mapping[Where, object] | None = None) -> None:

@@ -5,8 +5,8 @@ from time import perf_counter
 
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
-from fleet.policy.snapshot import CarPicture, Picture, Seen
-from fleet.policy.state import Memory
+from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation
+from fleet.policy.state import PolicyState
 from tests.bench.measured import Measured, in_turns, percentile
 
 CARS = tuple(f"car{number:02}" for number in range(50))
@@ -23,24 +23,24 @@ PLAN = parse(
         for number in range(20)
     )
 )
-HERE = CarPicture(present=True, mode="manual", verdict="confirmed", link="online", motors="off", platform="arduino")
+HERE = CarSnapshot(present=True, mode="manual", verdict="confirmed", link="online", motors="off", platform="arduino")
 STEPS = 100
 
 
-def _pictures() -> list[Picture]:
+def _pictures() -> list[FleetSnapshot]:
     """New readings from every car in each; one car more or less in every second."""
     found = []
     for number in range(STEPS):
         readings = {
             car: {
-                "sensor/battery": Seen({"voltage_v": 7.4}, number * 0.1),
-                "sensor/light": Seen({"left": number % 3 == 0, "right": False}, number * 0.1),
-                "sensor/range": Seen({"range_m": 0.2}, number * 0.1),
+                "sensor/battery": Observation({"voltage_v": 7.4}, number * 0.1),
+                "sensor/light": Observation({"left": number % 3 == 0, "right": False}, number * 0.1),
+                "sensor/range": Observation({"range_m": 0.2}, number * 0.1),
             }
             for car in CARS
         }
         away = replace(HERE, held_by="ann") if number % 2 else HERE
-        found.append(Picture({**dict.fromkeys(CARS, HERE), CARS[number % 50]: away}, readings))
+        found.append(FleetSnapshot({**dict.fromkeys(CARS, HERE), CARS[number % 50]: away}, readings))
     return found
 
 
@@ -48,7 +48,7 @@ PICTURES = _pictures()
 
 
 def _ours() -> float:
-    memory = Memory()
+    memory = PolicyState()
     took = []
     for number, picture in enumerate(PICTURES):
         began = perf_counter()

@@ -21,10 +21,10 @@ import zenoh
 
 from fleet import aio
 from fleet import cli as command_line
-from fleet.client.condition import Condition, topics_under
-from fleet.client.key_survey import Survey
+from fleet.client.condition import KeyCondition, topics_under
+from fleet.client.key_survey import KeySurvey
 from fleet.client.reading import Reading
-from fleet.client.wait import NotInTime, Waiting
+from fleet.client.wait import ConditionWait, NotInTime
 from fleet.conditions import BadExpression
 from schemas import keys, topics
 from schemas.bus import Bus, reply_value
@@ -122,7 +122,7 @@ def reading(topic: str, seq: int, age_s: float, boot: str = "a", **fields: Any) 
 def test_a_rate_is_counted_by_the_publishers_numbers(
     seen: list[tuple[int, float]], rate: float | None, age_s: float
 ) -> None:
-    survey = Survey(2.5)
+    survey = KeySurvey(2.5)
     for seq, age in seen:
         survey.take(reading("sensor/range", seq, age), NOW)
     (found,) = survey.found([], NOW)
@@ -130,7 +130,7 @@ def test_a_rate_is_counted_by_the_publishers_numbers(
 
 
 def test_a_publisher_that_began_anew_counts_anew() -> None:
-    survey = Survey(2.5)
+    survey = KeySurvey(2.5)
     for seq, age, boot in ((900, 2.0, "a"), (1, 1.0, "b"), (2, 0.0, "b")):
         survey.take(reading("sensor/range", seq, age, boot), NOW)
     (found,) = survey.found([], NOW)
@@ -315,11 +315,11 @@ def test_the_topics_that_a_key_expression_can_match() -> None:
     assert topics_under("fleet/red/@cmd/*") == []
 
 
-def close(for_s: float = 0.0) -> Waiting:
-    return Waiting(Condition.of("range_m < 0.3", "fleet/*/sensor/range"), for_s)
+def close(for_s: float = 0.0) -> ConditionWait:
+    return ConditionWait(KeyCondition.of("range_m < 0.3", "fleet/*/sensor/range"), for_s)
 
 
-def ends(waiting: Waiting, seen: list[tuple[float, float | None]], end_s: float = 100.0) -> list[bool]:
+def ends(waiting: ConditionWait, seen: list[tuple[float, float | None]], end_s: float = 100.0) -> list[bool]:
     """For readings as (moment, distance)."""
     found = []
     for number, (at, range_m) in enumerate(seen):

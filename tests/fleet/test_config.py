@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.fleetfile.fleet_file import CarSpec, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
+from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
 from fleet.fleetfile.models import CRITICAL_V, EMPTY_V, FULL_V, LONGEST_DRIVE_S, LOW_V, BatteryAction, schema
-from fleet.links import BadLink, Link, LinkKind, parse_link, shared_ports
+from fleet.links import BadLink, LinkKind, LinkUrl, parse_link, shared_ports
 from gateway.bus import requests
 from gateway.control.estimate import battery
 from gateway.link import BadUrl, parse_url
@@ -56,7 +56,7 @@ def test_a_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> Non
     assert (red.roles, red.colour) == (("patrol", "guard"), "#e01b24")
     assert red.capabilities == profile_capabilities("arduino")
     slow = Limits(longest_drive_s=3, battery_low_v=7.2, speed_max=0.5, on_battery_low=BatteryAction.STOP)
-    assert green == CarSpec(
+    assert green == FleetCar(
         "green", "tcp://Pi:8888", "arduino", "#00ff00", profile_capabilities("arduino"), slow, ("guard",)
     )
     assert (blue.platform, blue.capabilities, blue.roles) == ("raspberry_pi+arm", frozenset({"drive"}), ())
@@ -71,9 +71,9 @@ def test_what_is_not_said() -> None:
 
 
 def test_what_is_not_said_is_as_gateways_have_it() -> None:
-    policy = battery.Policy()
+    policy = battery.BatteryPolicy()
     assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.low, policy.critical)
-    assert [*BatteryAction] == [*battery.Action]
+    assert [*BatteryAction] == [*battery.BatteryReaction]
     assert (EMPTY_V, FULL_V, LOW_V, CRITICAL_V) == (battery.EMPTY_V, battery.FULL_V, battery.LOW_V, battery.CRITICAL_V)
     assert requests.LONGEST_DRIVE_S == LONGEST_DRIVE_S
 
@@ -164,7 +164,7 @@ _PORTS = [parse_link(each) for each in ("/dev/a", "/dev/b", "tcp://a:1", "tcp://
 
 
 @given(st.lists(st.sampled_from(_PORTS), max_size=12))
-def test_shared_ports_are_those_that_a_comparison_of_each_pair_finds(links: list[Link]) -> None:
+def test_shared_ports_are_those_that_a_comparison_of_each_pair_finds(links: list[LinkUrl]) -> None:
     named = {f"car{number}": link for number, link in enumerate(links)}
     first: dict[str, str] = {}
     for (one, before), (other, after) in combinations(named.items(), 2):

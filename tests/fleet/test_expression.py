@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.conditions import BadExpression, contradictory, fields_of, parse, value_in
-from fleet.conditions.expression import Compare, Every, Expression, Kind, Literal, Name, Node, Not, Op, Some, joined
+from fleet.conditions.expression import And, Compare, Expression, Literal, Name, Node, Not, Op, Or, ValueKind, joined
 from fleet.conditions.parser import DEPTH, LENGTH
 from schemas import messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
@@ -182,17 +182,19 @@ def test_two_conditions_make_one() -> None:
 _numbers = st.one_of(st.integers(-5, 5), st.floats(-3, 3), st.sampled_from([0.25, 1e22, -1e-9, 2**64]))
 _words = st.text(st.characters(codec="utf-8", exclude_characters="\n\"'"), max_size=4) | st.just("it's")
 _atoms = st.one_of(
-    st.sampled_from(["light.left", "no_echo"]).map(lambda name: Name(name, Kind.TRUTH)),
+    st.sampled_from(["light.left", "no_echo"]).map(lambda name: Name(name, ValueKind.TRUTH)),
     st.booleans().map(Literal),
     st.builds(
         Compare,
-        st.sampled_from(["range_m", "voltage_v"]).map(lambda name: Name(name, Kind.NUMBER)) | _numbers.map(Literal),
+        st.sampled_from(["range_m", "voltage_v"]).map(lambda name: Name(name, ValueKind.NUMBER))
+        | _numbers.map(Literal),
         st.sampled_from(list(Op)),
-        st.sampled_from(["range_m", "voltage_v"]).map(lambda name: Name(name, Kind.NUMBER)) | _numbers.map(Literal),
+        st.sampled_from(["range_m", "voltage_v"]).map(lambda name: Name(name, ValueKind.NUMBER))
+        | _numbers.map(Literal),
     ),
     st.builds(
         Compare,
-        st.sampled_from(["level", "verdict"]).map(lambda name: Name(name, Kind.WORD)),
+        st.sampled_from(["level", "verdict"]).map(lambda name: Name(name, ValueKind.WORD)),
         st.sampled_from([Op.EQ, Op.NE]),
         _words.map(Literal),
     ),
@@ -202,8 +204,8 @@ _atoms = st.one_of(
 def _larger(inner: st.SearchStrategy[Node]) -> st.SearchStrategy[Node]:
     parts = st.lists(inner, min_size=2, max_size=3)
     return st.one_of(
-        parts.map(lambda several: joined(Every, several)),
-        parts.map(lambda several: joined(Some, several)),
+        parts.map(lambda several: joined(And, several)),
+        parts.map(lambda several: joined(Or, several)),
         inner.map(lambda one: one.inner if isinstance(one, Not) else Not(one)),
         st.builds(Compare, inner, st.sampled_from([Op.EQ, Op.NE]), inner),
     )
@@ -236,16 +238,16 @@ def _reference(node: Node, values: dict[str, Any]) -> Any:
     if isinstance(node, Literal):
         return float(node.value) if isinstance(node.value, bool) else node.value
     if isinstance(node, Name):
-        found = values.get(node.name, 0.5 if node.kind is Kind.TRUTH else None)
+        found = values.get(node.name, 0.5 if node.kind is ValueKind.TRUTH else None)
         return float(found) if isinstance(found, bool) else found
     if isinstance(node, Compare):
-        truth = not isinstance(node.left, Name | Literal) or node.left.kind is Kind.TRUTH
+        truth = not isinstance(node.left, Name | Literal) or node.left.kind is ValueKind.TRUTH
         one, other = _reference(node.left, values), _reference(node.right, values)
         unknown = 0.5 in (one, other) if truth else None in (one, other)
         return 0.5 if unknown else float(_OPS[node.op](one, other))
     if isinstance(node, Not):
         return 1 - _reference(node.inner, values)
-    return (min if isinstance(node, Every) else max)(_reference(part, values) for part in node.parts)
+    return (min if isinstance(node, And) else max)(_reference(part, values) for part in node.parts)
 
 
 @given(_trees)

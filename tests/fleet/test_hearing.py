@@ -2,11 +2,11 @@
 
 import pytest
 
-from fleet.coordinator.observer import FORGOTTEN_S, MOST_GONE, NEEDED, Hearing
+from fleet.coordinator.observer import FORGOTTEN_S, MOST_GONE, NEEDED, FleetObserver
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
-from fleet.policy.snapshot import CarPicture
-from fleet.policy.state import Memory
+from fleet.policy.snapshot import CarSnapshot
+from fleet.policy.state import PolicyState
 from schemas import messages, topics
 from schemas.bus import Sample
 
@@ -19,14 +19,14 @@ def said(topic: str, car: str = "red") -> Sample:
     return Sample(f"fleet/{car}/{topic}", payload, messages.encoding_of(name), 0, 1)
 
 
-def come(hearing: Hearing, car: str, now: float) -> None:
+def come(hearing: FleetObserver, car: str, now: float) -> None:
     hearing.token(car, now, alive=True)
     for topic in NEEDED:
         hearing.take(said(topic, car), now, None)
 
 
 def test_a_car_is_unheard_until_all_is_known_that_could_forbid_a_command() -> None:
-    hearing = Hearing()
+    hearing = FleetObserver()
     assert hearing.unheard == set()
     hearing.token("red", 99.0, alive=True)
     for topic in NEEDED:
@@ -40,7 +40,7 @@ def test_a_car_is_unheard_until_all_is_known_that_could_forbid_a_command() -> No
 
 
 def test_a_car_is_forgotten_a_minute_after_its_gateway_went_but_not_one_that_is_named() -> None:
-    hearing = Hearing({"blue": CarPicture(listed=True)})
+    hearing = FleetObserver({"blue": CarSnapshot(listed=True)})
     for car in ("red", "green", "blue"):
         come(hearing, car, 100.0)
         hearing.token(car, 101.0, alive=False)
@@ -54,7 +54,7 @@ def test_a_car_is_forgotten_a_minute_after_its_gateway_went_but_not_one_that_is_
 
 
 def test_a_car_that_is_back_within_the_minute_is_not_forgotten() -> None:
-    hearing = Hearing()
+    hearing = FleetObserver()
     come(hearing, "red", 100.0)
     hearing.token("red", 101.0, alive=False)
     come(hearing, "red", 150.0)
@@ -65,7 +65,7 @@ def test_a_car_that_is_back_within_the_minute_is_not_forgotten() -> None:
 def test_ten_thousand_names_in_ten_seconds_are_decided_on_a_few_times_and_forgotten() -> None:
     """Of which nothing is said; that say a word, or how they are, and go; and one that is not on the bus."""
     plan = parse("roles: {scout: {mode: manual}}")
-    hearing, memory, now = Hearing(), Memory(), 100.0
+    hearing, memory, now = FleetObserver(), PolicyState(), 100.0
     come(hearing, "red", now)
     decisions = most = 0
     while now < 100.0 + 10.0 + FORGOTTEN_S + 2 * TURN_S:
@@ -94,7 +94,7 @@ def test_ten_thousand_names_in_ten_seconds_are_decided_on_a_few_times_and_forgot
 @pytest.mark.parametrize("topic", NEEDED)
 @pytest.mark.parametrize("sent", ["fleet.v1.Battery", "fleet.v1.Result", "foxglove.Log", "fleet.v1.Nothing"])
 def test_another_message_than_the_topics_is_ignored(topic: str, sent: str) -> None:
-    hearing = Hearing()
+    hearing = FleetObserver()
     hearing.token("red", 100.0, alive=True)
     hearing.take(Sample(f"fleet/red/{topic}", b"", messages.encoding_of(sent), 0, 1), 100.0, None)
     for each in NEEDED:
@@ -105,6 +105,6 @@ def test_another_message_than_the_topics_is_ignored(topic: str, sent: str) -> No
 
 
 def test_a_token_that_names_no_car_is_ignored() -> None:
-    hearing = Hearing()
+    hearing = FleetObserver()
     hearing.token("RED!", 100.0, alive=True)
     assert hearing.present == set()

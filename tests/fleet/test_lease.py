@@ -10,7 +10,7 @@ from fleet import Fleet, LeaseLost, NotCarriedOut
 from fleet.aio import Car as AsyncCar
 from fleet.aio import Fleet as AsyncFleet
 from fleet.client.client import Car
-from fleet.client.lease import Ours
+from fleet.client.lease import LeaseMonitor
 from fleet.client.outcome import Outcome
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars, asked
@@ -49,14 +49,14 @@ def safety(holder: str = "", *, hold: str = "", since_s: int = 1, estop: str = "
     ],
 )
 def test_what_a_gateway_says_of_a_car(heard: list[pb.Safety], lost: str) -> None:
-    ours = Ours("red", "bot")
+    ours = LeaseMonitor("red", "bot")
     for message in heard:
         ours.heard(message)
     assert ours.lost == lost
 
 
 def test_what_was_published_before_is_no_news_when_it_comes_late() -> None:
-    ours, told = Ours("red", "bot"), [safety("mia"), safety("bot"), safety("mia")]
+    ours, told = LeaseMonitor("red", "bot"), [safety("mia"), safety("bot"), safety("mia")]
     for seq, message in enumerate(told, start=1):
         message.boot_id, message.seq = "a", seq
     before, had, taken = told
@@ -67,14 +67,14 @@ def test_what_was_published_before_is_no_news_when_it_comes_late() -> None:
     assert ours.lost == "red was taken by mia (person)"
     again = safety("bob")
     again.boot_id, again.seq = "b", 1
-    ours = Ours("red", "bot")
+    ours = LeaseMonitor("red", "bot")
     for message in (had, again):
         ours.heard(message)
     assert ours.lost == "red was taken by bob (person)", "a gateway that began anew counts anew"
 
 
 def test_a_refusal_says_who_has_it() -> None:
-    ours = Ours("red", "bot")
+    ours = LeaseMonitor("red", "bot")
     ours.refused(Outcome("red", ok=False, phase="rejected", reason="unsupported", words="no arm"))
     assert not ours.lost
     ours.refused(Outcome("red", ok=False, phase="rejected", reason="leased", words="red is driven by mia"))

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from gateway.control.commands import (
-    Act,
+    Action,
     ChangeSpeed,
     Command,
     CommandRecord,
@@ -18,17 +18,17 @@ from gateway.control.commands import (
     EmergencyStop,
     Fan,
     Find,
-    Kind,
+    FrameOrigin,
+    OneShot,
+    OutgoingFrame,
     Phase,
     Reason,
     Resume,
     Sender,
+    SenderKind,
     SetMode,
     Stop,
     TakeLease,
-    What,
-    Why,
-    Write,
 )
 from gateway.control.controller import Controller
 from gateway.control.estimate.trust import Basis, CarTrust
@@ -39,7 +39,7 @@ from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose,
 from gateway.protocol.platforms import Platform, parse_platform
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")
-SENDERS = [Sender(f"{kind}-{number}", kind) for kind in Kind for number in range(3)]
+SENDERS = [Sender(f"{kind}-{number}", kind) for kind in SenderKind for number in range(3)]
 MANUAL = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
 PI = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
 READINGS = (
@@ -63,19 +63,19 @@ STOP_WITHIN_S = 45.0
 """The longest a stop may go on once the link carries everything."""
 
 
-def anything(moments: random.Random) -> What:
+def anything(moments: random.Random) -> Action:
     """One command, most of them drives."""
     match moments.randrange(16):
         case 0:
             return SetMode(moments.choice(list(Mode)))
         case 1:
-            return Act(General(Motion.STOP, whistle=True))
+            return OneShot(General(Motion.STOP, whistle=True))
         case 2:
-            return Act(General(Motion.STOP, light=moments.choice(list(Light))))
+            return OneShot(General(Motion.STOP, light=moments.choice(list(Light))))
         case 3:
-            return Act(General(Motion.STOP, servo=moments.choice(list(ServoAction))))
+            return OneShot(General(Motion.STOP, servo=moments.choice(list(ServoAction))))
         case 4:
-            return Act(moments.choice([Ptz(moments.randrange(181)), ColorLed(255, 0, 7), ArmSet((90,) * 6)]))
+            return OneShot(moments.choice([Ptz(moments.randrange(181)), ColorLed(255, 0, 7), ArmSet((90,) * 6)]))
         case 5:
             return ChangeSpeed(moments.choice(list(SpeedStep)))
         case 6:
@@ -112,7 +112,7 @@ class Wild:
         self.now = 0.0
         self.writes = 0
         self.stops = 0
-        self.kinds: dict[str, Kind] = {}
+        self.kinds: dict[str, SenderKind] = {}
         self._restart()
 
     def _restart(self) -> None:
@@ -161,7 +161,7 @@ class Wild:
         if self.ending and (self.control.finished or moments.random() < 0.01):
             self._restart()
 
-    def _command(self, what: What) -> Command:
+    def _command(self, what: Action) -> Command:
         moments = self.moments
         if isinstance(what, EmergencyStop):
             identity = f"id{moments.randrange(40)}"
@@ -181,19 +181,19 @@ class Wild:
             streamed=isinstance(what, Drive) and moments.random() < 0.5,
         )
 
-    def _ask(self, what: What) -> None:
+    def _ask(self, what: Action) -> None:
         answer = self.control.command(self._command(what), self.now)
         assert answer.status in (Phase.SENT, Phase.QUEUED, Phase.REJECTED)
         assert (answer.reason is not None) == (answer.status is Phase.REJECTED)
         if answer.status is Phase.QUEUED:
             self._owe(what)
 
-    def _owe(self, what: What) -> None:
+    def _owe(self, what: Action) -> None:
         match what:
-            case Act(General() as frame):
+            case OneShot(General() as frame):
                 self.owed["whistle"] += frame.whistle
                 self.owed["servo"] += frame.servo is not None
-            case Act():
+            case OneShot():
                 self.owed["named"] += 1
             case ChangeSpeed():
                 self.owed["speed"] += 1
@@ -250,13 +250,13 @@ class Wild:
 
     # ------------------------------------------------------------------ what must hold
 
-    def _check_write(self, write: Write) -> None:
+    def _check_write(self, write: OutgoingFrame) -> None:
         frame, control = write.frame, self.control
         assert self.linked, "nothing is written without a link"
         self.doubted = self.doubted or control.platform.doubted
         known = control.profile.refusal(frame) is None
         assert known or (self.doubted and isinstance(frame, ModeClose)), "only what the platform knows"
-        if write.why in (Why.COMMAND, Why.REPEAT) and not isinstance(frame, ModeClose):
+        if write.why in (FrameOrigin.COMMAND, FrameOrigin.REPEAT) and not isinstance(frame, ModeClose):
             stopping = isinstance(frame, General) and frame == General(Motion.STOP)
             assert self.now >= self.free_at - 1e-9 or stopping, "not into a block of ours"
         self._check_motion(frame)
@@ -271,7 +271,7 @@ class Wild:
             # A car that is heard but shows no stop may be driven by whoever sees it; a car of unknown state may not.
             assert self.control.known or self.control.model.trust.state is CarTrust.UNPROVEN
 
-    def _check_once(self, frame: Frame, why: Why) -> None:
+    def _check_once(self, frame: Frame, why: FrameOrigin) -> None:
         """What acts once is written once for each command that was accepted, and never repeated."""
         acts: dict[str, bool] = {}
         if isinstance(frame, General):
@@ -285,7 +285,7 @@ class Wild:
             acts = {"named": True}
         for name, done in acts.items():
             if done:
-                assert why is Why.COMMAND
+                assert why is FrameOrigin.COMMAND
                 self.owed[name] -= 1
                 assert self.owed[name] >= 0, f"{name} was doubled"
 

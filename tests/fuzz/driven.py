@@ -3,7 +3,7 @@
 import random
 from dataclasses import dataclass
 
-from gateway.control.commands import Act, EmergencyStop, Find, Phase, Resume, Sender, SetMode, Stop
+from gateway.control.commands import EmergencyStop, Find, OneShot, Phase, Resume, Sender, SetMode, Stop
 from gateway.protocol.enums import Mode
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
@@ -100,7 +100,7 @@ class Driven:
             return  # without an echo the car is deaf there for ever
         if isinstance(what, Resume | EmergencyStop):
             what = Resume(tuple(estop.id for estop in self.pair.control.safety.estops))
-        if isinstance(what, Find | Act) and not self.named:
+        if isinstance(what, Find | OneShot) and not self.named:
             return
         self.asked += 1
         self.pair.ask(what, sender=self.moments.choice(SENDERS), identity=f"f{self.asked}")

@@ -3,19 +3,19 @@
 from collections.abc import Callable
 from typing import Any
 
-from gateway.control.estimate.mode import ModeTruth
+from gateway.control.estimate.mode import ModeEstimator
 from gateway.control.estimate.trust import Basis
 from gateway.control.executor import Executor
 from gateway.control.stops import evidence
 from gateway.control.stops.evidence import StopCase, StopEvidence
-from gateway.control.stops.stopping import Running
+from gateway.control.stops.stopping import StopInProgress
 
 Patch = Callable[[object, str, Any], None]
 """`pytest.MonkeyPatch.setattr`."""
 
 
 def _time_decides(patch: Patch) -> None:
-    def await_time(self: Executor, running: Running, now: float) -> None:
+    def await_time(self: Executor, running: StopInProgress, now: float) -> None:
         if now >= running.obeyed_at:
             self._finish(running, Basis.SHOWN, "time", now)
 
@@ -69,7 +69,7 @@ def _no_renewal(patch: Patch) -> None:
 
 
 def _confirmations_stay(patch: Patch) -> None:
-    patch(ModeTruth, "fade", lambda self, now: None)
+    patch(ModeEstimator, "fade", lambda self, now: None)
 
 
 def _shutdown_waits_for_time(patch: Patch) -> None:
@@ -79,7 +79,7 @@ def _shutdown_waits_for_time(patch: Patch) -> None:
 
 
 def _sent_without_a_report(patch: Patch) -> None:
-    def ends(self: Executor, running: Running, now: float) -> StopCase | None:
+    def ends(self: Executor, running: StopInProgress, now: float) -> StopCase | None:
         return StopCase.NO_ECHO if running.frames_sent and now >= running.obeyed_at else None
 
     patch(Executor, "_ends_as_sent", ends)

@@ -15,17 +15,17 @@ from functools import partial
 from typing import Any
 
 from gateway.control.commands import (
-    Act,
+    Action,
     Command,
     CommandRecord,
     Drive,
     EmergencyStop,
+    OneShot,
     Phase,
     Reason,
     Sender,
     SetMode,
     Stop,
-    What,
 )
 from gateway.control.controller import Controller
 from gateway.control.estimate.mode import Verdict
@@ -472,9 +472,9 @@ class Episode:
                     self._run(0.05 + 0.2 * moments.random())
             case "acts":
                 self._ask(Drive(Motion.FORWARD, 10.0))
-                acts: list[What] = [Act(General(Motion.STOP, whistle=True))]
+                acts: list[Action] = [OneShot(General(Motion.STOP, whistle=True))]
                 if plan.platform == "arduino" and plan.told != "unknown":
-                    acts += [Act(Ptz(moments.randrange(181))), Act(ColorLed(255, 2, 3))]
+                    acts += [OneShot(Ptz(moments.randrange(181))), OneShot(ColorLed(255, 2, 3))]
                 for what in acts:
                     self._ask(what)
             case mode:
@@ -549,7 +549,7 @@ class Episode:
         self._linked = True
         self.control.link_up(self.now)
 
-    def _ask(self, what: What, *, stop: bool = False) -> None:
+    def _ask(self, what: Action, *, stop: bool = False) -> None:
         self._number += 1
         identity = f"c{self._number}"
         self._complete = False

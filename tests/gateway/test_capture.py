@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.capture import FORMAT, LINE_LIMIT, BadCapture, Piece, Writer, read
+from gateway.capture import FORMAT, LINE_LIMIT, BadCapture, CapturedBytes, CaptureWriter, read
 
 MICROSECONDS = st.integers(0, 10**13)
 PIECES = st.lists(st.tuples(MICROSECONDS, st.binary(max_size=300)), max_size=12).map(
-    lambda found: [Piece(at / 1e6, data) for at, data in sorted(found)]
+    lambda found: [CapturedBytes(at / 1e6, data) for at, data in sorted(found)]
 )
 
 
-def _kept(path: Path, pieces: list[Piece]) -> bytes:
+def _kept(path: Path, pieces: list[CapturedBytes]) -> bytes:
     path.unlink(missing_ok=True)
-    writer = Writer(path, "serial:///dev/ttyUSB0", "2026-01-01T00:00:00.000+00:00")
+    writer = CaptureWriter(path, "serial:///dev/ttyUSB0", "2026-01-01T00:00:00.000+00:00")
     for piece in pieces:
         writer.add(piece)
     writer.close()
@@ -26,7 +26,7 @@ def _kept(path: Path, pieces: list[Piece]) -> bytes:
 
 
 @given(PIECES)
-def test_any_bytes_are_given_back(tmp_path: Path, pieces: list[Piece]) -> None:
+def test_any_bytes_are_given_back(tmp_path: Path, pieces: list[CapturedBytes]) -> None:
     path = tmp_path / "kept"
     _kept(path, pieces)
     assert list(read(path)) == pieces
@@ -34,7 +34,7 @@ def test_any_bytes_are_given_back(tmp_path: Path, pieces: list[Piece]) -> None:
 
 @given(PIECES, st.data())
 def test_a_capture_that_was_cut_anywhere_gives_its_whole_pieces(
-    tmp_path: Path, pieces: list[Piece], data: st.DataObject
+    tmp_path: Path, pieces: list[CapturedBytes], data: st.DataObject
 ) -> None:
     path = tmp_path / "kept"
     whole = _kept(path, pieces)
@@ -52,7 +52,7 @@ def test_a_capture_that_was_cut_anywhere_gives_its_whole_pieces(
 
 @given(PIECES, st.integers(0, 10**6), st.binary(min_size=1, max_size=20))
 def test_a_damaged_capture_is_refused_or_still_pieces(
-    tmp_path: Path, pieces: list[Piece], place: int, damage: bytes
+    tmp_path: Path, pieces: list[CapturedBytes], place: int, damage: bytes
 ) -> None:
     path = tmp_path / "kept"
     whole = _kept(path, pieces)
@@ -104,7 +104,7 @@ def test_a_bad_line_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "kept"
     path.write_text(HEAD + '{"t": 0, "rx": "a"}\n' + line + "\n")
     pieces = read(path)
-    assert next(pieces) == Piece(0.0, b"a")
+    assert next(pieces) == CapturedBytes(0.0, b"a")
     with pytest.raises(BadCapture, match="kept:3: "):
         next(pieces)
 
@@ -137,20 +137,20 @@ def test_a_line_without_end_is_not_read_to_its_end(tmp_path: Path) -> None:
 
 def test_a_capture_is_not_written_over_and_is_there_at_once(tmp_path: Path) -> None:
     path = tmp_path / "kept"
-    writer = Writer(path, "link", "now")
-    writer.add(Piece(0.5, b"\x00\xff$#"))
-    assert list(read(path)) == [Piece(0.5, b"\x00\xff$#")]
+    writer = CaptureWriter(path, "link", "now")
+    writer.add(CapturedBytes(0.5, b"\x00\xff$#"))
+    assert list(read(path)) == [CapturedBytes(0.5, b"\x00\xff$#")]
     with pytest.raises(FileExistsError):
-        Writer(path, "link", "now")
+        CaptureWriter(path, "link", "now")
     writer.close()
 
 
 def test_a_capture_can_come_through_a_pipe(tmp_path: Path) -> None:
-    content = _kept(tmp_path / "kept", [Piece(0.5, b"abc")])
+    content = _kept(tmp_path / "kept", [CapturedBytes(0.5, b"abc")])
     end, other = os.pipe()
     os.write(other, content)
     os.close(other)
     try:
-        assert list(read(Path(f"/dev/fd/{end}"))) == [Piece(0.5, b"abc")]
+        assert list(read(Path(f"/dev/fd/{end}"))) == [CapturedBytes(0.5, b"abc")]
     finally:
         os.close(end)

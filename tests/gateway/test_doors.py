@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.bus.service import COMMANDS_WAITING, HISTORIES_WAITING, Doors
+from gateway.bus.service import COMMANDS_WAITING, HISTORIES_WAITING, CarService
 from schemas import bus, keys
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, wait_for
@@ -19,7 +19,7 @@ LARGE = b"x" * 5_000_000
 class Hall:
     """Who stands behind the doors: keeps what comes."""
 
-    def __init__(self, doors: Doors) -> None:
+    def __init__(self, doors: CarService) -> None:
         self.doors = doors
         self.commands: list[tuple[zenoh.Query, str]] = []
         self.drives: list[bus.Sample] = []
@@ -45,7 +45,7 @@ class Hall:
 async def hall(tmp_path: Path) -> AsyncIterator[tuple[Hall, bus.Bus]]:
     fleet = Fleet(free_endpoint(), tmp_path)
     with bus.Bus.open(fleet.endpoint) as opened:
-        there = Hall(Doors(opened, "fleet", "red"))
+        there = Hall(CarService(opened, "fleet", "red"))
         await there.until(lambda: fleet.bus.tokens("fleet/red"), "its doors are open")
         yield there, fleet.bus
         there.commands.clear()

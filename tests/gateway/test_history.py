@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.bus.history import BadRange, Ring, parse_range
+from gateway.bus.history import BadRange, HistoryBuffer, parse_range
 from schemas.topics import HISTORY
 
 S = 1_000_000_000
@@ -65,8 +65,8 @@ def test_what_is_no_range_is_refused_with_how_to_write_one(text: str) -> None:
         parse_range(text, NOW)
 
 
-def filled(count: int, size: int = 5) -> Ring:
-    ring = Ring(size)
+def filled(count: int, size: int = 5) -> HistoryBuffer:
+    ring = HistoryBuffer(size)
     for number in range(count):
         ring.add(NOW - (count - number) * S, str(number).encode())
     return ring
@@ -108,7 +108,7 @@ def test_a_count_of_thousands_of_digits_is_all_there_is() -> None:
 
 def test_an_empty_ring_has_nothing_to_give() -> None:
     for time_range, last in [(None, None), ("[..]", None), (None, "3")]:
-        assert Ring(3).select(time_range=time_range, last=last, now_ns=NOW) == []
+        assert HistoryBuffer(3).select(time_range=time_range, last=last, now_ns=NOW) == []
 
 
 PIECES = st.sampled_from(["[", "]", "..", "now(", ")", "-", "1", "9" * 30, "s", "ms", "w", "Z", "T", ":", ";", "2026"])

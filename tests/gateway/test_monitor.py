@@ -13,29 +13,29 @@ from typing import Any
 
 import pytest
 
-from gateway.capture import Piece, Writer, read
+from gateway.capture import CapturedBytes, CaptureWriter, read
 from tests.gateway.conftest import PATIENCE_S, Command, Started
 from tests.support.processes import Process, TcpCar, wait_for
 
 MANUAL = b"$4WD,CSB57.24,PV7.91,GS214,LF0110,HW01,GM10#"
 NO_ECHO = b"$4WD,CSB0.00,PV7.9,GS2140,LF0110,HW01,GM10#"
 PIECES = [
-    Piece(0.2, b"BT04 ready\x1b[2J\r\n"),
-    Piece(1.0, MANUAL[:10]),
-    Piece(1.01, MANUAL[10:] + b"\r\n"),
-    Piece(2.0, NO_ECHO),
-    Piece(3.0, b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"),
-    Piece(3.1, b"$4WD,CSB120,PV8.3,GS000,LF0000,HW01,GM00"),
-    Piece(3.2, b"$4WD,J190,J280,J370,J460,J50,J6180#"),
-    Piece(3.3, b"$4WD,MPUgx-1,MPUgy2,MPUgz3.5,MPUax4,MPUay5,MPUaz-16384#"),
-    Piece(4.0, b"$4WD,CSB1"),
+    CapturedBytes(0.2, b"BT04 ready\x1b[2J\r\n"),
+    CapturedBytes(1.0, MANUAL[:10]),
+    CapturedBytes(1.01, MANUAL[10:] + b"\r\n"),
+    CapturedBytes(2.0, NO_ECHO),
+    CapturedBytes(3.0, b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"),
+    CapturedBytes(3.1, b"$4WD,CSB120,PV8.3,GS000,LF0000,HW01,GM00"),
+    CapturedBytes(3.2, b"$4WD,J190,J280,J370,J460,J50,J6180#"),
+    CapturedBytes(3.3, b"$4WD,MPUgx-1,MPUgy2,MPUgz3.5,MPUax4,MPUay5,MPUaz-16384#"),
+    CapturedBytes(4.0, b"$4WD,CSB1"),
 ]
 
 
 @pytest.fixture
 def kept(tmp_path: Path) -> Path:
     path = tmp_path / "kept.jsonl"
-    writer = Writer(path, "serial:///dev/ttyUSB0", "now")
+    writer = CaptureWriter(path, "serial:///dev/ttyUSB0", "now")
     for piece in PIECES:
         writer.add(piece)
     writer.close()
@@ -154,9 +154,9 @@ def _is_raw(device: int) -> bool:
 def test_a_pipe_that_closes_ends_it_quietly(simulate: Callable[..., Any], tmp_path: Path) -> None:
     _, [link] = simulate("red:arduino+imu:pty")
     long = tmp_path / "long"  # its lines are more than a pipe holds
-    writer = Writer(long, "link", "now")
+    writer = CaptureWriter(long, "link", "now")
     for second in range(2000):
-        writer.add(Piece(float(second), MANUAL))
+        writer.add(CapturedBytes(float(second), MANUAL))
     writer.close()
     for source in (["--link", link], ["--from", str(long)]):
         with subprocess.Popen(

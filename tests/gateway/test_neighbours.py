@@ -7,7 +7,7 @@ from pathlib import Path
 
 import zenoh
 
-from gateway.bus.estop_sync import Neighbours
+from gateway.bus.estop_sync import EstopSync
 from gateway.control.safety import Estop
 from schemas.bus import Bus, Handover, reply
 from schemas.gen import fleet_v1_pb2 as pb
@@ -41,7 +41,7 @@ async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) ->
             blue.queryable(KEY, Handover(asyncio.get_running_loop(), answer))
             while not asked:  # until the hub knows of it
                 await asyncio.to_thread(lambda: list(opened.query(KEY, timeout_s=0.1)))
-            neighbours, before = Neighbours(opened, "fleet", "red"), len(asked)
+            neighbours, before = EstopSync(opened, "fleet", "red"), len(asked)
             keeping = asyncio.ensure_future(neighbours.keep_united(unite))
             neighbours.changed({"blue": True})
             await asyncio.to_thread(wait_for, lambda: len(asked) > before, "it is asked")
@@ -76,7 +76,7 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
                 cars.queryable(f"fleet/{car}/state/safety", Handover(loop, partial(answer, car=car)))
             while not all(asked.values()):  # until the hub knows of both
                 await asyncio.to_thread(lambda: list(opened.query("fleet/*/state/safety", timeout_s=0.1)))
-            neighbours = Neighbours(opened, "fleet", "red")
+            neighbours = EstopSync(opened, "fleet", "red")
             keeping = asyncio.ensure_future(neighbours.keep_united(learn))
             for car in asked:
                 neighbours.changed({car: True})

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.bus.publisher import SLICE, Publications
+from gateway.bus.publisher import SLICE, CarPublisher
 from gateway.control.commands import Command, CommandRecord, Drive, Find, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.link_health import LinkHealth
-from gateway.control.estimate.platform import PlatformTruth
+from gateway.control.estimate.platform import PlatformDetector
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import ImuReading
@@ -29,7 +29,7 @@ def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
     fleet = Fleet(free_endpoint(), tmp_path)
     try:
         with Bus.open(fleet.endpoint) as opened:
-            out = Publications(opened, "fleet", "red", Controller("red", parse_platform("arduino")), "tcp://x")
+            out = CarPublisher(opened, "fleet", "red", Controller("red", parse_platform("arduino")), "tcp://x")
             for number in range(3 * SLICE + 1):
                 out.event(ImuReading(b"", float(number), (number, 0, 0), (0, 0, 0)), None, loaded=False)
             pauses: queue.Queue[int] = queue.Queue()
@@ -55,7 +55,7 @@ class Published:
     def __init__(self, fleet: Fleet, opened: Bus) -> None:
         self.desk = Desk()
         self.health = LinkHealth()
-        self._out = Publications(opened, "fleet", "red", self.desk.control, "tcp://x")
+        self._out = CarPublisher(opened, "fleet", "red", self.desk.control, "tcp://x")
         self._said: queue.Queue[tuple[str, dict[str, Any]]] = queue.Queue()
         self._before: dict[str, dict[str, Any]] = {}
         fleet.bus.subscribe("fleet/red/**", self._take)
@@ -75,7 +75,7 @@ class Published:
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
         return self._before
 
-    def told_health(self, platform: PlatformTruth) -> dict[str, Any]:
+    def told_health(self, platform: PlatformDetector) -> dict[str, Any]:
         """Publish the health; return its fields, as JSON has them."""
         self._out.health(self.desk.now, loop_lag_s=0.0, bus_drops=0, platform=platform)
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
@@ -102,7 +102,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Published]:
 
 
 def test_what_speaks_against_the_platform_is_published(published: Published) -> None:
-    told = PlatformTruth(parse_platform("raspberry_pi"))
+    told = PlatformDetector(parse_platform("raspberry_pi"))
     assert published.told_health(told)["platform_contradictions"] == []
     for _ in range(3):
         for event in Decoder().feed(READING, 0.0):

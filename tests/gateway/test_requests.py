@@ -8,23 +8,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.bus.requests import BadRequest, Request, parse
+from gateway.bus.requests import BadRequest, ParsedRequest, parse
 from gateway.control.commands import (
-    Act,
+    Action,
     ChangeSpeed,
     Command,
     Drive,
     EmergencyStop,
     Fan,
     Find,
-    Kind,
+    OneShot,
     Reason,
     Resume,
     Sender,
+    SenderKind,
     SetMode,
     Stop,
     TakeLease,
-    What,
 )
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
@@ -37,7 +37,7 @@ NOW = 1_800_000_000_000_000_000
 
 def ask(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any) -> Command:
     data = payload if isinstance(payload, bytes | None) else json.dumps(payload).encode()
-    return parse(Request(verb, data, encoding, NOW, **more))
+    return parse(ParsedRequest(verb, data, encoding, NOW, **more))
 
 
 def refused(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any) -> BadRequest:
@@ -47,7 +47,7 @@ def refused(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any)
     return caught.value
 
 
-def parsed(request: Request) -> tuple[Command, str]:
+def parsed(request: ParsedRequest) -> tuple[Command, str]:
     """The command, or what is known of it and why it is refused."""
     try:
         return parse(request), ""
@@ -55,8 +55,8 @@ def parsed(request: Request) -> tuple[Command, str]:
         return error.command, error.words or "no words"
 
 
-def general(**fields: Any) -> Act:
-    return Act(General(Motion.STOP, **fields))
+def general(**fields: Any) -> OneShot:
+    return OneShot(General(Motion.STOP, **fields))
 
 
 @pytest.mark.parametrize(
@@ -66,16 +66,16 @@ def general(**fields: Any) -> Act:
         ("drive", {"motion": "forward", "duration_s": 10}, Drive(Motion.FORWARD, 10.0)),
         ("drive", {"motion": "forward", "duration_s": 1e-3}, Drive(Motion.FORWARD, 1e-3)),
         *(("mode", {"mode": mode}, SetMode(mode)) for mode in Mode),
-        ("led", {"r": 0, "g": 0, "b": 0}, Act(ColorLed(0, 0, 0))),
-        ("led", {"r": 255, "g": 16, "b": 1}, Act(ColorLed(255, 16, 1))),
+        ("led", {"r": 0, "g": 0, "b": 0}, OneShot(ColorLed(0, 0, 0))),
+        ("led", {"r": 255, "g": 16, "b": 1}, OneShot(ColorLed(255, 16, 1))),
         *(("light", {"light": light}, general(light=light)) for light in Light),
-        ("servo", {"deg": 0}, Act(Ptz(0))),
-        ("servo", {"servo": "front", "deg": 180}, Act(Ptz(180))),
+        ("servo", {"deg": 0}, OneShot(Ptz(0))),
+        ("servo", {"servo": "front", "deg": 180}, OneShot(Ptz(180))),
         ("servo", {"action": "left"}, general(servo=ServoAction.FRONT_LEFT)),
         ("servo", {"servo": "front", "action": "reset"}, general(servo=ServoAction.FRONT_RESET)),
         ("servo", {"servo": "vertical", "action": "up"}, general(servo=ServoAction.VERTICAL_UP)),
         ("servo", {"servo": "horizontal", "action": "right"}, general(servo=ServoAction.HORIZONTAL_RIGHT)),
-        ("arm", {"joint_deg": [0, 180, 1, 2, 3, 4]}, Act(ArmSet((0, 180, 1, 2, 3, 4)))),
+        ("arm", {"joint_deg": [0, 180, 1, 2, 3, 4]}, OneShot(ArmSet((0, 180, 1, 2, 3, 4)))),
         ("whistle", {}, general(whistle=True)),
         ("speed", {"step": "up"}, ChangeSpeed(SpeedStep.UP)),
         ("speed", {"step": "down"}, ChangeSpeed(SpeedStep.DOWN)),
@@ -94,10 +94,10 @@ def general(**fields: Any) -> Act:
         ("find", {}, Find()),
     ],
 )
-def test_a_payload_becomes_a_command(verb: str, payload: Any, what: What) -> None:
+def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> None:
     command = ask(verb, payload)
     assert command.what == what
-    assert (command.verb, command.sender, command.streamed) == (verb, Sender("anonymous", Kind.SCRIPT), False)
+    assert (command.verb, command.sender, command.streamed) == (verb, Sender("anonymous", SenderKind.SCRIPT), False)
     assert (command.age_s, command.ttl_s) == (None, 0.5 if verb == "drive" else 2.0)
     assert len(command.id) == 32
     if payload is not None:
@@ -108,7 +108,7 @@ def test_a_payload_becomes_a_command(verb: str, payload: Any, what: What) -> Non
 
 def test_every_verb_of_the_table_is_known_here() -> None:
     for verb in COMMANDS:
-        assert (verb, parsed(Request(verb, b"{}", messages.JSON, NOW))[0].verb) == (verb, verb)
+        assert (verb, parsed(ParsedRequest(verb, b"{}", messages.JSON, NOW))[0].verb) == (verb, verb)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_an_e_stop_for_an_unknown_scope_stops_this_car() -> None:
 
 def test_a_refusal_is_recorded_under_the_id_and_the_sender_that_were_given() -> None:
     error = refused("drive", {"motion": "up", "id": "abc", "sender": "mia", "kind": "person"})
-    assert (error.command.id, error.command.sender) == ("abc", Sender("mia", Kind.PERSON))
+    assert (error.command.id, error.command.sender) == ("abc", Sender("mia", SenderKind.PERSON))
 
 
 def test_a_gateway_may_allow_longer_drives() -> None:
@@ -295,7 +295,7 @@ WIRE = st.binary(max_size=40).map(lambda tail: pb.DriveCommand(motion="forward",
 def test_any_bytes_on_any_verb_are_a_command_or_a_bad_request(
     verb: str, payload: bytes | None, encoding: str, sampled_ns: int | None, by_wildcard: bool
 ) -> None:
-    request = Request(verb, payload, encoding, NOW, sampled_ns=sampled_ns, by_wildcard=by_wildcard)
+    request = ParsedRequest(verb, payload, encoding, NOW, sampled_ns=sampled_ns, by_wildcard=by_wildcard)
     command, words = parsed(request)
     assert words != "no words"
     assert command.verb == verb

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.safety import Estop, Hold, Kept
-from gateway.state_file import Store
+from gateway.control.safety import Estop, Hold, PersistedSafety
+from gateway.state_file import SafetyStateFile
 
 NOW = 1_800_000_000_000_000_000
 
@@ -16,39 +16,39 @@ NOW = 1_800_000_000_000_000_000
 def test_a_hold_is_read_back_by_the_next_process(tmp_path: Path) -> None:
     directory = tmp_path / "not" / "yet" / "there"
     estop = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=True)
-    kept = Kept(Hold("mia", NOW - 5), (estop,), ("e0",))
-    Store(directory, "fleet", "red").save(kept)
-    assert Store(directory, "fleet", "red").load(NOW) == kept
-    assert Store(directory, "fleet", "blue").load(NOW) == Kept()
-    assert Store(directory, "other", "red").load(NOW) == Kept()
-    Store(directory, "fleet", "red").save(Kept())
-    assert Store(directory, "fleet", "red").load(NOW) == Kept()
+    kept = PersistedSafety(Hold("mia", NOW - 5), (estop,), ("e0",))
+    SafetyStateFile(directory, "fleet", "red").save(kept)
+    assert SafetyStateFile(directory, "fleet", "red").load(NOW) == kept
+    assert SafetyStateFile(directory, "fleet", "blue").load(NOW) == PersistedSafety()
+    assert SafetyStateFile(directory, "other", "red").load(NOW) == PersistedSafety()
+    SafetyStateFile(directory, "fleet", "red").save(PersistedSafety())
+    assert SafetyStateFile(directory, "fleet", "red").load(NOW) == PersistedSafety()
     assert [path.name for path in directory.iterdir()] == ["fleet.red.json"]
 
 
 def test_a_hold_from_the_future_began_now(tmp_path: Path) -> None:
-    store = Store(tmp_path, "fleet", "red")
-    store.save(Kept(Hold("mia", NOW + 10**30)))
-    assert store.load(NOW) == Kept(Hold("mia", NOW))
+    store = SafetyStateFile(tmp_path, "fleet", "red")
+    store.save(PersistedSafety(Hold("mia", NOW + 10**30)))
+    assert store.load(NOW) == PersistedSafety(Hold("mia", NOW))
 
 
 def test_a_file_of_a_version_without_e_stops_is_read(tmp_path: Path) -> None:
-    store = Store(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red")
     store.path.write_text('{"hold": {"by": "mia", "since_ns": 7}}')
-    assert store.load(NOW) == Kept(Hold("mia", 7))
+    assert store.load(NOW) == PersistedSafety(Hold("mia", 7))
 
 
 def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
-        Store(tmp_path / "file", "fleet", "red").save(Kept())
-    assert Store(tmp_path / "file", "fleet", "red").load(NOW).hold is not None
-    store = Store(tmp_path, "fleet", "red")
-    store.save(Kept(Hold("mia", 1)))
+        SafetyStateFile(tmp_path / "file", "fleet", "red").save(PersistedSafety())
+    assert SafetyStateFile(tmp_path / "file", "fleet", "red").load(NOW).hold is not None
+    store = SafetyStateFile(tmp_path, "fleet", "red")
+    store.save(PersistedSafety(Hold("mia", 1)))
     (tmp_path / "fleet.red.new").mkdir()
     with pytest.raises(OSError, match="fleet"):
-        store.save(Kept())
-    assert store.load(NOW) == Kept(Hold("mia", 1))
+        store.save(PersistedSafety())
+    assert store.load(NOW) == PersistedSafety(Hold("mia", 1))
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -
     ],
 )
 def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
-    store = Store(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red")
     store.path.write_text(text)
     held = store.load(NOW).hold
     assert held is not None
@@ -86,7 +86,7 @@ def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
 
 @given(st.one_of(st.binary(), st.text().map(str.encode), st.integers(0, 80).map(lambda cut: SAVED[:cut])))
 def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: bytes) -> None:
-    store = Store(tmp_path, "fleet", "red")
+    store = SafetyStateFile(tmp_path, "fleet", "red")
     store.path.write_bytes(content)
     held = store.load(NOW).hold
     if held is None:

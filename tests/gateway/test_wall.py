@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from gateway.clock import STEP_NS, TRIES, Wall
+from gateway.clock import STEP_NS, TRIES, WallClock
 
 EPOCH_NS = 1_795_000_000_000_000_000
 MS = 1_000_000
@@ -28,9 +28,9 @@ class Clocks:
         return self.now + self.ahead
 
 
-def _wall(takes: Callable[[int], int] = lambda look: 50) -> tuple[Clocks, Wall]:
+def _wall(takes: Callable[[int], int] = lambda look: 50) -> tuple[Clocks, WallClock]:
     clocks = Clocks(map(takes, itertools.count()))
-    return clocks, Wall(clocks.monotonic_ns, clocks.wall_ns)
+    return clocks, WallClock(clocks.monotonic_ns, clocks.wall_ns)
 
 
 def test_a_moment_has_its_wall_time() -> None:

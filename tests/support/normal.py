@@ -3,7 +3,7 @@
 import random
 from collections.abc import Callable
 
-from gateway.control.commands import Act, ChangeSpeed, Drive, Fan, Find, Phase, Reason, SetMode, Stop, What
+from gateway.control.commands import Action, ChangeSpeed, Drive, Fan, Find, OneShot, Phase, Reason, SetMode, Stop
 from gateway.control.estimate.link_health import LinkHealth, LinkState
 from gateway.control.estimate.mode import Verdict
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
@@ -97,7 +97,7 @@ class Run:
         pair.records.clear()
         del pair.sent[:-6]
 
-    def ask(self, what: What) -> None:
+    def ask(self, what: Action) -> None:
         """Give a command."""
         self.commands += 1
         self.pair.ask(what, verb=type(what).__name__)
@@ -135,12 +135,12 @@ def _joystick(run: Run) -> None:
 
 def _acts(run: Run) -> None:
     """One-shots of each kind, as fast as the queue takes them or slower."""
-    one_shots: tuple[What, ...] = (
-        Act(General(Motion.STOP, whistle=True)),
-        Act(Ptz(run.moments.randint(0, 180))),
-        Act(General(Motion.STOP, servo=run.moments.choice((ServoAction.FRONT_LEFT, ServoAction.FRONT_RESET)))),
-        Act(ColorLed(*(run.moments.randint(0, 255) for _ in range(3)))),
-        Act(General(Motion.STOP, light=run.moments.choice((Light.RED, Light.GREEN, Light.BLUE)))),
+    one_shots: tuple[Action, ...] = (
+        OneShot(General(Motion.STOP, whistle=True)),
+        OneShot(Ptz(run.moments.randint(0, 180))),
+        OneShot(General(Motion.STOP, servo=run.moments.choice((ServoAction.FRONT_LEFT, ServoAction.FRONT_RESET)))),
+        OneShot(ColorLed(*(run.moments.randint(0, 255) for _ in range(3)))),
+        OneShot(General(Motion.STOP, light=run.moments.choice((Light.RED, Light.GREEN, Light.BLUE)))),
         ChangeSpeed(run.moments.choice((SpeedStep.UP, SpeedStep.DOWN))),
         Find(),
     )
@@ -152,7 +152,7 @@ def _acts(run: Run) -> None:
 def _whistles(run: Run) -> None:
     """Whistles without a pause for half a minute: the loop of the car hardly turns."""
     for _ in range(80):
-        run.ask(Act(General(Motion.STOP, whistle=True)))
+        run.ask(OneShot(General(Motion.STOP, whistle=True)))
         run.run(0.36)
 
 

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from itertools import product
 
-from gateway.control.commands import Act, ChangeSpeed, Drive, Fan, Find, Phase, SetMode, Stop
+from gateway.control.commands import ChangeSpeed, Drive, Fan, Find, OneShot, Phase, SetMode, Stop
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
@@ -33,7 +33,7 @@ RATIO = 1.5
 """The announced worst case is at most so many times the worst seen."""
 AVOIDANCE = Mode.OBSTACLE_AVOIDANCE
 READS_PINS = (Mode.REMOTE_CONTROL, Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING)
-WHISTLE = Act(General(Motion.STOP, whistle=True))
+WHISTLE = OneShot(General(Motion.STOP, whistle=True))
 MOTIONS = (Motion.FORWARD, Motion.LEFT, Motion.SPIN_RIGHT, Motion.BACK)
 
 Load = Callable[[Pair, random.Random], None]
@@ -127,12 +127,12 @@ def let_go(pair: Pair, moments: random.Random) -> None:
 def acting(pair: Pair, moments: random.Random) -> None:
     """One-shots of every kind queue while it drives."""
     pair.ask(Drive(Motion.FORWARD, 10.0))
-    for what in (WHISTLE, Act(Ptz(45)), Act(ColorLed(255, 2, 3)), WHISTLE, Act(Ptz(120))):
+    for what in (WHISTLE, OneShot(Ptz(45)), OneShot(ColorLed(255, 2, 3)), WHISTLE, OneShot(Ptz(120))):
         pair.ask(what)
     pair.run(2.5 * moments.random())
 
 
-def one_shot(what: Act | Fan | Find | ChangeSpeed, block_s: float) -> Load:
+def one_shot(what: OneShot | Fan | Find | ChangeSpeed, block_s: float) -> Load:
     """While driving, from just before it is written to the end of its block."""
 
     def load(pair: Pair, moments: random.Random) -> None:
@@ -230,8 +230,8 @@ class Case:
         return Pair(self.platform, seed=seed, world=world, told=self.told, transport=self.transport, start_s=2.0)
 
 
-SERVO = Act(General(Motion.STOP, servo=ServoAction.FRONT_LEFT))
-LIGHT = Act(General(Motion.STOP, light=Light.RED))
+SERVO = OneShot(General(Motion.STOP, servo=ServoAction.FRONT_LEFT))
+LIGHT = OneShot(General(Motion.STOP, light=Light.RED))
 MOVING: list[tuple[str, Load]] = [
     ("rest", rest),
     ("driving", driving),
@@ -251,8 +251,8 @@ EVERY_CAR: list[tuple[str, Load]] = [
     ("fan-on", fan),
 ]
 NAMED: list[tuple[str, Load]] = [
-    ("ptz", one_shot(Act(Ptz(45)), 0.65)),
-    ("led", one_shot(Act(ColorLed(255, 2, 3)), 0.1)),
+    ("ptz", one_shot(OneShot(Ptz(45)), 0.65)),
+    ("led", one_shot(OneShot(ColorLed(255, 2, 3)), 0.1)),
     ("find", one_shot(Find(), 1.0)),
     ("acting", acting),
 ]
@@ -296,7 +296,7 @@ CASES = tuple(_cases())
 # ---------------------------------------------------------------------- links just restored
 
 
-def half(*whats: Drive | Act | SetMode) -> Load:
+def half(*whats: Drive | OneShot | SetMode) -> Load:
     """The write is cut anywhere in its frame, and the link with it."""
 
     def load(pair: Pair, moments: random.Random) -> None:
@@ -308,7 +308,7 @@ def half(*whats: Drive | Act | SetMode) -> Load:
     return load
 
 
-def within(what: Act | SetMode, block_s: float) -> Load:
+def within(what: OneShot | SetMode, block_s: float) -> Load:
     """The link is cut in the block of a frame that the car has read."""
 
     def load(pair: Pair, moments: random.Random) -> None:
@@ -366,7 +366,7 @@ def then(first: Load, second: Load) -> Load:
 
 
 HALF_GENERAL = half(*(Drive(motion, 5.0) for motion in (Motion.RIGHT, Motion.SPIN_LEFT)))
-HALF_NAMED = half(Act(Ptz(135)), Act(ColorLed(255, 128, 33)), Act(Ptz(45)))
+HALF_NAMED = half(OneShot(Ptz(135)), OneShot(ColorLed(255, 128, 33)), OneShot(Ptz(45)))
 LOST: list[tuple[str, Load]] = [
     ("rest", cut_off(rest)),
     ("driving", cut_off(driving)),

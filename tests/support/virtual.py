@@ -3,7 +3,7 @@
 import random
 from collections.abc import Callable
 
-from gateway.control.commands import Answer, Command, CommandRecord, Level, LogRecord, Phase, Sender, What
+from gateway.control.commands import Action, Answer, Command, CommandRecord, Level, LogRecord, Phase, Sender
 from gateway.control.controller import Controller
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.platforms import parse_platform
@@ -73,7 +73,7 @@ class Pair:
         self.until(lambda: self.control.known and self.control.mode.inferred is not None, 30.0)
         return self
 
-    def ask(self, what: What, *, verb: str = "test", sender: Sender | None = None, identity: str = "") -> Answer:
+    def ask(self, what: Action, *, verb: str = "test", sender: Sender | None = None, identity: str = "") -> Answer:
         """Give a command, and pump once."""
         self.number += 1
         command = Command(identity or f"c{self.number}", verb, sender or Sender(), what)

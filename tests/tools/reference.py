@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fleet import LeaseLost, NotCarriedOut, Outcome, Reading, aio, conditions
 from fleet.client import client, reading, wait
-from fleet.client.commands import Verbs
+from fleet.client.commands import CarCommands
 from fleet.client.lease import Lease
 from schemas import bus, keys
 
@@ -72,9 +72,9 @@ def _text(of: object) -> str:
 
 
 def _methods(of: type) -> list[str]:
-    """Public methods and properties, in the order in which they are written; those of `Verbs` last."""
+    """Public methods and properties, in the order in which they are written; those of `CarCommands` last."""
     found: dict[str, None] = {}
-    for base in (each for each in of.__mro__ if each in (of, Verbs)):
+    for base in (each for each in of.__mro__ if each in (of, CarCommands)):
         for name, member in vars(base).items():
             callable_or_property = inspect.isfunction(member) or isinstance(member, property)
             public = name == "__getitem__" or not name.startswith("_")
@@ -137,7 +137,7 @@ def _async(name: str) -> str:
         for method, member in vars(each).items()
         if inspect.iscoroutinefunction(member) and not method.startswith("_") and method not in _HIDDEN
     ]
-    verbs = ["every command"] if issubclass(each, Verbs) else []
+    verbs = ["every command"] if issubclass(each, CarCommands) else []
     extra = f" Awaited: {', '.join(awaited + verbs)}." if awaited or verbs else ""
     return f"- `{name}`: {' '.join(_text(each).split())}{extra}"
 

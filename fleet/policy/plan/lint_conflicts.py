@@ -8,9 +8,9 @@ from functools import lru_cache
 from typing import Final
 
 from fleet.conditions import Expression, contradictory
-from fleet.conditions.expression import Compare, Kind, Literal, Name, Op
+from fleet.conditions.expression import Compare, Literal, Name, Op, ValueKind
 from fleet.policy.debounce import HYSTERESIS_S
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Condition, Effect, Of, Plan, Rule
+from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanCondition, Quantifier, Rule
 from gateway.protocol.enums import Mode
 
 _REMEMBERED: Final = 4096
@@ -23,19 +23,23 @@ def _contradictory(both: Expression) -> bool:
     return contradictory(both)
 
 
-def implies(one: Condition, other: Condition) -> bool:
+def implies(one: PlanCondition, other: PlanCondition) -> bool:
     """Whether the other is so whenever the one is; some that are not are not found."""
     if one.for_s < other.for_s or (other.role is not None and one.role != other.role):
         return False
-    same = one.of is other.of and one.car == other.car and (one.of is not Of.ALL or one.role == other.role)
-    if not same and not (one.of is Of.CAR and other.of is Of.ANY and other.role is None):
+    same = one.of is other.of and one.car == other.car and (one.of is not Quantifier.ALL or one.role == other.role)
+    if not same and not (one.of is Quantifier.CAR and other.of is Quantifier.ANY and other.role is None):
         return False
     return _contradictory(one.expression & ~other.expression)
 
 
-def _together(one: Condition, other: Condition) -> bool:
+def _together(one: PlanCondition, other: PlanCondition) -> bool:
     """Whether both may be so at once."""
-    same = one.car == other.car if one.of is Of.CAR and other.of is Of.CAR else one.of is Of.ALL and other.of is Of.ALL
+    same = (
+        one.car == other.car
+        if one.of is Quantifier.CAR and other.of is Quantifier.CAR
+        else one.of is Quantifier.ALL and other.of is Quantifier.ALL
+    )
     return not same or not _contradictory(one.expression & other.expression)
 
 
@@ -80,7 +84,7 @@ def _with_itself(plan: Plan, rule: Rule) -> Iterator[tuple[Rule, str, bool]]:
 
 def _asked_for(mode: Mode) -> Expression:
     """Return the condition that a car was asked for this mode."""
-    return Expression(Compare(Name("mode.asked", Kind.WORD), Op.EQ, Literal(str(mode))))
+    return Expression(Compare(Name("mode.asked", ValueKind.WORD), Op.EQ, Literal(str(mode))))
 
 
 def _unlike(effect: Effect, other: Effect) -> str:
@@ -140,7 +144,7 @@ def alternations(plan: Plan) -> Iterator[tuple[str, str]]:
                 yield circle[0], words
 
 
-def _edges(plan: Plan) -> Iterator[tuple[str, str, Condition, Rule | None]]:
+def _edges(plan: Plan) -> Iterator[tuple[str, str, PlanCondition, Rule | None]]:
     for name, phase in plan.phases.items():
         if phase.until is not None and phase.next not in (None, name):
             assert phase.next is not None

@@ -7,7 +7,18 @@ from typing import Final
 from fleet.conditions import BadExpression, Expression
 from fleet.conditions import parse as parse_expression
 from fleet.policy.plan.models import ConditionEntry, EffectEntry, PhaseEntry, PlanEntry, RoleEntry, RuleEntry
-from fleet.policy.plan.plan import OTHERS, RESERVED, THAT, Condition, Effect, Of, Phase, Plan, Role, Rule
+from fleet.policy.plan.plan import (
+    OTHERS,
+    RESERVED,
+    THAT,
+    Effect,
+    Plan,
+    PlanCondition,
+    PlanPhase,
+    Quantifier,
+    Role,
+    Rule,
+)
 from fleet.policy.snapshot import NAMES
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import OPTIONS, parse_platform
@@ -31,12 +42,12 @@ def parse(text: str, source: str = "plan") -> Plan:
     if entry is None:
         document.end()
     assert entry is not None  # else there was a problem
-    plan = _Reader(document, entry).plan(text)
+    plan = _PlanParser(document, entry).plan(text)
     document.end()
     return plan
 
 
-class _Reader:
+class _PlanParser:
     """Makes a plan of the entries, and complains of what does not fit together."""
 
     def __init__(self, document: Document, entry: PlanEntry) -> None:
@@ -168,7 +179,7 @@ class _Reader:
             self._bad((*where, "role"), f"{entry.who} has only role {fixed}, says `cars`")
         return Effect(entry.who or "", entry.role, entry.mode, entry.led, entry.phase)
 
-    def _phase(self, name: str, entry: PhaseEntry) -> Phase:
+    def _phase(self, name: str, entry: PhaseEntry) -> PlanPhase:
         where: Where = ("phases", name)
         modes = {role for role in self._entry.cars.values() if role in self._modes}
         for index, role in enumerate(entry.roles or ()):
@@ -185,7 +196,7 @@ class _Reader:
             self._bad((*where, "timeout_s"), words, unless=where)
         if entry.on_timeout is not None and entry.timeout_s is None:
             self._bad((*where, "on_timeout"), "it needs timeout_s", unless=where)
-        return Phase(
+        return PlanPhase(
             name,
             None if entry.roles is None else frozenset(entry.roles),
             None if entry.until is None else self._condition((*where, "until"), entry.until),
@@ -215,25 +226,25 @@ class _Reader:
                 words = f"a cycle of phases without a condition or a time-out: {circle}; give one until or timeout_s"
                 self._bad(("phases", name), words, unless=("phases", name))
 
-    def _condition(self, where: Where, entry: ConditionEntry) -> Condition:
-        given = [name for name in Of if getattr(entry, name) is not None]
+    def _condition(self, where: Where, entry: ConditionEntry) -> PlanCondition:
+        given = [name for name in Quantifier if getattr(entry, name) is not None]
         if len(given) != 1:
-            words = f"exactly one of {', '.join(Of)}, as `any: light.left` or `car: red` with `is: light.left`"
+            words = f"exactly one of {', '.join(Quantifier)}, as `any: light.left` or `car: red` with `is: light.left`"
             self._bad(where, words, unless=where)
-        of = given[0] if given else Of.ANY
-        if of is Of.CAR and entry.is_ is None:
+        of = given[0] if given else Quantifier.ANY
+        if of is Quantifier.CAR and entry.is_ is None:
             self._bad(where, "car needs `is`: the expression that must be so of it", unless=where)
-        if of is not Of.CAR and entry.is_ is not None:
+        if of is not Quantifier.CAR and entry.is_ is not None:
             self._bad((*where, "is"), f"only with car; with {of} the expression stands there")
         if entry.role is not None:
-            if of is Of.CAR:
+            if of is Quantifier.CAR:
                 self._bad((*where, "role"), "only with any or all")
             else:
                 self._is_role((*where, "role"), entry.role)
         if entry.car is not None:
             self._name((*where, "car"), entry.car)
-        place, text = ((*where, "is"), entry.is_) if of is Of.CAR else ((*where, of.value), getattr(entry, of))
-        return Condition(of, self._expression(place, text or "false"), entry.car, entry.role, entry.for_s)
+        place, text = ((*where, "is"), entry.is_) if of is Quantifier.CAR else ((*where, of.value), getattr(entry, of))
+        return PlanCondition(of, self._expression(place, text or "false"), entry.car, entry.role, entry.for_s)
 
     def _expression(self, where: Where, text: str) -> Expression:
         try:

@@ -19,7 +19,7 @@ RESERVED: Final = frozenset({THAT, OTHERS, ALL, "any"})
 """Words of rules, so no names of cars, roles or phases."""
 
 
-class Of(StrEnum):
+class Quantifier(StrEnum):
     """Of which cars a condition must be so."""
 
     ANY = "any"
@@ -28,10 +28,10 @@ class Of(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class PlanCondition:
     """An expression, of which cars it must be so, and for how long without a break, s."""
 
-    of: Of
+    of: Quantifier
     expression: Expression
     car: str | None = None
     """With Of.CAR."""
@@ -45,7 +45,7 @@ class Condition:
         object.__setattr__(self, "text", self._text())  # asked for ten times a second, for each car
 
     def _text(self) -> str:
-        who = self.car if self.of is Of.CAR else f"{self.of} {f'with role {self.role}' if self.role else 'car'}"
+        who = self.car if self.of is Quantifier.CAR else f"{self.of} {f'with role {self.role}' if self.role else 'car'}"
         lasting = f" for {self.for_s:g} s" if self.for_s else ""
         return f"{who}: {self.expression}{lasting}"
 
@@ -88,20 +88,20 @@ class Rule:
     """While `when` is so, or once it was and `until` is not, its effects count."""
 
     name: str
-    when: Condition
+    when: PlanCondition
     effects: tuple[Effect, ...]
-    until: Condition | None = None
+    until: PlanCondition | None = None
     during: frozenset[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
+class PlanPhase:
     """A part of the job."""
 
     name: str
     roles: frozenset[str] | None = None
     """Those that count; None: all."""
-    until: Condition | None = None
+    until: PlanCondition | None = None
     timeout_s: float | None = None
     next: str | None = None
     on_timeout: str | None = None
@@ -115,7 +115,7 @@ class Plan:
     fixed: Mapping[str, str]
     """Cars that may have one role only."""
     rules: tuple[Rule, ...]
-    phases: Mapping[str, Phase]
+    phases: Mapping[str, PlanPhase]
     idle: Mode | None
     """The mode of a car without a role; None: it is left alone."""
     text: str
@@ -145,7 +145,7 @@ class Plan:
         return tuple(dict.fromkeys([*cars, *(who for who in targets if who and self.is_car(who))]))
 
     @property
-    def conditions(self) -> Iterable[Condition]:
+    def conditions(self) -> Iterable[PlanCondition]:
         """Every condition in it."""
         for rule in self.rules:
             yield rule.when

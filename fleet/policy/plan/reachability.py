@@ -10,11 +10,11 @@ from typing import Final
 
 from fleet.conditions import Expression, contradictory
 from fleet.conditions.domains import outside
-from fleet.conditions.expression import Compare, Every, Literal, Name, Node, Not, Some
+from fleet.conditions.expression import And, Compare, Literal, Name, Node, Not, Or
 from fleet.policy.allocation import unfit
 from fleet.policy.assignment import assign
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Condition, Effect, Plan, Role, Rule
-from fleet.policy.snapshot import NAMES, CarPicture, topic_of
+from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanCondition, Role, Rule
+from fleet.policy.snapshot import NAMES, CarSnapshot, topic_of
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import OPTIONS, Platform, Profile, parse_platform
 
@@ -44,10 +44,10 @@ def _without(node: Node, names: frozenset[str], *, wanted: bool) -> Node:
     match node:
         case Not(inner):
             return Not(_without(inner, names, wanted=not wanted))
-        case Every(parts):
-            return Every(tuple(_without(part, names, wanted=wanted) for part in parts))
-        case Some(parts):
-            return Some(tuple(_without(part, names, wanted=wanted) for part in parts))
+        case And(parts):
+            return And(tuple(_without(part, names, wanted=wanted) for part in parts))
+        case Or(parts):
+            return Or(tuple(_without(part, names, wanted=wanted) for part in parts))
         case Name() | Compare() if names.intersection(Expression(node).names):
             return Literal(not wanted)
     return node
@@ -61,14 +61,14 @@ class Outlook:
     only: str = ""
 
 
-class Reach:
+class ModeReachability:
     """Where the cars of a fleet (None: of any) get to under a plan."""
 
-    def __init__(self, plan: Plan, fleet: Mapping[str, CarPicture] | None, named: Iterable[str]) -> None:
+    def __init__(self, plan: Plan, fleet: Mapping[str, CarSnapshot] | None, named: Iterable[str]) -> None:
         self._plan = plan
         self._known = fleet is not None
         others = (ANY_CAR,) if plan.open else ()
-        self.cars = fleet if fleet is not None else dict.fromkeys((*sorted(named), *others), CarPicture())
+        self.cars = fleet if fleet is not None else dict.fromkeys((*sorted(named), *others), CarSnapshot())
         self._able = {
             (car, name): not self.why_not(car, role) for name, role in plan.roles.items() for car in self.cars
         }
@@ -108,7 +108,7 @@ class Reach:
             f"it needs {role.needs}, and {_first_missing(role.needs, self.profiles(car), Mode)} is never measured on it"
         )
 
-    def outlook(self, condition: Condition, during: Iterable[str] | None) -> Outlook:
+    def outlook(self, condition: PlanCondition, during: Iterable[str] | None) -> Outlook:
         """Whether it can be so in one of these phases (None: in any), of a car that is as the plan wants it."""
         if why := outside(condition.expression, NAMES):
             return Outlook(why)
@@ -129,7 +129,11 @@ class Reach:
         return Outlook(only=only) if only else Outlook(self._never(condition, tuple(modes), tuple(kinds), during))
 
     def _never(
-        self, condition: Condition, modes: tuple[Mode, ...], kinds: tuple[Profile, ...], during: Iterable[str] | None
+        self,
+        condition: PlanCondition,
+        modes: tuple[Mode, ...],
+        kinds: tuple[Profile, ...],
+        during: Iterable[str] | None,
     ) -> str:
         where = f" in phase {' or '.join(sorted(during))}" if during is not None else ""
         whom = condition.car or f"{condition.of} car{f' with role {condition.role}' if condition.role else ''}"
@@ -152,12 +156,12 @@ class Reach:
     def _phases(self, during: Iterable[str] | None) -> Iterable[str]:
         return (self._plan.phases or ("",)) if during is None else during
 
-    def _watched(self, condition: Condition) -> Iterable[str]:
+    def _watched(self, condition: PlanCondition) -> Iterable[str]:
         if condition.car is not None:
             return (condition.car,)
         return self.cars if self._plan.open else [car for car in self._plan.named if car in self.cars]
 
-    def _modes(self, car: str, phase: str, condition: Condition) -> dict[Mode, str]:
+    def _modes(self, car: str, phase: str, condition: PlanCondition) -> dict[Mode, str]:
         """The modes that a car the condition looks at is brought into, each with the only cars that are, if not any."""
         roles, role = self._roles(car, phase), condition.role
         found = {each.mode: "" for each in roles if role in (None, each.name)}
@@ -262,7 +266,7 @@ def _or(modes: Iterable[str]) -> str:
     return " or ".join(modes)
 
 
-def blind(expression: Expression, cars: Iterable[tuple[CarPicture, str]], more: str = "") -> str:
+def blind(expression: Expression, cars: Iterable[tuple[CarSnapshot, str]], more: str = "") -> str:
     """` (light.left is not measured in mode tracking)` if none of these cars can see it to be so, each in this mode."""
     names, modes = dict[str, None](), dict[str, None]()
     for known, mode in cars:
@@ -278,7 +282,7 @@ def blind(expression: Expression, cars: Iterable[tuple[CarPicture, str]], more: 
 @cache  # asked for at each decision: by the platform's name, which is looked up faster than a profile
 def _blind(expression: Expression, platform: str, mode: str) -> tuple[str, ...]:
     """What keeps a car from seeing it to be so in this mode; nothing if it can, or that is not known."""
-    profile = CarPicture(platform=platform).profile
+    profile = CarSnapshot(platform=platform).profile
     if profile is None or mode not in set(Mode) or seen(expression, profile, Mode(mode)):
         return ()
     return unmeasured(expression, profile, Mode(mode))

@@ -39,7 +39,7 @@ class Damage:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class ChunkPart:
     """A chunk, or in a file without chunks one record, as bytes."""
 
     at: int

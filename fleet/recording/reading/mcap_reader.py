@@ -20,9 +20,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, DataEnd, Footer, Header, Schema
 
 from fleet.recording.reading import mcap_index
-from fleet.recording.reading.mcap_chunk import BROKEN, Damage, Piece, Record, read
+from fleet.recording.reading.mcap_chunk import BROKEN, ChunkPart, Damage, Record, read
 from fleet.recording.reading.mcap_index import HEAD, LIMIT, Index, Place
-from fleet.recording.reading.mcap_scan import MAGIC, Walk
+from fleet.recording.reading.mcap_scan import MAGIC, RecordScanner
 from fleet.recording.selection import EVERYTHING, Selection
 
 _FOOTER_SIZE: Final = HEAD.size + 20
@@ -35,18 +35,18 @@ class NotMcap(Exception):
     """A file of another kind, or none; its text says why."""
 
 
-class Lane(NamedTuple):
+class ChannelInfo(NamedTuple):
     """A channel and its schema, if it has one."""
 
     channel: Channel
     schema: Schema | None
 
 
-Row = tuple[Lane, int, int, int, bytes]
+Row = tuple[ChannelInfo, int, int, int, bytes]
 """One message: lane, sequence, log time and publish time in ns, payload. A plain tuple: there are millions."""
 
 
-class Salvage:
+class McapReader:
     """One file; raises NotMcap. What is wrong is in `damage`, as far as `check` or `messages` have looked."""
 
     def __init__(self, path: Path) -> None:
@@ -116,7 +116,7 @@ class Salvage:
                 _, index = self._index(file)
                 channels = {} if index is None else dict(index.channels)
                 schemas: dict[int, Schema | None] = {0: None} if index is None else {0: None, **index.schemas}
-                lanes = _Lanes(channels, schemas, selection)
+                lanes = _Channels(channels, schemas, selection)
                 strays: list[int] = []
                 for piece in self._pieces(file, index, selection):
                     try:
@@ -172,10 +172,10 @@ class Salvage:
             self.damage.append(Damage(footer.summary_start, "the index there cannot be taken apart"))
             return None, None
 
-    def _pieces(self, file: IO[bytes], index: Index | None, selection: Selection = EVERYTHING) -> Iterator[Piece]:
+    def _pieces(self, file: IO[bytes], index: Index | None, selection: Selection = EVERYTHING) -> Iterator[ChunkPart]:
         """What holds messages, by the index or, without one, from record to record."""
         if index is None or not index.complete:
-            walk = Walk(file)
+            walk = RecordScanner(file)
             for piece in walk.pieces():
                 self.damage += walk.damage
                 walk.damage.clear()
@@ -195,7 +195,7 @@ class Salvage:
         for place in places:
             yield from self._indexed(file, place)
 
-    def _indexed(self, file: IO[bytes], place: Place) -> Iterator[Piece]:
+    def _indexed(self, file: IO[bytes], place: Place) -> Iterator[ChunkPart]:
         at, length = place.at, place.length - HEAD.size
         if length > LIMIT:
             self.damage.append(Damage(at, f"the chunk there has {length} bytes: no more than {LIMIT} are read"))
@@ -206,7 +206,7 @@ class Salvage:
         record = read(file, at, place.length)
         if record[: HEAD.size] != HEAD.pack(Opcode.CHUNK, length):
             self.damage.append(Damage(at, "the head of the chunk there is damaged, its messages are shown if whole"))
-        yield Piece(at, Opcode.CHUNK, record[HEAD.size :], _span(place))
+        yield ChunkPart(at, Opcode.CHUNK, record[HEAD.size :], _span(place))
 
     def _check_data(self, file: IO[bytes], footer: Footer) -> None:
         """What lies between the chunks has one checksum, if its writer made one: ours does."""
@@ -221,14 +221,14 @@ class Salvage:
             self.damage.append(Damage(at, words))
 
 
-class _Lanes:
+class _Channels:
     """The channels of a file as they become known, and whether each is selected."""
 
     def __init__(self, channels: dict[int, Channel], schemas: dict[int, Schema | None], selection: Selection) -> None:
         self._channels = channels
         self._schemas = schemas
         self._selection = selection
-        self._found: dict[int, Lane | None] = {}
+        self._found: dict[int, ChannelInfo | None] = {}
 
     def rows(self, records: list[Record], at: int, strays: list[int]) -> Iterator[Row]:
         """The selected messages of one chunk; each of an unknown channel adds `at` to `strays`."""
@@ -246,7 +246,7 @@ class _Lanes:
                     strays.append(at)
                     continue
                 wanted = selection.has_key(channel.topic)
-                lane = found[number] = Lane(channel, self._schemas[channel.schema_id]) if wanted else None
+                lane = found[number] = ChannelInfo(channel, self._schemas[channel.schema_id]) if wanted else None
             if lane is not None and (not timed or selection.has_time(log_ns)):
                 yield lane, sequence, log_ns, publish_ns, data
 
@@ -278,7 +278,7 @@ def _is_mcap(file: IO[bytes]) -> bool:
             pass
         else:
             return bool(body.tell() == length)
-    return Walk(file).chunk_from(len(MAGIC)) is not None
+    return RecordScanner(file).chunk_from(len(MAGIC)) is not None
 
 
 def _checksum(file: IO[bytes], start: int, end: int) -> int:

@@ -15,7 +15,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema, Statistics
 
-from fleet.recording.reading.mcap_chunk import BROKEN, Damage, Piece, named, read
+from fleet.recording.reading.mcap_chunk import BROKEN, ChunkPart, Damage, named, read
 from fleet.recording.reading.mcap_index import HEAD, LIMIT
 
 MAGIC: Final = b"\x89MCAP0\r\n"
@@ -42,7 +42,7 @@ _PATIENCE: Final = 4
 """What looks like a chunk and is none costs its length: so many times the file's size are spent on it."""
 
 
-class Walk:
+class RecordScanner:
     """One file that is open; what is wrong with it is in `damage`."""
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -55,7 +55,7 @@ class Walk:
         self.cut = False
         """Whether it stops before its end."""
 
-    def pieces(self) -> Iterator[Piece]:
+    def pieces(self) -> Iterator[ChunkPart]:
         """What holds messages, in order."""
         size, at = self._size, len(MAGIC)
         in_data, chunks = True, False
@@ -83,7 +83,7 @@ class Walk:
                 if length > LIMIT:
                     self._say(at, f"the {named(opcode)} there has {length} bytes: no more than {LIMIT} are read")
                 else:
-                    yield Piece(at, opcode, read(self._file, at + HEAD.size, length))
+                    yield ChunkPart(at, opcode, read(self._file, at + HEAD.size, length))
             at += HEAD.size + length
         self._say(at, "it stops there")
 
@@ -110,7 +110,7 @@ class Walk:
         _, length = HEAD.unpack(read(self._file, at, HEAD.size))
         if length > LIMIT or at + HEAD.size + length > self._size:
             return False
-        if Piece(at, Opcode.CHUNK, read(self._file, at + HEAD.size, length)).whole:
+        if ChunkPart(at, Opcode.CHUNK, read(self._file, at + HEAD.size, length)).whole:
             return True
         self._spent += length
         return False

@@ -8,20 +8,20 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
-from fleet.recording.reading.mcap_reader import Lane
+from fleet.recording.reading.mcap_reader import ChannelInfo
 from schemas import messages
 
 SAME: Final = "same"
 """The state of a schema that has the fields of today's."""
 
 
-class Decoder:
+class MessageDecoder:
     """Message classes of a session's lanes."""
 
     def __init__(self) -> None:
         self._classes: dict[tuple[str, bytes], type[Message] | None] = {}
 
-    def class_of(self, lane: Lane) -> type[Message] | None:
+    def class_of(self, lane: ChannelInfo) -> type[Message] | None:
         """The class of a lane's messages; None if it is not protobuf, or its schema cannot be understood."""
         schema = lane.schema
         if schema is None or schema.encoding != "protobuf" or lane.channel.message_encoding != "protobuf":
@@ -31,7 +31,7 @@ class Decoder:
             self._classes[kind] = _made(*kind)
         return self._classes[kind]
 
-    def message(self, lane: Lane, payload: bytes) -> Message | None:
+    def message(self, lane: ChannelInfo, payload: bytes) -> Message | None:
         """A payload as a message; None if it is none."""
         made = self.class_of(lane)
         if made is None:

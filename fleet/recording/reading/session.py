@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from fleet.recording import session_dir
 from fleet.recording.reading.mcap_index import Index
-from fleet.recording.reading.mcap_reader import Lane, NotMcap, Row, Salvage
+from fleet.recording.reading.mcap_reader import ChannelInfo, McapReader, NotMcap, Row
 from fleet.recording.selection import EVERYTHING, Selection
 from fleet.recording.writing.mcap_copy import Copy
 
@@ -46,7 +46,7 @@ class Session:
     path: Path
     segments: tuple[Path, ...]
     """Those that can be read."""
-    description: session_dir.Description | None
+    description: session_dir.SessionInfo | None
     damage: dict[Path, str] = field(default_factory=dict)
     unended: set[Path] = field(default_factory=set)
     """Those of which nothing is known to be wrong but that they stop somewhere, as one does that is being written."""
@@ -70,7 +70,7 @@ class Session:
         damage = {}
         for segment in there:
             try:
-                Salvage(segment)
+                McapReader(segment)
             except NotMcap as error:
                 damage[segment] = str(error)
         if len(damage) == len(there):
@@ -86,7 +86,7 @@ class Session:
                     "update zenoh-car-fleet; "
                     f"its files can be looked into one by one, as {there[0]}"
                 )
-        description = session_dir.Description.read(path) if whole else None
+        description = session_dir.SessionInfo.read(path) if whole else None
         return cls(path, tuple(segment for segment in there if segment not in damage), description, damage)
 
     @property
@@ -108,7 +108,7 @@ class Session:
         """Look at every checksum, which reading by way of the index does not; adds what is wrong to `damage`."""
         for segment in self.segments:
             try:
-                salvage = Salvage(segment)
+                salvage = McapReader(segment)
                 salvage.check()
             except NotMcap as error:  # it was one when it was opened
                 self.damage[segment] = str(error)
@@ -168,21 +168,21 @@ class Session:
         found: dict[Path, Index | None] = {}
         for segment in self.segments:
             try:
-                found[segment] = Salvage(segment).index()
+                found[segment] = McapReader(segment).index()
             except (NotMcap, OSError):
                 found[segment] = None
         return found
 
     def _whole(self, segment: Path, selection: Selection) -> Iterator[Row]:
         try:
-            salvage = Salvage(segment)
+            salvage = McapReader(segment)
         except NotMcap as error:
             self.damage[segment] = str(error)
             return
         yield from salvage.messages(selection)
         self._note(salvage)
 
-    def _note(self, salvage: Salvage) -> None:
+    def _note(self, salvage: McapReader) -> None:
         if salvage.damage:
             self.damage[salvage.path] = salvage.words
             (self.unended.add if salvage.only_cut else self.unended.discard)(salvage.path)
@@ -208,6 +208,6 @@ def _json(path: Path) -> dict[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
-def message_of(lane: Lane) -> str:
+def message_of(lane: ChannelInfo) -> str:
     """Full protobuf name of a lane's messages; empty where the file has no schema for it."""
     return lane.schema.name if lane.schema is not None and lane.schema.encoding == "protobuf" else ""

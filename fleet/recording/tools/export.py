@@ -8,8 +8,8 @@ from typing import Final
 
 from google.protobuf.message import DecodeError, Message
 
-from fleet.recording.reading.mcap_reader import Lane, Row
-from fleet.recording.reading.message_decoder import Decoder
+from fleet.recording.reading.mcap_reader import ChannelInfo, Row
+from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import message_of
 from fleet.recording.tools import tables
 from fleet.recording.tools.table_formats import Sink
@@ -34,7 +34,7 @@ class Exported:
 class _Waiting:
     """Messages that wait for their table, by column: of a row each, the garbage collector would take a third longer."""
 
-    lanes: list[Lane] = field(default_factory=list)
+    lanes: list[ChannelInfo] = field(default_factory=list)
     log_ns: list[int] = field(default_factory=list)
     publish_ns: list[int] = field(default_factory=list)
     sequences: list[int] = field(default_factory=list)
@@ -119,8 +119,8 @@ class _Export:
     def __init__(self, out: Path, sink: type[Sink]) -> None:
         self._out = out
         self._sink = sink
-        self._decoder = Decoder()
-        self._by_lane: dict[int, tuple[Lane, _Table]] = {}
+        self._decoder = MessageDecoder()
+        self._by_lane: dict[int, tuple[ChannelInfo, _Table]] = {}
         self.tables: dict[type[Message] | None, _Table] = {}
         self.undecoded = 0
 

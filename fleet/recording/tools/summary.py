@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fleet.recording import session_dir, time_spec
-from fleet.recording.reading.message_decoder import Decoder
+from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
 from fleet.recording.tools.transform import lost_words
@@ -26,7 +26,7 @@ STEP_NS: Final = 1_000_000_000
 """Times that go back further than this are a clock that went back."""
 
 
-class State(StrEnum):
+class SessionState(StrEnum):
     """How a session is."""
 
     WHOLE = "whole"
@@ -38,12 +38,12 @@ class State(StrEnum):
 
 
 @dataclass(slots=True)
-class Overview:
+class SessionSummary:
     """A line of the list."""
 
     name: str
     path: str
-    state: State
+    state: SessionState
     words: str = ""
     """Why it is not whole."""
     started: str = ""
@@ -70,7 +70,7 @@ class Overview:
         return asdict(self)
 
 
-def overviews(root: Path) -> Iterator[Overview]:
+def overviews(root: Path) -> Iterator[SessionSummary]:
     """Every session below a directory, the oldest first; raises OSError if it cannot be listed."""
     for path in sorted(root.iterdir()):
         if path.is_dir() and not path.name.startswith("."):
@@ -81,19 +81,19 @@ def overviews(root: Path) -> Iterator[Overview]:
             yield overview(path)
 
 
-def overview(path: Path) -> Overview:
+def overview(path: Path) -> SessionSummary:
     """One session; nothing that is wrong with it is an error."""
     try:
         session = Session.open(path)
     except NoSession as error:
         files = [*path.glob(session_dir.SEGMENTS)] if path.is_dir() else [path]
-        return Overview(path.name, str(path), State.UNREADABLE, str(error), bytes=_size(files))
+        return SessionSummary(path.name, str(path), SessionState.UNREADABLE, str(error), bytes=_size(files))
     return of_session(session)
 
 
-def of_session(session: Session) -> Overview:
+def of_session(session: Session) -> SessionSummary:
     """As `overview`, of one that is open."""
-    found = Overview(session.name, str(session.path), State.WHOLE)
+    found = SessionSummary(session.name, str(session.path), SessionState.WHOLE)
     counts: dict[str, int] = {}
     cut: list[Path] = []
     span = _Span()
@@ -126,10 +126,10 @@ def of_session(session: Session) -> Overview:
         found.marks = list(description.marks)
         found.kept = description.kept
     found.state, found.words = _state(session, cut)
-    if found.state is State.WHOLE and (words := session.lacking(found.messages)):
-        found.state, found.words = State.DAMAGED, f"{session_dir.DESCRIPTION} {words}"
-    if found.state is State.WHOLE and (words := lost_words(session)):
-        found.state, found.words = State.RECOVERED, words
+    if found.state is SessionState.WHOLE and (words := session.lacking(found.messages)):
+        found.state, found.words = SessionState.DAMAGED, f"{session_dir.DESCRIPTION} {words}"
+    if found.state is SessionState.WHOLE and (words := lost_words(session)):
+        found.state, found.words = SessionState.RECOVERED, words
     return found
 
 
@@ -189,12 +189,12 @@ def total(session: Session) -> int | None:
     return count
 
 
-def marks_of(session: Session, about: Overview) -> list[Mapping[str, Any]]:
+def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]:
     """The marks of a session: as its description has them, else as they were recorded."""
     if about.marks:
         return list(about.marks)
     found: list[Mapping[str, Any]] = []
-    decoder = Decoder()
+    decoder = MessageDecoder()
     marked = [key for key in about.keys if key.endswith(f"/{MARK}")]
     for lane, _, log_ns, _, data in session.rows(Selection.of(marked, None, None)) if marked else ():
         message: Any = decoder.message(lane, data)
@@ -204,18 +204,21 @@ def marks_of(session: Session, about: Overview) -> list[Mapping[str, Any]]:
     return found
 
 
-def _state(session: Session, cut: Sequence[Path]) -> tuple[State, str]:
+def _state(session: Session, cut: Sequence[Path]) -> tuple[SessionState, str]:
     description = session.description
     if session.damage:
-        return State.DAMAGED, session.damage_words
+        return SessionState.DAMAGED, session.damage_words
     if description is not None and not description.closed:
         lately = max(segment.stat().st_mtime for segment in session.segments) > time.time() - WRITING_S
         if lately and not description.ended:
-            return State.RECORDING, ""
-        return State.CUT, description.error or "the recorder did not close it: `fleet sessions recover` makes it whole"
+            return SessionState.RECORDING, ""
+        return (
+            SessionState.CUT,
+            description.error or "the recorder did not close it: `fleet sessions recover` makes it whole",
+        )
     if cut:
-        return State.CUT, f"{cut[0].name} has no end that is whole: `fleet sessions recover` makes it whole"
-    return State.WHOLE, ""
+        return SessionState.CUT, f"{cut[0].name} has no end that is whole: `fleet sessions recover` makes it whole"
+    return SessionState.WHOLE, ""
 
 
 def _size(paths: Sequence[Path]) -> int:

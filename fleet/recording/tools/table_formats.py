@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol
 
-from fleet.recording.tools.tables import Column, Kind, Values
+from fleet.recording.tools.tables import Column, ColumnKind, Values
 
 SECONDS: Final = 4096
 """So many seconds are remembered as text."""
@@ -78,12 +78,12 @@ def _by(text: Callable[[Any], str]) -> Callable[[Values], Values]:
     return lambda column: [None if value is None else text(value) for value in column]
 
 
-_TEXTS: Final[dict[Kind, Callable[[Values], Values]]] = {
-    Kind.BOOL: lambda column: [None if value is None else "true" if value else "false" for value in column],
-    Kind.BYTES: _by(bytes.hex),
-    Kind.TIME: _times,
-    Kind.LIST: _by(json.dumps),
-    Kind.MAP: _by(json.dumps),
+_TEXTS: Final[dict[ColumnKind, Callable[[Values], Values]]] = {
+    ColumnKind.BOOL: lambda column: [None if value is None else "true" if value else "false" for value in column],
+    ColumnKind.BYTES: _by(bytes.hex),
+    ColumnKind.TIME: _times,
+    ColumnKind.LIST: _by(json.dumps),
+    ColumnKind.MAP: _by(json.dumps),
 }
 """What makes text of the values of a column; the csv module writes the others as they are to be."""
 
@@ -102,21 +102,21 @@ class ParquetSink:
                 "Parquet needs pyarrow, which is not installed: pip install 'zenoh-car-fleet[parquet]', or use --csv"
             ) from None
         kinds = {
-            Kind.FLOAT: pa.float64(),
-            Kind.INT: pa.int64(),
-            Kind.UINT: pa.uint64(),
-            Kind.BOOL: pa.bool_(),
-            Kind.BYTES: pa.binary(),
-            Kind.TIME: pa.timestamp("ns"),
+            ColumnKind.FLOAT: pa.float64(),
+            ColumnKind.INT: pa.int64(),
+            ColumnKind.UINT: pa.uint64(),
+            ColumnKind.BOOL: pa.bool_(),
+            ColumnKind.BYTES: pa.binary(),
+            ColumnKind.TIME: pa.timestamp("ns"),
         }
-        made = {Kind.LIST: pa.list_, Kind.MAP: lambda item: pa.map_(pa.string(), item)}
+        made = {ColumnKind.LIST: pa.list_, ColumnKind.MAP: lambda item: pa.map_(pa.string(), item)}
         self._types = [
             made[column.kind](kinds.get(column.item, pa.string()))
             if column.kind in made
             else kinds.get(column.kind, pa.string())
             for column in columns
         ]
-        self._maps = [column.kind is Kind.MAP for column in columns]
+        self._maps = [column.kind is ColumnKind.MAP for column in columns]
         self._array = pa.array
         self._table = pa.Table.from_arrays
         self._schema = pa.schema(

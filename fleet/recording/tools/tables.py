@@ -23,7 +23,7 @@ TIMESTAMP: Final = "google.protobuf.Timestamp"
 _UNITS: Final[Mapping[str, Mapping[str, str]]] = {topic.message: topic.units for topic in TOPICS.values()}
 
 
-class Kind(StrEnum):
+class ColumnKind(StrEnum):
     """What is in a column."""
 
     FLOAT = "float"
@@ -43,9 +43,9 @@ class Column:
     """One column of a table."""
 
     name: str
-    kind: Kind
+    kind: ColumnKind
     unit: str = ""
-    item: Kind = Kind.TEXT
+    item: ColumnKind = ColumnKind.TEXT
     """What a LIST or a MAP is of."""
 
 
@@ -53,32 +53,32 @@ Values = list[Any]
 """The values of one column."""
 
 COMMON: Final = (
-    Column("key", Kind.TEXT),
-    Column("car", Kind.TEXT),
-    Column("log_time", Kind.TIME, "UTC"),
-    Column("publish_time", Kind.TIME, "UTC"),
-    Column("sequence", Kind.UINT),
+    Column("key", ColumnKind.TEXT),
+    Column("car", ColumnKind.TEXT),
+    Column("log_time", ColumnKind.TIME, "UTC"),
+    Column("publish_time", ColumnKind.TIME, "UTC"),
+    Column("sequence", ColumnKind.UINT),
 )
 OTHER: Final = (
     *COMMON,
-    Column("message", Kind.TEXT),
-    Column("encoding", Kind.TEXT),
-    Column("text", Kind.TEXT),
-    Column("data", Kind.BYTES),
+    Column("message", ColumnKind.TEXT),
+    Column("encoding", ColumnKind.TEXT),
+    Column("text", ColumnKind.TEXT),
+    Column("data", ColumnKind.BYTES),
 )
 """Columns of what is no protobuf message: JSON and the like as text, anything else as bytes."""
 
 _KINDS: Final = {
-    FieldDescriptor.CPPTYPE_DOUBLE: Kind.FLOAT,
-    FieldDescriptor.CPPTYPE_FLOAT: Kind.FLOAT,
-    FieldDescriptor.CPPTYPE_INT32: Kind.INT,
-    FieldDescriptor.CPPTYPE_INT64: Kind.INT,
-    FieldDescriptor.CPPTYPE_UINT32: Kind.UINT,
-    FieldDescriptor.CPPTYPE_UINT64: Kind.UINT,
-    FieldDescriptor.CPPTYPE_BOOL: Kind.BOOL,
-    FieldDescriptor.CPPTYPE_ENUM: Kind.TEXT,
-    FieldDescriptor.CPPTYPE_STRING: Kind.TEXT,
-    FieldDescriptor.CPPTYPE_MESSAGE: Kind.JSON,
+    FieldDescriptor.CPPTYPE_DOUBLE: ColumnKind.FLOAT,
+    FieldDescriptor.CPPTYPE_FLOAT: ColumnKind.FLOAT,
+    FieldDescriptor.CPPTYPE_INT32: ColumnKind.INT,
+    FieldDescriptor.CPPTYPE_INT64: ColumnKind.INT,
+    FieldDescriptor.CPPTYPE_UINT32: ColumnKind.UINT,
+    FieldDescriptor.CPPTYPE_UINT64: ColumnKind.UINT,
+    FieldDescriptor.CPPTYPE_BOOL: ColumnKind.BOOL,
+    FieldDescriptor.CPPTYPE_ENUM: ColumnKind.TEXT,
+    FieldDescriptor.CPPTYPE_STRING: ColumnKind.TEXT,
+    FieldDescriptor.CPPTYPE_MESSAGE: ColumnKind.JSON,
 }
 
 
@@ -113,12 +113,12 @@ def car_of(key: str) -> str:
     return parsed.car if parsed is not None else ""
 
 
-def kind_of(field: FieldDescriptor) -> Kind:
+def kind_of(field: FieldDescriptor) -> ColumnKind:
     """What one value of a field is."""
     if field.type == FieldDescriptor.TYPE_BYTES:
-        return Kind.BYTES
+        return ColumnKind.BYTES
     if field.message_type is not None and field.message_type.full_name == TIMESTAMP:
-        return Kind.TIME
+        return ColumnKind.TIME
     return _KINDS[field.cpp_type]
 
 
@@ -130,21 +130,21 @@ def _filled(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Sequenc
         of = field.message_type.fields_by_name
         item = kind_of(of["value"])
         if of["key"].cpp_type == FieldDescriptor.CPPTYPE_STRING and item in _PLAIN:
-            column = Column(name, Kind.MAP, unit, item)
+            column = Column(name, ColumnKind.MAP, unit, item)
             return column, lambda messages: [dict(sorted(get(message).items())) for message in messages]
-        column = Column(name, Kind.JSON, unit)
+        column = Column(name, ColumnKind.JSON, unit)
         return column, lambda messages: [json.dumps(plain(message)[field.name]) for message in messages]
     if field.is_repeated:
         if kind in _PLAIN:
-            return Column(name, Kind.LIST, unit, kind), lambda messages: [
+            return Column(name, ColumnKind.LIST, unit, kind), lambda messages: [
                 [one(value) for value in get(message)] for message in messages
             ]
-        return Column(name, Kind.JSON, unit), lambda messages: [
-            json.dumps([plain(value) if kind is Kind.JSON else one(value) for value in get(message)])
+        return Column(name, ColumnKind.JSON, unit), lambda messages: [
+            json.dumps([plain(value) if kind is ColumnKind.JSON else one(value) for value in get(message)])
             for message in messages
         ]
-    column = Column(name, kind, unit or ("UTC" if kind is Kind.TIME else ""))
-    if kind is Kind.JSON:
+    column = Column(name, kind, unit or ("UTC" if kind is ColumnKind.TIME else ""))
+    if kind is ColumnKind.JSON:
         return column, lambda messages: [
             json.dumps(plain(get(message))) if message.HasField(field.name) else None for message in messages
         ]
@@ -157,7 +157,9 @@ def _filled(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Sequenc
     return column, lambda messages: list(map(get, messages))
 
 
-_PLAIN: Final = frozenset({Kind.FLOAT, Kind.INT, Kind.UINT, Kind.BOOL, Kind.TEXT, Kind.TIME})
+_PLAIN: Final = frozenset(
+    {ColumnKind.FLOAT, ColumnKind.INT, ColumnKind.UINT, ColumnKind.BOOL, ColumnKind.TEXT, ColumnKind.TIME}
+)
 
 
 def _is_map(field: FieldDescriptor) -> bool:
@@ -169,7 +171,7 @@ def _one(field: FieldDescriptor) -> Callable[[Any], Any]:
     if field.enum_type is not None:
         names = {number: value.name for number, value in field.enum_type.values_by_number.items()}
         return lambda number: names.get(number, str(number))
-    if kind_of(field) is Kind.TIME:
+    if kind_of(field) is ColumnKind.TIME:
         return _nanoseconds
     return lambda value: value
 
@@ -197,11 +199,11 @@ def plain(message: Any) -> dict[str, Any]:
 
 def _plain_one(field: FieldDescriptor, value: Any) -> Any:
     match kind_of(field):
-        case Kind.JSON:
+        case ColumnKind.JSON:
             return plain(value)
-        case Kind.BYTES:
+        case ColumnKind.BYTES:
             return value.hex()
-        case Kind.FLOAT if not math.isfinite(value):
+        case ColumnKind.FLOAT if not math.isfinite(value):
             return str(value)  # JSON has no such numbers
         case _:
             return _one(field)(value)

@@ -152,7 +152,7 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
         origin["missing"] = _sum((origin.get("missing"), before.get("missing")))
     if not origin.get("cars") and before.get("cars"):
         origin = {**origin, "cars": before["cars"]}
-    base = old if old is not None else session_dir.Description(fleet, time_spec.iso(first), "", {})
+    base = old if old is not None else session_dir.SessionInfo(fleet, time_spec.iso(first), "", {})
     made = {"by": origin["by"], "of": session.name, **origin}
     replace(
         base,

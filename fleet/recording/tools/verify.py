@@ -7,8 +7,8 @@ from typing import Any, Final
 from google.protobuf.message import Message
 
 from fleet.recording import session_dir, time_spec
-from fleet.recording.reading.mcap_reader import Lane, Row
-from fleet.recording.reading.message_decoder import SAME, Decoder, compared
+from fleet.recording.reading.mcap_reader import ChannelInfo, Row
+from fleet.recording.reading.message_decoder import SAME, MessageDecoder, compared
 from fleet.recording.reading.session import Session, message_of
 from fleet.recording.tools.sequence_check import Stream
 from fleet.recording.tools.transform import lost_words
@@ -34,7 +34,7 @@ class Clock:
 
 
 @dataclass(slots=True)
-class Verdict:
+class SessionVerdict:
     """What was found."""
 
     session: str
@@ -137,12 +137,12 @@ def _missing_words(one: dict[str, Any]) -> str:
 class _Audit:
     """Looks at every message once."""
 
-    def __init__(self, verdict: Verdict) -> None:
+    def __init__(self, verdict: SessionVerdict) -> None:
         self._verdict = verdict
-        self._decoder = Decoder()
+        self._decoder = MessageDecoder()
         self._streams: dict[tuple[str, str], Stream] = {}
         self._times: dict[tuple[str, str], int] = {}
-        self._lanes: dict[int, tuple[Lane, type[Message] | None, str]] = {}
+        self._lanes: dict[int, tuple[ChannelInfo, type[Message] | None, str]] = {}
         self._last_ns: int | None = None
 
     def add(self, row: Row) -> None:
@@ -172,7 +172,7 @@ class _Audit:
             newest = stream.add(number, log_ns)
         self._publisher_clock(owner, (key, publisher), log_ns, publish_ns, newest=newest)
 
-    def _met(self, lane: Lane) -> type[Message] | None:
+    def _met(self, lane: ChannelInfo) -> type[Message] | None:
         made = self._decoder.class_of(lane)
         name = message_of(lane)
         if made is not None:
@@ -226,9 +226,9 @@ def verify(
     session: Session,
     watched: Callable[[Iterable[Row]], Iterable[Row]] = iter,
     recording: Callable[[], bool] = lambda: False,
-) -> Verdict:
+) -> SessionVerdict:
     """Look at every byte and every message; `watched` may look on as they pass, `recording` is asked at the end."""
-    verdict = Verdict(str(session.path))
+    verdict = SessionVerdict(str(session.path))
     audit = _Audit(verdict)
     for row in watched(session.rows()):
         audit.add(row)

@@ -30,7 +30,7 @@ MOST: Final = 200_000
 """Answers that wait for the writer; what is over is asked again."""
 
 
-class Recall:
+class Backfill:
     """Asks from a thread of its own, from `start` to `close`."""
 
     def __init__(self, bus: Bus, expressions: Sequence[str], *, follows: bool) -> None:

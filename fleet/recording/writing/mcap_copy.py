@@ -8,7 +8,7 @@ from typing import Any, Final, Self
 
 from mcap.writer import LIBRARY_IDENTIFIER, Writer
 
-from fleet.recording.reading.mcap_reader import Lane, Row
+from fleet.recording.reading.mcap_reader import ChannelInfo, Row
 
 CHUNK_NS: Final = 1_000_000_000
 """A chunk for each second, as the recorder's are: what is read of a part is no more than needed."""
@@ -25,7 +25,7 @@ class Copy:
             self._writer.add_metadata("session", dict(about))
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[object, ...], int] = {}
-        self._lanes: dict[int, tuple[Lane, int]] = {}
+        self._lanes: dict[int, tuple[ChannelInfo, int]] = {}
         self._chunk_ns: int | None = None
         self.messages = 0
 
@@ -56,7 +56,7 @@ class Copy:
         self._writer.add_message(known[1], log_ns, data, publish_ns, sequence)
         self.messages += 1
 
-    def _channel(self, lane: Lane) -> int:
+    def _channel(self, lane: ChannelInfo) -> int:
         channel, schema = lane
         schema_id = 0
         if schema is not None:

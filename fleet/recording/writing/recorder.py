@@ -16,8 +16,8 @@ from typing import Any, Final
 
 import zenoh
 
-from fleet.recording.writing.backfill import Recall
-from fleet.recording.writing.session_writer import Options, Tape
+from fleet.recording.writing.backfill import Backfill
+from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
 from schemas.bus import Bus, Sample, reply_value
 from schemas.gen import fleet_v1_pb2
@@ -62,7 +62,7 @@ class _Refused(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class RecordingOutcome:
     """What a recording holds; numbers by key only where something was lost."""
 
     session: Path
@@ -129,7 +129,7 @@ class Recorder:
         self._refuse_a_second()
         for expression in keys.recorded(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, CHANNEL))
-        self._tape = Tape(self._root, self._fleet, self._options, self._now())
+        self._tape = SessionWriter(self._root, self._fleet, self._options, self._now())
         self._drops = self._tape.drops
         session = self._tape.path
         key = keys.topic_key(self._fleet, keys.RECORDER, STATUS.name.partition("/")[2])
@@ -137,7 +137,7 @@ class Recorder:
         marks = keys.topic_key(self._fleet, keys.RECORDER, MARK.name.partition("/")[2])
         self._marks = self._bus.publisher(marks, MARK, keys.RECORDER)
         self._last = self._status()
-        self._recall = Recall(self._bus, keys.recorded(self._fleet), follows=bool(self._tape.description.continues))
+        self._recall = Backfill(self._bus, keys.recorded(self._fleet), follows=bool(self._tape.description.continues))
         self._reader = threading.Thread(target=self._read, name="bus-reader")
         self._writer = threading.Thread(target=self._write, name="mcap-writer")
         self._reader.start()
@@ -156,7 +156,7 @@ class Recorder:
         """Why nothing is written for now; empty if it is."""
         return self._tape.full
 
-    def close(self) -> Outcome:
+    def close(self) -> RecordingOutcome:
         """Write what has come until now, and close the session whole; raises RecordingFailed."""
         if not self.ended.is_set():
             time.sleep(LINGER_S)
@@ -170,7 +170,7 @@ class Recorder:
         if self._error:
             raise RecordingFailed(self._error)
         tape = self._tape
-        return Outcome(tape.path, tape.messages, tape.bytes, dict(tape.drops), tape.missed, tape.cost)
+        return RecordingOutcome(tape.path, tape.messages, tape.bytes, dict(tape.drops), tape.missed, tape.cost)
 
     def _refuse_a_second(self) -> None:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
@@ -295,17 +295,17 @@ class Recorder:
 
     def _begin(self) -> None:
         """The next session; raises OSError if none can be made."""
-        self._tape = Tape(self._root, self._fleet, self._options, self._now())
+        self._tape = SessionWriter(self._root, self._fleet, self._options, self._now())
         self._drops = self._tape.drops
         if not self._tape.full:
             self._tell(f"recording fleet {self._fleet} to {self._tape.path}")
 
-    def _end(self, tape: Tape) -> None:
+    def _end(self, tape: SessionWriter) -> None:
         """Close a session."""
         tape.close(self._now())
         self._say_once(tape)
 
-    def _say_once(self, tape: Tape) -> None:
+    def _say_once(self, tape: SessionWriter) -> None:
         """Tell what is new of what should be known."""
         for session in tape.removed:
             self._tell(f"{session} was removed: the oldest that nobody marked, to keep the quota")

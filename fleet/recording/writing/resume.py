@@ -14,7 +14,7 @@ TAIL_S: Final = 3 * HELD_S
 
 
 @dataclass(frozen=True, slots=True)
-class Before:
+class ResumePoint:
     """What a new session need not write again."""
 
     name: str
@@ -25,18 +25,18 @@ class Before:
     """What was written since then: key, number, time of publication."""
 
 
-def cut_off(root: Path, fleet: str, now_ns: int) -> Before:
+def cut_off(root: Path, fleet: str, now_ns: int) -> ResumePoint:
     """Look for it below `root`: what it has is not written again, what it has not is."""
     session = _last(root, fleet, now_ns)
     if session is None:
-        return Before("", now_ns)
+        return ResumePoint("", now_ns)
     start_ns = now_ns - int(TAIL_S * 1e9)
     # Killed again before it had what the one before it lacked, it lacks that still.
     chain = [session, *_continued(session, start_ns)]
     known = frozenset(
         (row.key, row.sequence, row.published_ns) for each in chain for row in each.messages(start_ns=start_ns)
     )
-    return Before(session.path.name, max(start_ns, _begun_ns(chain[-1])), known)
+    return ResumePoint(session.path.name, max(start_ns, _begun_ns(chain[-1])), known)
 
 
 def _continued(session: Session, start_ns: int) -> list[Session]:
@@ -67,7 +67,7 @@ def _last(root: Path, fleet: str, now_ns: int) -> Session | None:
     """The session of a recorder that ended a moment ago without closing it; None if there is none."""
     there = sorted(root.glob(f"*/{session_dir.DESCRIPTION}"), key=lambda path: path.parent.name)
     for path in reversed(there):
-        description = session_dir.Description.read(path.parent)
+        description = session_dir.SessionInfo.read(path.parent)
         if description is None or description.fleet != fleet:
             continue
         if description.closed or description.ended is not None:

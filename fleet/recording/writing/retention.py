@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from fleet.recording.session_dir import DESCRIPTION, Description
+from fleet.recording.session_dir import DESCRIPTION, SessionInfo
 
 _IN_USE_S: Final = 60.0
 """A session that was not closed, and was written to since then, may be another recorder's."""
@@ -58,7 +58,7 @@ def _sessions(root: Path) -> Iterator[Path]:
 
 
 def _may_go(session: Path) -> bool:
-    description = Description.read(session)
+    description = SessionInfo.read(session)
     if description is None or description.kept:
         return False
     try:

@@ -16,7 +16,7 @@ from typing import Any, Final
 import zenoh
 
 from fleet.recording import session_dir
-from fleet.recording.sequence_tracker import Numbers
+from fleet.recording.sequence_tracker import SequenceTracker
 from fleet.recording.writing import resume, retention
 from fleet.recording.writing.segment_writer import Segment
 from schemas.bus import sequence_of
@@ -71,12 +71,12 @@ class Options:
         return self.session_bytes or self.root_bytes // SHARE
 
 
-class Lane:
+class KeyState:
     """What came under one key and encoding, in one segment."""
 
     __slots__ = ("channel", "count", "encoding", "final", "first", "key", "numbers")
 
-    def __init__(self, key: str, encoding: zenoh.Encoding, numbers: Numbers, channel: int) -> None:
+    def __init__(self, key: str, encoding: zenoh.Encoding, numbers: SequenceTracker, channel: int) -> None:
         self.key = key
         self.encoding = encoding
         self.numbers = numbers
@@ -84,11 +84,11 @@ class Lane:
         self.count = self.first = self.final = 0
 
 
-_Row = tuple[Lane, int, bytes, int, int]
+_Row = tuple[KeyState, int, bytes, int, int]
 """Lane, time of receipt, payload, time of publication, number."""
 
 
-class Tape:
+class SessionWriter:
     """Begins with a new session; raises OSError if none can be made, later also if it cannot be written.
 
     A full disk is not an error: `full` says so, what comes is held for a while, and it goes on when there is room.
@@ -107,7 +107,7 @@ class Tape:
         self._about |= {**self.description.versions, "format": str(session_dir.FORMAT)}
         self.uncopied: list[str] = []
         """Whoever tells of them clears it."""
-        self._numbers: dict[str, Numbers] = {}
+        self._numbers: dict[str, SequenceTracker] = {}
         self._odd: set[str] = set()
         """Keys whose numbers did not always follow."""
         self.gaps: set[str] = set()
@@ -197,7 +197,7 @@ class Tape:
         except OSError as error:
             self._stumble(error)
 
-    def _lane(self, key: str, encoding: zenoh.Encoding) -> Lane:
+    def _lane(self, key: str, encoding: zenoh.Encoding) -> KeyState:
         """The lane of a key and an encoding; a key has another one only if its encoding changes."""
         words = str(encoding)
         lane = self._others.get((key, words))
@@ -208,7 +208,7 @@ class Tape:
                     channel = self._segment.channel(key, words)
                 except OSError as error:
                     self._stumble(error)
-            lane = Lane(key, encoding, self._numbers.setdefault(key, Numbers()), channel)
+            lane = KeyState(key, encoding, self._numbers.setdefault(key, SequenceTracker()), channel)
             self._others[key, words] = lane
         self._lanes[key] = lane
         return lane
@@ -351,8 +351,8 @@ class Tape:
         return True
 
     def _forget_lanes(self, now_ns: int) -> None:
-        self._lanes: dict[str, Lane] = {}
-        self._others: dict[tuple[str, str], Lane] = {}
+        self._lanes: dict[str, KeyState] = {}
+        self._others: dict[tuple[str, str], KeyState] = {}
         self._begun_ns, self._first_ns, self._last_ns = now_ns, 0, 0
         self._segment: Segment | None = None
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from fleet.policy.decision import Kind
+from fleet.policy.decision import DecisionKind
 from fleet.recording.reading.session import Recorded
 from schemas import keys, messages
 from schemas.topics import TOPICS
@@ -20,7 +20,7 @@ GONE_NS: Final = 2_500_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class RecordedDecision:
     """A decision of one subject, from `at_ns` (the recorder's clock) until its next."""
 
     at_ns: int
@@ -34,18 +34,18 @@ class Said:
     @property
     def what(self) -> tuple[str, str, str]:
         """What is compared. Reasons have ages in them; the role of a car left alone ends later without a word."""
-        return self.kind, self.decided, "" if self.kind == Kind.ALONE else self.role
+        return self.kind, self.decided, "" if self.kind == DecisionKind.ALONE else self.role
 
     def __str__(self) -> str:
         role = f" (role {self.role})" if self.role and self.kind != "role" else ""
         return f"{self.kind} {self.decided}{role}"
 
 
-Timeline = dict[str, list[Said]]
+Timeline = dict[str, list[RecordedDecision]]
 """By subject, the decisions that differ from the one before, in order."""
 
 
-def add(timeline: Timeline, subject: str, said: Said) -> None:
+def add(timeline: Timeline, subject: str, said: RecordedDecision) -> None:
     """One more decision; one that says what the last one said is none."""
     before = timeline.setdefault(subject, [])
     if not before or before[-1].what != said.what:
@@ -53,7 +53,7 @@ def add(timeline: Timeline, subject: str, said: Said) -> None:
 
 
 @dataclass(slots=True)
-class Run:
+class CoordinatorRun:
     """One coordinator, from its first message in the session to its last."""
 
     fleet: str
@@ -69,9 +69,9 @@ class Run:
     phase: str = ""
 
 
-def runs(recorded: Iterable[Recorded]) -> list[Run]:
+def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
     """The coordinators of a session, in order; `recorded`: the messages of KEYS."""
-    found: dict[tuple[str, str], Run] = {}
+    found: dict[tuple[str, str], CoordinatorRun] = {}
     for one in recorded:
         key = keys.parse(one.key)
         value = message(one)
@@ -82,7 +82,7 @@ def runs(recorded: Iterable[Recorded]) -> list[Run]:
         if run is None:
             # The plan is the first thing that a coordinator says; later it says all of it again every ten seconds.
             whole = key.topic == "plan" and value.seq == 1
-            run = found[key.fleet, value.boot_id] = Run(key.fleet, at_ns, at_ns, whole)
+            run = found[key.fleet, value.boot_id] = CoordinatorRun(key.fleet, at_ns, at_ns, whole)
         run.end_ns = max(run.end_ns, at_ns)
         match key.topic:
             case "plan":
@@ -93,7 +93,7 @@ def runs(recorded: Iterable[Recorded]) -> list[Run]:
                     run.roles = {car: role.name for role in value.roles for car in role.cars}
                     run.phase = value.phase
             case _:
-                said = Said(
+                said = RecordedDecision(
                     at_ns,
                     value.kind,
                     value.decided,
@@ -107,7 +107,7 @@ def runs(recorded: Iterable[Recorded]) -> list[Run]:
 
 
 @dataclass(frozen=True, slots=True)
-class Token:
+class PresenceToken:
     """A car came to the bus, or went."""
 
     at_ns: int
@@ -115,7 +115,7 @@ class Token:
     alive: bool
 
 
-def presence(recorded: Iterable[Recorded], end_ns: int) -> list[Token]:
+def presence(recorded: Iterable[Recorded], end_ns: int) -> list[PresenceToken]:
     """When cars came and went, by their states (those of STATES), until `end_ns`; the times of going are estimates."""
     last: dict[str, tuple[int, str]] = {}
     found = []
@@ -126,13 +126,15 @@ def presence(recorded: Iterable[Recorded], end_ns: int) -> list[Token]:
             continue
         at_ns, before = one.recorded_ns, last.get(key.car)
         if before is None:
-            found.append(Token(at_ns, key.car, alive=True))
+            found.append(PresenceToken(at_ns, key.car, alive=True))
         elif before[1] != value.boot_id or at_ns - before[0] > GONE_NS:
-            found.append(Token(min(before[0] + 500_000_000, (before[0] + at_ns) // 2), key.car, alive=False))
-            found.append(Token(at_ns, key.car, alive=True))
+            found.append(PresenceToken(min(before[0] + 500_000_000, (before[0] + at_ns) // 2), key.car, alive=False))
+            found.append(PresenceToken(at_ns, key.car, alive=True))
         last[key.car] = at_ns, value.boot_id
     found += [
-        Token(at_ns + 500_000_000, car, alive=False) for car, (at_ns, _) in last.items() if end_ns - at_ns > GONE_NS
+        PresenceToken(at_ns + 500_000_000, car, alive=False)
+        for car, (at_ns, _) in last.items()
+        if end_ns - at_ns > GONE_NS
     ]
     return sorted(found, key=lambda token: token.at_ns)
 
@@ -152,34 +154,34 @@ def message(one: Recorded) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class DecisionDifference:
     """From when until when something else was decided then than now; None: nothing."""
 
     subject: str
     from_ns: int
     to_ns: int
-    then: Said | None
-    now: Said | None
+    then: RecordedDecision | None
+    now: RecordedDecision | None
 
 
-def differences(then: Timeline, now: Timeline, start_ns: int, end_ns: int) -> Iterator[Difference]:
+def differences(then: Timeline, now: Timeline, start_ns: int, end_ns: int) -> Iterator[DecisionDifference]:
     """Every stretch between two times in which the two say otherwise; both sides are stepwise."""
     for subject in sorted({*then, *now}):
         one, other = then.get(subject, []), now.get(subject, [])
         times = sorted({start_ns, *(said.at_ns for said in (*one, *other) if start_ns < said.at_ns < end_ns)})
         open_from: int | None = None
-        pair: tuple[Said | None, Said | None] = (None, None)
+        pair: tuple[RecordedDecision | None, RecordedDecision | None] = (None, None)
         for at_ns in (*times, end_ns):
             held = _at(one, at_ns), _at(other, at_ns)
             same = at_ns == end_ns or _what(held[0]) == _what(held[1])
             if open_from is not None and (same or (_what(held[0]), _what(held[1])) != (_what(pair[0]), _what(pair[1]))):
-                yield Difference(subject, open_from, at_ns, *pair)
+                yield DecisionDifference(subject, open_from, at_ns, *pair)
                 open_from = None
             if not same and open_from is None:
                 open_from, pair = at_ns, held
 
 
-def _at(said: list[Said], at_ns: int) -> Said | None:
+def _at(said: list[RecordedDecision], at_ns: int) -> RecordedDecision | None:
     found = None
     for each in said:
         if each.at_ns > at_ns:
@@ -188,5 +190,5 @@ def _at(said: list[Said], at_ns: int) -> Said | None:
     return found
 
 
-def _what(said: Said | None) -> tuple[str, str, str] | None:
+def _what(said: RecordedDecision | None) -> tuple[str, str, str] | None:
     return None if said is None else said.what

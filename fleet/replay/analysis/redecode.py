@@ -33,7 +33,7 @@ Outcome = tuple[str, dict[str, dict[str, Any]]]
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class ReadingDifference:
     """One thing that is otherwise now."""
 
     car: str
@@ -75,7 +75,7 @@ class Redecoding:
     _platforms: deque[Treated] = field(default_factory=deque)
     _began_ns: int | None = None
 
-    def take(self, item: Item) -> Iterator[Difference]:
+    def take(self, item: Item) -> Iterator[ReadingDifference]:
         """One more item; the differences of frames that nothing more can be learnt of. Raises NoPlatform."""
         if self._began_ns is None:
             self._began_ns = item.at_ns
@@ -91,12 +91,12 @@ class Redecoding:
         while self._waiting and item.at_ns - self._waiting[0].at_ns > WAIT_NS:
             yield from self._judge(self._waiting.popleft())
 
-    def end(self) -> Iterator[Difference]:
+    def end(self) -> Iterator[ReadingDifference]:
         """Nothing more comes."""
         while self._waiting:
             yield from self._judge(self._waiting.popleft())
 
-    def _judge(self, frame: Rx) -> Iterator[Difference]:
+    def _judge(self, frame: Rx) -> Iterator[ReadingDifference]:
         self.counts.frames += 1
         self.counts.readings += len(frame.readings)
         self.counts.absent += len(frame.published) - len(frame.readings)
@@ -177,16 +177,16 @@ def _outcome(events: Iterable[Event], profile: Profile, mode: Mode | None) -> Ou
     return " ".join(verdicts), readings
 
 
-def _compared(car: str, frame: Rx, outcome: Outcome) -> Iterator[Difference]:
+def _compared(car: str, frame: Rx, outcome: Outcome) -> Iterator[ReadingDifference]:
     verdict, readings = outcome
     if verdict != frame.verdict:
-        yield Difference(car, frame.at_ns, frame.data, "verdict", frame.verdict, verdict)
+        yield ReadingDifference(car, frame.at_ns, frame.data, "verdict", frame.verdict, verdict)
     if set(readings) != set(frame.published):
-        yield Difference(car, frame.at_ns, frame.data, "published", frame.published, tuple(readings))
+        yield ReadingDifference(car, frame.at_ns, frame.data, "published", frame.published, tuple(readings))
     for topic, fields in readings.items():
         recorded: Mapping[str, Any] = frame.readings.get(topic, {})
         for name, now in fields.items():
             if topic in frame.readings and recorded.get(name) != now:
-                yield Difference(car, frame.at_ns, frame.data, f"{topic} {name}", recorded.get(name), now)
+                yield ReadingDifference(car, frame.at_ns, frame.data, f"{topic} {name}", recorded.get(name), now)
         if "range_m" in recorded and "range_m" not in fields:
-            yield Difference(car, frame.at_ns, frame.data, f"{topic} range_m", recorded["range_m"], None)
+            yield ReadingDifference(car, frame.at_ns, frame.data, f"{topic} range_m", recorded["range_m"], None)

@@ -11,14 +11,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from fleet.coordinator.observer import Hearing
+from fleet.coordinator.observer import FleetObserver
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
-from fleet.policy.snapshot import NOBODY, CarPicture, Refused, topic_of
-from fleet.policy.state import TAKEN_OVER, Held, Kept, Memory, carried, restored, to_keep
+from fleet.policy.snapshot import NOBODY, CarSnapshot, Refusal, topic_of
+from fleet.policy.state import TAKEN_OVER, HeldRole, PersistedPolicy, PolicyState, carried, restored, to_keep
 from fleet.recording.reading.session import Recorded
-from fleet.replay.analysis.recorded_decisions import Run, Said, Timeline, Token, add, message
+from fleet.replay.analysis.recorded_decisions import (
+    CoordinatorRun,
+    PresenceToken,
+    RecordedDecision,
+    Timeline,
+    add,
+    message,
+)
 from schemas import keys, messages
 from schemas.bus import Sample
 from schemas.topics import PROTOBUF
@@ -44,7 +51,7 @@ def wanted_keys(fleet: str, plans: Iterable[Plan]) -> list[str]:
     return [f"{fleet}/*/{topic}" for topic in ("state/*", "event/command", *sorted(topics)) if topic]
 
 
-def plans_of(run: Run) -> list[Plan]:
+def plans_of(run: CoordinatorRun) -> list[Plan]:
     """The plans that a coordinator had, one after the other; raises BadPlan for one that this version cannot read."""
     return [parse(text, f"the recorded plan of {run.fleet}") for _, text in run.plans]
 
@@ -53,24 +60,24 @@ def plans_of(run: Run) -> list[Plan]:
 class Replanning:
     """One coordinator again, from its beginning to its end: `plans` are (from when on, plan)."""
 
-    run: Run
+    run: CoordinatorRun
     plans: list[tuple[int, Plan]]
-    listed: Mapping[str, CarPicture] = field(default_factory=dict)
-    kept: Kept = field(default_factory=Kept)
+    listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
+    kept: PersistedPolicy = field(default_factory=PersistedPolicy)
     """What the coordinator before it left."""
     said: Timeline = field(default_factory=dict)
-    _hearing: Hearing = field(init=False)
+    _hearing: FleetObserver = field(init=False)
     _plan: Plan = field(init=False)
-    _memory: Memory | None = None
+    _memory: PolicyState | None = None
     _busy: dict[str, str] = field(default_factory=dict)
     """Car: the mode that it was asked for."""
     _looked_ns: int = 0
 
     def __post_init__(self) -> None:
-        self._hearing = Hearing(self.listed)
+        self._hearing = FleetObserver(self.listed)
         self._plan = self.plans[0][1]
 
-    def go(self, recorded: Iterable[Recorded], tokens: Iterable[Token]) -> Kept:
+    def go(self, recorded: Iterable[Recorded], tokens: Iterable[PresenceToken]) -> PersistedPolicy:
         """Take all of it, of the keys that are wanted and in order; what it would leave to the next coordinator."""
         changes = [_NewPlan(at_ns, plan) for at_ns, plan in self.plans[1:]]
         new_ns: int | None = None
@@ -85,7 +92,7 @@ class Replanning:
             self._pass(at_ns)
             new_ns = at_ns if new_ns is None else new_ns
             match item:
-                case Token():
+                case PresenceToken():
                     self._hearing.token(item.car, item.at_ns / 1e9, alive=item.alive)
                 case _NewPlan():
                     if self._memory is not None:
@@ -119,7 +126,7 @@ class Replanning:
                 return
             self._busy[key.car] = request.mode
         elif event.phase in _ENDED and (mode := self._busy.pop(key.car, None)) is not None:
-            refusal = Refused(mode, event.reason, event.words, item.recorded_ns / 1e9)
+            refusal = Refusal(mode, event.reason, event.words, item.recorded_ns / 1e9)
             self._hearing.refused(key.car, None if event.phase in _DONE else refusal)
 
     def _pass(self, to_ns: int) -> None:
@@ -132,21 +139,23 @@ class Replanning:
         while self._looked_ns + TURN_NS <= to_ns:
             self._look(self._looked_ns + TURN_NS)
 
-    def _begin(self) -> Memory:
+    def _begin(self) -> PolicyState:
         now = self.run.start_ns / 1e9
         known = {car: role for car, role in self.run.roles.items() if role in self._plan.roles}
         picture = self._hearing.picture(())
         if not self.run.whole or any(not picture.cars.get(car, NOBODY).mode for car in known):
             # It began, or knew its cars, before the recording: that is where its first roles are from.
-            return restored(self._plan, picture, Kept(self._plan.version, known, self.run.phase, now), now, now)
+            return restored(
+                self._plan, picture, PersistedPolicy(self._plan.version, known, self.run.phase, now), now, now
+            )
         memory = restored(self._plan, picture, self.kept, now, now)
         # Roles from before the session: its first words tell of them.
         told = {
-            car: Held(known[car], TAKEN_OVER)
+            car: HeldRole(known[car], TAKEN_OVER)
             for car, said in self.run.said.items()
             if car in known and said[0].role == known[car] and TAKEN_OVER in said[0].why
         }
-        return memory if memory.held or not told else Memory(held=told)
+        return memory if memory.held or not told else PolicyState(held=told)
 
     def _look(self, at_ns: int) -> None:
         if self._memory is None or at_ns < self._looked_ns:
@@ -156,7 +165,9 @@ class Replanning:
         result = step(self._plan, self._hearing.picture(self._busy), self._memory, at_ns / 1e9)
         self._memory = result.memory
         for each in result.changed:
-            said = Said(at_ns, each.kind, each.decided, each.role or "", each.why, each.readings, each.would_change)
+            said = RecordedDecision(
+                at_ns, each.kind, each.decided, each.role or "", each.why, each.readings, each.would_change
+            )
             add(self.said, each.subject, said)
 
 
@@ -171,5 +182,5 @@ def _ordered(recorded: Iterable[Recorded]) -> Iterable[Recorded]:
             yield one
 
 
-def _time(item: Recorded | Token | _NewPlan) -> int:
+def _time(item: Recorded | PresenceToken | _NewPlan) -> int:
     return item.recorded_ns if isinstance(item, Recorded) else item.at_ns

@@ -12,7 +12,7 @@ from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMa
 from fleet.replay import colors
 from fleet.replay import panels as mapping
 from fleet.replay.colors import Rgb, colour
-from fleet.replay.panels import Contents, Curve, Lane, Panel
+from fleet.replay.panels import Contents, Curve, Panel, StateTrack
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.lenses import component
 from fleet.replay.rerun.staleness import PUBLISHED
@@ -36,7 +36,7 @@ def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.
     `last_s`: of curves and lanes the last seconds before the cursor are in view; None: the whole time.
     """
     session = drawing.contents()
-    shown = _Layout(session, colors.leds(drawing.leds), drawing.lanes, _axis(drawing.span_ns, last_s))
+    shown = _RerunLayout(session, colors.leds(drawing.leds), drawing.lanes, _axis(drawing.span_ns, last_s))
     tabs = [shown.fleet_tab(drawing.ground()), *(shown.car_tab(car) for car in session.cars)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=1 + list(session.cars).index(tab) if tab else 0),
@@ -48,7 +48,7 @@ def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.
     )
 
 
-class _Layout:
+class _RerunLayout:
     """The tabs of one session."""
 
     def __init__(
@@ -119,7 +119,7 @@ class _Layout:
             return topic in self._session.services
         return topic in self._session.cars.get(car, ())
 
-    def _has_lane(self, car: str, lane: Lane) -> bool:
+    def _has_lane(self, car: str, lane: StateTrack) -> bool:
         if lane.drawn:
             return (self._entity(car, lane.topic), _name(lane, car)) in self._drawn
         return self._has(car, lane.topic)
@@ -129,7 +129,7 @@ class _Layout:
         shown += [self._entity("", topic) for topic in theirs if self._has("", topic)]
         return _text(name, shown) if shown else None
 
-    def _fleet_lanes(self, name: str, lanes: Iterable[Lane]) -> rrb.View | None:
+    def _fleet_lanes(self, name: str, lanes: Iterable[StateTrack]) -> rrb.View | None:
         shown: _Shown = {}
         for car in self._session.cars:
             for lane in lanes:
@@ -156,7 +156,7 @@ class _Layout:
             return None
         return self._lanes(panel.name, shown) if panel.lanes else self._curves(panel.name, shown)
 
-    def _lane(self, lane: Lane, car: str) -> rrb.Visualizer:
+    def _lane(self, lane: StateTrack, car: str) -> rrb.Visualizer:
         tints = self._leds if lane.name in _LEDS else colors.MARKS if lane == mapping.MARKS else colors.STATES
         style = rr.StateConfiguration(values=list(tints), colors=np.array(list(tints.values()), dtype=np.uint32))
         source = VisualizerComponentMapping(
@@ -204,7 +204,7 @@ def _axis(span_ns: tuple[int, int] | None, last_s: float | None) -> rrb.TimeAxis
     return rrb.TimeAxis(view_range=rr.TimeRange(at.absolute(nanos=span_ns[0]), at.absolute(nanos=span_ns[1])))
 
 
-def _name(lane: Lane, car: str) -> str:
+def _name(lane: StateTrack, car: str) -> str:
     """The component of a lane: of roles there is one for each car, on one entity."""
     return f"{lane.name} {car}" if lane == mapping.ROLE else lane.name
 

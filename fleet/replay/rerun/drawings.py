@@ -18,7 +18,7 @@ import rerun.chunk as rrc
 from fleet.replay import panels
 from fleet.replay.colors import OFF, Rgb, colour, rgb
 from fleet.replay.rerun.lenses import component, numbers, triples
-from fleet.replay.rerun.staleness import LOGGED, PUBLISHED, Ends
+from fleet.replay.rerun.staleness import LOGGED, PUBLISHED, StaleStates
 from schemas import keys, messages
 from schemas.topics import COMMANDS
 
@@ -49,7 +49,7 @@ class Drawing:
         self._ways: dict[str, Any] = {}
         self._parts: dict[str, list[Any]] = {}
         self._still: dict[str, Any] = {}
-        self._ends = Ends()
+        self._ends = StaleStates()
         self._asked: dict[str, str] = {}
         """Colours of LEDs that were asked for, by the command's id, until it is known what became of it."""
         self._drawn: dict[str, Callable[[str, Any, _Times], Iterator[Any]]] = {

@@ -14,7 +14,7 @@ import rerun.chunk as rrc
 
 from fleet.fleetfile.models import CRITICAL_V, LOW_V
 from fleet.replay import panels
-from fleet.replay.panels import Curve, How, Lane
+from fleet.replay.panels import Curve, How, StateTrack
 from schemas.topics import TOPICS
 
 MESSAGE: Final = ":message"
@@ -38,7 +38,7 @@ def lenses() -> list[Any]:
         return made.get(topic) or rrc.DeriveLens(component(topic))
 
     for part in panels.parts():
-        if (isinstance(part, Lane) and not part.drawn) or (isinstance(part, Curve) and part.how is not None):
+        if (isinstance(part, StateTrack) and not part.drawn) or (isinstance(part, Curve) and part.how is not None):
             made[part.topic] = lens(part.topic).to_component(part.name, _selector(part))
     for words in panels.WORDS:
         line = rrc.Selector(".").pipe(_line(words.fields, words.before))
@@ -65,7 +65,7 @@ def numbers(messages: Any, name: str) -> Any:
     return messages.field(name).to_numpy(zero_copy_only=False)
 
 
-def _selector(part: Lane | Curve) -> Any:
+def _selector(part: StateTrack | Curve) -> Any:
     selector = rrc.Selector(f".{part.field}")
     if part.how is None:
         return selector

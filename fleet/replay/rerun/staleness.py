@@ -13,7 +13,7 @@ import rerun.chunk as rrc
 from google.protobuf.descriptor import FieldDescriptor
 
 from fleet.replay import panels
-from fleet.replay.panels import Lane
+from fleet.replay.panels import StateTrack
 from schemas.messages import message_class
 from schemas.topics import TOPICS
 
@@ -31,7 +31,7 @@ class _Run(NamedTuple):
     last_logged: int
 
 
-class Ends:
+class StaleStates:
     """What was heard when, of every entity that has lanes."""
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ def _lanes() -> dict[str, dict[str, Any]]:
     """Topic: its lanes, with what their states are; of topics that can be stale."""
     found: dict[str, dict[str, Any]] = {}
     for part in panels.parts():
-        if isinstance(part, Lane) and not part.drawn and TOPICS[part.topic].stale_after_s is not None:
+        if isinstance(part, StateTrack) and not part.drawn and TOPICS[part.topic].stale_after_s is not None:
             fields = message_class(TOPICS[part.topic].message).DESCRIPTOR.fields_by_name
             is_bool = part.how is None and fields[part.field].type == FieldDescriptor.TYPE_BOOL
             found.setdefault(part.topic, {})[part.name] = pa.bool_() if is_bool else pa.string()

@@ -31,7 +31,7 @@ class BatteryLevel(StrEnum):
     CRITICAL = "critical"
 
 
-class Action(StrEnum):
+class BatteryReaction(StrEnum):
     """What a level leads to."""
 
     WARN = "warn"
@@ -42,14 +42,14 @@ class Action(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Policy:
+class BatteryPolicy:
     """What each level leads to, and where it begins, V at rest.
 
     A brownout resets the car, which stops it, so nothing is stopped by default.
     """
 
-    low: Action = Action.WARN
-    critical: Action = Action.REFUSE
+    low: BatteryReaction = BatteryReaction.WARN
+    critical: BatteryReaction = BatteryReaction.REFUSE
     low_v: float = LOW_V
     critical_v: float = CRITICAL_V
 
@@ -59,7 +59,7 @@ class Policy:
             return BatteryLevel.CRITICAL
         return BatteryLevel.LOW if voltage_v < self.low_v else BatteryLevel.OK
 
-    def action(self, level: BatteryLevel | None) -> Action | None:
+    def action(self, level: BatteryLevel | None) -> BatteryReaction | None:
         """What this level leads to; nothing if it is fine, or was never measured."""
         match level:
             case BatteryLevel.LOW:
@@ -74,7 +74,7 @@ class Policy:
 class Battery:
     """The level of one car's battery, as its readings show it. Times are seconds on one monotonic clock."""
 
-    policy: Policy = field(default_factory=Policy)
+    policy: BatteryPolicy = field(default_factory=BatteryPolicy)
     level: BatteryLevel | None = None
     """None until a voltage was measured; then OK until readings have shown another level for HOLD_S."""
     voltage_v: float | None = None
@@ -119,7 +119,7 @@ class Battery:
         return self.heard_at - self._loaded_at < RECOVERS_S
 
     @property
-    def action(self) -> Action | None:
+    def action(self) -> BatteryReaction | None:
         """What the level leads to."""
         return self.policy.action(self.level)
 
@@ -134,7 +134,7 @@ class Battery:
     @property
     def refusal(self) -> str:
         """Why no new drive or mode is allowed, for a person; empty if it is."""
-        refuses = self.action in (Action.REFUSE, Action.STOP)
+        refuses = self.action in (BatteryReaction.REFUSE, BatteryReaction.STOP)
         return f"{self.words}: charge it, then drive; manual, stop, whistle and light work" if refuses else ""
 
 

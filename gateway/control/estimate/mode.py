@@ -36,7 +36,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(slots=True)
-class ModeTruth:
+class ModeEstimator:
     """Asked, inferred, verdict, evidence. Times are seconds on one monotonic clock."""
 
     profile: Profile

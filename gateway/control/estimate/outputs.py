@@ -11,7 +11,7 @@ from gateway.protocol.platforms import Profile
 
 
 @dataclass(slots=True)
-class Believed:
+class StateEstimate:
     """The sum of what was written since the link came up. Times are seconds on one monotonic clock."""
 
     profile: Profile

@@ -21,7 +21,7 @@ _WITH_MODES: Final = "arduino (or stm32: their bytes are the same)"
 
 
 @dataclass(slots=True)
-class _Shown:
+class _PlatformEvidence:
     """Words for something, and whether frames show it."""
 
     stands: bool = False
@@ -38,7 +38,7 @@ class _Shown:
 
 
 @dataclass(slots=True)
-class PlatformTruth:
+class PlatformDetector:
     """The profile in force, and what speaks for and against it.
 
     With `auto` the profile is looked for: `profile` is the unknown one until the bytes show another.
@@ -48,13 +48,13 @@ class PlatformTruth:
     auto: bool = False
     profile: Profile = field(init=False)
     """What the car is treated as: what was told; with `auto` what it was settled on."""
-    _against: dict[str, _Shown] = field(default_factory=dict)
+    _against: dict[str, _PlatformEvidence] = field(default_factory=dict)
     _with_modes: str = ""
     _raspberry_pi: str = ""
     """What showed that it is one, in words; both are filled by a car that is none of those that are known."""
     _options: frozenset[str] = frozenset()
-    _seen: dict[str, _Shown] = field(
-        default_factory=lambda: {word: _Shown() for word in (_MODES, _MEASURED, _CONSTANTS)}
+    _seen: dict[str, _PlatformEvidence] = field(
+        default_factory=lambda: {word: _PlatformEvidence() for word in (_MODES, _MEASURED, _CONSTANTS)}
     )
     _frames: dict[str, int] = field(default_factory=lambda: {"arm": 0, "imu": 0})
     _more: set[str] = field(default_factory=set)
@@ -98,7 +98,7 @@ class PlatformTruth:
             return ()
         in_manual = event.signature is Mode.MANUAL
         for words in found:
-            self._against.setdefault(words, _Shown())
+            self._against.setdefault(words, _PlatformEvidence())
         weighed = [words for words in self._against if in_manual or words in found]
         new = tuple(words for words in weighed if self._against[words].weigh(shown=words in found))
         for words in weighed:
@@ -116,7 +116,7 @@ class PlatformTruth:
             return ()
         words = f"{option} frames, which {self.profile.name} cars do not send: is it {self.profile.name}+{option}?"
         self._more.add(words)
-        self._against[words] = _Shown(stands=True)
+        self._against[words] = _PlatformEvidence(stands=True)
         return (words,)
 
     def _look(self, event: Sensors) -> None:

@@ -35,7 +35,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class StopSequence:
     """A way to stop. `rank`: a running recipe is only replaced by one of a higher rank."""
 
     name: str
@@ -52,22 +52,22 @@ _STOP: Final = General(Motion.STOP)
 _MANUAL: Final = ModeClose()
 
 # protocol.md, stopping, soft
-SOFT: Final = Recipe("soft", 1, (Step(_STOP, Gate.FLIGHT), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+SOFT: Final = StopSequence("soft", 1, (Step(_STOP, Gate.FLIGHT), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
 
 # protocol.md, stopping, full
-FULL: Final = Recipe("full", 2, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+FULL: Final = StopSequence("full", 2, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
 
 # The same where a frame of ours may lie in the buffer: `MODE00` behind it would be read at the wrong place, and waits.
 # The general stop need not: behind that frame it is lost without harm, and mostly there is none.
-FULL_BEHIND: Final = Recipe("full_behind", 2, (Step(_STOP, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
+FULL_BEHIND: Final = StopSequence("full_behind", 2, (Step(_STOP, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
 
 # protocol.md, stopping, Raspberry Pi
 _PI_STEPS: Final = (Step(_STOP, Gate.FLIGHT), Step(_STOP, after_s=0.06), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S))
-PI_SOFT: Final = Recipe("raspberry_pi_soft", 1, _PI_STEPS)
-PI: Final = Recipe("raspberry_pi", 2, _PI_STEPS)
+PI_SOFT: Final = StopSequence("raspberry_pi_soft", 1, _PI_STEPS)
+PI: Final = StopSequence("raspberry_pi", 2, _PI_STEPS)
 
 # protocol.md, stopping, recovery
-RECOVERY: Final = Recipe(
+RECOVERY: Final = StopSequence(
     "recovery",
     3,
     (
@@ -79,7 +79,7 @@ RECOVERY: Final = Recipe(
 )
 
 # protocol.md, stopping, platform unknown
-UNKNOWN: Final = Recipe(
+UNKNOWN: Final = StopSequence(
     "unknown_platform",
     3,
     (
@@ -93,7 +93,7 @@ UNKNOWN: Final = Recipe(
 
 # The same where mode 0 is certain: there general stops stop every platform, behind whatever frame of ours is unread.
 # `MODE00` comes last, alone: in one string with a stop it would undo it, with a servo frame it would open a mode.
-UNKNOWN_MANUAL: Final = Recipe(
+UNKNOWN_MANUAL: Final = StopSequence(
     "unknown_platform_manual",
     3,
     (
@@ -106,4 +106,4 @@ UNKNOWN_MANUAL: Final = Recipe(
 )
 
 # Asks a car that reports in mode 0 to show that it obeys: its reports pause for the second that `MODE00` takes.
-PROBE: Final = Recipe("probe", 3, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+PROBE: Final = StopSequence("probe", 3, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))

@@ -4,11 +4,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.command_log import Pending
-from gateway.control.commands import Why
+from gateway.control.commands import FrameOrigin
 from gateway.control.pacing import Pacing
 from gateway.control.stops import sequences
 from gateway.control.stops.evidence import StopCase
-from gateway.control.stops.sequences import Gate, Recipe
+from gateway.control.stops.sequences import Gate, StopSequence
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import Frame, ModeClose
 from gateway.protocol.platforms import Profile, StopStyle
@@ -40,7 +40,7 @@ def style_of(profile: Profile, *, doubted: bool) -> StopStyle:
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class StopContext:
     """What the choice of a stop looks at."""
 
     profile: Profile
@@ -74,14 +74,14 @@ class Situation:
 
 
 @dataclass(slots=True)
-class Running:
+class StopInProgress:
     """A stop under way: the frames of its present try, and the commands that end with it. Times: s, monotonic.
 
     A stop ends on evidence (see `stop_evidence`), so after its last frame it waits, and tries again.
     """
 
-    recipe: Recipe
-    why: Why
+    recipe: StopSequence
+    why: FrameOrigin
     began_at: float
     try_at: float
     """When the present try began."""
@@ -173,12 +173,12 @@ class Running:
         self.index += 1
         return first
 
-    def again(self, recipe: Recipe, now: float) -> None:
+    def again(self, recipe: StopSequence, now: float) -> None:
         """Begin the next try."""
         self.recipe, self.index, self.try_at = recipe, 0, now
 
 
-def recovery(situation: Situation) -> Recipe:
+def recovery(situation: StopContext) -> StopSequence:
     """What brings a car of unknown state to rest in mode 0."""
     match situation.style:
         case StopStyle.RASPBERRY_PI:
@@ -189,7 +189,7 @@ def recovery(situation: Situation) -> Recipe:
             return sequences.RECOVERY
 
 
-def full(situation: Situation) -> Recipe:
+def full(situation: StopContext) -> StopSequence:
     """What `stop`, `estop` and a shutdown send."""
     style = situation.style
     if not situation.known or style is StopStyle.RASPBERRY_PI:
@@ -199,7 +199,7 @@ def full(situation: Situation) -> Recipe:
     return sequences.FULL_BEHIND if situation.manual and not situation.clear else sequences.FULL
 
 
-def soft(situation: Situation) -> Recipe:
+def soft(situation: StopContext) -> StopSequence:
     """What release and expiry send."""
     if situation.style is StopStyle.RASPBERRY_PI:
         return sequences.PI_SOFT
@@ -208,7 +208,7 @@ def soft(situation: Situation) -> Recipe:
     return full(situation)
 
 
-def worst_s(recipe: Recipe, situation: Situation, pacing: Pacing, now: float) -> float:
+def worst_s(recipe: StopSequence, situation: StopContext, pacing: Pacing, now: float) -> float:
     """How long a recipe that begins now takes at worst until the motors are off for good (protocol.md, stopping).
 
     What it waits for + the rest of the block it meets + the wire; and where its first frames may be lost, because a

@@ -14,7 +14,7 @@ from gateway.sim.model.firmware import (
     NO_ECHO_S,
     REPORT_EVERY_S,
     WHISTLE_S,
-    Body,
+    CarBodyState,
     Firmware,
     Program,
     Rng,
@@ -53,7 +53,9 @@ _JOINTS: Final = re.compile(r"ServoJ1(\d+),J2(\d+),J3(\d+),J4(\d+),J5(\d+),J6(\d
 class ArduinoCar(Firmware):
     """A car with the vendor's Arduino program. Options: `arm`, `imu`."""
 
-    def __init__(self, body: Body, rng: Rng, *, options: frozenset[str] = frozenset(), now: float = 0.0) -> None:
+    def __init__(
+        self, body: CarBodyState, rng: Rng, *, options: frozenset[str] = frozenset(), now: float = 0.0
+    ) -> None:
         super().__init__(body, rng, options=options, now=now)
         self._joints = [90] * 6
         self.report_every_s = REPORT_EVERY_S

@@ -8,7 +8,7 @@ PAUSE_S: Final = 1.0
 """Between two rounds of a loop: about what lies between two reports of a car."""
 
 
-class Played:
+class CaptureCar:
     """Plays (time in the capture s, bytes) once or for ever, `rate` times as fast. Times must not run backwards."""
 
     def __init__(

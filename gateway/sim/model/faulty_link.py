@@ -18,7 +18,7 @@ NEVER_ENDING: Final = b"$4WD,CSB"
 """How the frame begins that has no end; zeros follow."""
 
 
-class Way(StrEnum):
+class Direction(StrEnum):
     """Either way of a link."""
 
     TO_CAR = "car"
@@ -93,12 +93,12 @@ class _Lane:
         self.waiting = 0
 
 
-class Line:
+class FaultyLink:
     """Both ways of a car's link. Times: seconds from any origin, must not run backwards; `until` inf: for ever."""
 
     def __init__(self, to_car: Noise, to_host: Noise) -> None:
         self._noise = to_host
-        self._lanes = {Way.TO_CAR: _Lane(to_car, inf), Way.TO_HOST: _Lane(to_host, TO_HOST_LIMIT)}
+        self._lanes = {Direction.TO_CAR: _Lane(to_car, inf), Direction.TO_HOST: _Lane(to_host, TO_HOST_LIMIT)}
         self._echo_until = 0.0
         self._flood_until = 0.0
         self._flood_at = 0.0
@@ -115,12 +115,12 @@ class Line:
         for lane in self._lanes.values():
             lane.rate, lane.slow_until = factor * BYTES_PER_S, until
 
-    def lossy(self, share: float, ways: tuple[Way, ...], until: float) -> None:
+    def lossy(self, share: float, ways: tuple[Direction, ...], until: float) -> None:
         """This part of the bytes is lost, each by itself."""
         for way in ways:
             self._lanes[way].share, self._lanes[way].lossy_until = share, until
 
-    def close(self, way: Way, until: float) -> None:
+    def close(self, way: Direction, until: float) -> None:
         """All is taken and nothing comes out."""
         self._lanes[way].closed_until = until
 
@@ -140,7 +140,7 @@ class Line:
     @property
     def cut(self) -> bool:
         """Whether the cut has come, and what came before it is out."""
-        return self._cut == 0 and self._cut_began and not self._lanes[Way.TO_CAR].pieces
+        return self._cut == 0 and self._cut_began and not self._lanes[Direction.TO_CAR].pieces
 
     def mend(self) -> None:
         """The cut is over."""
@@ -151,10 +151,10 @@ class Line:
     def from_host(self, data: bytes, now: float) -> None:
         """The host has sent this."""
         if now < self._echo_until:
-            self._lanes[Way.TO_HOST].put(data, now)
+            self._lanes[Direction.TO_HOST].put(data, now)
         if self._cut is not None:
             data = self._before_cut(data)
-        self._lanes[Way.TO_CAR].put(data, now)
+        self._lanes[Direction.TO_CAR].put(data, now)
 
     def _before_cut(self, data: bytes) -> bytes:
         assert self._cut is not None
@@ -170,15 +170,15 @@ class Line:
 
     def from_car(self, data: bytes, now: float) -> None:
         """The car has sent this."""
-        self._lanes[Way.TO_HOST].put(data, now)
+        self._lanes[Direction.TO_HOST].put(data, now)
 
     def to_car(self, now: float) -> list[bytes]:
         """What reaches the car's UART."""
-        return self._lanes[Way.TO_CAR].take(now)
+        return self._lanes[Direction.TO_CAR].take(now)
 
     def to_host(self, now: float) -> list[bytes]:
         """What reaches the host."""
-        out = self._lanes[Way.TO_HOST].take(now)
+        out = self._lanes[Direction.TO_HOST].take(now)
         if self._flood_at < self._flood_until:
             end = min(now, self._flood_until)
             # A host that was busy finds at most a second's worth: nobody has kept the rest.
@@ -197,10 +197,10 @@ class Line:
 
     def waiting(self) -> int:
         """Bytes on their way to the car: whoever feeds should hold back while this is large."""
-        return self._lanes[Way.TO_CAR].waiting
+        return self._lanes[Direction.TO_CAR].waiting
 
     @property
-    def lost_bytes(self) -> dict[Way, int]:
+    def lost_bytes(self) -> dict[Direction, int]:
         """What was lost so far, each way."""
         return {way: lane.lost_bytes for way, lane in self._lanes.items()}
 

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from gateway.protocol.enums import Mode
 from gateway.sim.model.ir_remote import Button
-from gateway.sim.model.scheduler import Company
+from gateway.sim.model.scheduler import EventScheduler
 
 BYTES_PER_S: Final = 960.0
 """9600 baud, 8N1: ten bits a byte (protocol.md, "Framing")."""
@@ -49,7 +49,7 @@ class Pose(NamedTuple):
     heading_rad: float
 
 
-class Body(Protocol):
+class CarBodyState(Protocol):
     """The car in its world, as its program meets it."""
 
     def drive(self, now: float, left: int, right: int) -> None:
@@ -133,7 +133,7 @@ class Firmware:
 
     def __init__(
         self,
-        body: Body,
+        body: CarBodyState,
         rng: Rng,
         *,
         options: frozenset[str] = frozenset(),
@@ -165,7 +165,7 @@ class Firmware:
         """Bytes that found the receive buffer full."""
         self._pressed: Button | None = None
         """A button of the remote that the program has not looked at."""
-        self.company: Company | None = None
+        self.company: EventScheduler | None = None
         """Whose programs run in one order with this one."""
         self._program = self._main()
         self._wait = Wait(now)

@@ -42,7 +42,7 @@ class Lamp:
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class MovingObject:
     """A disc, or a box if it has no radius. It stands, moves along a path, or is carried by a car."""
 
     name: str
@@ -96,17 +96,17 @@ class Thing:
         gone = self.speed_m_s * (at_s - self.since_s) if self.going else 0.0
         return (self.from_m + gone) % length if length > 0 else 0.0
 
-    def faster(self, speed_m_s: float, at_s: float) -> "Thing":
+    def faster(self, speed_m_s: float, at_s: float) -> "MovingObject":
         """The same with another speed from now on."""
         return replace(self, from_m=self.along_m(at_s), since_s=at_s, speed_m_s=speed_m_s)
 
-    def waiting(self, at_s: float, *, near: bool) -> "Thing":
+    def waiting(self, at_s: float, *, near: bool) -> "MovingObject":
         """The same when the nearest car is, or is not, as near as it waits for."""
         if not self.waits_for_m or near == self.going:
             return self
         return replace(self, from_m=self.along_m(at_s), since_s=at_s, going=near)
 
-    def put(self, x_m: float, y_m: float) -> "Thing":
+    def put(self, x_m: float, y_m: float) -> "MovingObject":
         """The same elsewhere, where it stays: it has left its path."""
         return replace(self, x_m=x_m, y_m=y_m, path=(), speed_m_s=0.0)
 

@@ -13,7 +13,7 @@ from gateway.sim.model.firmware import (
     COLOUR_S,
     REPORT_EVERY_S,
     WHISTLE_S,
-    Body,
+    CarBodyState,
     Firmware,
     Program,
     Rng,
@@ -65,7 +65,7 @@ class RaspberryPiCar(Firmware):
 
     def __init__(
         self,
-        body: Body,
+        body: CarBodyState,
         rng: Rng,
         *,
         transport: Transport = Transport.TCP,

@@ -15,7 +15,7 @@ class Member(Protocol):
         ...
 
 
-class Company:
+class EventScheduler:
     """All the programs of one world in which cars meet."""
 
     def __init__(self) -> None:

@@ -24,8 +24,8 @@ from gateway.sim.model.geometry import (
     ray_to_circle,
     reach,
 )
-from gateway.sim.model.objects import Lamp, Thing, carried
-from gateway.sim.model.scheduler import Company
+from gateway.sim.model.objects import Lamp, MovingObject, carried
+from gateway.sim.model.scheduler import EventScheduler
 
 RADIUS_M: Final = 0.13
 """Of a car: it is a disc to walls, things and other cars, and to their sensors."""
@@ -42,7 +42,7 @@ _SPREAD_M: Final = 4.0
 """How far out they are if there are no walls."""
 
 
-class Body(Protocol):
+class WorldBody(Protocol):
     """A car as the world moves it."""
 
     @property
@@ -74,7 +74,7 @@ class World:
         line: Sequence[Point] = (),
         lamps: Iterable[Lamp] = (),
         *,
-        things: Iterable[Thing] = (),
+        things: Iterable[MovingObject] = (),
         starts: Mapping[str, Pose] | None = None,
         cars_meet: bool = False,
     ) -> None:
@@ -87,8 +87,8 @@ class World:
         """Whether cars see each other and are in each other's way."""
         self.lively = cars_meet or bool(self.things) or any(lamp.carried_by for lamp in self.lamps)
         """Whether what one car does may matter to another, or something moves by itself."""
-        self.company = Company()
-        self.bodies: list[Body] = []
+        self.company = EventScheduler()
+        self.bodies: list[WorldBody] = []
         self._starts = dict(starts or {})
         self._began = 0.0
         self._tick = 0
@@ -204,7 +204,7 @@ class World:
 
     # What moves.
 
-    def join(self, body: Body, now: float) -> None:
+    def join(self, body: WorldBody, now: float) -> None:
         """A car has been put into the world."""
         if self.lively:
             if not self.bodies:
@@ -226,21 +226,21 @@ class World:
             if any(thing.waits_for_m for thing in self.things):
                 self.things = tuple(self._waiting(thing, at) for thing in self.things)
 
-    def _waiting(self, thing: Thing, now: float) -> Thing:
+    def _waiting(self, thing: MovingObject, now: float) -> MovingObject:
         x, y, _ = thing.pose(now - self._began)
         places = [body.place for body in self.bodies]
         near = any(hypot(place.x_m - x, place.y_m - y) <= thing.waits_for_m for place in places)
         return thing.waiting(now - self._began, near=near)
 
-    def others(self, me: Body | None) -> Iterator[Body]:
+    def others(self, me: WorldBody | None) -> Iterator[WorldBody]:
         """The cars that a car meets."""
         return (body for body in self.bodies if body is not me) if self.cars_meet else iter(())
 
-    def carrier(self, name: str) -> Body | None:
+    def carrier(self, name: str) -> WorldBody | None:
         """A car by its name, if it is there."""
         return next((body for body in self.bodies if body.name == name), None)
 
-    def where(self, thing: Thing, now: float) -> Pose | None:
+    def where(self, thing: MovingObject, now: float) -> Pose | None:
         """Where a thing is; None if the car that carries it is not there."""
         pose = thing.pose(now - self._began)
         if not thing.carried_by:
@@ -257,7 +257,7 @@ class World:
         base = self.where(thing, now) if thing is not None else None if car is None else car.place
         return None if base is None else carried(base, lamp.x_m, lamp.y_m)[:2]
 
-    def solids(self, me: Body | None, now: float) -> Iterator[tuple[Thing, Pose]]:
+    def solids(self, me: WorldBody | None, now: float) -> Iterator[tuple[MovingObject, Pose]]:
         """The things that a car meets, which is not what it carries itself."""
         for thing in self.things:
             if me is None or thing.carried_by != me.name:
@@ -265,7 +265,7 @@ class World:
                 if pose is not None:
                     yield thing, pose
 
-    def make_room(self, me: Body, x: float, y: float, now: float) -> Point:
+    def make_room(self, me: WorldBody, x: float, y: float, now: float) -> Point:
         """Where a car that wants to be at x, y can be. One that is jammed stays where it is."""
         things = [
             (thing, pose)
@@ -312,7 +312,7 @@ class World:
 
     # What is seen.
 
-    def met(self, me: Body | None, x: float, y: float, angle: float, reach_m: float, now: float) -> Hit | None:
+    def met(self, me: WorldBody | None, x: float, y: float, angle: float, reach_m: float, now: float) -> Hit | None:
         """The first thing or car, no wall, that a ray meets within `reach_m`. All cars have to be at `now`."""
         dx, dy = cos(angle), sin(angle)
         hits: list[Hit | None] = []
@@ -376,7 +376,7 @@ class World:
     def put_thing(self, name: str, x_m: float | None, y_m: float | None, now: float) -> None:
         """Put a thing elsewhere (None: as it is), where it stays; one that is carried: elsewhere on its car."""
 
-        def put(thing: Thing) -> Thing:
+        def put(thing: MovingObject) -> MovingObject:
             pose = thing.pose(now - self._began)
             return thing.put(pose.x_m if x_m is None else x_m, pose.y_m if y_m is None else y_m)
 

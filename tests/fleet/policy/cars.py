@@ -3,17 +3,17 @@
 from dataclasses import replace
 from typing import Any
 
-from fleet.policy.decide import Step, step
+from fleet.policy.decide import DecisionStep, step
 from fleet.policy.plan.plan import Plan
-from fleet.policy.snapshot import CarPicture, Picture, Seen
-from fleet.policy.state import Memory
+from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation
+from fleet.policy.state import PolicyState
 
-HERE = CarPicture(present=True, mode="manual", verdict="confirmed", link="online", motors="off", platform="arduino")
-GONE = CarPicture()
+HERE = CarSnapshot(present=True, mode="manual", verdict="confirmed", link="online", motors="off", platform="arduino")
+GONE = CarSnapshot()
 
 
-def seen(at: float, **topics: dict[str, Any]) -> dict[str, Seen]:
-    return {f"sensor/{name}": Seen(fields, at) for name, fields in topics.items()}
+def seen(at: float, **topics: dict[str, Any]) -> dict[str, Observation]:
+    return {f"sensor/{name}": Observation(fields, at) for name, fields in topics.items()}
 
 
 class Run:
@@ -21,13 +21,13 @@ class Run:
 
     def __init__(self, plan: Plan, *cars: str, obey: bool = True) -> None:
         self.plan = plan
-        self.memory = Memory()
-        self.cars: dict[str, CarPicture] = dict.fromkeys(cars, HERE)
-        self.readings: dict[str, dict[str, Seen]] = {}
+        self.memory = PolicyState()
+        self.cars: dict[str, CarSnapshot] = dict.fromkeys(cars, HERE)
+        self.readings: dict[str, dict[str, Observation]] = {}
         self.obey = obey
         self.asked: list[tuple[float, str, str]] = []
         self.now = 0.0
-        self.last = Step(self.memory)
+        self.last = DecisionStep(self.memory)
 
     def change(self, car: str, **fields: Any) -> None:
         self.cars[car] = replace(self.cars[car], **fields)
@@ -35,10 +35,10 @@ class Run:
     def sees(self, car: str, **topics: dict[str, Any]) -> None:
         self.readings[car] = {**self.readings.get(car, {}), **seen(self.now, **topics)}
 
-    def at(self, now: float) -> Step:
+    def at(self, now: float) -> DecisionStep:
         """One step at this time."""
         self.now = now
-        self.last = step(self.plan, Picture(dict(self.cars), dict(self.readings)), self.memory, now)
+        self.last = step(self.plan, FleetSnapshot(dict(self.cars), dict(self.readings)), self.memory, now)
         self.memory = self.last.memory
         for ask in self.last.asks:
             if ask.mode is not None:
@@ -47,7 +47,7 @@ class Run:
                     self.change(ask.car, mode=str(ask.mode), verdict="assumed")
         return self.last
 
-    def until(self, now: float, every: float = 0.1) -> Step:
+    def until(self, now: float, every: float = 0.1) -> DecisionStep:
         """Steps up to this time."""
         while self.now + every <= now + 1e-9:
             self.at(round(self.now + every, 6))

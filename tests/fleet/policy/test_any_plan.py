@@ -11,15 +11,15 @@ from fleet.policy.decide import step
 from fleet.policy.plan.lint import faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
-from fleet.policy.snapshot import NAMES, CarPicture, Picture
-from fleet.policy.state import Memory
+from fleet.policy.snapshot import NAMES, CarSnapshot, FleetSnapshot
+from fleet.policy.state import PolicyState
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import parse_platform
 from schemas.yaml_document.document import BadFile
 from tests.fleet.policy.cars import HERE, seen
 
 FLEET = {
-    car: CarPicture(platform=platform, capabilities=frozenset(map(str, parse_platform(platform).modes)), listed=True)
+    car: CarSnapshot(platform=platform, capabilities=frozenset(map(str, parse_platform(platform).modes)), listed=True)
     for car, platform in (("red", "arduino"), ("pi", "raspberry_pi"))
 }
 LOW = "battery.voltage_v < 7"
@@ -39,8 +39,8 @@ def put_in_force(text: str) -> Plan | None:
         return None
     for cars in (None, FLEET):
         str(faults(plan, cars, ["red"]).refusal())
-    picture = Picture({"red": HERE, "pi": HERE}, {"red": seen(0.0, battery={"voltage_v": 6.0})})
-    memory = Memory()
+    picture = FleetSnapshot({"red": HERE, "pi": HERE}, {"red": seen(0.0, battery={"voltage_v": 6.0})})
+    memory = PolicyState()
     for now in (0.0, 2.0, 90_000.0):
         memory = step(plan, picture, memory, now).memory
     return plan

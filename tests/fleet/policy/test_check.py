@@ -2,16 +2,16 @@
 
 import pytest
 
-from fleet.policy.plan.lint import Gravity, check, faults
+from fleet.policy.plan.lint import Severity, check, faults
 from fleet.policy.plan.parser import parse
-from fleet.policy.snapshot import CarPicture
+from fleet.policy.snapshot import CarSnapshot
 from gateway.protocol.platforms import parse_platform
 
 
-def listed(platform: str, *roles: str) -> CarPicture:
+def listed(platform: str, *roles: str) -> CarSnapshot:
     profile = parse_platform(platform)
     able = frozenset(str(word) for word in (*profile.capabilities, *profile.modes))
-    return CarPicture(platform=platform, capabilities=able, roles=frozenset(roles) or None, listed=True)
+    return CarSnapshot(platform=platform, capabilities=able, roles=frozenset(roles) or None, listed=True)
 
 
 FLEET = {"red": listed("arduino"), "green": listed("arduino", "scout"), "pi": listed("raspberry_pi")}
@@ -154,7 +154,7 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
     ],
 )
 def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> None:
-    errors = [each for each in check(parse(text), FLEET) if each.gravity is Gravity.ERROR]
+    errors = [each for each in check(parse(text), FLEET) if each.gravity is Severity.ERROR]
     assert [each.part for each in errors if told in each.words] == [part], [str(each) for each in errors]
 
 
@@ -178,8 +178,8 @@ def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> Non
 )
 def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
     found = check(parse(text), FLEET)
-    assert [each.gravity for each in found if told in each.words] == [Gravity.WARNING], [str(each) for each in found]
-    assert not [each for each in found if each.gravity is Gravity.ERROR]
+    assert [each.gravity for each in found if told in each.words] == [Severity.WARNING], [str(each) for each in found]
+    assert not [each for each in found if each.gravity is Severity.ERROR]
 
 
 def test_a_good_plan_is_let_alone_with_and_without_a_fleet_file() -> None:
@@ -217,7 +217,7 @@ phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_o
 )
 def test_what_does_not_get_into_its_own_way_is_let_alone(more: str) -> None:
     plan = parse("roles: {scout: {mode: tracking, count: all}, near: {mode: manual}}\n" + more)
-    assert [str(each) for each in check(plan, FLEET) if each.gravity is Gravity.ERROR or "together" in str(each)] == []
+    assert [str(each) for each in check(plan, FLEET) if each.gravity is Severity.ERROR or "together" in str(each)] == []
 
 
 BROKEN = parse("""
@@ -252,6 +252,6 @@ def test_without_one_a_named_car_that_is_not_there_is_a_warning() -> None:
 def test_a_role_of_the_fleet_file_that_the_plan_does_not_have_is_told() -> None:
     fleet = {"red": listed("arduino", "patroll", "patrol"), "blue": listed("arduino")}
     (found,) = check(parse("roles: {patrol: {mode: tracking}}"), fleet)
-    assert found.gravity is Gravity.WARNING
+    assert found.gravity is Severity.WARNING
     assert str(found).startswith("car red: the fleet file lets it take role patroll, which this plan does not have")
     assert "did you mean 'patrol'" in found.words

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
-from fleet.policy.snapshot import CarPicture, Picture, Refused
-from fleet.policy.state import HUB_BACK_S, Memory, carried, hub_back, restored, to_keep
+from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
+from fleet.policy.state import HUB_BACK_S, PolicyState, carried, hub_back, restored, to_keep
 from tests.fleet.policy.cars import GONE, HERE, Run
 
 FIXED = parse("cars: {red: tracking}")
@@ -40,7 +40,7 @@ rules:
         (replace(HERE, mode="unknown"), "tracking", True),
         (replace(HERE, link="stale"), "tracking", True),
         (replace(HERE, busy=True), "tracking", False),
-        (CarPicture(), None, False),
+        (CarSnapshot(), None, False),
         (replace(HERE, held_by="ann"), None, False),
         (replace(HERE, estopped_by="ann"), None, False),
         (replace(HERE, mode="tracking", verdict="contradicted", held_by="ann"), None, False),
@@ -51,8 +51,8 @@ rules:
         (replace(HERE, motors="unknown", verdict="contradicted", mode="tracking"), "tracking", True),
     ],
 )
-def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarPicture, mode: str | None, asks: bool) -> None:
-    result = step(FIXED, Picture({"red": car}), Memory(began=-9.0), 0.0)
+def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarSnapshot, mode: str | None, asks: bool) -> None:
+    result = step(FIXED, FleetSnapshot({"red": car}), PolicyState(began=-9.0), 0.0)
     (decision, *_) = result.decisions
     assert decision.mode == mode
     assert bool(result.asks) is asks
@@ -146,7 +146,7 @@ def test_a_contradicted_mode_is_asked_for_ever_more_slowly_and_then_another_car_
 def test_what_a_car_refuses_another_does() -> None:
     run = Run(ONE, "green", "red", obey=False)
     run.at(0.0)
-    run.change("green", refused=Refused("tracking", "battery_low", "battery critical: 6.4 V", 0.2))
+    run.change("green", refused=Refusal("tracking", "battery_low", "battery critical: 6.4 V", 0.2))
     run.at(0.2)
     assert run.roles == {"red": "scout"}
 
@@ -275,7 +275,7 @@ rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led:
     until(9.0)
     assert coloured == [2.1]
     kept = to_keep(plan, run.memory, run.now, 100.0)
-    run.memory = restored(plan, Picture(run.cars), kept, run.now, 100.0)
+    run.memory = restored(plan, FleetSnapshot(run.cars), kept, run.now, 100.0)
     until(12.0)
     assert coloured == [2.1], "nor by a coordinator that takes over"
 
@@ -308,7 +308,7 @@ def test_a_restarted_coordinator_switches_no_mode() -> None:
     run.change("red", mode="obstacle_avoidance")
     run.at(0.0)
     before, asked = run.roles, len(run.asked)
-    run.memory = Memory()
+    run.memory = PolicyState()
     run.at(10.0)
     assert len(run.asked) == asked
     assert run.roles == before
@@ -316,7 +316,7 @@ def test_a_restarted_coordinator_switches_no_mode() -> None:
     run = Run(same, "green", "red")
     run.at(0.0)
     kept = replace(to_keep(same, run.memory, 1.0, 100.0), roles={"green": "b", "red": "a"})
-    run.memory = restored(same, Picture(run.cars), kept, 2.0, 101.0)
+    run.memory = restored(same, FleetSnapshot(run.cars), kept, 2.0, 101.0)
     run.at(2.0)
     assert run.roles == {"green": "b", "red": "a"}
     assert len(run.asked) == 2
@@ -485,7 +485,7 @@ def test_when_nothing_changes_any_more_nothing_is_decided_any_more(plan: Any, co
 
 
 def test_gone_is_gone() -> None:
-    assert step(FIXED, Picture({"red": GONE}), Memory(began=-9.0), 0.0).asks == ()
+    assert step(FIXED, FleetSnapshot({"red": GONE}), PolicyState(began=-9.0), 0.0).asks == ()
 
 
 DEPLOYED = parse((Path(__file__).parents[3] / "deploy" / "plan.yaml").read_text(encoding="utf-8"))

@@ -2,16 +2,16 @@
 
 import pytest
 
-from fleet.policy.plan.lint import Gravity, check
+from fleet.policy.plan.lint import Severity, check
 from fleet.policy.plan.parser import parse
-from fleet.policy.snapshot import CarPicture
+from fleet.policy.snapshot import CarSnapshot
 from gateway.protocol.platforms import parse_platform
 
 
-def listed(platform: str) -> CarPicture:
+def listed(platform: str) -> CarSnapshot:
     profile = parse_platform(platform)
     able = frozenset(str(word) for word in (*profile.capabilities, *profile.modes))
-    return CarPicture(platform=platform, capabilities=able, listed=True)
+    return CarSnapshot(platform=platform, capabilities=able, listed=True)
 
 
 TWO = {"red": listed("arduino"), "blue": listed("arduino")}
@@ -25,7 +25,7 @@ phases: {search: {SEARCH, until: {any: light.left or light.right, for_s: 1}, nex
 LIGHT = "rules: [{when: {any: light.left or light.right, for_s: 1}, then: {who: others, mode: following}}]"
 
 
-def found(text: str, fleet: dict[str, CarPicture] | None, gravity: Gravity) -> list[str]:
+def found(text: str, fleet: dict[str, CarSnapshot] | None, gravity: Severity) -> list[str]:
     return [str(each) for each in check(parse(text), fleet) if each.gravity is gravity]
 
 
@@ -87,9 +87,9 @@ def found(text: str, fleet: dict[str, CarPicture] | None, gravity: Gravity) -> l
     ],
 )
 def test_what_the_plan_never_lets_be_measured_is_an_error(
-    text: str, told: str, fleet: dict[str, CarPicture] | None
+    text: str, told: str, fleet: dict[str, CarSnapshot] | None
 ) -> None:
-    assert any(told in each for each in found(text, fleet, Gravity.ERROR)), check(parse(text), fleet)
+    assert any(told in each for each in found(text, fleet, Severity.ERROR)), check(parse(text), fleet)
 
 
 @pytest.mark.parametrize(
@@ -118,9 +118,11 @@ def test_what_the_plan_never_lets_be_measured_is_an_error(
         ),
     ],
 )
-def test_what_may_be_measured_by_chance_is_a_warning(text: str, fleet: dict[str, CarPicture] | None, told: str) -> None:
-    assert any(told in each for each in found(text, fleet, Gravity.WARNING)), check(parse(text), fleet)
-    assert found(text, fleet, Gravity.ERROR) == []
+def test_what_may_be_measured_by_chance_is_a_warning(
+    text: str, fleet: dict[str, CarSnapshot] | None, told: str
+) -> None:
+    assert any(told in each for each in found(text, fleet, Severity.WARNING)), check(parse(text), fleet)
+    assert found(text, fleet, Severity.ERROR) == []
 
 
 TWO_PATROLS = PATROL.replace("count: all", "count: 2")
@@ -158,12 +160,12 @@ TWO_PATROLS = PATROL.replace("count: all", "count: 2")
         ),
     ],
 )
-def test_what_can_be_measured_is_let_alone(text: str, fleet: dict[str, CarPicture] | None) -> None:
+def test_what_can_be_measured_is_let_alone(text: str, fleet: dict[str, CarSnapshot] | None) -> None:
     assert [str(each) for each in check(parse(text), fleet) if "measured" in str(each) or "only" in str(each)] == []
 
 
 def test_two_cars_for_two_places_leave_none_that_stands() -> None:
-    (told,) = found(TWO_PATROLS + LIGHT, TWO, Gravity.ERROR)
+    (told,) = found(TWO_PATROLS + LIGHT, TWO, Severity.ERROR)
     assert told.startswith("rule 1: it can never fire: light.left is never measured on any car")
 
 

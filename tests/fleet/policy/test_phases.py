@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from fleet.coordinator.state_file import Keeper
+from fleet.coordinator.state_file import CoordinatorStateFile
 from fleet.policy.plan.parser import parse
 from fleet.policy.rules import SETTLES_WITHIN_S
-from fleet.policy.snapshot import Picture
-from fleet.policy.state import Kept, restarted, restored, to_keep
+from fleet.policy.snapshot import FleetSnapshot
+from fleet.policy.state import PersistedPolicy, restarted, restored, to_keep
 from tests.fleet.policy.cars import GONE, HERE, Run
 
 PLAN = parse(
@@ -63,18 +63,18 @@ def test_phase_and_rules_are_kept_within_one_run_and_roles_longer(
     run = Run(PLAN, "red")
     run.until(12.0)
     assert run.memory.phase.name == "done"
-    Keeper("fleet", "tcp/x", "run-1").save(to_keep(PLAN, run.memory, run.now, 1000.0))
+    CoordinatorStateFile("fleet", "tcp/x", "run-1").save(to_keep(PLAN, run.memory, run.now, 1000.0))
 
     def begins(name: str) -> str:
-        kept = Keeper("fleet", "tcp/x", name).load()
+        kept = CoordinatorStateFile("fleet", "tcp/x", name).load()
         assert kept.roles == {"red": "rest"}
-        memory = restored(PLAN, Picture(run.cars), kept, 0.0, 1001.0)
+        memory = restored(PLAN, FleetSnapshot(run.cars), kept, 0.0, 1001.0)
         run.memory = memory
         return run.at(0.1).memory.phase.name
 
     assert begins("run-1") == "done", "its coordinator was killed"
     assert begins("run-2") == "work", "a new fleet up"
-    assert Keeper("fleet", "tcp/y", "run-1").load() == Kept()
+    assert CoordinatorStateFile("fleet", "tcp/y", "run-1").load() == PersistedPolicy()
 
 
 def test_a_restarted_plan_begins_with_its_first_phase() -> None:

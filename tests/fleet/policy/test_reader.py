@@ -6,7 +6,7 @@ import pytest
 
 from fleet.policy.plan.lint import check
 from fleet.policy.plan.parser import parse
-from fleet.policy.plan.plan import Of
+from fleet.policy.plan.plan import Quantifier
 from gateway.protocol.enums import Mode
 from schemas.yaml_document.document import BadFile
 
@@ -40,7 +40,7 @@ def test_a_condition_is_told_as_it_was_meant() -> None:
         "cars: {red: tracking}\nrules: [{when: {all: not (light.left), for_s: 2}, then: {who: all, mode: manual}}]"
     )
     (rule,) = plan.rules
-    assert rule.when.of is Of.ALL
+    assert rule.when.of is Quantifier.ALL
     assert rule.when.text == "all car: not light.left for 2 s"
 
 

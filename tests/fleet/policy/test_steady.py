@@ -2,11 +2,11 @@
 
 import pytest
 
-from fleet.policy.debounce import Settled, Steady, follow, settle
+from fleet.policy.debounce import Debounced, Settled, follow, settle
 
 
 def _followed(for_s: float, course: list[tuple[float, bool | None]]) -> list[bool]:
-    steady: Steady | None = None
+    steady: Debounced | None = None
     found = []
     for now, so in course:
         steady = follow(steady, so, for_s, now)

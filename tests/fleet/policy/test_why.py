@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from fleet.policy.decision import Kind
+from fleet.policy.decision import DecisionKind
 from fleet.policy.plan.parser import parse
-from fleet.policy.snapshot import Refused, Seen
+from fleet.policy.snapshot import Observation, Refusal
 from tests.fleet.policy.cars import HERE, Run
 from tests.support.vectors import rows
 
@@ -40,7 +40,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "battery not known": {},
     "platform": {"platform": "raspberry_pi"},
     "not in the fleet file": {"roles": frozenset({"seeker"})},
-    "refused": {"refused": Refused("tracking", "battery_low", "6.5 V", 10.0)},
+    "refused": {"refused": Refusal("tracking", "battery_low", "6.5 V", 10.0)},
     "contradicted": {"mode": "tracking", "verdict": "contradicted", "evidence": "silent for 3.1 s"},
     "not on the bus": {"present": False, "mode": ""},
     "not heard yet": {"mode": ""},
@@ -56,13 +56,13 @@ def _last(case: str) -> Run:
     """A coordinator that has come to the decision."""
     run = Run(SCOUT, "red", obey=False)
     run.memory = replace(run.memory, began=0.0)
-    run.readings["red"] = {} if "not known" in case else {"sensor/battery": Seen({"voltage_v": 7.4}, 9.5)}
+    run.readings["red"] = {} if "not known" in case else {"sensor/battery": Observation({"voltage_v": 7.4}, 9.5)}
     if "too low" in case or case == "role lacks a car":
-        run.readings["red"] = {"sensor/battery": Seen({"voltage_v": 6.8}, 9.5)}
+        run.readings["red"] = {"sensor/battery": Observation({"voltage_v": 6.8}, 9.5)}
     match case:
         case "in place of another" | "no place left" | "role lacks a car" | "rule gives a role" | "rule gives a mode":
             run.cars["blue"] = HERE
-            run.readings["blue"] = {"sensor/battery": Seen({"voltage_v": 7.4}, 9.5)}
+            run.readings["blue"] = {"sensor/battery": Observation({"voltage_v": 7.4}, 9.5)}
             run.cars["red"] = replace(HERE, mode="tracking")
     match case:
         case "in place of another":
@@ -73,9 +73,9 @@ def _last(case: str) -> Run:
             run.change("blue", mode="tracking")
         case "rule gives a role" | "rule gives a mode":
             for at in (7.5, 8.4):
-                run.readings["red"]["sensor/light"] = Seen({"left": True}, at)
+                run.readings["red"]["sensor/light"] = Observation({"left": True}, at)
                 run.at(at)
-            run.readings["red"]["sensor/light"] = Seen({"left": True}, 9.5)
+            run.readings["red"]["sensor/light"] = Observation({"left": True}, 9.5)
         case "role lacks a car":
             run.cars["blue"] = replace(HERE, present=False)
         case "role filled again":
@@ -87,7 +87,7 @@ def _last(case: str) -> Run:
             run.change("red", present=False, mode="")
         case "contradicted":
             run.change("red", mode="tracking")
-            run.readings["red"] = {"sensor/battery": Seen({"voltage_v": 7.4}, 7.5)}
+            run.readings["red"] = {"sensor/battery": Observation({"voltage_v": 7.4}, 7.5)}
             run.at(8.0)
     run.change("red", **CHANGES.get(case, {}))
     run.at(10.0)
@@ -105,9 +105,9 @@ def _phase(case: str) -> Run:
     run = Run(PHASES, "red")
     run.at(0.0)
     if case == "phase by condition":
-        run.readings["red"] = {"sensor/light": Seen({"left": True}, 9.5)}
+        run.readings["red"] = {"sensor/light": Observation({"left": True}, 9.5)}
     elif case == "phase by rule":
-        run.readings["red"] = {"state/motion": Seen({"fan": True}, 9.5)}
+        run.readings["red"] = {"state/motion": Observation({"fan": True}, 9.5)}
     if case != "phase at the start":
         run.at(30.0 if case == "phase by time-out" else 10.0)
     return run
@@ -129,7 +129,7 @@ def _out(case: str) -> Run:
     for car in ("blue", "red"):
         run.change(car, held_by="ann")
     run.at(0.0)
-    assert any(each.kind == Kind.VACANT for each in run.last.changed)
+    assert any(each.kind == DecisionKind.VACANT for each in run.last.changed)
     run.at(0.1)  # cars on hold are not waited for: the phase's time-out counts from its start
     run.change("red", held_by=None)
     run.at(10.0)
@@ -192,7 +192,7 @@ def _in_vain() -> Run:
 def _passed_over() -> Run:
     run = Run(PASSED_OVER, "red", "pi")
     run.change("pi", platform="raspberry_pi")
-    run.readings["red"] = {"sensor/light": Seen({"left": True}, 0.0)}
+    run.readings["red"] = {"sensor/light": Observation({"left": True}, 0.0)}
     run.at(0.0)
     return run
 
@@ -227,4 +227,4 @@ def test_a_decision_is_explained(row: dict[str, str]) -> None:
 
 
 def test_the_table_has_every_kind() -> None:
-    assert {row["kind"] for row in TABLE} == set(Kind)
+    assert {row["kind"] for row in TABLE} == set(DecisionKind)

@@ -17,7 +17,7 @@ import pytest
 from fleet.recording import session_dir
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.verify import verify
-from fleet.recording.writing.session_writer import MB, Options, Tape
+from fleet.recording.writing.session_writer import MB, Options, SessionWriter
 from schemas.bus import Bus, Failure, Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -190,7 +190,7 @@ def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_dro
         process.send_signal(signal.SIGINT)
         text, errors = process.communicate(timeout=60)
         end = json.loads(text)
-        description = session_dir.Description.read(session)
+        description = session_dir.SessionInfo.read(session)
         assert description is not None
         assert description.closed
         dropped = end["drops"].get(out.key, 0)
@@ -264,7 +264,7 @@ def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_noth
 @pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
 def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing(tmp_path: Path) -> None:
     with disk("really full", tmp_path) as there:
-        tape = Tape(there.root, "fleet", Options(keep_free_bytes=0), BEGUN_NS)
+        tape = SessionWriter(there.root, "fleet", Options(keep_free_bytes=0), BEGUN_NS)
         there.fill()
         written = []
         for second in range(3):
@@ -280,7 +280,7 @@ def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing
         assert 0 < written[-1] < 1500
         assert all(any(Session.open(segment).messages()) for segment in tape.path.glob("000[2-9].mcap"))
         assert tape.segments < 4
-        description = session_dir.Description.read(tape.path)
+        description = session_dir.SessionInfo.read(tape.path)
         assert description is not None
         assert (description.messages, description.error) == (written[-1], tape.full)
         there.free()

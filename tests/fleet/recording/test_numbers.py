@@ -5,10 +5,10 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.recording.sequence_tracker import SENDERS, Numbers
+from fleet.recording.sequence_tracker import SENDERS, SequenceTracker
 
 
-def live(numbers: Numbers, *given: int, sender: str = "a") -> list[bool]:
+def live(numbers: SequenceTracker, *given: int, sender: str = "a") -> list[bool]:
     """As the recorder does: only what does not follow is looked at."""
     found = []
     for number in given:
@@ -21,7 +21,7 @@ def live(numbers: Numbers, *given: int, sender: str = "a") -> list[bool]:
 
 
 def test_a_gap_is_missing_until_it_is_filled_and_what_comes_twice_is_told() -> None:
-    numbers = Numbers()
+    numbers = SequenceTracker()
     assert all(live(numbers, 5, 6, 10))
     assert numbers.missing == 3
     assert numbers.recalled("a", 8, 80)
@@ -34,7 +34,7 @@ def test_a_gap_is_missing_until_it_is_filled_and_what_comes_twice_is_told() -> N
 
 
 def test_what_was_published_before_the_first_that_came_is_taken_and_what_lies_between_is_missing() -> None:
-    numbers = Numbers()
+    numbers = SequenceTracker()
     live(numbers, 5)
     assert numbers.recalled("a", 2, 20)
     assert numbers.missing == 2
@@ -44,7 +44,7 @@ def test_what_was_published_before_the_first_that_came_is_taken_and_what_lies_be
 
 
 def test_what_was_recalled_before_it_came_is_not_written_again() -> None:
-    numbers = Numbers()
+    numbers = SequenceTracker()
     live(numbers, 1)
     assert all(numbers.recalled("a", number, number * 10) for number in (2, 3, 4))
     assert live(numbers, 2, 3, 4, 5) == [False, False, False, True]
@@ -52,7 +52,7 @@ def test_what_was_recalled_before_it_came_is_not_written_again() -> None:
 
 
 def test_what_comes_after_later_ones_were_recalled_is_no_new_stream() -> None:
-    numbers = Numbers()
+    numbers = SequenceTracker()
     live(numbers, 1)
     assert numbers.recalled("a", 5, 50)
     assert numbers.missing == 3
@@ -61,13 +61,13 @@ def test_what_comes_after_later_ones_were_recalled_is_no_new_stream() -> None:
 
 
 def test_a_number_that_goes_back_is_a_new_stream() -> None:
-    numbers = Numbers()
+    numbers = SequenceTracker()
     assert live(numbers, 7, 8, 1, 2, 4) == [True] * 5
     assert numbers.missing == 1
 
 
 def test_the_wrap_is_no_gap() -> None:
-    numbers = Numbers()
+    numbers = SequenceTracker()
     top = (1 << 32) - 1
     live(numbers, top - 1)
     numbers.live("a", top, 0)
@@ -84,7 +84,7 @@ def test_the_wrap_is_no_gap() -> None:
 
 
 def test_of_many_senders_the_oldest_are_forgotten_and_their_gaps_are_not() -> None:
-    numbers = Numbers()
+    numbers = SequenceTracker()
     for sender in range(SENDERS * 3):
         live(numbers, 1, 3, sender=str(sender))
     assert numbers.missing == SENDERS * 3
@@ -93,7 +93,7 @@ def test_of_many_senders_the_oldest_are_forgotten_and_their_gaps_are_not() -> No
 
 @given(st.sets(st.integers(1, 60)), st.integers(0, 2**32))
 def test_whatever_is_lost_and_recalled_each_is_taken_once(lost: set[int], seed: int) -> None:
-    chance, numbers, taken = random.Random(seed), Numbers(), []
+    chance, numbers, taken = random.Random(seed), SequenceTracker(), []
     for number in range(1, 61):
         if number not in lost and (numbers.last.get("a") == number - 1 or numbers.live("a", number, number)):
             numbers.last["a"] = number

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from fleet.recording.reading.mcap_reader import LIMIT, NotMcap, Salvage
+from fleet.recording.reading.mcap_reader import LIMIT, McapReader, NotMcap
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.writing.recorder import LIMIT_BYTES
 from fleet.recording.writing.segment_writer import Segment
@@ -66,7 +66,7 @@ def test_cut_at_every_byte_it_shows_every_whole_chunk(original: Original, tmp_pa
 
 def report(path: Path) -> str:
     try:
-        salvage = Salvage(path)
+        salvage = McapReader(path)
     except NotMcap as error:
         return str(error)
     salvage.check()
@@ -165,7 +165,7 @@ def test_what_the_recorder_takes_is_read(tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:-8])
     for each in (path, cut):
-        salvage = Salvage(each)
+        salvage = McapReader(each)
         assert [len(row[4]) for row in salvage.messages()] == list(sizes)
         assert salvage.only_cut or not salvage.damage
         salvage.check()
@@ -175,7 +175,7 @@ def test_what_the_recorder_takes_is_read(tmp_path: Path) -> None:
 def test_a_file_in_which_nothing_was_recorded_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "0001.mcap"
     Segment(path, {}).finish({})
-    salvage = Salvage(path)
+    salvage = McapReader(path)
     index = salvage.index()
     assert index is not None
     assert index.complete
@@ -232,7 +232,7 @@ def test_a_chunk_that_grows_when_uncompressed_is_not_followed(tmp_path: Path) ->
         path = tmp_path / f"{compression.name}.mcap"
         for data in (out.getvalue(), out.getvalue()[:-8]):
             path.write_bytes(data)
-            salvage = Salvage(path)
+            salvage = McapReader(path)
             assert [row[1] for row in salvage.messages()] == [1]
             assert f"byte {at}: " in salvage.words
             assert str(LIMIT) in salvage.words
@@ -254,14 +254,14 @@ def test_lz4_and_no_compression_and_no_chunks_are_read_too(tmp_path: Path) -> No
             for number in range(100):
                 writer.add_message(channel, number, b"{}", number, number)
             writer.finish()  # type: ignore[no-untyped-call]  # it has no return type
-        salvage = Salvage(path)
+        salvage = McapReader(path)
         salvage.check()
         assert [row[1] for row in salvage.messages()] == list(range(100)), options
         assert not salvage.words, options
         whole = path.read_bytes()
         for length in range(8, len(whole), 7):
             path.write_bytes(whole[:length])
-            cut = Salvage(path)
+            cut = McapReader(path)
             list(cut.messages())
             assert "is cut" in cut.words
 
@@ -353,7 +353,7 @@ def test_any_record_anywhere_gives_no_surprise(
     path = tmp_path / "x.mcap"
     for tail in (b"", original.data[at:]):
         path.write_bytes(original.data[:at] + record + tail)
-        salvage = Salvage(path)
+        salvage = McapReader(path)
         salvage.check()
         assert salvage.words
         before = original.until(at)
@@ -367,7 +367,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "loop.mcap").symlink_to("loop.mcap")
     for path in (tmp_path / "directory.mcap", tmp_path / "fifo.mcap", Path(os.devnull), Path("/dev/zero")):
         with pytest.raises(NotMcap, match="is not a regular file"):
-            Salvage(path)
+            McapReader(path)
     for path in (tmp_path / "fifo.mcap", tmp_path / "loop.mcap", Path(os.devnull), tmp_path / ("n" * 300)):
         with pytest.raises(NoSession) as caught:
             Session.open(path)

@@ -10,16 +10,16 @@ import zenoh
 
 from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
-from fleet.recording.session_dir import Description
+from fleet.recording.session_dir import SessionInfo
 from fleet.recording.tools.verify import verify
-from fleet.recording.writing.session_writer import MB, Options, Sync, Tape
+from fleet.recording.writing.session_writer import MB, Options, SessionWriter, Sync
 
 BEGUN_NS = 1_790_000_000_000_000_000
 SECOND_NS = 1_000_000_000
 JSON = zenoh.Encoding("application/json")
 
 
-def feed(tape: Tape, at_ns: int, count: int = 10, size: int = 1000) -> None:
+def feed(tape: SessionWriter, at_ns: int, count: int = 10, size: int = 1000) -> None:
     for number in range(count):
         tape.add("fleet/red/note", os.urandom(size).hex().encode(), JSON, None, None, at_ns + number)
 
@@ -30,7 +30,7 @@ def payloads(paths: Iterable[Path]) -> int:
 
 @pytest.mark.parametrize("sync", list(Sync))
 def test_a_file_ends_at_its_size_and_none_is_begun_for_nothing(tmp_path: Path, sync: Sync) -> None:
-    tape = Tape(tmp_path, "fleet", Options(segment_bytes=100_000, sync=sync), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(segment_bytes=100_000, sync=sync), BEGUN_NS)
     for second in range(20):
         feed(tape, BEGUN_NS + second * SECOND_NS, count=20)
         tape.tick(BEGUN_NS + second * SECOND_NS)
@@ -45,7 +45,7 @@ def test_a_file_ends_at_its_size_and_none_is_begun_for_nothing(tmp_path: Path, s
 
 
 def test_a_file_ends_at_its_time(tmp_path: Path) -> None:
-    tape = Tape(tmp_path, "fleet", Options(segment_s=5.0), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(segment_s=5.0), BEGUN_NS)
     for second in range(12):
         feed(tape, BEGUN_NS + second * SECOND_NS)
         tape.tick(BEGUN_NS + second * SECOND_NS)
@@ -55,7 +55,7 @@ def test_a_file_ends_at_its_time(tmp_path: Path) -> None:
 
 
 def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
-    tape = Tape(tmp_path, "fleet", Options(segment_s=5.0), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(segment_s=5.0), BEGUN_NS)
     for second in range(12):
         feed(tape, BEGUN_NS + second * SECOND_NS)
         tape.tick(BEGUN_NS + second * SECOND_NS)
@@ -70,7 +70,7 @@ def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
 
 
 def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> None:
-    tape = Tape(tmp_path, "fleet", Options(), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
     for second in (0, 1, 2, -3600, -3599):
         feed(tape, BEGUN_NS + second * SECOND_NS)
         tape.tick(BEGUN_NS + second * SECOND_NS)
@@ -84,7 +84,7 @@ def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> Non
 
 
 def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
-    tape = Tape(tmp_path, "fleet", Options(session_bytes=100_000), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(session_bytes=100_000), BEGUN_NS)
     feed(tape, BEGUN_NS)
     tape.tick(BEGUN_NS)
     assert not tape.over
@@ -96,7 +96,7 @@ def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("limit", [{"session_bytes": 100_000}, {"root_bytes": MB}])
 def test_a_session_that_has_enough_begins_no_other_file(limit: dict[str, int], tmp_path: Path) -> None:
-    tape = Tape(tmp_path, "fleet", Options(segment_bytes=100_000, **limit), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(segment_bytes=100_000, **limit), BEGUN_NS)
     feed(tape, BEGUN_NS, count=200)
     tape.tick(BEGUN_NS)
     assert tape.over
@@ -108,7 +108,7 @@ def test_a_session_that_has_enough_begins_no_other_file(limit: dict[str, int], t
 def session(root: Path, number: int, *, closed: bool = True) -> Path:
     """One of half a megabyte, an hour after the one before."""
     now = BEGUN_NS + number * 3600 * SECOND_NS
-    tape = Tape(root, "fleet", Options(), now)
+    tape = SessionWriter(root, "fleet", Options(), now)
     feed(tape, now, count=400)
     tape.tick(now)
     if closed:
@@ -118,14 +118,14 @@ def session(root: Path, number: int, *, closed: bool = True) -> Path:
 
 def test_the_oldest_that_nobody_marked_give_way_and_nothing_else_does(tmp_path: Path) -> None:
     paths = [session(tmp_path, number) for number in range(6)]
-    marked = Description.read(paths[1])
+    marked = SessionInfo.read(paths[1])
     assert marked is not None
     marked.kept = True
     marked.write(paths[1])
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "mine.txt").write_bytes(b"x" * MB)
     one = sum(path.stat().st_size for path in paths[0].iterdir())
-    tape = Tape(tmp_path, "fleet", Options(root_bytes=4 * one), BEGUN_NS + 7 * 3600 * SECOND_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(root_bytes=4 * one), BEGUN_NS + 7 * 3600 * SECOND_NS)
     tape.tick(BEGUN_NS + 7 * 3600 * SECOND_NS)
     assert tape.removed == [paths[0], paths[2], paths[3]]
     assert not tape.warning
@@ -135,12 +135,12 @@ def test_the_oldest_that_nobody_marked_give_way_and_nothing_else_does(tmp_path: 
 
 
 def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp_path: Path) -> None:
-    tape = Tape(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS)
+    tape = SessionWriter(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS)
     tape.mark("keep this", "me", BEGUN_NS)
     feed(tape, BEGUN_NS, count=400)
     tape.tick(BEGUN_NS)
     tape.close(BEGUN_NS)
-    after = Tape(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS + SECOND_NS)
+    after = SessionWriter(tmp_path, "fleet", Options(root_bytes=100_000), BEGUN_NS + SECOND_NS)
     after.tick(BEGUN_NS + SECOND_NS)
     assert "has more than its quota, by 0." in after.warning
     assert "MB that are marked, in use or not to be removed" in after.warning
@@ -152,11 +152,11 @@ def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp
 def test_files_are_copied_into_each_session(tmp_path: Path) -> None:
     plan = tmp_path / "my.yaml"
     plan.write_text("roles: {}\n")
-    tape = Tape(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN: plan}), BEGUN_NS)
+    tape = SessionWriter(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN: plan}), BEGUN_NS)
     tape.close(BEGUN_NS)
     assert (tape.path / "plan.yaml").read_text() == "roles: {}\n"
     plan.unlink()
-    after = Tape(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN: plan}), BEGUN_NS + SECOND_NS)
+    after = SessionWriter(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN: plan}), BEGUN_NS + SECOND_NS)
     assert after.uncopied == [f"{plan} could not be copied into {after.path}: No such file or directory"]
     after.close(BEGUN_NS + SECOND_NS)
     assert verify(Session.open(after.path)).whole

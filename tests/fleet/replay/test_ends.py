@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
 
-from fleet.replay.rerun.staleness import LOGGED, PUBLISHED, Ends
+from fleet.replay.rerun.staleness import LOGGED, PUBLISHED, StaleStates
 
 LINE = "/fleet/red/sensor/line"
 STALE_S = 3
@@ -17,7 +17,7 @@ def batch(*seconds: float) -> Any:
     return pa.record_batch({PUBLISHED: pa.array(at), LOGGED: pa.array(at + np.timedelta64(1_000_000, "ns"))})
 
 
-def drawn(ends: Ends, now: float) -> list[float]:
+def drawn(ends: StaleStates, now: float) -> list[float]:
     """Seconds at which lanes end."""
     found: list[float] = []
     for chunk in ends.chunks(int(now * 1e9)):
@@ -33,7 +33,7 @@ def drawn(ends: Ends, now: float) -> list[float]:
 
 
 def test_a_gap_in_a_batch_between_batches_and_at_the_end_ends_lanes() -> None:
-    ends = Ends()
+    ends = StaleStates()
     ends.heard(LINE, "sensor/line", batch(1, 2, 10, 11))
     ends.heard(LINE, "sensor/line", batch(20, 21))
     assert drawn(ends, 30) == [2 + STALE_S, 11 + STALE_S, 21 + STALE_S]
@@ -41,14 +41,14 @@ def test_a_gap_in_a_batch_between_batches_and_at_the_end_ends_lanes() -> None:
 
 
 def test_what_is_heard_often_enough_does_not_end() -> None:
-    ends = Ends()
+    ends = StaleStates()
     for start in range(0, 60, 6):
         ends.heard(LINE, "sensor/line", batch(start, start + 3))
         assert drawn(ends, start + 3 + STALE_S) == []
 
 
 def test_batches_may_come_in_any_order() -> None:
-    ends = Ends()
+    ends = StaleStates()
     ends.heard(LINE, "sensor/line", batch(16, 14, 15))
     ends.heard(LINE, "sensor/line", batch(3, 1, 2))
     ends.heard(LINE, "sensor/line", batch(0, 20))
@@ -56,7 +56,7 @@ def test_batches_may_come_in_any_order() -> None:
 
 
 def test_live_an_end_is_told_once_and_again_after_more_was_heard() -> None:
-    ends = Ends()
+    ends = StaleStates()
     ends.heard(LINE, "sensor/line", batch(1, 2))
     assert drawn(ends, 4) == []
     assert drawn(ends, 6) == [2 + STALE_S]
@@ -66,6 +66,6 @@ def test_live_an_end_is_told_once_and_again_after_more_was_heard() -> None:
 
 
 def test_what_is_never_stale_never_ends() -> None:
-    ends = Ends()
+    ends = StaleStates()
     ends.heard("/fleet/red/event/command", "event/command", batch(1))
     assert drawn(ends, 1000) == []

@@ -12,7 +12,7 @@ from mcap.writer import Writer
 from fleet.cli import cli
 from fleet.replay.analysis import test_vector
 from fleet.replay.analysis.recorded_frames import Confirmed, Item, Rx, Treated, Tx
-from fleet.replay.analysis.redecode import Difference, Redecoding
+from fleet.replay.analysis.redecode import ReadingDifference, Redecoding
 from gateway.protocol.enums import Mode
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.replay.make_session import Made, make
@@ -28,7 +28,7 @@ def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(cli, [str(each) for each in arguments])
 
 
-def redecoded(items: list[Item], platform: str | None = None) -> tuple[list[Difference], Redecoding]:
+def redecoded(items: list[Item], platform: str | None = None) -> tuple[list[ReadingDifference], Redecoding]:
     one = Redecoding("red", platform)
     found = [difference for item in items for difference in one.take(item)]
     return [*found, *one.end()], one

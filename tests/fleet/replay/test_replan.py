@@ -13,7 +13,15 @@ from fleet.cli import cli
 from fleet.client.client import Fleet
 from fleet.recording import time_spec
 from fleet.recording.reading.session import Recorded, Session
-from fleet.replay.analysis.recorded_decisions import Difference, Said, Timeline, Token, add, differences, presence
+from fleet.replay.analysis.recorded_decisions import (
+    DecisionDifference,
+    PresenceToken,
+    RecordedDecision,
+    Timeline,
+    add,
+    differences,
+    presence,
+)
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars
 from tests.fleet.replay.make_session import Made
@@ -145,11 +153,11 @@ def test_a_session_without_cars_that_were_decided_on_is_refused(recorded: Path, 
         assert "then:" not in result.output
 
 
-def said(at_s: float, decided: str) -> Said:
-    return Said(int(at_s * S), "role", decided, "")
+def said(at_s: float, decided: str) -> RecordedDecision:
+    return RecordedDecision(int(at_s * S), "role", decided, "")
 
 
-def timeline(*found: Said) -> Timeline:
+def timeline(*found: RecordedDecision) -> Timeline:
     made: Timeline = {}
     for each in found:
         add(made, "red", each)
@@ -162,10 +170,10 @@ def test_differences_are_stretches_of_time() -> None:
     assert list(differences(then, then, 0, 20 * S)) == []
     now = timeline(said(1.5, "tracking"), said(4, "following"), said(8, "manual"))
     assert list(differences(then, now, 0, 20 * S)) == [
-        Difference("red", 1 * S, int(1.5 * S), then["red"][0], None),
-        Difference("red", 4 * S, 8 * S, then["red"][0], now["red"][1]),
+        DecisionDifference("red", 1 * S, int(1.5 * S), then["red"][0], None),
+        DecisionDifference("red", 4 * S, 8 * S, then["red"][0], now["red"][1]),
     ]
-    assert list(differences(then, {}, 0, 3 * S)) == [Difference("red", 1 * S, 3 * S, then["red"][0], None)]
+    assert list(differences(then, {}, 0, 3 * S)) == [DecisionDifference("red", 1 * S, 3 * S, then["red"][0], None)]
     # Two that follow each other are two.
     changing = timeline(said(1, "a"), said(2, "b"))
     assert [(each.from_ns, each.to_ns) for each in differences(changing, {}, 0, 3 * S)] == [(S, 2 * S), (2 * S, 3 * S)]
@@ -188,7 +196,7 @@ def test_a_car_was_there_as_long_as_its_states_came() -> None:
         (9.0, True),
         (9.5, False),
     ]
-    assert presence(states[:3], 5 * S) == [Token(S, "red", alive=True)]
+    assert presence(states[:3], 5 * S) == [PresenceToken(S, "red", alive=True)]
 
 
 def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:

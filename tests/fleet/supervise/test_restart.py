@@ -14,10 +14,10 @@ from fleet.supervisor.restart_policy import (
     LONGEST_S,
     STEADY_S,
     WRONG_USE_RETRY_S,
-    Act,
     Patience,
-    State,
-    Ward,
+    ProcessState,
+    RestartAction,
+    RunState,
     delay_s,
 )
 from gateway.control.executor import SHUTDOWN_S
@@ -27,9 +27,9 @@ LEAVES_BUS_S = 2.0
 PATIENCE = Patience(start_s=20.0, silence_s=4.0)
 
 
-def running(at: float = 100.0) -> Ward:
-    ward = Ward(PATIENCE, at)
-    assert ward.turn(at, None) is Act.START
+def running(at: float = 100.0) -> ProcessState:
+    ward = ProcessState(PATIENCE, at)
+    assert ward.turn(at, None) is RestartAction.START
     ward.started(at)
     assert ward.heard(at)
     return ward
@@ -47,23 +47,23 @@ def test_the_delay_doubles_to_its_longest_and_is_spread_either_way(falls: int, d
 def test_a_gateway_is_killed_no_sooner_than_its_own_wait_for_evidence_is_over() -> None:
     ward = running()
     assert ward.end(200.0, GATEWAY_GRACE_S)
-    assert ward.turn(200.0 + SHUTDOWN_S + LEAVES_BUS_S, None) is Act.NOTHING
-    assert ward.turn(200.0 + GATEWAY_GRACE_S, None) is Act.KILL
+    assert ward.turn(200.0 + SHUTDOWN_S + LEAVES_BUS_S, None) is RestartAction.NOTHING
+    assert ward.turn(200.0 + GATEWAY_GRACE_S, None) is RestartAction.KILL
 
 
 def test_what_dies_is_started_again_after_the_delay() -> None:
     ward = running()
     ward.ended(-9, "", 101.0, 0.5)
-    assert ward.state is State.WAITING
+    assert ward.state is RunState.WAITING
     assert ward.words == "was ended by signal 9"
-    assert ward.turn(101.0 + FIRST_S - 0.01, 0.0) is Act.NOTHING
-    assert ward.turn(101.0 + FIRST_S, 0.0) is Act.START
+    assert ward.turn(101.0 + FIRST_S - 0.01, 0.0) is RestartAction.NOTHING
+    assert ward.turn(101.0 + FIRST_S, 0.0) is RestartAction.START
     ward.started(102.0)
-    assert (ward.state, ward.restarts) == (State.STARTING, 1)
+    assert (ward.state, ward.restarts) == (RunState.STARTING, 1)
 
 
 def test_who_falls_at_once_again_and_again_waits_ever_longer_and_who_ran_steadily_does_not() -> None:
-    ward, at, delays = Ward(PATIENCE, 0.0), 0.0, []
+    ward, at, delays = ProcessState(PATIENCE, 0.0), 0.0, []
     for _ in range(8):
         ward.started(at)
         ward.ended(1, "no", at + 0.1, 0.5)
@@ -81,77 +81,82 @@ def test_who_falls_at_once_again_and_again_waits_ever_longer_and_who_ran_steadil
 def test_a_process_that_refuses_its_arguments_is_retried_each_minute_and_at_once_after_a_reload() -> None:
     ward = running()
     ward.ended(2, "no such platform", 101.0, 0.5)
-    assert ward.state is State.REFUSED
+    assert ward.state is RunState.REFUSED
     assert ward.words == "ended with exit code 2: no such platform"
-    assert ward.turn(101.0 + WRONG_USE_RETRY_S - 0.1, 0.0) is Act.NOTHING
-    assert ward.turn(101.0 + WRONG_USE_RETRY_S, 0.0) is Act.START
+    assert ward.turn(101.0 + WRONG_USE_RETRY_S - 0.1, 0.0) is RestartAction.NOTHING
+    assert ward.turn(101.0 + WRONG_USE_RETRY_S, 0.0) is RestartAction.START
     ward.end(120.0, 5.0, again=True)
-    assert ward.turn(120.0, 0.0) is Act.START
+    assert ward.turn(120.0, 0.0) is RestartAction.START
 
 
-@pytest.mark.parametrize(("leave_s", "act"), [(0.0, Act.KILL), (4.9, Act.KILL), (5.1, Act.NOTHING), (inf, Act.NOTHING)])
-def test_a_silent_process_may_be_left_longer_than_its_patience(leave_s: float, act: Act) -> None:
+@pytest.mark.parametrize(
+    ("leave_s", "act"),
+    [(0.0, RestartAction.KILL), (4.9, RestartAction.KILL), (5.1, RestartAction.NOTHING), (inf, RestartAction.NOTHING)],
+)
+def test_a_silent_process_may_be_left_longer_than_its_patience(leave_s: float, act: RestartAction) -> None:
     assert running(100.0).turn(105.0, 0.0, leave_s) is act
 
 
 def test_a_process_that_is_to_end_has_its_time_however_long_it_may_be_silent() -> None:
     ward = running()
     ward.end(110.0, 7.0)
-    assert ward.turn(117.0, 0.0, inf) is Act.KILL
+    assert ward.turn(117.0, 0.0, inf) is RestartAction.KILL
 
 
 @pytest.mark.parametrize(
     ("now", "listening_since", "act"),
     [
-        (103.9, 0.0, Act.NOTHING),
-        (104.1, 0.0, Act.KILL),
-        (200.0, None, Act.NOTHING),  # nobody could have been heard
-        (200.0, 197.0, Act.NOTHING),  # the hub is back, or we are awake, for 3 s only
-        (200.0, 195.9, Act.KILL),
+        (103.9, 0.0, RestartAction.NOTHING),
+        (104.1, 0.0, RestartAction.KILL),
+        (200.0, None, RestartAction.NOTHING),  # nobody could have been heard
+        (200.0, 197.0, RestartAction.NOTHING),  # the hub is back, or we are awake, for 3 s only
+        (200.0, 195.9, RestartAction.KILL),
     ],
 )
-def test_who_is_silent_hangs_if_it_could_have_been_heard(now: float, listening_since: float | None, act: Act) -> None:
+def test_who_is_silent_hangs_if_it_could_have_been_heard(
+    now: float, listening_since: float | None, act: RestartAction
+) -> None:
     ward = running(100.0)
     assert ward.turn(now, listening_since) is act
-    if act is Act.KILL:
+    if act is RestartAction.KILL:
         assert ward.words.startswith("hung: not heard for ")
         assert ward.killed
-        assert ward.turn(now + 10, listening_since) is Act.NOTHING, "once is enough"
+        assert ward.turn(now + 10, listening_since) is RestartAction.NOTHING, "once is enough"
         ward.ended(-9, "", now + 0.1, 0.5)
         assert ward.words.startswith("hung"), "the reason stays the first"
 
 
 def test_who_starts_has_longer() -> None:
-    ward = Ward(PATIENCE, 0.0)
+    ward = ProcessState(PATIENCE, 0.0)
     ward.started(100.0)
-    assert ward.turn(119.9, 0.0) is Act.NOTHING
-    assert ward.turn(120.1, 0.0) is Act.KILL
+    assert ward.turn(119.9, 0.0) is RestartAction.NOTHING
+    assert ward.turn(120.1, 0.0) is RestartAction.KILL
 
 
 def test_told_to_end_it_has_its_time_and_then_is_killed_and_not_started_again() -> None:
     ward = running()
     assert ward.end(110.0, 7.0)
     assert not ward.end(111.0, 7.0), "told twice is told once"
-    assert ward.turn(116.9, 0.0) is Act.NOTHING
-    assert ward.turn(117.0, 0.0) is Act.KILL
+    assert ward.turn(116.9, 0.0) is RestartAction.NOTHING
+    assert ward.turn(117.0, 0.0) is RestartAction.KILL
     ward.ended(-9, "", 117.1, 0.5)
-    assert ward.state is State.ENDED
-    assert ward.turn(1e6, 0.0) is Act.NOTHING
+    assert ward.state is RunState.ENDED
+    assert ward.turn(1e6, 0.0) is RestartAction.NOTHING
 
 
 def test_begun_anew_is_no_fall() -> None:
     ward = running()
     ward.end(110.0, 7.0, again=True)
     ward.ended(0, "", 111.0, 0.5)
-    assert ward.turn(111.0, 0.0) is Act.START
+    assert ward.turn(111.0, 0.0) is RestartAction.START
 
 
 def test_what_somebody_else_does_is_not_started_until_nobody_does() -> None:
-    ward = Ward(PATIENCE, 0.0)
+    ward = ProcessState(PATIENCE, 0.0)
     ward.elsewhere(1.0, "somebody else's")
-    assert ward.turn(100.0, 0.0) is Act.NOTHING
+    assert ward.turn(100.0, 0.0) is RestartAction.NOTHING
     ward.wanted(101.0)
-    assert ward.turn(101.0, 0.0) is Act.START
+    assert ward.turn(101.0, 0.0) is RestartAction.START
 
 
 @dataclass
@@ -171,16 +176,16 @@ class Process:
     )
 )
 def test_for_any_order_there_is_at_most_one_and_what_may_run_is_due(steps: list[tuple[str, float, float]]) -> None:
-    ward, process, now = Ward(PATIENCE, 0.0), Process(), 0.0
+    ward, process, now = ProcessState(PATIENCE, 0.0), Process(), 0.0
     for step, seconds, chance in steps:
         now += seconds
         if step in ("turn", "deaf"):
             act = ward.turn(now, None if step == "deaf" else 0.0)
-            if act is Act.START:
+            if act is RestartAction.START:
                 assert not process.alive
                 process.alive = True
                 ward.started(now)
-            elif act is Act.KILL:
+            elif act is RestartAction.KILL:
                 assert process.alive
                 process.alive = False
                 ward.ended(-9, "", now, chance)
@@ -192,19 +197,19 @@ def test_for_any_order_there_is_at_most_one_and_what_may_run_is_due(steps: list[
         elif step in ("end", "again"):
             assert ward.end(now, 5.0, again=step == "again") <= process.alive
         assert ward.alive == process.alive
-        if ward.state is State.WAITING:
+        if ward.state is RunState.WAITING:
             assert ward.due <= now + LONGEST_S * (1 + JITTER)
 
 
 def test_who_is_heard_to_the_end_is_killed_when_it_hangs_while_it_ends_and_nobody_else() -> None:
     for to_the_end in (True, False):
-        ward = Ward(Patience(start_s=20.0, silence_s=4.0, to_the_end=to_the_end), 100.0)
+        ward = ProcessState(Patience(start_s=20.0, silence_s=4.0, to_the_end=to_the_end), 100.0)
         ward.started(100.0)
         ward.heard(101.0)
         ward.end(110.0, 15.0)
-        assert ward.turn(114.0, None) is Act.NOTHING, "nobody could be heard"
-        assert ward.turn(114.0, 112.0) is Act.NOTHING
+        assert ward.turn(114.0, None) is RestartAction.NOTHING, "nobody could be heard"
+        assert ward.turn(114.0, 112.0) is RestartAction.NOTHING
         ward.heard(112.5)
-        assert ward.turn(116.4, 112.0) is Act.NOTHING
-        assert ward.turn(116.6, 112.0) is (Act.KILL if to_the_end else Act.NOTHING)
-        assert ward.turn(125.0, 112.0) is (Act.NOTHING if to_the_end else Act.KILL)
+        assert ward.turn(116.4, 112.0) is RestartAction.NOTHING
+        assert ward.turn(116.6, 112.0) is (RestartAction.KILL if to_the_end else RestartAction.NOTHING)
+        assert ward.turn(125.0, 112.0) is (RestartAction.NOTHING if to_the_end else RestartAction.KILL)

@@ -8,10 +8,10 @@ import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
 from rich.console import Console
 
-from fleet.supervisor.car_status import Row, left_from_before
+from fleet.supervisor.car_status import CarStatus, left_from_before
 from fleet.supervisor.child import RUNS, Log, new_run, runs
-from fleet.supervisor.restart_policy import State
-from fleet.supervisor.spec import Kind, Wanted
+from fleet.supervisor.restart_policy import RunState
+from fleet.supervisor.spec import FleetSpec, ProcessKind
 from fleet.supervisor.status_table import Table
 from fleet.supervisor.supervisor import Supervisor
 from schemas.bus import DEFAULT_ENDPOINT
@@ -19,7 +19,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 
 def test_a_row_says_what_is_new_once() -> None:
-    row = Row("red")
+    row = CarStatus("red")
     online = pb.Link(state="online", reason="heard")
     assert row.take("state/link", online, 0.0) == "link online: heard"
     assert row.take("state/link", online, 1.0) == ""
@@ -31,7 +31,7 @@ def test_a_row_says_what_is_new_once() -> None:
 
 
 def test_a_row_shows_hold_and_e_stop() -> None:
-    row = Row("red")
+    row = CarStatus("red")
     assert row.take("state/safety", pb.Safety(motors="off"), 0.0) == ""
     held = pb.Safety(hold=pb.Hold(by="ann"))
     assert row.take("state/safety", held, 1.0) == "on hold by ann"
@@ -83,7 +83,7 @@ def test_what_keeps_a_car_still_from_an_earlier_day_is_told_with_how_to_end_it(s
 
 
 def test_the_rate_is_what_came_over_some_seconds() -> None:
-    row = Row("red")
+    row = CarStatus("red")
     for second in range(5):
         row.take("state/link", pb.Link(state="online", rx_frames=second * 25), float(second))
     assert row.rate_hz == 25.0
@@ -95,14 +95,14 @@ def test_the_rate_is_what_came_over_some_seconds() -> None:
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
 def test_the_table_fits_and_names_every_car(width: int) -> None:
-    wish = Wanted(endpoint="tcp/127.0.0.1:7999")
+    wish = FleetSpec(endpoint="tcp/127.0.0.1:7999")
     supervisor = Supervisor(wish, "", lambda: wish, lambda happening: None)
-    for name, kind in (("@hub", Kind.HUB), ("red", Kind.GATEWAY), ("green", Kind.GATEWAY)):
+    for name, kind in (("@hub", ProcessKind.HUB), ("red", ProcessKind.GATEWAY), ("green", ProcessKind.GATEWAY)):
         supervisor.crew.add(name, kind, ())
     for process in supervisor.crew:
-        process.ward.state = State.RUNNING
+        process.ward.state = RunState.RUNNING
     for name in ("red", "green"):
-        supervisor.rows[name] = Row(name, link="online", mode="obstacle_avoidance", event="x" * 300)
+        supervisor.rows[name] = CarStatus(name, link="online", mode="obstacle_avoidance", event="x" * 300)
     console = Console(file=io.StringIO(), width=width)
     console.print(Table(supervisor, console).rendered())
     assert isinstance(console.file, io.StringIO)

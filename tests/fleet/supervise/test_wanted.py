@@ -12,8 +12,8 @@ from fleet.supervisor.reload import change
 from fleet.supervisor.spec import (
     SIMULATED,
     Asked,
-    Wanted,
-    WantedCar,
+    CarProcessSpec,
+    FleetSpec,
     coordinator_command,
     gateway_command,
     recorder_command,
@@ -92,8 +92,8 @@ def test_every_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
         assert "--nonsense" in done.stderr, done.stderr
 
 
-CARS = {name: WantedCar(name, f"/dev/{name}") for name in ("ann", "bob")}
-OLD = Wanted(cars=CARS | {"sim": WantedCar("sim", SIMULATED, "arduino")})
+CARS = {name: CarProcessSpec(name, f"/dev/{name}") for name in ("ann", "bob")}
+OLD = FleetSpec(cars=CARS | {"sim": CarProcessSpec("sim", SIMULATED, "arduino")})
 
 
 def test_nothing_new_is_no_change() -> None:
@@ -103,7 +103,7 @@ def test_nothing_new_is_no_change() -> None:
 
 def test_cars_come_go_and_change() -> None:
     cars = {name: car for name, car in OLD.cars.items() if name != "ann"}
-    cars |= {"bob": WantedCar("bob", "/dev/other"), "eve": WantedCar("eve", "/dev/eve")}
+    cars |= {"bob": CarProcessSpec("bob", "/dev/other"), "eve": CarProcessSpec("eve", "/dev/eve")}
     found = change(OLD, replace(OLD, cars=cars))
     assert found.gone == ("ann",)
     assert found.begun == ("bob", "eve")
@@ -119,12 +119,12 @@ def test_cars_come_go_and_change() -> None:
         (replace(OLD, world=Path("w")), "the world"),
         (replace(OLD, recordings=Path("r")), "where recordings go"),
         (replace(OLD, record=False), "whether it records"),
-        (replace(OLD, cars=OLD.cars | {"two": WantedCar("two", SIMULATED)}), "two, a simulated car,"),
-        (replace(OLD, cars=OLD.cars | {"sim": WantedCar("sim", SIMULATED, "stm32")}), "sim, a simulated car,"),
-        (replace(OLD, cars=OLD.cars | {"sim": WantedCar("sim", "/dev/sim")}), "sim, a simulated car,"),
+        (replace(OLD, cars=OLD.cars | {"two": CarProcessSpec("two", SIMULATED)}), "two, a simulated car,"),
+        (replace(OLD, cars=OLD.cars | {"sim": CarProcessSpec("sim", SIMULATED, "stm32")}), "sim, a simulated car,"),
+        (replace(OLD, cars=OLD.cars | {"sim": CarProcessSpec("sim", "/dev/sim")}), "sim, a simulated car,"),
     ],
 )
-def test_what_the_processes_are_bound_to_stays_and_is_said(new: Wanted, words: str) -> None:
+def test_what_the_processes_are_bound_to_stays_and_is_said(new: FleetSpec, words: str) -> None:
     found = change(OLD, new)
     assert found.wish == OLD
     assert found.words == (f"{words} cannot be changed while running (fleet down, fleet up)",)

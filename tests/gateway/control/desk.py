@@ -3,20 +3,20 @@
 from collections.abc import Callable
 
 from gateway.control.commands import (
+    Action,
     Answer,
     Command,
     CommandRecord,
-    Kind,
+    FrameOrigin,
     Level,
     LogRecord,
     Phase,
     Reason,
     Sender,
-    What,
-    Why,
+    SenderKind,
 )
 from gateway.control.controller import Controller
-from gateway.control.safety import Kept
+from gateway.control.safety import PersistedSafety
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
@@ -44,9 +44,9 @@ MODE00 = b"$4WD,MODE00#"
 SHOWN_STOP = [MODE00, STOP, MODE00, STOP]
 """What a stop of a driven car writes: the second `MODE00` asks for the second pause that shows it."""
 
-PERSON = Sender("mia", Kind.PERSON)
-SCRIPT = Sender("script", Kind.SCRIPT)
-COORDINATOR = Sender("plan", Kind.COORDINATOR)
+PERSON = Sender("mia", SenderKind.PERSON)
+SCRIPT = Sender("script", SenderKind.SCRIPT)
+COORDINATOR = Sender("plan", SenderKind.COORDINATOR)
 
 
 class ObedientCar:
@@ -91,11 +91,11 @@ class ObedientCar:
 class Desk:
     """Drives a controller exactly as its loop does: it is woken by what it says, and by what happens."""
 
-    def __init__(self, platform: str = "arduino", *, kept: Kept | None = None) -> None:
+    def __init__(self, platform: str = "arduino", *, kept: PersistedSafety | None = None) -> None:
         self.now = 100.0
         self.control = Controller("red", parse_platform(platform), kept=kept)
         self.car = ObedientCar(platform, self.now)
-        self.sent: list[tuple[float, bytes, Why]] = []
+        self.sent: list[tuple[float, bytes, FrameOrigin]] = []
         self.records: list[CommandRecord] = []
         self.logs: list[LogRecord] = []
         self.number = 0
@@ -127,7 +127,7 @@ class Desk:
 
     def ask(
         self,
-        what: What,
+        what: Action,
         sender: Sender = SCRIPT,
         *,
         identity: str = "",

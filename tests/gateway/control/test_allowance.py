@@ -1,10 +1,10 @@
 """So much per second and no more."""
 
-from gateway.control.rate_limit import Allowance
+from gateway.control.rate_limit import TokenBucket
 
 
 def test_so_much_at_once_and_so_much_a_second() -> None:
-    allowance = Allowance(per_s=100, at_once=500)
+    allowance = TokenBucket(per_s=100, at_once=500)
     assert allowance.take(300, 7.0) == 300
     assert allowance.take(300, 7.0) == 200
     assert allowance.take(300, 7.0) == 0
@@ -14,12 +14,12 @@ def test_so_much_at_once_and_so_much_a_second() -> None:
 
 
 def test_little_by_little_nothing_is_lost() -> None:
-    allowance = Allowance(per_s=100, at_once=10)
+    allowance = TokenBucket(per_s=100, at_once=10)
     assert sum(allowance.take(1, number / 100) for number in range(1000)) == 1000
 
 
 def test_a_clock_that_goes_back_gives_nothing() -> None:
-    allowance = Allowance(per_s=100, at_once=100)
+    allowance = TokenBucket(per_s=100, at_once=100)
     assert allowance.take(100, 5.0) == 100
     assert allowance.take(100, 4.0) == 0
     assert allowance.take(100, 5.5) == 50

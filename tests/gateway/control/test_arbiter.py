@@ -6,31 +6,31 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.control.arbiter import QUEUE_LIMIT, TABLE, Situation, needs, refuse
+from gateway.control.arbiter import QUEUE_LIMIT, TABLE, CommandContext, needs, refuse
 from gateway.control.commands import (
-    Act,
+    Action,
     ChangeSpeed,
     Command,
     Drive,
     EmergencyStop,
     Fan,
     Find,
-    Kind,
+    OneShot,
     Reason,
     Resume,
     Sender,
+    SenderKind,
     SetMode,
     Stop,
     TakeLease,
-    What,
 )
-from gateway.control.safety import Estop, Lease
+from gateway.control.safety import Estop, LeaseState
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
 
 NOW = 100.0
-WHATS: list[What] = [
+WHATS: list[Action] = [
     Stop(),
     EmergencyStop(),
     EmergencyStop("smoke", fleet_wide=True),
@@ -44,12 +44,12 @@ WHATS: list[What] = [
     Drive(Motion.STOP),
     SetMode(Mode.TRACKING),
     SetMode(Mode.MANUAL),
-    Act(General(Motion.STOP, light=Light.RED)),
-    Act(General(Motion.STOP, whistle=True)),
-    Act(General(Motion.STOP, servo=ServoAction.FRONT_LEFT)),
-    Act(ColorLed(1, 2, 3)),
-    Act(Ptz(90)),
-    Act(ArmSet((0,) * 6)),
+    OneShot(General(Motion.STOP, light=Light.RED)),
+    OneShot(General(Motion.STOP, whistle=True)),
+    OneShot(General(Motion.STOP, servo=ServoAction.FRONT_LEFT)),
+    OneShot(ColorLed(1, 2, 3)),
+    OneShot(Ptz(90)),
+    OneShot(ArmSet((0,) * 6)),
     ChangeSpeed(SpeedStep.UP),
     Fan(),
     Fan(on=True),
@@ -57,19 +57,23 @@ WHATS: list[What] = [
 ]
 MOVES = (Drive, SetMode, ChangeSpeed, Fan)
 """What moves the car, or how it moves; with servo and arm it needs the lease."""
-SENDERS = [Sender("ann", kind) for kind in Kind]
-LEASES = [None, *(Lease(Sender("bob", kind), NOW + 1.0) for kind in Kind), Lease(Sender("bob", Kind.PERSON), NOW - 1.0)]
+SENDERS = [Sender("ann", kind) for kind in SenderKind]
+LEASES = [
+    None,
+    *(LeaseState(Sender("bob", kind), NOW + 1.0) for kind in SenderKind),
+    LeaseState(Sender("bob", SenderKind.PERSON), NOW - 1.0),
+]
 MODES = [
     (None, False),
     *((mode, contradicted) for mode in (Mode.MANUAL, Mode.TRACKING) for contradicted in (False, True)),
     (Mode.COLOR_LED, False),
 ]
 """The mode that was asked, and whether what is heard contradicts it."""
-RANK = [Kind.COORDINATOR, Kind.SCRIPT, Kind.PERSON]
+RANK = [SenderKind.COORDINATOR, SenderKind.SCRIPT, SenderKind.PERSON]
 ESTOP = Estop("e1", "eve", "smoke", 1, fleet_wide=False)
 
 
-def situations() -> Iterator[Situation]:
+def situations() -> Iterator[CommandContext]:
     """30,720 states: link, answering, closing, hold, e-stop, lease, battery, queue; mode and verdict; platform."""
     for (
         (link, answering, closing, held, estopped, lease, battery, queued),
@@ -82,7 +86,7 @@ def situations() -> Iterator[Situation]:
         MODES,
         ("arduino", "raspberry_pi", "unknown", "stm32+arm"),
     ):
-        yield Situation(
+        yield CommandContext(
             car="red",
             profile=PROFILES[platform],
             now=NOW,
@@ -107,7 +111,7 @@ PROFILES = {name: parse_platform(name) for name in ("arduino", "raspberry_pi", "
 
 @pytest.mark.parametrize("sender", SENDERS, ids=lambda sender: sender.kind)
 @pytest.mark.parametrize("what", WHATS, ids=repr)
-def test_every_command_in_every_state(what: What, sender: Sender) -> None:
+def test_every_command_in_every_state(what: Action, sender: Sender) -> None:
     seen: set[Reason | None] = set()
     for take in (False, True):
         command = Command("c", "verb", sender, what, take=take)
@@ -119,10 +123,10 @@ def test_every_command_in_every_state(what: What, sender: Sender) -> None:
             _check(command, at, None if refusal is None else refusal[0])
     if isinstance(what, Drive) and what.motion is not Motion.STOP:
         every = {None, *(Reason.ESTOPPED, Reason.LEASED, Reason.BATTERY_LOW, Reason.LINK_DOWN, Reason.WRONG_MODE)}
-        assert seen == (every | {Reason.HELD} if sender.kind is Kind.COORDINATOR else every)
+        assert seen == (every | {Reason.HELD} if sender.kind is SenderKind.COORDINATOR else every)
 
 
-def _check(command: Command, at: Situation, reason: Reason | None) -> None:
+def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     """What must hold, said in another way than the arbiter's rules."""
     what, kind = command.what, command.sender.kind
     if isinstance(what, Stop | EmergencyStop):
@@ -130,7 +134,7 @@ def _check(command: Command, at: Situation, reason: Reason | None) -> None:
         return
     if isinstance(what, Resume):
         in_force = what.ids == ("e1",) and bool(at.estops)
-        allowed = kind is not Kind.COORDINATOR and (not what.ids or what.ids == ("over",) or in_force)
+        allowed = kind is not SenderKind.COORDINATOR and (not what.ids or what.ids == ("over",) or in_force)
         assert (reason is None) == allowed
         return
     if what == TakeLease(release=True):
@@ -139,15 +143,15 @@ def _check(command: Command, at: Situation, reason: Reason | None) -> None:
     if reason is not None:
         return
     assert not at.estops, "an e-stopped car obeys nothing"
-    assert not (at.held_by and kind is Kind.COORDINATOR), "no coordinator's command moves a held car"
+    assert not (at.held_by and kind is SenderKind.COORDINATOR), "no coordinator's command moves a held car"
     if not isinstance(what, TakeLease):
         assert at.link_open
         assert at.answering or isinstance(what, Fan), "a fan that runs silences a car"
         assert not at.closing
-    moves = isinstance(what, MOVES) or (isinstance(what, Act) and _turns(what))
+    moves = isinstance(what, MOVES) or (isinstance(what, OneShot) and _turns(what))
     if (moves or isinstance(what, TakeLease)) and at.lease is not None and at.lease.until > NOW:
         mine, theirs = RANK.index(kind), RANK.index(at.lease.holder.kind)
-        assert mine > theirs or (mine == theirs and command.take and kind is Kind.PERSON)
+        assert mine > theirs or (mine == theirs and command.take and kind is SenderKind.PERSON)
     if at.battery:
         assert not isinstance(what, Drive) or what.motion is Motion.STOP
         assert not isinstance(what, SetMode) or what.mode is Mode.MANUAL
@@ -155,11 +159,11 @@ def _check(command: Command, at: Situation, reason: Reason | None) -> None:
     if not isinstance(what, SetMode | TakeLease) and not releases:
         assert at.asked in (None, Mode.MANUAL), "the car would ignore it"
         assert not at.contradicted, "the car may ignore it"
-    if isinstance(what, Act | ChangeSpeed | Fan | Find):
+    if isinstance(what, OneShot | ChangeSpeed | Fan | Find):
         assert at.queued < QUEUE_LIMIT
 
 
-def _turns(act: Act) -> bool:
+def _turns(act: OneShot) -> bool:
     return isinstance(act.frame, Ptz | ArmSet) or (isinstance(act.frame, General) and act.frame.servo is not None)
 
 
@@ -170,7 +174,7 @@ def test_the_table_has_every_command() -> None:
 
 
 @pytest.mark.parametrize("what", [what for what in WHATS if not isinstance(what, Stop | EmergencyStop)], ids=repr)
-def test_what_came_too_late_is_stale_but_a_stop_never_is(what: What) -> None:
+def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
     calm = replace(
         next(situations()),
         profile=PROFILES["stm32+arm"],

@@ -3,28 +3,28 @@
 import pytest
 
 from gateway.control.commands import (
-    Act,
+    Action,
     ChangeSpeed,
     Drive,
     EmergencyStop,
-    Kind,
+    OneShot,
     Phase,
     Reason,
     Resume,
     Sender,
+    SenderKind,
     SetMode,
     Stop,
     TakeLease,
-    What,
 )
-from gateway.control.safety import Estop, Kept
+from gateway.control.safety import Estop, PersistedSafety
 from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import ColorLed
 from tests.gateway.control.desk import COORDINATOR, MODE00, PERSON, RUN, SCRIPT, SHOWN_STOP, STOP, TRACKING, Desk
 
 SENT, QUEUED, REJECTED, SUPERSEDED = Phase.SENT, Phase.QUEUED, Phase.REJECTED, Phase.SUPERSEDED
 FORWARD = Drive(Motion.FORWARD, 5.0)
-BOB = Sender("bob", Kind.PERSON)
+BOB = Sender("bob", SenderKind.PERSON)
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Desk) -> None:
     desk.run(600.0)
     assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.life("e1") == [Phase.ASKED, QUEUED, SENT, Phase.COMPLETE]
-    for what in (FORWARD, SetMode(Mode.MANUAL), Act(ColorLed(1, 2, 3)), TakeLease(), Drive(Motion.STOP)):
+    for what in (FORWARD, SetMode(Mode.MANUAL), OneShot(ColorLed(1, 2, 3)), TakeLease(), Drive(Motion.STOP)):
         refused = desk.ask(what, PERSON)
         assert (refused.status, refused.reason) == (REJECTED, Reason.ESTOPPED)
         assert "red is e-stopped by mia: smoke; a person or script ends it: resume e1" in refused.words
@@ -78,10 +78,10 @@ def test_an_e_stop_of_a_car_out_of_reach_is_latched_all_the_same(desk: Desk) -> 
 
 def test_an_e_stop_survives_a_restart() -> None:
     estop = Estop("e1", "mia", "smoke", 7, fleet_wide=False)
-    desk = Desk(kept=Kept(None, (estop,), ())).ready()
+    desk = Desk(kept=PersistedSafety(None, (estop,), ())).ready()
     assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
     desk.ask(Resume(("e1",)), PERSON)
-    assert desk.control.safety.kept == Kept(None, (), ("e1",))
+    assert desk.control.safety.kept == PersistedSafety(None, (), ("e1",))
 
 
 def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Desk) -> None:
@@ -118,7 +118,7 @@ def test_who_drives_has_the_car_and_two_seconds_more(desk: Desk) -> None:
     assert "red is driven by script (script), for 5.0 s more: wait, or ask as a person" in refused.words
     desk.run(4.9)
     assert desk.ask(Drive(Motion.STOP), other).reason is Reason.LEASED, "whose idle stick would stop another's car"
-    assert desk.ask(Act(ColorLed(1, 2, 3)), other).status is QUEUED
+    assert desk.ask(OneShot(ColorLed(1, 2, 3)), other).status is QUEUED
     desk.run(0.2)
     assert desk.ask(Drive(Motion.LEFT), other).status is QUEUED
 
@@ -181,7 +181,7 @@ def test_between_persons_the_holder_keeps_it_unless_it_is_taken(desk: Desk) -> N
 
 
 @pytest.mark.parametrize("what", [TakeLease(), ChangeSpeed(SpeedStep.UP)])
-def test_what_is_asked_on_the_way_does_not_shorten_the_lease(desk: Desk, what: What) -> None:
+def test_what_is_asked_on_the_way_does_not_shorten_the_lease(desk: Desk, what: Action) -> None:
     desk.ask(FORWARD, PERSON)
     desk.run(0.5)
     assert desk.ask(what, PERSON).status in (SENT, QUEUED)
@@ -306,7 +306,7 @@ def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Desk) -> None:
         desk.run(0.3, reports=False)
         desk.hear(TRACKING)
     assert (desk.control.motors, desk.control.motion) == ("unknown", None)
-    assert desk.ask(Act(ColorLed(1, 2, 3)), PERSON).reason is Reason.WRONG_MODE, "it would be lost"
+    assert desk.ask(OneShot(ColorLed(1, 2, 3)), PERSON).reason is Reason.WRONG_MODE, "it would be lost"
 
 
 def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Desk) -> None:

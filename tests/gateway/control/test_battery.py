@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.estimate.battery import HOLD_S, LOW_V, Action, Battery, BatteryLevel, Policy, charge
+from gateway.control.estimate.battery import (
+    HOLD_S,
+    LOW_V,
+    Battery,
+    BatteryLevel,
+    BatteryPolicy,
+    BatteryReaction,
+    charge,
+)
 
 
 @pytest.mark.parametrize(
@@ -24,12 +32,12 @@ from gateway.control.estimate.battery import HOLD_S, LOW_V, Action, Battery, Bat
     ],
 )
 def test_level_and_charge(voltage_v: float, expected: BatteryLevel, share: float) -> None:
-    assert Policy().level(voltage_v) is expected
+    assert BatteryPolicy().level(voltage_v) is expected
     assert charge(voltage_v, loaded=False) == (pytest.approx(share), 0.15)
 
 
 def test_where_a_level_begins_may_be_told() -> None:
-    policy = Policy(low_v=7.4, critical_v=7.2)
+    policy = BatteryPolicy(low_v=7.4, critical_v=7.2)
     assert [policy.level(volts) for volts in (7.4, 7.39, 7.2, 7.19)] == ["ok", "low", "low", "critical"]
 
 
@@ -61,10 +69,14 @@ def test_nothing_measured_is_no_level_and_refuses_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("voltage_v", "expected", "action", "refuses"),
-    [(8.0, "ok", None, False), (6.9, "low", Action.WARN, False), (6.5, "critical", Action.REFUSE, True)],
+    [
+        (8.0, "ok", None, False),
+        (6.9, "low", BatteryReaction.WARN, False),
+        (6.5, "critical", BatteryReaction.REFUSE, True),
+    ],
 )
 def test_the_first_readings_say_where_it_stands_when_they_have_held(
-    voltage_v: float, expected: str, action: Action | None, refuses: bool
+    voltage_v: float, expected: str, action: BatteryReaction | None, refuses: bool
 ) -> None:
     battery = Battery()
     assert not hear(battery, *[voltage_v] * 5)
@@ -145,11 +157,11 @@ def test_readings_on_both_sides_of_critical_are_low_at_least() -> None:
 
 
 def test_a_policy_may_stop_or_only_warn() -> None:
-    assert Policy(critical=Action.STOP).action(BatteryLevel.CRITICAL) is Action.STOP
-    warns = Battery(Policy(critical=Action.WARN))
+    assert BatteryPolicy(critical=BatteryReaction.STOP).action(BatteryLevel.CRITICAL) is BatteryReaction.STOP
+    warns = Battery(BatteryPolicy(critical=BatteryReaction.WARN))
     hear(warns, *[6.0] * 6)
-    assert (warns.action, warns.refusal) == (Action.WARN, "")
-    refuses = Battery(Policy(low=Action.REFUSE))
+    assert (warns.action, warns.refusal) == (BatteryReaction.WARN, "")
+    refuses = Battery(BatteryPolicy(low=BatteryReaction.REFUSE))
     hear(refuses, *[6.9] * 6)
     assert refuses.refusal.startswith("battery low: 6.90 V, charge 25% +- 15%: charge it")
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from gateway.control.commands import Act, Drive, Phase, Reason, SetMode, Stop
+from gateway.control.commands import Drive, OneShot, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
-from gateway.control.estimate.battery import Action, Policy
+from gateway.control.estimate.battery import BatteryPolicy, BatteryReaction
 from gateway.protocol.enums import Light, Mode, Motion
 from gateway.protocol.frames import General
 from gateway.protocol.platforms import parse_platform
@@ -35,7 +35,7 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
         refused = desk.ask(what)
         assert (refused.status, refused.reason) == (Phase.REJECTED, Reason.BATTERY_LOW)
         assert "charge it" in refused.words
-    for what in (Drive(Motion.STOP), SetMode(Mode.MANUAL), Stop(), Act(General(Motion.STOP, light=Light.RED))):
+    for what in (Drive(Motion.STOP), SetMode(Mode.MANUAL), Stop(), OneShot(General(Motion.STOP, light=Light.RED))):
         assert desk.ask(what).status is not Phase.REJECTED
         desk.run(3.0)
     drained(desk, 8.0)
@@ -45,7 +45,9 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
 
 def test_a_car_can_be_stopped_by_its_battery() -> None:
     desk = Desk()
-    desk.control = Controller("red", parse_platform("arduino"), battery_policy=Policy(critical=Action.STOP))
+    desk.control = Controller(
+        "red", parse_platform("arduino"), battery_policy=BatteryPolicy(critical=BatteryReaction.STOP)
+    )
     desk.ready()
     desk.ask(FORWARD, identity="d")
     desk.car.reading = reading(5.9)

@@ -9,25 +9,25 @@ import pytest
 
 from gateway.control.command_queue import PATIENCE_S
 from gateway.control.commands import (
-    Act,
+    Action,
     ChangeSpeed,
     Drive,
     EmergencyStop,
     Fan,
     Find,
+    FrameOrigin,
+    OneShot,
     Phase,
     Reason,
     Resume,
     Sender,
     SetMode,
     Stop,
-    What,
-    Why,
 )
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.control.executor import RENEW_S, SHUTDOWN_S
-from gateway.control.safety import Hold, Kept
+from gateway.control.safety import Hold, PersistedSafety
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
@@ -37,8 +37,8 @@ from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 
 ASKED, QUEUED, SENT, COMPLETE = Phase.ASKED, Phase.QUEUED, Phase.SENT, Phase.COMPLETE
-WHISTLE = Act(General(Motion.STOP, whistle=True))
-LIGHT = Act(General(Motion.STOP, light=Light.RED))
+WHISTLE = OneShot(General(Motion.STOP, whistle=True))
+LIGHT = OneShot(General(Motion.STOP, light=Light.RED))
 FORWARD = Drive(Motion.FORWARD, 5.0)
 
 
@@ -58,11 +58,11 @@ def desk() -> Desk:
         (Drive(Motion.STOP), [], [ASKED, SENT]),
         (SetMode(Mode.TRACKING), [b"$4WD,MODE21#"], [ASKED, QUEUED, SENT, Phase.EFFECT_SEEN]),
         (SetMode(Mode.MANUAL), [MODE00, STOP], [ASKED, QUEUED, SENT, Phase.EFFECT_SEEN]),
-        (Act(ColorLed(1, 2, 3)), [b"$4WD,CLR1,CLG2,CLB3#"], [ASKED, QUEUED, SENT]),
-        (Act(Ptz(30)), [b"$4WD,PTZ30#"], [ASKED, QUEUED, SENT]),
+        (OneShot(ColorLed(1, 2, 3)), [b"$4WD,CLR1,CLG2,CLB3#"], [ASKED, QUEUED, SENT]),
+        (OneShot(Ptz(30)), [b"$4WD,PTZ30#"], [ASKED, QUEUED, SENT]),
         (LIGHT, [b"$0,0,0,0,0,0,2,0,0#"], [ASKED, QUEUED, SENT]),
         (WHISTLE, [b"$0,0,1,0,0,0,0,0,0#"], [ASKED, QUEUED, SENT]),
-        (Act(General(Motion.STOP, servo=ServoAction.FRONT_RESET)), [b"$0,0,0,0,0,0,0,0,1#"], [ASKED, QUEUED, SENT]),
+        (OneShot(General(Motion.STOP, servo=ServoAction.FRONT_RESET)), [b"$0,0,0,0,0,0,0,0,1#"], [ASKED, QUEUED, SENT]),
         (ChangeSpeed(SpeedStep.UP), [b"$0,0,0,1,0,0,0,0,0#"], [ASKED, QUEUED, SENT]),
         (Fan(), [b"$0,0,0,0,0,0,0,1,0#"], [ASKED, QUEUED, SENT]),
         (Fan(on=True), [b"$0,0,0,0,0,0,0,1,0#"], [ASKED, QUEUED, SENT]),
@@ -78,13 +78,13 @@ def desk() -> Desk:
     ],
     ids=str,
 )
-def test_the_life_of_a_command(desk: Desk, what: What, frames: list[bytes], life: list[Phase]) -> None:
+def test_the_life_of_a_command(desk: Desk, what: Action, frames: list[bytes], life: list[Phase]) -> None:
     answer = desk.ask(what, identity="it")
     assert answer.status in (QUEUED, SENT)
     desk.run(4.0)
     shown = desk.control.basis == Basis.SHOWN or isinstance(what, SetMode)
     assert desk.frames == (frames if shown else [*frames, STOP]), "a rest that nothing has shown is renewed"
-    assert shown or desk.sent[-1][2] is Why.REPEAT
+    assert shown or desk.sent[-1][2] is FrameOrigin.REPEAT
     assert desk.life("it") == life
     assert all(b.at >= a.at for a, b in zip(desk.records, desk.records[1:], strict=False))
 
@@ -108,8 +108,8 @@ def test_a_changed_motion_is_sent_again_once_alone_and_never_more(desk: Desk) ->
     desk.ask(FORWARD)
     desk.run(4.9)
     assert [(round(at - began, 3), data, why) for at, data, why in desk.sent] == [
-        (0.0, RUN, Why.COMMAND),
-        (1.1, RUN, Why.REPEAT),
+        (0.0, RUN, FrameOrigin.COMMAND),
+        (1.1, RUN, FrameOrigin.REPEAT),
     ]
 
 
@@ -159,7 +159,7 @@ def test_motion_overtakes_what_queues(desk: Desk) -> None:
     ],
     ids=str,
 )
-def test_a_one_shot_while_driving_carries_the_motion(desk: Desk, what: What, frame: bytes) -> None:
+def test_a_one_shot_while_driving_carries_the_motion(desk: Desk, what: Action, frame: bytes) -> None:
     desk.ask(FORWARD)
     desk.run(2.0)
     desk.ask(what)
@@ -191,7 +191,7 @@ def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Desk
     desk.run(30.0)
     renewed = [(round(at - began, 1), data, why) for at, data, why in desk.sent[sent:]]
     assert [data for _, data, _ in renewed] == [STOP] * len(renewed)
-    assert {why for _, _, why in renewed} == {Why.REPEAT}
+    assert {why for _, _, why in renewed} == {FrameOrigin.REPEAT}
     times = [0.0, *(at for at, _, _ in renewed)]
     gaps = [round(later - earlier, 1) for earlier, later in pairwise(times)]
     assert gaps[:3] == list(RENEW_S)
@@ -327,7 +327,7 @@ def test_a_drive_that_would_be_over_before_a_recovery_is_is_refused_at_once() ->
 
 
 @pytest.mark.parametrize("what", [WHISTLE, SetMode(Mode.TRACKING)], ids=str)
-def test_what_waits_too_long_for_a_busy_car_expires(what: What) -> None:
+def test_what_waits_too_long_for_a_busy_car_expires(what: Action) -> None:
     desk = Desk()
     desk.control.link_up(desk.now)
     desk.pump()
@@ -339,9 +339,9 @@ def test_what_waits_too_long_for_a_busy_car_expires(what: What) -> None:
 
 def test_one_shots_asked_before_a_mode_are_sent_before_it(desk: Desk) -> None:
     desk.ask(WHISTLE)
-    desk.ask(Act(Ptz(30)))
+    desk.ask(OneShot(Ptz(30)))
     desk.ask(SetMode(Mode.TRACKING))
-    assert desk.ask(Act(Ptz(60))).reason is Reason.WRONG_MODE
+    assert desk.ask(OneShot(Ptz(60))).reason is Reason.WRONG_MODE
     desk.run(3.0)
     assert desk.frames == [b"$0,0,1,0,0,0,0,0,0#", b"$4WD,PTZ30#", b"$4WD,MODE21#"]
 
@@ -365,7 +365,7 @@ def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Desk) -> Non
     desk.ask(Stop(), PERSON)
     assert desk.control.hold == Hold("mia", int(desk.now * 1e9))
     desk.run(600.0)
-    everything: list[What] = [FORWARD, Drive(Motion.STOP), SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), LIGHT, Fan()]
+    everything: list[Action] = [FORWARD, Drive(Motion.STOP), SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), LIGHT, Fan()]
     for what in [*everything, ChangeSpeed(SpeedStep.UP), Find(), Resume()]:
         answer = desk.ask(what, COORDINATOR)
         assert (answer.status, answer.reason) == (Phase.REJECTED, Reason.HELD), what
@@ -381,7 +381,7 @@ def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Desk) -> Non
 
 @pytest.mark.parametrize("what", [FORWARD, SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), Resume()])
 @pytest.mark.parametrize("sender", [PERSON, SCRIPT], ids=["person", "script"])
-def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Desk, what: What, sender: Sender) -> None:
+def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Desk, what: Action, sender: Sender) -> None:
     desk.ask(Stop(), PERSON)
     desk.run(2.0)
     assert desk.ask(what, sender).status is not Phase.REJECTED
@@ -408,7 +408,7 @@ def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Desk) -
 
 
 def test_a_hold_from_before_a_restart_counts() -> None:
-    desk = Desk(kept=Kept(Hold("mia", 1))).ready()
+    desk = Desk(kept=PersistedSafety(Hold("mia", 1))).ready()
     assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
     assert desk.ask(FORWARD, PERSON).status is QUEUED
 
@@ -416,8 +416,8 @@ def test_a_hold_from_before_a_restart_counts() -> None:
 # ---------------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize("what", [FORWARD, LIGHT, Act(Ptz(1)), Fan(), ChangeSpeed(SpeedStep.UP), Find()], ids=str)
-def test_in_another_mode_the_car_would_ignore_it(desk: Desk, what: What) -> None:
+@pytest.mark.parametrize("what", [FORWARD, LIGHT, OneShot(Ptz(1)), Fan(), ChangeSpeed(SpeedStep.UP), Find()], ids=str)
+def test_in_another_mode_the_car_would_ignore_it(desk: Desk, what: Action) -> None:
     desk.ask(SetMode(Mode.TRACKING))
     desk.run(3.0)
     answer = desk.ask(what)
@@ -434,21 +434,21 @@ def test_in_another_mode_the_car_would_ignore_it(desk: Desk, what: What) -> None
     ("platform", "what"),
     [
         ("raspberry_pi", SetMode(Mode.TRACKING)),
-        ("raspberry_pi", Act(General(Motion.STOP, light=Light.YELLOW))),
+        ("raspberry_pi", OneShot(General(Motion.STOP, light=Light.YELLOW))),
         ("raspberry_pi", Fan(on=True)),
         ("unknown", SetMode(Mode.FOLLOWING)),
-        ("unknown", Act(Ptz(3))),
-        ("arduino", Act(ArmSet((1, 2, 3, 4, 5, 6)))),
-        ("arduino", Act(General(Motion.STOP, servo=ServoAction.VERTICAL_UP))),
+        ("unknown", OneShot(Ptz(3))),
+        ("arduino", OneShot(ArmSet((1, 2, 3, 4, 5, 6)))),
+        ("arduino", OneShot(General(Motion.STOP, servo=ServoAction.VERTICAL_UP))),
     ],
     ids=str,
 )
-def test_what_the_platform_does_not_know_is_never_sent(platform: str, what: What) -> None:
+def test_what_the_platform_does_not_know_is_never_sent(platform: str, what: Action) -> None:
     desk = Desk(platform).ready()
     assert desk.ask(what, identity="it").reason is Reason.UNSUPPORTED
     desk.run(2.0)
     assert set(desk.frames) <= {STOP, MODE00}, "a rest that nothing has shown is renewed"
-    assert {why for _, _, why in desk.sent} <= {Why.REPEAT}
+    assert {why for _, _, why in desk.sent} <= {FrameOrigin.REPEAT}
     assert desk.life("it") == [ASKED, Phase.REJECTED]
 
 
@@ -583,7 +583,7 @@ def driving(desk: Desk) -> None:
 
 def acting(desk: Desk) -> None:
     desk.ask(Find(), identity="it")
-    desk.ask(Act(Ptz(1)))
+    desk.ask(OneShot(Ptz(1)))
 
 
 def opening(desk: Desk) -> None:
@@ -709,12 +709,12 @@ def test_a_link_that_goes_during_the_last_stop_is_said(desk: Desk) -> None:
 # ---------------------------------------------------------------------- everything at once
 
 
-def anything(moments: random.Random) -> What:
+def anything(moments: random.Random) -> Action:
     return moments.choice(
         [
             *(Drive(motion, moments.choice([0.1, 0.5, 3.0])) for motion in Motion),
             *(SetMode(mode) for mode in (Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED)),
-            *(WHISTLE, LIGHT, Act(Ptz(90)), Act(ColorLed(1, 2, 3)), Find(), Resume()),
+            *(WHISTLE, LIGHT, OneShot(Ptz(90)), OneShot(ColorLed(1, 2, 3)), Find(), Resume()),
             *(Fan(), ChangeSpeed(SpeedStep.UP), Stop()),
         ]
     )
@@ -757,7 +757,7 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
             gap = later - earlier + 1e-6
             if first == b"#":
                 assert gap >= 0.05
-            elif why is Why.RECOVERY or (second in stops and platform != "arduino"):
+            elif why is FrameOrigin.RECOVERY or (second in stops and platform != "arduino"):
                 assert gap >= 0.06, "recovery, and the stops of these platforms, do not wait for a block's end"
             elif isinstance(frame, ModeOpen) and second == MODE00:
                 assert gap >= 1.1, "the opening frame is read by then: MODE00 is alone when its block ends"

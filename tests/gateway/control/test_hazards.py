@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.control.commands import Act, Answer, Drive, Fan, Phase, Reason, SetMode, Stop
+from gateway.control.commands import Answer, Drive, Fan, OneShot, Phase, Reason, SetMode, Stop
 from gateway.control.estimate.trust import Basis
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.protocol.enums import Light, Mode, Motion
@@ -67,7 +67,7 @@ def driving(pair: Pair, motion: Motion = Motion.FORWARD) -> None:
     pair.until(lambda: pair.car.truth.driving, 3.0)
 
 
-def blocked(pair: Pair, by: Act | Fan) -> None:
+def blocked(pair: Pair, by: OneShot | Fan) -> None:
     """Deaf from now on, by a frame that the car has read."""
     pair.ask(by)
     pair.until(lambda: pair.car.truth.blocked, 3.0)
@@ -105,7 +105,7 @@ def recovers(pair: Pair) -> None:
     assert pair.control.motors == "off"
 
 
-def refused(pair: Pair, what: Act | SetMode) -> None:
+def refused(pair: Pair, what: OneShot | SetMode) -> None:
     sent = len(pair.sent)
     assert pair.ask(what).reason is Reason.UNSUPPORTED
     pair.run(2.0)
@@ -113,7 +113,7 @@ def refused(pair: Pair, what: Act | SetMode) -> None:
     assert all(parse_sent(data) == repeated for _, data in pair.sent[sent:]), "only the repetition"
 
 
-PTZ = Act(Ptz(90))
+PTZ = OneShot(Ptz(90))
 
 
 # ---------------------------------------------------------------------- the Arduino program
@@ -195,11 +195,11 @@ def opened_while_driving(pair: Pair) -> None:
 @ours("a named frame it does not know: wedged")
 def wedged(pair: Pair) -> None:
     driving(pair)
-    refused(pair, Act(ArmSet((90,) * 6)))
+    refused(pair, OneShot(ArmSet((90,) * 6)))
     stops(pair)
 
 
-def cut(pair: Pair, what: Act | Drive, count: int) -> None:
+def cut(pair: Pair, what: OneShot | Drive, count: int) -> None:
     """A write that is cut after so many bytes, and the link with it."""
     pair.cut = count
     pair.ask(what)
@@ -209,7 +209,7 @@ def cut(pair: Pair, what: Act | Drive, count: int) -> None:
 
 @ours("half of a named frame: wedged", "half of a named frame, then a MODE frame: it can OPEN mode 4")
 def half_named(pair: Pair) -> None:
-    for what, length in ((PTZ, 12), (Act(ColorLed(255, 0, 16)), 24)):
+    for what, length in ((PTZ, 12), (OneShot(ColorLed(255, 0, 16)), 24)):
         for count in range(1, length):
             driving(pair)
             cut(pair, what, count)
@@ -360,9 +360,9 @@ def pi_hang_up(pair: Pair) -> None:
 @ours("light 1 cycles; lights 5..8 are not known")
 def pi_light(pair: Pair) -> None:
     for light in (Light.WHITE, Light.CYAN, Light.MAGENTA, Light.YELLOW, Light.OFF):
-        refused(pair, Act(General(Motion.STOP, light=light)))
+        refused(pair, OneShot(General(Motion.STOP, light=light)))
     before = pair.car.truth.led
-    pair.ask(Act(General(Motion.STOP, light=Light.GREEN)))
+    pair.ask(OneShot(General(Motion.STOP, light=Light.GREEN)))
     pair.run(1.0)
     assert (before, pair.car.truth.led) == ("off", "#00ff00")
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.control.estimate.mode import CONTRADICTING_FRAMES, ModeTruth, Verdict
+from gateway.control.estimate.mode import CONTRADICTING_FRAMES, ModeEstimator, Verdict
 from gateway.protocol.decoder import SILENCE_S, Decoder, Sensors
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import parse_platform
@@ -29,9 +29,9 @@ def reading(shape: bytes, at: float) -> Sensors:
     return event
 
 
-def asked(mode: Mode) -> ModeTruth:
+def asked(mode: Mode) -> ModeEstimator:
     """A car that was in mode 0, or in tracking, and heard there; at 0.0 the mode was asked."""
-    truth = ModeTruth(parse_platform("arduino"))
+    truth = ModeEstimator(parse_platform("arduino"))
     before = Mode.TRACKING if mode is Mode.MANUAL else Mode.MANUAL
     truth.ask(before, now=-10.0, block_s=1.0)
     truth.heard(reading(SHAPES[before], -0.1))
@@ -42,7 +42,7 @@ def asked(mode: Mode) -> ModeTruth:
 
 
 def test_before_anything_is_asked_nothing_is_said() -> None:
-    truth = ModeTruth(parse_platform("arduino"))
+    truth = ModeEstimator(parse_platform("arduino"))
     truth.silent(now=100.0, fan=False)
     truth.heard(reading(SHAPES[Mode.TRACKING], 1.0))
     assert (truth.asked, truth.inferred, truth.verdict, truth.confirmed) == (None, Mode.TRACKING, ASSUMED, None)
@@ -219,7 +219,7 @@ def test_asked_again_for_manual_a_confirmed_car_stays_confirmed() -> None:
 def test_it_is_in_the_new_mode_when_the_turn_of_the_old_one_and_the_block_are_over(
     before: Mode | None, latest_s: float
 ) -> None:
-    truth = ModeTruth(parse_platform("arduino"))
+    truth = ModeEstimator(parse_platform("arduino"))
     if before is not None:
         truth.ask(before, now=0.0, block_s=BLOCK_S)
     truth.ask(Mode.MANUAL, now=100.0, block_s=1.0)
@@ -230,7 +230,7 @@ def test_it_is_in_the_new_mode_when_the_turn_of_the_old_one_and_the_block_are_ov
 
 @pytest.mark.parametrize(("platform", "fits"), [("raspberry_pi", ()), ("unknown", SILENT), ("stm32", SILENT)])
 def test_silence_of_a_car_that_knows_no_silent_mode_is_none_of_its_modes(platform: str, fits: tuple[Mode, ...]) -> None:
-    truth = ModeTruth(parse_platform(platform))
+    truth = ModeEstimator(parse_platform(platform))
     truth.ask(Mode.MANUAL, now=0.0, block_s=0.0)
     truth.heard(reading(b"$4WD,CSB57,PV8.4,GS0,LF1011,HW01,GM10#", 5.0))
     assert truth.verdict is CONFIRMED
@@ -240,7 +240,7 @@ def test_silence_of_a_car_that_knows_no_silent_mode_is_none_of_its_modes(platfor
 
 
 def test_the_fan_of_a_raspberry_pi_car_silences_nothing() -> None:
-    truth = ModeTruth(parse_platform("raspberry_pi"))
+    truth = ModeEstimator(parse_platform("raspberry_pi"))
     truth.ask(Mode.MANUAL, now=0.0, block_s=0.0)
     assert truth.silence_limit(fan=True) == 3.0
 

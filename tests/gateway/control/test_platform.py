@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.estimate.platform import RUNNING, PlatformTruth
+from gateway.control.estimate.platform import RUNNING, PlatformDetector
 from gateway.protocol.decoder import SILENCE_S, Decoder
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
@@ -27,15 +27,15 @@ def event_of(text: str) -> Event:
     return (decoder.feed(wire(text), 1.0) + decoder.tick(1.0 + SILENCE_S))[0]
 
 
-def hear(truth: PlatformTruth, *frames: str) -> list[str]:
+def hear(truth: PlatformDetector, *frames: str) -> list[str]:
     return [words for frame in frames for words in truth.heard(event_of(frame))]
 
 
 @pytest.mark.parametrize("row", CASES, ids=ids(CASES))
 def test_what_is_heard_and_what_follows(row: dict[str, str]) -> None:
     """Vectors: frames in turn, each so many times; what is contradicted then, and the platform that `auto` has."""
-    auto = PlatformTruth(parse_platform("unknown"), auto=True)
-    told = {name: PlatformTruth(parse_platform(name)) for name in ("arduino", "stm32", "raspberry_pi", "unknown")}
+    auto = PlatformDetector(parse_platform("unknown"), auto=True)
+    told = {name: PlatformDetector(parse_platform(name)) for name in ("arduino", "stm32", "raspberry_pi", "unknown")}
     events: dict[str, list[str]] = {name: [] for name in told}
     for part in row["heard"].split(" "):
         count, _, frame = part.partition("x")
@@ -56,7 +56,7 @@ def test_what_is_heard_and_what_follows(row: dict[str, str]) -> None:
 
 
 def test_a_contradiction_is_told_when_it_first_stands_and_ends_when_three_readings_do_not_show_it() -> None:
-    truth = PlatformTruth(parse_platform("stm32"))
+    truth = PlatformDetector(parse_platform("stm32"))
     assert not hear(truth, PI, PI)
     assert hear(truth, PI) == list(truth.contradictions) != []
     assert not hear(truth, PI, PI, ARDUINO, ARDUINO)
@@ -66,7 +66,7 @@ def test_a_contradiction_is_told_when_it_first_stands_and_ends_when_three_readin
 
 
 def test_readings_of_another_mode_say_nothing_of_mode_0() -> None:
-    truth = PlatformTruth(parse_platform("arduino"))
+    truth = PlatformDetector(parse_platform("arduino"))
     hear(truth, PI, PI, *[TRACKING] * 30)
     assert hear(truth, PI)
 
@@ -77,8 +77,8 @@ def test_readings_of_another_mode_say_nothing_of_mode_0() -> None:
     )
 )
 def test_one_damaged_frame_never_contradicts(bursts: list[tuple[int, str]]) -> None:
-    truth = PlatformTruth(parse_platform("arduino"))
-    auto = PlatformTruth(parse_platform("unknown"), auto=True)
+    truth = PlatformDetector(parse_platform("arduino"))
+    auto = PlatformDetector(parse_platform("unknown"), auto=True)
     hear(auto, *[ARDUINO] * RUNNING)
     for good, damaged in bursts:
         assert not hear(truth, *[ARDUINO] * good, damaged)
@@ -88,7 +88,7 @@ def test_one_damaged_frame_never_contradicts(bursts: list[tuple[int, str]]) -> N
 
 
 def test_auto_adds_the_options_that_it_hears() -> None:
-    truth = PlatformTruth(parse_platform("unknown"), auto=True)
+    truth = PlatformDetector(parse_platform("unknown"), auto=True)
     hear(truth, ARM, ARM, ARM)
     assert truth.profile.name == "unknown+arm"
     hear(truth, *[ARDUINO] * RUNNING)
@@ -96,7 +96,7 @@ def test_auto_adds_the_options_that_it_hears() -> None:
 
 
 def test_a_car_that_is_neither_is_treated_as_unknown() -> None:
-    truth = PlatformTruth(parse_platform("unknown"), auto=True)
+    truth = PlatformDetector(parse_platform("unknown"), auto=True)
     hear(truth, *[ARDUINO] * RUNNING)
     assert truth.profile.name == "arduino"
     hear(truth, *[PI] * RUNNING)
@@ -111,8 +111,8 @@ def test_a_car_that_is_neither_is_treated_as_unknown() -> None:
 def test_the_simulated_cars_are_found_and_contradict_nothing_of_their_own(platform: str, world: str) -> None:
     for mode in Mode:
         car = build(platform, WORLDS[world](), 0, random.Random(3), options=frozenset({"arm"}))
-        told = PlatformTruth(parse_platform(f"{platform}+arm"))
-        auto = PlatformTruth(parse_platform("unknown"), auto=True)
+        told = PlatformDetector(parse_platform(f"{platform}+arm"))
+        auto = PlatformDetector(parse_platform("unknown"), auto=True)
         decoder = Decoder()
         car.feed(frame_of(mode), 0.0)
         for tenth in range(300):

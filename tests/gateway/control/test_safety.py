@@ -3,11 +3,11 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.commands import Kind, Sender
-from gateway.control.safety import REMEMBERED_ENDED, Estop, Hold, Kept, Lease, Safety
+from gateway.control.commands import Sender, SenderKind
+from gateway.control.safety import REMEMBERED_ENDED, Estop, Hold, LeaseState, PersistedSafety, Safety
 
-ANN, BOB = Sender("ann", Kind.PERSON), Sender("bob", Kind.PERSON)
-SCRIPT, PLAN = Sender("ann", Kind.SCRIPT), Sender("plan", Kind.COORDINATOR)
+ANN, BOB = Sender("ann", SenderKind.PERSON), Sender("bob", SenderKind.PERSON)
+SCRIPT, PLAN = Sender("ann", SenderKind.SCRIPT), Sender("plan", SenderKind.COORDINATOR)
 
 
 def estop(identity: str, *, fleet_wide: bool = True) -> Estop:
@@ -49,7 +49,7 @@ def test_what_is_kept_is_restored() -> None:
     safety.end(["a"])
     safety.grant(ANN, 5.0)
     restored = Safety.restored(safety.kept)
-    assert restored.kept == safety.kept == Kept(Hold("eve", 7), (estop("b"),), ("a",))
+    assert restored.kept == safety.kept == PersistedSafety(Hold("eve", 7), (estop("b"),), ("a",))
     assert restored.lease is None, "who drives says so again"
 
 
@@ -97,18 +97,18 @@ def test_a_lease() -> None:
     safety = Safety()
     safety.grant(SCRIPT, 10.0)
     lease = safety.leased(11.9)
-    assert lease == Lease(SCRIPT, 12.0)
+    assert lease == LeaseState(SCRIPT, 12.0)
     assert safety.leased(12.0) is None
     assert not lease.refuses(SCRIPT, 11.0, take=False)
     assert not lease.refuses(ANN, 11.0, take=False), "a person outranks a script"
     assert lease.refuses(PLAN, 11.0, take=True)
     assert lease.refuses(Sender("other"), 11.0, take=True), "only a person may take"
     assert not lease.refuses(PLAN, 12.0, take=False), "it is over"
-    persons = Lease(ANN, 12.0)
+    persons = LeaseState(ANN, 12.0)
     assert persons.refuses(BOB, 11.0, take=False), "between equals the holder keeps it"
     assert not persons.refuses(BOB, 11.0, take=True)
     safety.driven_no_more(5.0)
-    assert safety.leased(6.9) == Lease(SCRIPT, 7.0)
+    assert safety.leased(6.9) == LeaseState(SCRIPT, 7.0)
     assert not safety.release(ANN)
     assert safety.release(SCRIPT)
     assert safety.leased(5.0) is None

@@ -143,23 +143,23 @@ def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
 # ---------------------------------------------------------------------- the choice, as a table
 
 
-def situations() -> list[stopping.Situation]:
+def situations() -> list[stopping.StopContext]:
     """The whole product of what the choice looks at."""
     return [
-        stopping.Situation(parse_platform(platform), known, mode, *flags)
+        stopping.StopContext(parse_platform(platform), known, mode, *flags)
         for platform, known, mode, *flags in product(
             Platform, (True, False), (None, *Mode), (True, False), (True, False), (True, False), (True, False)
         )
     ]
 
 
-def certain(situation: stopping.Situation) -> bool:
+def certain(situation: stopping.StopContext) -> bool:
     """Known to be in mode 0, where general frames are obeyed."""
     return situation.known and situation.mode is Mode.MANUAL and not situation.contradicted
 
 
 # protocol.md, stopping: the first row that fits.
-FULL: tuple[tuple[Callable[[stopping.Situation], bool], sequences.Recipe], ...] = (
+FULL: tuple[tuple[Callable[[stopping.StopContext], bool], sequences.StopSequence], ...] = (
     (lambda it: (it.doubted or it.profile.kind is Platform.UNKNOWN) and certain(it), sequences.UNKNOWN_MANUAL),
     (lambda it: it.doubted or it.profile.kind is Platform.UNKNOWN, sequences.UNKNOWN),
     (lambda it: it.profile.stop_style is StopStyle.RASPBERRY_PI, sequences.PI),

@@ -10,13 +10,13 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from gateway.link import CannotOpen, LinkLost, open_link, parse_url
 from gateway.link.url import SerialUrl, UsbUrl
-from gateway.link.usb import Plugged, choose
+from gateway.link.usb import UsbSerialPort, choose
 from tests.gateway.link.peers import PtyPeer
 
-CH340 = Plugged("/dev/ttyUSB0", 0x1A86, 0x7523)
-UNO_1 = Plugged("/dev/ttyACM0", 0x2341, 0x0043, "7573")
-UNO_2 = Plugged("/dev/ttyACM1", 0x2341, 0x0043, "9912")
-BOARD = Plugged("/dev/ttyS0")
+CH340 = UsbSerialPort("/dev/ttyUSB0", 0x1A86, 0x7523)
+UNO_1 = UsbSerialPort("/dev/ttyACM0", 0x2341, 0x0043, "7573")
+UNO_2 = UsbSerialPort("/dev/ttyACM1", 0x2341, 0x0043, "9912")
+BOARD = UsbSerialPort("/dev/ttyS0")
 THERE = [UNO_2, CH340, BOARD, UNO_1]
 PATIENCE_S = 20.0
 FRAME = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
@@ -57,10 +57,14 @@ def test_one_fits(url: UsbUrl, device: str) -> None:
                 "(2341:0043 serial number 9912): add a serial= that only one has, or give its device path"
             ),
         ),
-        (UsbUrl(1), [Plugged("/dev/x", 2, 3, "a\n\x1b[1m")], "there are: /dev/x (0002:0003 serial number a??[1m)"),
+        (
+            UsbUrl(1),
+            [UsbSerialPort("/dev/x", 2, 3, "a\n\x1b[1m")],
+            "there are: /dev/x (0002:0003 serial number a??[1m)",
+        ),
     ],
 )
-def test_none_or_several_is_one_line(url: UsbUrl, there: list[Plugged], words: str) -> None:
+def test_none_or_several_is_one_line(url: UsbUrl, there: list[UsbSerialPort], words: str) -> None:
     with pytest.raises(CannotOpen) as caught:
         choose(url, there)
     assert words in str(caught.value)
@@ -71,7 +75,7 @@ def test_none_or_several_is_one_line(url: UsbUrl, there: list[Plugged], words: s
 def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Say which ports the system lists, in pyserial's own words: a PTY is in no such list."""
 
-    def listed(*ports: Plugged) -> None:
+    def listed(*ports: UsbSerialPort) -> None:
         found = []
         for port in ports:
             info = ListPortInfo(port.device)
@@ -87,7 +91,7 @@ async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: 
     (tmp_path / "ACM1").mkdir()
     first, second = PtyPeer(tmp_path / "ACM0"), PtyPeer(tmp_path / "ACM1")
     url = parse_url("serial://?vid=2341&serial=7573")
-    plug(CH340, Plugged(path(first), 0x2341, 0x0043, "7573"))
+    plug(CH340, UsbSerialPort(path(first), 0x2341, 0x0043, "7573"))
     link = await open_link(url)
     first.die()
     plug(CH340)
@@ -96,7 +100,7 @@ async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: 
     with pytest.raises(CannotOpen, match="no such USB device is plugged in; there are: /dev/ttyUSB0"):
         await open_link(url)
     await link.close()
-    plug(Plugged(path(second), 0x2341, 0x0043, "7573"), CH340)
+    plug(UsbSerialPort(path(second), 0x2341, 0x0043, "7573"), CH340)
     link = await open_link(url)
     second.send(FRAME)
     assert await link.read() == FRAME
@@ -119,7 +123,7 @@ async def test_a_device_that_goes_while_the_ports_are_listed_costs_one_try(
         with pytest.raises(CannotOpen, match=r"cannot be listed|cannot be opened"):
             await open_link(parse_url(asked), timeout_s=PATIENCE_S)
     peer = PtyPeer(tmp_path)
-    plug(Plugged(path(peer), 0x2341, 0x0043, "7573"))
+    plug(UsbSerialPort(path(peer), 0x2341, 0x0043, "7573"))
     link = await open_link(UsbUrl(vid=0x2341))
     await link.close()
     peer.close()
@@ -129,7 +133,7 @@ async def test_a_listing_that_fails_once_is_asked_for_again(
     tmp_path: Path, plug: Usb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peer = PtyPeer(tmp_path)
-    plug(Plugged(path(peer), 0x2341, 0x0043, "7573"))
+    plug(UsbSerialPort(path(peer), 0x2341, 0x0043, "7573"))
     whole, failures = list_ports.comports, [TypeError("half gone")]
     monkeypatch.setattr(list_ports, "comports", lambda: _raise(failures.pop()) if failures else whole())
     link = await open_link(UsbUrl(pid=0x0043))
@@ -146,7 +150,7 @@ async def test_another_device_that_comes_in_its_place_is_not_commanded(named: st
     peer = PtyPeer(tmp_path)
     url = parse_url(named.replace("PATH", path(peer)))
     device = str((tmp_path / "tty").resolve())
-    first, second = (Plugged(device, 0x2341, 0x0A0A, number) for number in ("7573", "99\n12"))
+    first, second = (UsbSerialPort(device, 0x2341, 0x0A0A, number) for number in ("7573", "99\n12"))
     plug(CH340, first)
     await (await open_link(url)).close()
     plug(CH340, second)
@@ -164,7 +168,7 @@ async def test_another_device_that_comes_in_its_place_is_not_commanded(named: st
 async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: Usb) -> None:
     """Gone, or something that says nothing of itself."""
     peer = PtyPeer(tmp_path)
-    plug(Plugged(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
+    plug(UsbSerialPort(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
     await (await open_link(peer.url)).close()
     plug(CH340)
     with pytest.raises(CannotOpen, match=f"another device is there, {path(peer)}, of which the system says nothing;"):
@@ -176,7 +180,7 @@ async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: 
 
 async def test_ports_that_say_nothing_of_themselves_are_all_the_same(tmp_path: Path, plug: Usb) -> None:
     peer = PtyPeer(tmp_path)
-    plug(Plugged(str((tmp_path / "tty").resolve())))
+    plug(UsbSerialPort(str((tmp_path / "tty").resolve())))
     await (await open_link(peer.url)).close()
     plug(CH340)
     await (await open_link(peer.url)).close()
@@ -185,7 +189,7 @@ async def test_ports_that_say_nothing_of_themselves_are_all_the_same(tmp_path: P
 
 async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> None:
     gone = str(tmp_path / "ttyACM0")
-    plug(Plugged(gone, 1, 2, "3"))
+    plug(UsbSerialPort(gone, 1, 2, "3"))
     with pytest.raises(CannotOpen) as caught:
         await open_link(UsbUrl(serial="3"))
     assert str(caught.value) == f"serial://?serial=3: {gone}: there is no such port; there are: {gone}"

@@ -15,20 +15,20 @@ from gateway.sim.faults import (
     press_of,
     targets,
 )
-from gateway.sim.model.faulty_link import Flood, Way
+from gateway.sim.model.faulty_link import Direction, Flood
 from gateway.sim.model.ir_remote import Button
 
 GOOD_FAULTS = [
     ("red:link_drop@5+2", Scheduled(5.0, Fault(FaultKind.LINK_DROP, "red", 2.0))),
     ("link_drop@0.5", Scheduled(0.5, Fault(FaultKind.LINK_DROP))),
-    ("red:garbage@3+200", Scheduled(3.0, Fault(FaultKind.GARBAGE, "red", bytes=200, ways=(Way.TO_HOST,)))),
-    ("garbage@3,to=car", Scheduled(3.0, Fault(FaultKind.GARBAGE, bytes=100, ways=(Way.TO_CAR,)))),
+    ("red:garbage@3+200", Scheduled(3.0, Fault(FaultKind.GARBAGE, "red", bytes=200, ways=(Direction.TO_HOST,)))),
+    ("garbage@3,to=car", Scheduled(3.0, Fault(FaultKind.GARBAGE, bytes=100, ways=(Direction.TO_CAR,)))),
     ("red:rename@1", Scheduled(1.0, Fault(FaultKind.RENAME, "red", 1.0))),
     ("red:rename@1+2,path=/x:y", Scheduled(1.0, Fault(FaultKind.RENAME, "red", 2.0, path="/x:y"))),
     ("red:cut_write@1+2,bytes=0", Scheduled(1.0, Fault(FaultKind.CUT_WRITE, "red", 2.0, bytes=0))),
     ("slow@1+2", Scheduled(1.0, Fault(FaultKind.SLOW, for_s=2.0, factor=0.1))),
     ("slow@1,factor=1e-2", Scheduled(1.0, Fault(FaultKind.SLOW, factor=0.01))),
-    ("lossy@1,share=0.5,to=car", Scheduled(1.0, Fault(FaultKind.LOSSY, share=0.5, ways=(Way.TO_CAR,)))),
+    ("lossy@1,share=0.5,to=car", Scheduled(1.0, Fault(FaultKind.LOSSY, share=0.5, ways=(Direction.TO_CAR,)))),
     ("stuck@1+0", Scheduled(1.0, Fault(FaultKind.STUCK, for_s=0.0))),
     ("deaf@1", Scheduled(1.0, Fault(FaultKind.DEAF))),
     ("mute@1", Scheduled(1.0, Fault(FaultKind.MUTE))),

@@ -9,7 +9,7 @@ import pytest
 
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.car_body import CarBody
-from gateway.sim.model.firmware import Body, Pose, Truth
+from gateway.sim.model.firmware import CarBodyState, Pose, Truth
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import RaspberryPiCar
 from gateway.sim.model.world import World
@@ -306,7 +306,7 @@ async def test_options_send_and_accept_their_frames() -> None:
         await car.until(lambda truth: truth.driving)
 
 
-def lit_body(lamp: Lamp) -> Body:
+def lit_body(lamp: Lamp) -> CarBodyState:
     world = World.room()
     return CarBody(World(world.walls, world.line, [lamp]), Pose(0.0, -1.05, 0.0), random.Random(1))
 

@@ -10,7 +10,7 @@ import pytest
 from gateway.control.commands import SetMode, Stop
 from gateway.control.estimate.mode import Verdict
 from gateway.protocol.enums import Mode
-from gateway.sim.model.objects import Lamp, Thing
+from gateway.sim.model.objects import Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
 from gateway.sim.world_file import WorldSpec, read_world
 from tests.support.virtual import Pair
@@ -142,7 +142,7 @@ def test_a_lamp_on_a_cars_back_leads_the_next() -> None:
 
 
 def test_a_follower_follows_a_thing_on_a_path() -> None:
-    post = Thing("post", radius_m=0.1, path=((0.35, 0.0), (3.0, 0.0)), speed_m_s=0.1, waits_for_m=0.37)
+    post = MovingObject("post", radius_m=0.1, path=((0.35, 0.0), (3.0, 0.0)), speed_m_s=0.1, waits_for_m=0.37)
     starts = {name: pose._replace(y_m=2.0) for name, pose in spec().starts.items()}
     starts["green"] = starts["green"]._replace(x_m=0.0, y_m=0.0)
     row = Row(World(things=[post], starts=starts, cars_meet=True))

@@ -7,16 +7,16 @@ from math import inf
 import pytest
 
 from gateway.protocol.decoder import Decoder
-from gateway.sim.model.faulty_link import FLOOD_EVERY_S, TO_HOST_LIMIT, Flood, Line, Way
+from gateway.sim.model.faulty_link import FLOOD_EVERY_S, TO_HOST_LIMIT, Direction, FaultyLink, Flood
 
 FRAME = b"$1,0,0,0,0,0,0,0,0#"
 
 
-def line(seed: int = 1) -> Line:
-    return Line(random.Random(seed), random.Random(seed + 1))
+def line(seed: int = 1) -> FaultyLink:
+    return FaultyLink(random.Random(seed), random.Random(seed + 1))
 
 
-def both(link: Line, data: bytes, now: float) -> tuple[bytes, bytes]:
+def both(link: FaultyLink, data: bytes, now: float) -> tuple[bytes, bytes]:
     """The same bytes sent each way, and what of them is out at once: at the car, at the host."""
     link.from_host(data, now)
     link.from_car(data, now)
@@ -28,7 +28,7 @@ def test_without_a_fault_bytes_pass_as_they_come() -> None:
     for now, data in enumerate((FRAME, b"", b"\x00\xff")):
         assert both(link, data, float(now)) == (data, data)
     assert link.next_event() == inf
-    assert link.lost_bytes == {Way.TO_CAR: 0, Way.TO_HOST: 0}
+    assert link.lost_bytes == {Direction.TO_CAR: 0, Direction.TO_HOST: 0}
 
 
 def test_a_slow_link_hands_on_byte_by_byte_and_catches_up_afterwards() -> None:
@@ -64,7 +64,7 @@ def test_a_slow_link_holds_so_much_for_the_host_and_no_more() -> None:
         link.from_car(bytes(100), 0.0)
     out = b"".join(link.to_host(1e6))
     assert len(out) == TO_HOST_LIMIT
-    assert link.lost_bytes[Way.TO_HOST] == 10_000 - TO_HOST_LIMIT
+    assert link.lost_bytes[Direction.TO_HOST] == 10_000 - TO_HOST_LIMIT
     link.from_car(b"again", 1e6)
     assert b"".join(link.to_host(1e6 + 100)) == b"again"
 
@@ -72,19 +72,19 @@ def test_a_slow_link_holds_so_much_for_the_host_and_no_more() -> None:
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
 def test_a_lossy_link_loses_its_share(share: float) -> None:
     link = line()
-    link.lossy(share, tuple(Way), until=5.0)
+    link.lossy(share, tuple(Direction), until=5.0)
     data = random.Random(3).randbytes(10_000)
     for out in both(link, data, 1.0):
         expected = 10_000 * (1 - share)
         assert abs(len(out) - expected) <= 4 * math.sqrt(10_000 * share * (1 - share))
-    assert link.lost_bytes[Way.TO_CAR] > 0 or share == 0
+    assert link.lost_bytes[Direction.TO_CAR] > 0 or share == 0
     assert both(link, FRAME, 5.0) == (FRAME, FRAME), "it ends"
 
 
 def test_what_is_lost_depends_on_the_seed_and_the_bytes_of_its_way_only() -> None:
     def run(seed: int, *, other: bool, piece: int) -> bytes:
         link = line(seed)
-        link.lossy(0.3, tuple(Way), until=inf)
+        link.lossy(0.3, tuple(Direction), until=inf)
         out = b""
         data = bytes(range(256)) * 4
         for start in range(0, len(data), piece):
@@ -98,15 +98,15 @@ def test_what_is_lost_depends_on_the_seed_and_the_bytes_of_its_way_only() -> Non
     assert run(1, other=False, piece=1024) != run(2, other=False, piece=1024)
 
 
-@pytest.mark.parametrize("way", list(Way))
-def test_one_way_is_lossy_or_closed_the_other_is_not(way: Way) -> None:
+@pytest.mark.parametrize("way", list(Direction))
+def test_one_way_is_lossy_or_closed_the_other_is_not(way: Direction) -> None:
     for fault in ("lossy", "closed"):
         link = line()
         if fault == "lossy":
             link.lossy(1.0, (way,), until=2.0)
         else:
             link.close(way, until=2.0)
-        out = dict(zip((Way.TO_CAR, Way.TO_HOST), both(link, FRAME, 1.0), strict=True))
+        out = dict(zip((Direction.TO_CAR, Direction.TO_HOST), both(link, FRAME, 1.0), strict=True))
         assert out.pop(way) == b""
         assert list(out.values()) == [FRAME]
         assert link.lost_bytes[way] == len(FRAME)
@@ -191,4 +191,4 @@ def test_a_cut_link_forgets_what_is_under_way() -> None:
     link.clear()
     assert link.next_event() == inf
     assert link.waiting() == 0
-    assert link.lost_bytes == {Way.TO_CAR: 19, Way.TO_HOST: 19}
+    assert link.lost_bytes == {Direction.TO_CAR: 19, Direction.TO_HOST: 19}

@@ -11,9 +11,9 @@ import pytest
 import serial
 
 from gateway.sim.car_spec import parse_cars
-from gateway.sim.endpoints import LinkError
+from gateway.sim.endpoints import EndpointError
 from gateway.sim.faults import Fault, FaultKind, Press
-from gateway.sim.model.faulty_link import Flood, Way
+from gateway.sim.model.faulty_link import Direction, Flood
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.simulation import Simulation
 from tests.gateway.sim.strangers import RUN, STOP, opening
@@ -164,7 +164,7 @@ async def test_a_frame_that_never_ends(cars: Simulation) -> None:
 
 async def test_a_lossy_link_to_the_car_only(cars: Simulation) -> None:
     with open_port(cars) as port:
-        await cars.inflict(Fault(FaultKind.LOSSY, "red", share=0.5, ways=(Way.TO_CAR,)))
+        await cars.inflict(Fault(FaultKind.LOSSY, "red", share=0.5, ways=(Direction.TO_CAR,)))
         port.write(b"x" * 400)
         car = cars.cars["red"]
         await until(lambda: car.lost_bytes["car"] > 150, "lost")
@@ -260,7 +260,7 @@ async def test_a_renamed_plain_pty_and_tcp_car_say_where_they_are(cars: Simulati
 async def test_a_path_that_is_taken_or_nowhere_is_refused_and_the_car_stays(cars: Simulation, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("precious")
     for path, words in ((tmp_path / "file", "is there already"), (tmp_path / "no" / "x", "directory is not there")):
-        with pytest.raises(LinkError, match=words):
+        with pytest.raises(EndpointError, match=words):
             await cars.inflict(Fault(FaultKind.RENAME, "red", for_s=0.0, path=str(path)))
     assert (tmp_path / "file").read_text() == "precious"
     assert (tmp_path / "red").is_symlink()

@@ -14,7 +14,7 @@ from gateway.sim.model.car_body import SONAR_REACH_CM, CarBody
 from gateway.sim.model.factory import build
 from gateway.sim.model.firmware import Firmware, Pose
 from gateway.sim.model.geometry import box, distance
-from gateway.sim.model.objects import Lamp, Thing
+from gateway.sim.model.objects import Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
 from tests.gateway.sim.strangers import RUN, VirtualStranger, opening, opening_s
 
@@ -27,7 +27,7 @@ def before(x: float, y: float) -> World:
     return World(starts={"red": HOME, "green": Pose(x, y, 0.0)}, cars_meet=True)
 
 
-def lit(lamp: Lamp, *, walls: bool = False, car: bool = False, thing: Thing | None = None) -> World:
+def lit(lamp: Lamp, *, walls: bool = False, car: bool = False, thing: MovingObject | None = None) -> World:
     """A car in the middle, a lamp, and what may stand in between, at x = 0.4."""
     return World(
         [(0.4, -0.1, 0.4, 0.1)] if walls else (),
@@ -73,10 +73,13 @@ async def test_following_a_car(where: str, at: tuple[float, float], word: bytes,
 
 @pytest.mark.parametrize(
     "thing",
-    [Thing("post", 0.25, 0.0, radius_m=0.05), Thing("crate", 0.3, 0.0, width_m=0.2, depth_m=0.3, heading_rad=0.3)],
+    [
+        MovingObject("post", 0.25, 0.0, radius_m=0.05),
+        MovingObject("crate", 0.3, 0.0, width_m=0.2, depth_m=0.3, heading_rad=0.3),
+    ],
     ids=["disc", "box"],
 )
-async def test_a_thing_is_followed_as_a_car_is(thing: Thing) -> None:
+async def test_a_thing_is_followed_as_a_car_is(thing: MovingObject) -> None:
     car = await opened(lit(Lamp(9.0, 9.0), thing=thing), 6)
     assert b"HW00" in car.received
     assert (car.truth.motor_left, car.truth.motor_right) == (200, 200)
@@ -95,11 +98,11 @@ SEEKING = [
     ("behind a wall", lit(Lamp(0.8, 0.0), walls=True), b"GM00", (0, 0)),
     ("overhead", lit(Lamp(0.8, 0.0, overhead=True), walls=True, car=True), b"GM11", (200, 200)),
     ("behind a car", lit(Lamp(0.8, 0.0), car=True), b"GM00", (0, 0)),
-    ("behind a disc", lit(Lamp(0.8, 0.0), thing=Thing("post", 0.4, 0.0, radius_m=0.1)), b"GM00", (0, 0)),
-    ("behind a box", lit(Lamp(0.8, 0.0), thing=Thing("b", 0.4, 0.0, width_m=0.1, depth_m=0.2)), b"GM00", (0, 0)),
+    ("behind a disc", lit(Lamp(0.8, 0.0), thing=MovingObject("post", 0.4, 0.0, radius_m=0.1)), b"GM00", (0, 0)),
+    ("behind a box", lit(Lamp(0.8, 0.0), thing=MovingObject("b", 0.4, 0.0, width_m=0.1, depth_m=0.2)), b"GM00", (0, 0)),
     (
         "on that thing",
-        lit(Lamp(0.0, 0.0, carried_by="post"), thing=Thing("post", 0.4, radius_m=0.1)),
+        lit(Lamp(0.0, 0.0, carried_by="post"), thing=MovingObject("post", 0.4, radius_m=0.1)),
         b"GM11",
         (200, 200),
     ),
@@ -132,12 +135,22 @@ RANGES = [
     ("touched", before(0.26, 0.0), 0.0, 3.0),
     ("a car beyond its reach", before(5.3, 0.0), 0.0, None),
     ("nothing ahead", before(-1.0, 0.0), 0.0, None),
-    ("a disc", lit(Lamp(0, 0), thing=Thing("post", 2.1, 0.0, radius_m=0.5)), 0.0, 150.0),
-    ("a box", lit(Lamp(0, 0), thing=Thing("box", 2.1, 0.0, width_m=1.0, depth_m=1.0)), 0.0, 150.0),
-    ("a wall before a car", lit(Lamp(0, 0), walls=True, thing=Thing("p", 0.9, radius_m=0.1)), 0.0, 30.0),
-    ("its own load", lit(Lamp(0, 0), thing=Thing("mast", 0.2, radius_m=0.05, carried_by="red")), 0.0, None),
-    ("another's load", lit(Lamp(0, 0), car=True, thing=Thing("m", -0.2, radius_m=0.05, carried_by="green")), 0.0, 5.0),
-    ("a box that sends the sound away", World(things=[Thing("b", 0.2, 0.4, width_m=2, depth_m=0.1)]), -5.0, None),
+    ("a disc", lit(Lamp(0, 0), thing=MovingObject("post", 2.1, 0.0, radius_m=0.5)), 0.0, 150.0),
+    ("a box", lit(Lamp(0, 0), thing=MovingObject("box", 2.1, 0.0, width_m=1.0, depth_m=1.0)), 0.0, 150.0),
+    ("a wall before a car", lit(Lamp(0, 0), walls=True, thing=MovingObject("p", 0.9, radius_m=0.1)), 0.0, 30.0),
+    ("its own load", lit(Lamp(0, 0), thing=MovingObject("mast", 0.2, radius_m=0.05, carried_by="red")), 0.0, None),
+    (
+        "another's load",
+        lit(Lamp(0, 0), car=True, thing=MovingObject("m", -0.2, radius_m=0.05, carried_by="green")),
+        0.0,
+        5.0,
+    ),
+    (
+        "a box that sends the sound away",
+        World(things=[MovingObject("b", 0.2, 0.4, width_m=2, depth_m=0.1)]),
+        -5.0,
+        None,
+    ),
 ]
 
 
@@ -181,7 +194,7 @@ def test_two_that_meet_head_on_stand_against_each_other() -> None:
 
 
 def test_a_thing_that_moves_pushes_a_car_that_stands_but_through_no_wall() -> None:
-    cart = Thing("cart", radius_m=0.1, path=((-1.0, 0.0), (9.0, 0.0)), speed_m_s=0.2)
+    cart = MovingObject("cart", radius_m=0.1, path=((-1.0, 0.0), (9.0, 0.0)), speed_m_s=0.2)
     world = World([(0.5, -1.0, 0.5, 1.0)], things=[cart])
     car = CarBody(world, HOME, random.Random(1), name="red")
     assert car.pose(3.0) == HOME
@@ -190,7 +203,7 @@ def test_a_thing_that_moves_pushes_a_car_that_stands_but_through_no_wall() -> No
 
 
 def test_a_thing_goes_round_its_path_at_its_speed_and_from_where_it_is_if_that_changes() -> None:
-    square = Thing("cart", radius_m=0.1, path=((0, 0), (1, 0), (1, 1), (0, 1)), speed_m_s=0.5)
+    square = MovingObject("cart", radius_m=0.1, path=((0, 0), (1, 0), (1, 1), (0, 1)), speed_m_s=0.5)
     for at_s, x, y in ((0, 0, 0), (1, 0.5, 0), (3, 1, 0.5), (7, 0, 0.5), (8, 0, 0), (9, 0.5, 0)):
         assert square.pose(at_s)[:2] == pytest.approx((x, y))
     assert square.faster(0.25, 1.0).pose(3.0)[:2] == pytest.approx((1, 0))
@@ -237,14 +250,14 @@ def lively_worlds(draw: st.DrawFn) -> tuple[World, list[Pose]]:
     speed, carrier = draw(st.floats(0, 0.5)), draw(st.sampled_from(("", "car0", "car7")))
     path = tuple(draw(st.lists(st.tuples(places, places), min_size=2, max_size=4, unique=True)))
     things = [
-        Thing(
+        MovingObject(
             "disc",
             radius_m=draw(st.floats(0.02, 0.5)),
             path=path,
             speed_m_s=speed,
             waits_for_m=draw(st.just(0) | places.map(abs)),
         ),
-        Thing(
+        MovingObject(
             "box", draw(places), draw(places), width_m=0.4, depth_m=0.2, heading_rad=draw(places), carried_by=carrier
         ),
     ]
@@ -293,7 +306,7 @@ def test_who_sees_is_seen(
 
 
 async def test_a_car_that_lost_its_leader_finds_it_again_when_it_is_put_before_it() -> None:
-    world = lit(Lamp(9.0, 9.0), thing=Thing("post", 2.0, 0.0, radius_m=0.1))
+    world = lit(Lamp(9.0, 9.0), thing=MovingObject("post", 2.0, 0.0, radius_m=0.1))
     car = await opened(world, 6)
     assert not car.truth.driving
     world.put_thing("post", 0.3, None, car.now)

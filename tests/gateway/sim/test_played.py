@@ -4,12 +4,12 @@ from math import inf
 
 import pytest
 
-from gateway.sim.model.capture_car import PAUSE_S, Played
+from gateway.sim.model.capture_car import PAUSE_S, CaptureCar
 
 PIECES = [(0.5, b"a"), (0.5, b"b"), (2.5, b"c")]
 
 
-def heard(played: Played, until: float) -> list[tuple[float, bytes]]:
+def heard(played: CaptureCar, until: float) -> list[tuple[float, bytes]]:
     out = []
     while (due := played.next_event()) <= until:
         out += played.advance(due)
@@ -18,7 +18,7 @@ def heard(played: Played, until: float) -> list[tuple[float, bytes]]:
 
 @pytest.mark.parametrize("rate", [0.5, 1.0, 4.0])
 def test_the_times_of_the_file_are_kept(rate: float) -> None:
-    played = Played(PIECES, rate=rate, now=10.0)
+    played = CaptureCar(PIECES, rate=rate, now=10.0)
     assert heard(played, inf if rate < 0 else 1000.0) == [(10.0 + at / rate, data) for at, data in PIECES]
     assert played.done
     assert (played.rounds, played.sent_bytes) == (1, 3)
@@ -26,14 +26,14 @@ def test_the_times_of_the_file_are_kept(rate: float) -> None:
 
 
 def test_one_late_look_gives_all_that_was_due() -> None:
-    played = Played(PIECES, now=0.0)
+    played = CaptureCar(PIECES, now=0.0)
     assert [data for _, data in played.advance(1.0)] == [b"a", b"b"]
     assert played.advance(2.0) == []
 
 
 @pytest.mark.parametrize("pieces", [PIECES, [(0.0, b"x")]])
 def test_a_loop_begins_again_after_a_pause(pieces: list[tuple[float, bytes]]) -> None:
-    played = Played(pieces, rate=2.0, loop=True, now=0.0)
+    played = CaptureCar(pieces, rate=2.0, loop=True, now=0.0)
     times = [at for at, _ in heard(played, 20.0)]
     length = (pieces[-1][0] + PAUSE_S) / 2
     assert times[: len(pieces) * 2] == pytest.approx([start + at / 2 for start in (0.0, length) for at, _ in pieces])
@@ -42,7 +42,7 @@ def test_a_loop_begins_again_after_a_pause(pieces: list[tuple[float, bytes]]) ->
 
 
 def test_it_waits_for_a_host_and_does_not_begin_again_for_another() -> None:
-    played = Played(PIECES)
+    played = CaptureCar(PIECES)
     assert played.next_event() == inf
     assert played.advance(100.0) == []
     played.begin(200.0)
@@ -51,7 +51,7 @@ def test_it_waits_for_a_host_and_does_not_begin_again_for_another() -> None:
 
 
 def test_it_hears_nothing_and_knows_nothing() -> None:
-    played = Played(PIECES, now=0.0)
+    played = CaptureCar(PIECES, now=0.0)
     played.feed(b"$0,0,0,0,0,0,0,0,0#", 0.1)
     played.drop_link(0.2)
     assert played.ignored_bytes == 19

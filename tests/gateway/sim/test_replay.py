@@ -19,16 +19,16 @@ from gateway.sim.cli import add_arguments, run
 
 PATIENCE = 20.0
 PIECES = [
-    capture.Piece(0.0, b"$4WD,CSB57.24,PV7.91,"),
-    capture.Piece(0.4, b"GS214,LF0000,HW00,GM00#"),
-    capture.Piece(0.8, bytes(range(256))),
+    capture.CapturedBytes(0.0, b"$4WD,CSB57.24,PV7.91,"),
+    capture.CapturedBytes(0.4, b"GS214,LF0000,HW00,GM00#"),
+    capture.CapturedBytes(0.8, bytes(range(256))),
 ]
 BYTES = b"".join(piece.data for piece in PIECES)
 
 
 @pytest.fixture
 def kept(tmp_path: Path) -> Path:
-    writer = capture.Writer(tmp_path / "red.raw", "/dev/ttyUSB0", "2026-01-01T00:00:00Z")
+    writer = capture.CaptureWriter(tmp_path / "red.raw", "/dev/ttyUSB0", "2026-01-01T00:00:00Z")
     for piece in PIECES:
         writer.add(piece)
     writer.close()
@@ -172,9 +172,9 @@ def test_a_capture_of_a_car_plays_as_that_car(start: Any, tmp_path: Path) -> Non
     with connect(sim.line()["link"]) as connection:
         got = read(connection, 100)
     begun = got[0][0]
-    writer = capture.Writer(tmp_path / "kept.raw", "tcp", "2026-01-01T00:00:00Z")
+    writer = capture.CaptureWriter(tmp_path / "kept.raw", "tcp", "2026-01-01T00:00:00Z")
     for at, data in got:
-        writer.add(capture.Piece(at - begun, data))
+        writer.add(capture.CapturedBytes(at - begun, data))
     writer.close()
     again = start("--replay", f"{tmp_path / 'kept.raw'}:red:tcp", "--rate", "10")
     with connect(again.line()["link"]) as connection:

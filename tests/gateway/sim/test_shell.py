@@ -19,9 +19,9 @@ import pytest
 import serial
 
 from gateway.sim.car_spec import parse_cars
-from gateway.sim.endpoints import LinkError, Taken
+from gateway.sim.endpoints import EndpointError, Taken
 from gateway.sim.faults import Fault, FaultKind
-from gateway.sim.model.faulty_link import Way
+from gateway.sim.model.faulty_link import Direction
 from gateway.sim.simulation import Simulation
 from gateway.sim.truth_publisher import LOOK_AGAIN_S, TruthPublisher
 from schemas.bus import Bus, Sample
@@ -220,23 +220,23 @@ async def test_a_second_host_is_sent_away(pair: Simulation) -> None:
 
 async def test_garbage_reaches_the_host_and_the_car(pair: Simulation) -> None:
     with serial.Serial(pair.cars["red"].url.removeprefix("serial://"), timeout=0) as port:
-        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=300, ways=(Way.TO_HOST,)))
+        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=300, ways=(Direction.TO_HOST,)))
         data = bytearray()
         await until(lambda: data.extend(port.read(4096)) or len(data) >= 300, "noise")
         assert len(set(data)) > 50
-        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=50, ways=(Way.TO_CAR,)))
+        await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=50, ways=(Direction.TO_CAR,)))
 
 
 async def test_a_port_in_use_and_a_path_in_use(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(LinkError, match=rf"car red: cannot listen on 127.0.0.1:{port}"):
+        with pytest.raises(EndpointError, match=rf"car red: cannot listen on 127.0.0.1:{port}"):
             await Simulation(parse_cars(["ok:arduino:pty", f"red:arduino:tcp://127.0.0.1:{port}"])).start()
     (tmp_path / "file").write_text("precious")
-    with pytest.raises(LinkError, match="file is there already: name another path"):
+    with pytest.raises(EndpointError, match="file is there already: name another path"):
         await Simulation(parse_cars([f"red:arduino:pty:{tmp_path / 'file'}"])).start()
     assert (tmp_path / "file").read_text() == "precious"
-    with pytest.raises(LinkError, match="No such file"):
+    with pytest.raises(EndpointError, match="No such file"):
         await Simulation(parse_cars([f"red:arduino:pty:{tmp_path / 'nowhere' / 'x'}"])).start()
 
 

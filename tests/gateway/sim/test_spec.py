@@ -2,14 +2,14 @@
 
 import pytest
 
-from gateway.sim.car_spec import BadSpec, CarSpec, PtyLink, ReplaySpec, TcpLink, parse_car, parse_cars, parse_replay
+from gateway.sim.car_spec import BadSpec, CarSpec, PtyPath, ReplaySpec, TcpListen, parse_car, parse_cars, parse_replay
 
 GOOD_CARS = [
-    ("red:arduino:pty", CarSpec("red", "arduino", frozenset(), PtyLink())),
-    ("r2_d-2:stm32+arm+imu:pty:/tmp/x", CarSpec("r2_d-2", "stm32", frozenset({"arm", "imu"}), PtyLink("/tmp/x"))),
-    ("blue:raspberry_pi:tcp://127.0.0.1:0", CarSpec("blue", "raspberry_pi", frozenset(), TcpLink("127.0.0.1", 0))),
-    ("blue:raspberry_pi:tcp", CarSpec("blue", "raspberry_pi", frozenset(), TcpLink())),
-    ("blue:arduino:tcp://[::1]:8888", CarSpec("blue", "arduino", frozenset(), TcpLink("::1", 8888))),
+    ("red:arduino:pty", CarSpec("red", "arduino", frozenset(), PtyPath())),
+    ("r2_d-2:stm32+arm+imu:pty:/tmp/x", CarSpec("r2_d-2", "stm32", frozenset({"arm", "imu"}), PtyPath("/tmp/x"))),
+    ("blue:raspberry_pi:tcp://127.0.0.1:0", CarSpec("blue", "raspberry_pi", frozenset(), TcpListen("127.0.0.1", 0))),
+    ("blue:raspberry_pi:tcp", CarSpec("blue", "raspberry_pi", frozenset(), TcpListen())),
+    ("blue:arduino:tcp://[::1]:8888", CarSpec("blue", "arduino", frozenset(), TcpListen("::1", 8888))),
 ]
 
 
@@ -52,12 +52,12 @@ def test_bad_cars(texts: list[str], words: str) -> None:
 
 
 REPLAYS = [
-    ("red.raw", ReplaySpec("replay", "red.raw", PtyLink())),
-    ("red.raw:red", ReplaySpec("red", "red.raw", PtyLink())),
-    ("/a/b:c.raw:red", ReplaySpec("red", "/a/b:c.raw", PtyLink())),
-    ("red.raw:red:pty:/tmp/red", ReplaySpec("red", "red.raw", PtyLink("/tmp/red"))),
-    ("red.raw:red:tcp", ReplaySpec("red", "red.raw", TcpLink())),
-    ("red.raw:red:tcp://127.0.0.1:80", ReplaySpec("red", "red.raw", TcpLink("127.0.0.1", 80))),
+    ("red.raw", ReplaySpec("replay", "red.raw", PtyPath())),
+    ("red.raw:red", ReplaySpec("red", "red.raw", PtyPath())),
+    ("/a/b:c.raw:red", ReplaySpec("red", "/a/b:c.raw", PtyPath())),
+    ("red.raw:red:pty:/tmp/red", ReplaySpec("red", "red.raw", PtyPath("/tmp/red"))),
+    ("red.raw:red:tcp", ReplaySpec("red", "red.raw", TcpListen())),
+    ("red.raw:red:tcp://127.0.0.1:80", ReplaySpec("red", "red.raw", TcpListen("127.0.0.1", 80))),
 ]
 
 

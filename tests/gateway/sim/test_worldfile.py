@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gateway.sim.model.car_body import CarBody
 from gateway.sim.model.firmware import Pose
-from gateway.sim.model.objects import Lamp, Thing
+from gateway.sim.model.objects import Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
 from gateway.sim.world_file import WorldSpec, read_world
 from gateway.sim.yaml_reader import LARGEST_BYTES, BadWorld
@@ -48,15 +48,15 @@ def test_every_field() -> None:
     assert not spec.cars_meet
     assert spec.starts == {"red": Pose(-1, -1, radians(90)), "011": Pose(-2, -1, 0)}
     assert spec.things == (
-        Thing(
+        MovingObject(
             "cart",
             radius_m=0.1,
             path=((0, 0), (1, 0), (2, 0), (1, 0)),
             speed_m_s=0.1,
             waits_for_m=1,
         ),
-        Thing("crate", 1, 2, width_m=0.4, depth_m=0.2, heading_rad=radians(-90)),
-        Thing("mast", -0.1, 0, radius_m=0.02, carried_by="red"),
+        MovingObject("crate", 1, 2, width_m=0.4, depth_m=0.2, heading_rad=radians(-90)),
+        MovingObject("mast", -0.1, 0, radius_m=0.02, carried_by="red"),
     )
     assert spec.lamps == (
         Lamp(0, 0, 10, 4, on=False, overhead=True, name="sun"),

@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 from fleet.cli import cli
 from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
-from fleet.recording.tools.summary import State, growing, overview
+from fleet.recording.tools.summary import SessionState, growing, overview
 from fleet.recording.writing.segment_writer import Segment
 
 START = 1_790_000_000_000_000_000
@@ -33,7 +33,7 @@ def write(path: Path, at_s: list[list[float]], *, closed: bool = True, cut: bool
     elif cut:
         segment.cut()
     count = sum(map(len, at_s))
-    session_dir.Description("fleet", "2026-09-21T14:13:20Z", "here", {}, closed=closed, messages=count).write(path)
+    session_dir.SessionInfo("fleet", "2026-09-21T14:13:20Z", "here", {}, closed=closed, messages=count).write(path)
     return segment
 
 
@@ -58,7 +58,7 @@ def test_what_was_made_of_a_damaged_one_says_how_much_is_missing(tmp_path: Path)
         assert "NOT whole" in result.output
         assert "3 messages are missing" in result.output
         found = overview(path)
-        assert (found.state, found.lost) == (State.RECOVERED, 3)
+        assert (found.state, found.lost) == (SessionState.RECOVERED, 3)
         assert "3 messages are missing" in found.words
 
 
@@ -67,7 +67,7 @@ def test_what_lost_nothing_when_it_was_recovered_is_whole(tmp_path: Path) -> Non
     write(old, [[1, 2], [3]])
     (old / "0001.mcap").write_bytes((old / "0001.mcap").read_bytes()[:-8])
     assert run("recover", old, "--out", new).exit_code == 0
-    assert overview(new).state is State.WHOLE
+    assert overview(new).state is SessionState.WHOLE
     assert run("verify", new).exit_code == 0
 
 
@@ -76,7 +76,7 @@ def test_a_file_in_which_nothing_was_recorded_cuts_no_session(tmp_path: Path) ->
     write(path, [[1, 2], [3]])
     Segment(path / "0002.mcap", {}).finish({})
     found = overview(path)
-    assert (found.state, found.words, found.length_s) == (State.WHOLE, "", 2.0)
+    assert (found.state, found.words, found.length_s) == (SessionState.WHOLE, "", 2.0)
 
 
 def test_a_clock_that_went_back_makes_no_hour(tmp_path: Path) -> None:

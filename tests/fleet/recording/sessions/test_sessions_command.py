@@ -156,7 +156,7 @@ def test_a_description_that_went_is_told(session: Path, text: str | None) -> Non
     assert broken.returncode == 1
     assert "damage: session.json is missing, or cannot be understood" in broken.stdout
     assert fleet("recover", session).returncode == 0
-    assert session_dir.Description.read(session.with_name(f"{session.name}-recovered")) is not None
+    assert session_dir.SessionInfo.read(session.with_name(f"{session.name}-recovered")) is not None
 
 
 def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -
     assert done.returncode == 0
     assert "could not be saved" in done.stdout
     assert list(open_session(out).messages()) == list(open_session(session).messages())
-    description = session_dir.Description.read(out)
+    description = session_dir.SessionInfo.read(out)
     assert description is not None
     assert description.closed
     assert description.origin["by"] == "recover"

@@ -10,7 +10,7 @@ from mcap.writer import Writer
 
 from fleet.recording.reading.session import Session
 from fleet.recording.tools.sequence_check import MOST_GAPS, Stream
-from fleet.recording.tools.verify import Verdict, verify
+from fleet.recording.tools.verify import SessionVerdict, verify
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -46,7 +46,7 @@ class Written:
             self._ids[key] = self._writer.register_channel(key, "json", 0)
         self._writer.add_message(self._ids[key], self.now, payload, self.now, sequence)
 
-    def verdict(self) -> Verdict:
+    def verdict(self) -> SessionVerdict:
         self._writer.finish()
         self._file.close()
         return verify(Session.open(Path(self._file.name)))
@@ -60,7 +60,7 @@ def written(tmp_path: Path) -> Written:
 RANGE = "fleet/red/sensor/range"
 
 
-def gaps(verdict: Verdict) -> list[tuple[str, str, int, int, int]]:
+def gaps(verdict: SessionVerdict) -> list[tuple[str, str, int, int, int]]:
     return [(one["key"], one["publisher"], one["first"], one["last"], one["count"]) for one in verdict.missing]
 
 
