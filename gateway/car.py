@@ -24,10 +24,11 @@ from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import RAW_PER_S, STALLED_S, CarPublisher
 from gateway.bus.service import CarService
 from gateway.control.backoff import Attempts
-from gateway.control.commands import Answer, Command, EmergencyStop, Level, LogRecord, Phase
+from gateway.control.commands import Answer, Command, EmergencyStop, Phase
 from gateway.control.controller import Controller
 from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.link_health import LinkHealth
+from gateway.control.events import Level, LogRecord
 from gateway.control.executor import SHUTDOWN_S
 from gateway.control.safety import Estop
 from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link

@@ -16,11 +16,12 @@ import zenoh
 
 from gateway.bus.history import BadRange, HistoryBuffer
 from gateway.clock import WallClock
-from gateway.control.commands import CommandRecord, Level, LogRecord, OutgoingFrame, Phase
+from gateway.control.commands import Phase
 from gateway.control.controller import Controller
 from gateway.control.estimate import battery
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.estimate.platform import PlatformDetector
+from gateway.control.events import CommandRecord, Level, LogRecord, OutgoingFrame
 from gateway.control.rate_limit import TokenBucket
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event

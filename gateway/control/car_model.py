@@ -6,12 +6,12 @@
 from dataclasses import dataclass, field, replace
 
 from gateway.control.command_log import CommandLog
-from gateway.control.commands import Level
 from gateway.control.estimate.battery import Battery, BatteryPolicy
 from gateway.control.estimate.mode import ModeEstimator, Verdict
 from gateway.control.estimate.outputs import StateEstimate
 from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import Basis, CarTrust, TrustEvent, TrustState
+from gateway.control.events import Level
 from gateway.control.pacing import AWAKE_S, FLIGHT_S, Pacing
 from gateway.control.stops import sequences, stopping
 from gateway.control.stops.evidence import StopCase, StopEvidence

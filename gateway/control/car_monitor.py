@@ -7,11 +7,12 @@ from typing import Final
 
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog
-from gateway.control.commands import FrameOrigin, Level, Phase, Reason, SetMode
+from gateway.control.commands import Phase, Reason, SetMode
 from gateway.control.estimate.battery import BatteryLevel, BatteryReaction
 from gateway.control.estimate.mode import MANUAL_SILENCE_S, Verdict
 from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
+from gateway.control.events import FrameOrigin, Level
 from gateway.control.executor import Executor
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.stops.evidence import Finding, StopCase

@@ -4,7 +4,8 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from gateway.control.commands import Command, CommandRecord, Level, LogRecord, Phase, Reason, Record
+from gateway.control.commands import Command, Phase, Reason
+from gateway.control.events import CommandRecord, Level, LogRecord, Record
 from gateway.protocol.frames import Frame
 
 _REMEMBERED_IDS: Final = 256

@@ -1,4 +1,4 @@
-"""What goes into control and comes out of it: commands, answers, records of what became of them. Values only."""
+"""Commands as control sees them: parsed, in range, and of a known age; and their answers. Values only."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -158,62 +158,3 @@ class Answer:
     reason: Reason | None = None
     words: str = ""
     worst_case_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class CommandRecord:
-    """One transition in the life of a command."""
-
-    command: Command
-    phase: Phase
-    at: float
-    reason: Reason | None = None
-    words: str = ""
-    worst_case_s: float = 0.0
-    took_s: float = 0.0
-    evidence: tuple[str, ...] = ()
-    count: int = 1
-    basis: str = ""
-    """`shown` or `sent`, in the last record of a stop."""
-
-
-class Level(StrEnum):
-    """How much a notable event matters."""
-
-    DEBUG = "debug"
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
-
-
-@dataclass(frozen=True, slots=True)
-class LogRecord:
-    """A notable event. `code` is one word for machines, `words` are for a person."""
-
-    level: Level
-    code: str
-    words: str
-    at: float
-
-
-Record = CommandRecord | LogRecord
-
-
-class FrameOrigin(StrEnum):
-    """Why a frame was sent."""
-
-    COMMAND = "command"
-    REPEAT = "repeat"
-    STOP = "stop"
-    RECOVERY = "recovery"
-    SHUTDOWN = "shutdown"
-
-
-@dataclass(frozen=True, slots=True)
-class OutgoingFrame:
-    """One frame to be written now, in one write."""
-
-    frame: Frame
-    data: bytes
-    why: FrameOrigin
-    command_id: str = ""

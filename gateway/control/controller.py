@@ -21,13 +21,9 @@ from gateway.control.commands import (
     EmergencyStop,
     Fan,
     Find,
-    FrameOrigin,
-    Level,
     OneShot,
-    OutgoingFrame,
     Phase,
     Reason,
-    Record,
     Resume,
     Sender,
     SenderKind,
@@ -40,6 +36,7 @@ from gateway.control.estimate.mode import ModeEstimator, Verdict
 from gateway.control.estimate.outputs import StateEstimate
 from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.control.events import FrameOrigin, Level, OutgoingFrame, Record
 from gateway.control.executor import Executor
 from gateway.control.pacing import Pacing
 from gateway.control.safety import LEASE_S, Estop, Hold, PersistedSafety, Safety

@@ -8,8 +8,9 @@ from typing import Final
 from gateway.control.car_model import CarModel
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue, HeldMotion
-from gateway.control.commands import Fan, FrameOrigin, Level, OutgoingFrame, Phase, Reason, SetMode
+from gateway.control.commands import Fan, Phase, Reason, SetMode
 from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
+from gateway.control.events import FrameOrigin, Level, OutgoingFrame
 from gateway.control.pacing import FLIGHT_S
 from gateway.control.safety import Safety
 from gateway.control.senders import Senders

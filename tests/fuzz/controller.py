@@ -13,14 +13,11 @@ from gateway.control.commands import (
     Action,
     ChangeSpeed,
     Command,
-    CommandRecord,
     Drive,
     EmergencyStop,
     Fan,
     Find,
-    FrameOrigin,
     OneShot,
-    OutgoingFrame,
     Phase,
     Reason,
     Resume,
@@ -32,6 +29,7 @@ from gateway.control.commands import (
 )
 from gateway.control.controller import Controller
 from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.control.events import CommandRecord, FrameOrigin, OutgoingFrame
 from gateway.control.safety import Estop
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep

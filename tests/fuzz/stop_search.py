@@ -17,7 +17,6 @@ from typing import Any
 from gateway.control.commands import (
     Action,
     Command,
-    CommandRecord,
     Drive,
     EmergencyStop,
     OneShot,
@@ -30,6 +29,7 @@ from gateway.control.commands import (
 from gateway.control.controller import Controller
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import CarTrust
+from gateway.control.events import CommandRecord
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed, General, Ptz

@@ -9,10 +9,11 @@ import pytest
 import zenoh
 
 from gateway.bus.publisher import SLICE, CarPublisher
-from gateway.control.commands import Command, CommandRecord, Drive, Find, Phase, Reason, SetMode, Stop
+from gateway.control.commands import Command, Drive, Find, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.estimate.platform import PlatformDetector
+from gateway.control.events import CommandRecord
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import ImuReading

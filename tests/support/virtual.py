@@ -3,8 +3,9 @@
 import random
 from collections.abc import Callable
 
-from gateway.control.commands import Action, Answer, Command, CommandRecord, Level, LogRecord, Phase, Sender
+from gateway.control.commands import Action, Answer, Command, Phase, Sender
 from gateway.control.controller import Controller
+from gateway.control.events import CommandRecord, Level, LogRecord
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build

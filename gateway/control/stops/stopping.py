@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.control.command_log import Pending
-from gateway.control.commands import FrameOrigin
+from gateway.control.events import FrameOrigin
 from gateway.control.pacing import Pacing
 from gateway.control.stops import sequences
 from gateway.control.stops.evidence import StopCase

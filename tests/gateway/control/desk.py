@@ -2,20 +2,9 @@
 
 from collections.abc import Callable
 
-from gateway.control.commands import (
-    Action,
-    Answer,
-    Command,
-    CommandRecord,
-    FrameOrigin,
-    Level,
-    LogRecord,
-    Phase,
-    Reason,
-    Sender,
-    SenderKind,
-)
+from gateway.control.commands import Action, Answer, Command, Phase, Reason, Sender, SenderKind
 from gateway.control.controller import Controller
+from gateway.control.events import CommandRecord, FrameOrigin, Level, LogRecord
 from gateway.control.safety import PersistedSafety
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode

@@ -15,7 +15,6 @@ from gateway.control.commands import (
     EmergencyStop,
     Fan,
     Find,
-    FrameOrigin,
     OneShot,
     Phase,
     Reason,
@@ -26,6 +25,7 @@ from gateway.control.commands import (
 )
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.control.events import FrameOrigin
 from gateway.control.executor import RENEW_S, SHUTDOWN_S
 from gateway.control.safety import Hold, PersistedSafety
 from gateway.control.stops.evidence import EVIDENCE, StopCase

@@ -1,0 +1,66 @@
+"""What comes out of control: records of commands, log records, and frames to be written. Values only."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from gateway.control.commands import Command, Phase, Reason
+from gateway.protocol.frames import Frame
+
+
+@dataclass(frozen=True, slots=True)
+class CommandRecord:
+    """One transition in the life of a command."""
+
+    command: Command
+    phase: Phase
+    at: float
+    reason: Reason | None = None
+    words: str = ""
+    worst_case_s: float = 0.0
+    took_s: float = 0.0
+    evidence: tuple[str, ...] = ()
+    count: int = 1
+    basis: str = ""
+    """`shown` or `sent`, in the last record of a stop."""
+
+
+class Level(StrEnum):
+    """How much a notable event matters."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, slots=True)
+class LogRecord:
+    """A notable event. `code` is one word for machines, `words` are for a person."""
+
+    level: Level
+    code: str
+    words: str
+    at: float
+
+
+Record = CommandRecord | LogRecord
+
+
+class FrameOrigin(StrEnum):
+    """Why a frame was sent."""
+
+    COMMAND = "command"
+    REPEAT = "repeat"
+    STOP = "stop"
+    RECOVERY = "recovery"
+    SHUTDOWN = "shutdown"
+
+
+@dataclass(frozen=True, slots=True)
+class OutgoingFrame:
+    """One frame to be written now, in one write."""
+
+    frame: Frame
+    data: bytes
+    why: FrameOrigin
+    command_id: str = ""
