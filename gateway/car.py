@@ -46,7 +46,9 @@ LONGEST_SLEEP_S: Final = 3600.0
 """No timer may lie at infinity."""
 HUB_GONE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 0.5
-"""Two gateways that started at the same moment see each other when both have declared (design.md, "Keys")."""
+"""Two gateways that started at the same moment see each other when both have declared.
+
+See docs/reference/keys.md#one-gateway-per-car."""
 YIELDS_S: Final = SHUTDOWN_S + 2.0
 """Maximum time that the gateway that remains waits for the link that the other one has open. The other one must notice
 the conflict, and waits until the car has shown its stop."""

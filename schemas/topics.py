@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Final
 
 PROTOBUF: Final = "application/protobuf"
-HISTORY: Final = 1500  # design.md, "Keys": one minute of the fastest readings
+HISTORY: Final = 1500  # docs/reference/keys.md#topics: one minute of the fastest readings
 HELD_S: Final = 10.0
 """How long a publication can be had again by who missed it: a hub or a recorder is back after two or three seconds."""
 _HELD_AT_LEAST: Final = 100  # events and states come in bursts
@@ -65,11 +65,11 @@ class Topic:
         return max(_HELD_AT_LEAST, math.ceil(HELD_S * self.rate_hz))
 
 
-# A mode-0 report comes about once a second and may be blocked for another (protocol.md, "From the car: readings"), so a
-# reading is stale after 3 s; states are published on change and once a second.
+# A mode-0 report comes about once a second and may be blocked for another (docs/reference/protocol.md#blocking-times),
+# so a reading is stale after 3 s; states are published on change and once a second.
 _READING: Final = 3.0
 _STATE: Final = 3.0
-_TRACKING_HZ: Final = 27.0  # protocol.md: the most frames the UART carries, in tracking
+_TRACKING_HZ: Final = 27.0  # docs/reference/protocol.md#rates: the most frames the UART carries, in tracking
 
 CAR_TOPICS: Final = (
     Topic(

@@ -1,11 +1,15 @@
-"""What the README shows is what the code says."""
+"""What the README and the generated pages show is what the code says."""
 
-from tests.tools.readme import README, STOP_EVIDENCE, generated, stop_evidence_page
+from pathlib import Path
+
+import pytest
+
+from tests.tools.readme import PAGES, STOP_EVIDENCE, generated, stop_evidence_page
 
 
-def test_the_generated_parts_are_up_to_date() -> None:
-    text = README.read_text(encoding="utf-8")
-    assert generated(text) == text, "run `make readme`"
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_generated_parts_are_up_to_date(page: Path) -> None:
+    assert generated(page) == page.read_text(encoding="utf-8"), "run `make readme`"
 
 
 def test_the_page_on_the_evidence_of_stops_is_up_to_date() -> None:

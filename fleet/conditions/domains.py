@@ -32,7 +32,7 @@ RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "motion.servo_deg": (0.0, 180.0),
     "link.tx_airtime": (0.0, 1.0),
 }
-"""Beyond these nothing is published: protocol.md, "From the car"."""
+"""Beyond these nothing is published: docs/reference/protocol.md#ranges."""
 
 
 def outside(expression: Expression, names: Mapping[str, type], of: str = "") -> str:

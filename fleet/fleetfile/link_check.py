@@ -1,8 +1,8 @@
 """Whether the links of a fleet file are there: looked at, never opened where that could move, reset or end anything.
 
 A serial port is not opened: that resets an Arduino. A Raspberry Pi car's TCP port is not connected to: its program ends
-when the connection does, and the motors stay as they were (protocol.md); its host is asked instead. A car that a
-gateway serves is left to it.
+when the connection does, and the motors stay as they were; its host is asked instead. A car that a gateway serves is
+left to it. See docs/reference/protocol.md#hazards-of-raspberry-pi-programs.
 """
 
 import errno

@@ -17,7 +17,7 @@ from schemas.yaml_document.messages import shown
 
 LONGEST_DRIVE_S: Final = 10.0
 LOW_V, CRITICAL_V = 7.0, 6.6
-EMPTY_V, FULL_V = 6.4, 8.4  # protocol.md: two Li-ion cells
+EMPTY_V, FULL_V = 6.4, 8.4  # docs/reference/protocol.md#readings: two Li-ion cells
 
 
 class BatteryAction(StrEnum):

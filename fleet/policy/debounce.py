@@ -6,7 +6,8 @@ from typing import Final
 HYSTERESIS_S: Final = 1.5
 """So long what was so must be otherwise before it counts (issue 5, coordinator)."""
 BLIND_S: Final = 5.0
-"""So long it may be unknown: a car that changes its mode says nothing while it does, 1 + 3.5 s (protocol.md)."""
+"""So long it may be unknown: a car that changes its mode says nothing while it does, 1 + 3.5 s
+(docs/reference/protocol.md#blocking-times)."""
 
 
 @dataclass(frozen=True, slots=True)

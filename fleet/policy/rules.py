@@ -10,7 +10,8 @@ from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanConditio
 from fleet.policy.snapshot import FleetSnapshot
 
 SETTLES_WITHIN_S: Final = 15.0
-"""Maximum wait for a phase's cars before its time-out counts. Recovery and opening take 4.9 + 3.5 s (protocol.md)."""
+"""Maximum wait for a phase's cars before its time-out counts. Recovery and opening take 4.9 + 3.5 s
+(docs/reference/protocol.md#stops and docs/reference/protocol.md#blocking-times)."""
 _WHOLE: Final = ""
 """Under this name stands a condition over all cars."""
 _NONE: Final[Mapping[str, Debounced]] = MappingProxyType({})

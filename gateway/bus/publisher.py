@@ -32,7 +32,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 VERSION: Final = "0.1.0"
 _STATM: Final = Path("/proc/self/statm")
 STATE_EVERY_S: Final = 1.0
-"""States are published on change and once a second (design.md, "Keys")."""
+"""States are published on change and once a second (docs/reference/keys.md#topics)."""
 SLICE: Final = 50
 """Answers to a query without a pause: 3 ms as JSON."""
 BACK_S: Final = 1.0
@@ -43,7 +43,8 @@ KEPT_RECORDS: Final = 1000
 """Records of commands and events that wait for the bus; of more the oldest are dropped, and counted."""
 RAW_PER_S: Final = 100.0
 RAW_AT_ONCE: Final = 1000.0
-"""Raw frames that are published: a car sends up to 27 a second (protocol.md); what a link held up comes at once."""
+"""Raw frames that are published: a car sends up to 27 a second (docs/reference/protocol.md#rates); what a link held
+up comes at once."""
 _CLASSES: Final[dict[str, Any]] = {
     topic.name: messages.message_class(topic.message)
     for topic in topics.CAR_TOPICS

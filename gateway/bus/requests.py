@@ -40,11 +40,11 @@ LONGEST_NAME: Final = 128
 LONGEST_WHY: Final = 200
 """Of an e-stop's reason, characters; the rest is cut off: nobody's e-stop fails over its words."""
 _DRIVE_TTL_S: Final = 0.5
-_TTL_S: Final = 2.0  # messages.md: greatest age at arrival, default 0.5 for drive, 2 for the rest
+_TTL_S: Final = 2.0  # docs/reference/messages.md#commands: maximum age at arrival
 _SAME_QUERY_NS: Final = 2_000_000_000
 """One query reaches every gateway within this time."""
 BY_WILDCARD: Final = ("stop", "estop", "resume")
-"""Verbs that may be asked of several cars with one query (design.md, "Keys")."""
+"""Verbs that may be asked of several cars with one query (docs/reference/keys.md#command-keys)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,8 @@ from gateway.protocol.events import Cause, Event, Rejected, Sensors
 from gateway.protocol.platforms import StopStyle
 
 STALL_S: Final = 0.5
-"""A loop that slept longer than this with motion held stops the car first (design.md, "Processes and threads")."""
+"""A loop that slept longer than this with motion held stops the car first
+(docs/explanation/how-it-works.md#processes-and-threads)."""
 STALE_TIMES_S: Final = 0.5
 """If the loop slept longer, reports were taken so much later than they came that a normal gap may look like a pause."""
 FAN_SETTLED_S: Final = 2.0
@@ -83,7 +84,7 @@ class CarMonitor:
         if event.voltage_v is not None and "battery" in model.profile.measured(event, model.mode.confirmed):
             self._weigh_battery(event.voltage_v, now)
         if now > model.believed.fan_at + FAN_SETTLED_S and model.profile.stop_style is not StopStyle.RASPBERRY_PI:
-            model.believed.fan = False  # protocol.md: a car whose fan runs sends no readings
+            model.believed.fan = False  # docs/reference/protocol.md#hazards: a car whose fan runs sends no readings
 
     def _log_delivery(self, finding: Finding, now: float) -> None:
         """Log that frames do not arrive, once, and that they do again."""

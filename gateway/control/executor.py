@@ -36,7 +36,7 @@ GAP_S: Final = 1.5
 """Minimum time to the next try of a stop in which other frames may go out."""
 CLEARING_RENEWALS: Final = 4
 """Maximum renewals by `MODE00` after a stop that an arduino could not show. A general stop does nothing to a car that
-keeps half a named frame (protocol.md, hazards). `MODE00` beeps, so there are no more."""
+keeps half a named frame (docs/reference/protocol.md#hazards). `MODE00` beeps, so there are no more."""
 _STOP: Final = General(Motion.STOP)
 
 
@@ -313,7 +313,10 @@ class Executor:
             model.mode.ask(Mode.MANUAL, now=now, block_s=block_s)
 
     def _doubt_rest(self, now: float) -> None:
-        """Rest on what was sent from now on: half of a named frame is read as a motion (protocol.md, hazards)."""
+        """Rest on what was sent from now on: half of a named frame is read as a motion.
+
+        See docs/reference/protocol.md#hazards.
+        """
         self.model.rest = StopCase.ACTED
         words = EVIDENCE[StopCase.ACTED].words.format(car=self.model.name)
         self.model.learn(TrustEvent.STOP_SENT, now, words)

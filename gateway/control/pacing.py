@@ -11,10 +11,11 @@ from gateway.protocol.frames import ArmSet, Frame, General
 from gateway.protocol.platforms import Platform, Profile, StopStyle
 
 FLIGHT_S: Final = 0.06
-"""A frame is in flight for 0.06 s or its block, whichever is longer (protocol.md): a report may be under way."""
+"""A frame is in flight for 0.06 s or its block, whichever is longer (docs/reference/protocol.md#pacing): a report may
+be under way."""
 FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 AWAKE_S: Final = 0.6
-"""A car that has just reported ranges again no sooner than 0.85 s later (protocol.md: once a second in mode 0); what is
+"""A car that has just reported ranges again no sooner than 0.85 s later (docs/reference/protocol.md#pacing); what is
 written within this time of a reading is read at once, with 0.25 s left for the link's own delays."""
 REPORT_S: Final = 2.2
 """A car in mode 0 that can report does so within this time: once a second, and 1.0 s more without an echo."""
@@ -51,7 +52,10 @@ class Pacing:
         self._sure_s = self._block_s if self._surely_blocks(frame) else 0.0
 
     def _surely_blocks(self, frame: Frame) -> bool:
-        """Whether its block has a row in protocol.md for this platform, and is not only allowed for."""
+        """Whether its block has a row for this platform, and is not only allowed for.
+
+        See docs/reference/protocol.md#blocking-times.
+        """
         if isinstance(frame, General):
             slow = frame.servo is None or frame.servo in FRONT_SERVO
             return slow and not (frame.fan and self.profile.kind is Platform.UNKNOWN)

@@ -10,7 +10,7 @@ from typing import Final
 from gateway.control.commands import Sender, SenderKind
 
 LEASE_S: Final = 2.0
-"""How long a lease outlives the driving (design.md, "Commands")."""
+"""How long a lease outlives the driving (docs/explanation/who-may-drive.md#lease)."""
 REMEMBERED_ENDED: Final = 64
 """Ended e-stops that are remembered, and shown in `state/safety` once a second: the newest."""
 _RANK: Final = {SenderKind.PERSON: 2, SenderKind.SCRIPT: 1, SenderKind.COORDINATOR: 0}

@@ -49,7 +49,8 @@ _UARTS: Final = (
     ((_uuid(0xFFE0), _uuid(0xFFE5)), (_uuid(0xFFE1), _uuid(0xFFE2), _uuid(0xFFE4), _uuid(0xFFE9))),
     ((_NORDIC.format(1),), (_NORDIC.format(2), _NORDIC.format(3))),
 )
-"""protocol.md, framing: the services of a UART over BLE, and their characteristics, the preferred ones first."""
+"""The services of a UART over BLE, and their characteristics, the preferred ones first
+(docs/reference/protocol.md#framing)."""
 UART_SERVICES: Final = tuple(service for services, _ in _UARTS for service in services)
 
 

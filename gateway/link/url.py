@@ -7,7 +7,7 @@ from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from gateway.link.base import BadUrl
 
-BAUD: Final = 9600  # protocol.md, framing: UART 9600 8N1
+BAUD: Final = 9600  # docs/reference/protocol.md#framing: UART 9600 8N1
 _BAUDS: Final = range(300, 4_000_001)
 _ALLOWED: Final = (
     "serial:///dev/ttyUSB0 (?baud=9600), a bare device path such as /dev/ttyUSB0 or COM3, "

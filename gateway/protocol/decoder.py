@@ -27,10 +27,10 @@ __all__ = [
     "Sensors",
 ]
 
-MAX_FRAME: Final = 256  # protocol.md, bad input: a frame longer than this is cut off as noise
+MAX_FRAME: Final = 256  # docs/reference/protocol.md#bad-input: a frame longer than this is cut off as noise
 _MIN_FRAME: Final = 64  # a sensors frame in its longest observed spelling has 46 bytes
-SILENCE_S: Final = 0.050  # protocol.md, readings: a missing `#` is accepted when nothing follows for 50 ms
-ECHO_S: Final = 2.0  # protocol.md, readings: bytes equal to a frame that we sent in the last 2 s
+SILENCE_S: Final = 0.050  # docs/reference/protocol.md#readings: accept a missing `#` if nothing follows for 50 ms
+ECHO_S: Final = 2.0  # docs/reference/protocol.md#readings: bytes equal to a frame that we sent in the last 2 s
 _SENT_MAX: Final = 256  # 2 s of the wire's 960 bytes/s hold 101 frames of 19 bytes; a lone `#` is one entry
 
 _START, _END = b"$"[0], b"#"[0]

@@ -11,7 +11,7 @@ from gateway.protocol.enums import Mode
 
 
 class Cause(StrEnum):
-    """Why bytes are no reading (protocol.md, bad input)."""
+    """Why bytes are no reading (docs/reference/protocol.md#bad-input)."""
 
     NO_START = "no_start"
     OVERLONG = "overlong"
@@ -104,7 +104,7 @@ class Rejected:
 
 Event = Sensors | ArmReading | ImuReading | Echo | Rejected
 
-# protocol.md, observed placeholders. Spelling counts: mode 0 has decimals on Arduino, PV8.4 on Raspberry Pi.
+# Spelling counts: mode 0 has decimals on Arduino, PV8.4 on Raspberry Pi (docs/reference/protocol.md#placeholders).
 _TRACKING = b"$4WD,CSB0,PV8,GS0,LF"
 _LIGHT_OR_FOLLOWING = b"$4WD,CSB120,PV8.3,GS000,LF0000,HW"
 

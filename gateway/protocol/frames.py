@@ -11,8 +11,8 @@ from typing import Final, TypeVar
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 
 ARM_JOINTS: Final = 6
-DEG_MAX: Final = 180  # protocol.md, named frames: PTZ and joints 0..180 degrees
-COLOR_MAX: Final = 255  # protocol.md, named frames: colour LED 0..255 each
+DEG_MAX: Final = 180  # docs/reference/protocol.md#named-frames: PTZ and joints 0..180 degrees
+COLOR_MAX: Final = 255  # docs/reference/protocol.md#named-frames: color LED 0..255 each
 
 
 class EncodeError(ValueError):
@@ -181,9 +181,9 @@ _SERVO_AT = {action.digits: action for action in ServoAction}
 _LIGHT_AT = {light.digit: light for light in Light}
 _MODE_AT = {mode.digit: mode for mode in Mode}
 
-# protocol.md, general frame: nine one-digit fields, always all nine
+# Nine one-digit fields, always all nine (docs/reference/protocol.md#general-frame).
 _GENERAL = re.compile(rb"\$([0-4]),([0-2]),([01]),([0-2]),([0-8]),([01]),([0-8]),([01]),([01])#")
-# protocol.md, named frames
+# docs/reference/protocol.md#named-frames
 _NAMED = re.compile(
     rb"\$4WD,(?:PTZ(?P<deg>\d{1,3})"
     rb"|CLR(?P<r>\d{1,3}),CLG(?P<g>\d{1,3}),CLB(?P<b>\d{1,3})"

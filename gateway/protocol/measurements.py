@@ -50,7 +50,7 @@ def _sensors(event: Sensors, profile: Profile, confirmed: Mode | None) -> dict[s
     names = profile.measured(event, confirmed)
     found: dict[str, Fields] = {}
     if "range" in names and event.range_cm is not None:
-        # protocol.md, readings: 0 is no echo, not a distance
+        # 0 is no echo, not a distance (docs/reference/protocol.md#ranges).
         found["sensor/range"] = (
             {"no_echo": False, "range_m": round(event.range_cm / 100, 4)} if event.range_cm else {"no_echo": True}
         )

@@ -8,14 +8,14 @@ from typing import Final
 
 from gateway.protocol.events import ArmReading, Cause, Event, ImuReading, Reject, Rejected, Sensors
 
-# protocol.md, readings: "ranges a reading must be in"
+# docs/reference/protocol.md#ranges
 CSB_MAX: Final = 1200.0
 PV_MAX: Final = 12.0
 GS_MAX: Final = 1023
 JOINT_MAX: Final = 180.0
 
-# protocol.md, readings (table) and observed spellings: an unsigned number, decimals only for CSB and PV, bits as
-# digits. `[0-9]` in a bytes pattern is ASCII only.
+# An unsigned number, decimals only for CSB and PV, bits as digits (docs/reference/protocol.md#spellings). `[0-9]` in a
+# bytes pattern is ASCII only.
 _SENSORS_TEXT = (
     rb"\$4WD,CSB([0-9]+(?:\.[0-9]+)?),PV([0-9]+(?:\.[0-9]+)?),GS([0-9]+),LF([0-9]{4}),HW([0-9]{2}),GM([0-9]{2})"
 )

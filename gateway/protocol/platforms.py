@@ -1,6 +1,7 @@
 """What each kind of car knows, how it is stopped, and which of its readings are measured.
 
-Every number cites its row of protocol.md; the times are in `timing`. When to send is not decided here (see `control`).
+Every number cites its row of docs/reference/protocol.md; the times are in `timing`. When to send is not
+decided here (see `control`).
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ class Platform(StrEnum):
 
 
 class StopStyle(StrEnum):
-    """Which of the stop recipes (protocol.md, stopping) a car gets."""
+    """Which of the stop recipes (docs/reference/protocol.md#stops) a car gets."""
 
     MODE_FRAME = "mode_frame"
     RASPBERRY_PI = "raspberry_pi"
@@ -33,7 +34,7 @@ class StopStyle(StrEnum):
 
 OPTIONS: Final = frozenset({"arm", "imu"})
 
-# observed placeholders: what each mode's frame measures
+# What the frame of each mode measures (docs/reference/protocol.md#placeholders).
 _ALL: Final = frozenset({"range", "battery", "grayscale", "line", "obstacle", "light"})
 _MEASURED: Final = {
     Mode.TRACKING: frozenset({"line"}),
@@ -102,7 +103,7 @@ def _sure(candidates: tuple[Mode, ...]) -> frozenset[str]:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One kind of car: protocol.md's table of platforms, one column."""
+    """One kind of car: one column of docs/reference/protocol.md#platforms."""
 
     kind: Platform
     options: frozenset[str]
@@ -127,7 +128,7 @@ class Profile:
 
     @property
     def silent_modes(self) -> frozenset[Mode]:
-        """The modes in which this car sends no readings (observed placeholders: 1, 3, 4 silent)."""
+        """The modes in which this car sends no readings (docs/reference/protocol.md#placeholders: 1, 3, 4)."""
         return self.modes & {Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED}
 
     @property
@@ -211,7 +212,7 @@ class Profile:
         if event.obstacle is None or "obstacle" not in self.measured(event, mode):
             return None
         left, right = event.obstacle
-        # observed placeholders, mode 6: HW inverted, 0 = object seen
+        # In mode 6 HW is inverted: 0 = object seen (docs/reference/protocol.md#placeholders).
         return (not left, not right) if self.resolved(event, mode) == (Mode.FOLLOWING,) else (left, right)
 
     def contradictions(self, event: Sensors) -> tuple[str, ...]:
@@ -286,7 +287,7 @@ def parse_platform(text: str) -> Profile:
     return _profile(Platform(kind), frozenset(options))
 
 
-# protocol.md, the table of platforms
+# docs/reference/protocol.md#platforms
 _EVERY_CAR: Final = frozenset({"drive", "whistle", "speed", "servo", "fan", "light"})
 _MODE_CAR: Final = _EVERY_CAR | {"servo_deg", "led", "mode"}
 _PI_CAR: Final = _EVERY_CAR | {"servo_deg", "led", "servo_vertical", "servo_horizontal"}

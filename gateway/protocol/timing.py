@@ -1,7 +1,7 @@
 """How long a car is deaf after each frame and in each mode, and how fast the wire is.
 
-Every number is a row of protocol.md ("observed about time" unless another section is named). Who waits for them is in
-`control`; which platform a number is for is in `profile`.
+Every number is a row of docs/reference/protocol.md#blocking-times unless another section is named. Who waits for
+them is in `control`; which platform a number is for is in `profile`.
 """
 
 from typing import Final

@@ -74,7 +74,7 @@ class LinkProbe:
         self.tally.until = time.monotonic()
 
     async def probe(self) -> None:
-        """Send an unknown car's stop (protocol.md, stopping), and wait for a reading of mode 0."""
+        """Send an unknown car's stop (docs/reference/protocol.md#stops), and wait for a reading of mode 0."""
         assert self.link is not None
         self.probed = True
         last = time.monotonic()

@@ -55,6 +55,8 @@ def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
         )
 
 
+# The cost of each default that this replaces is in docs/explanation/measurements.md#one-hub; the reason for the
+# lease is in docs/explanation/measurements.md#cut-links.
 _COMMON: Final[dict[str, Any]] = {
     "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
     "timestamping": {"enabled": True},

@@ -7,6 +7,7 @@ from zenoh import ext
 
 from schemas.topics import Qos, Topic
 
+# The losses that each choice avoids are in docs/explanation/measurements.md#quality-of-service.
 ZENOH_QOS: Final[dict[Qos, dict[str, Any]]] = {
     Qos.READING: {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA},
     Qos.STATE: {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA_HIGH},

@@ -1,5 +1,6 @@
-"""A stranger's Arduino car: a program of its own, written from protocol.md, which imports nothing of this repository.
+"""A stranger's Arduino car: a program of its own, which imports nothing of this repository.
 
+It was written from docs/reference/protocol.md alone.
 Run it with `--seed N`. It serves one TCP connection at a time; TCP only carries what a UART of 9600 baud would. The
 first line on stdout is `{"port": ...}`. Then follows its true state, at each change and ten times a second: `t` (s
 since the epoch), `motors`, `mode`, and `read` when it has read a string.

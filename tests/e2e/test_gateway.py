@@ -35,7 +35,7 @@ SHOWN_S = 3.5
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
 
-# What a car sent, and what of it are readings: protocol.md, "From the car: readings".
+# What a car sent, and what of it are readings: docs/reference/protocol.md#readings.
 LAST = b"$4WD,CSB33.00,PV7.25,GS7,LF0000,HW00,GM00#"
 RECORDED: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
     (b"BT-04 ready\r\n", {}),

@@ -24,7 +24,10 @@ def test_a_cut_link_that_is_back_stops_the_car_at_once(fleet: Fleet, tmp_path: P
 
 
 def test_a_raspberry_pi_car_whose_gateway_was_killed_drives_on_and_it_is_said(fleet: Fleet) -> None:
-    """Its program dies with its client (protocol.md): nobody can stop it, and nobody says that it stands."""
+    """Its program dies with its client: nobody can stop it, and nobody says that it stands.
+
+    See docs/reference/protocol.md#hazards-of-raspberry-pi-programs.
+    """
     judge = Judge.follow(fleet.bus)
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp", truth=True)
     gateway = fleet.gateway(link, platform="raspberry_pi")

@@ -139,7 +139,7 @@ class Driven:
 
 
 def wedged(pair: Pair) -> bool:
-    """The one string that no frame of protocol.md's recovery clears (test_stops.py, "in_one_millisecond")."""
+    """The one string that no frame of recovery clears (test_stops.py, "in_one_millisecond")."""
     return isinstance(pair.car, ArduinoCar) and pair.car._string.startswith("4WD")
 
 

@@ -779,7 +779,7 @@ def _is_lost(car: object) -> bool:
 
 
 def _is_wedged(car: object) -> bool:
-    """Return True if the car keeps half a named frame: it ignores general stops (protocol.md, hazards)."""
+    """Return True if the car keeps half a named frame: no general stop works (docs/reference/protocol.md#hazards)."""
     return isinstance(car, ArduinoCar) and "4WD" in car._string
 
 

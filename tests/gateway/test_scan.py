@@ -26,7 +26,7 @@ UNKNOWN_STOP = [
     *(b"$0,0,0,0,0,0,0,0,0#", b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#"),
     *(b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#"),
 ]
-"""protocol.md, stopping: what a car of an unknown platform is sent."""
+"""docs/reference/protocol.md#stops: what a car of an unknown platform is sent."""
 
 
 class Stranger:

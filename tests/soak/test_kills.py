@@ -24,7 +24,8 @@ from tests.support.processes import Fleet
 
 ROUNDS = 5
 NO_ECHO_S = 1.0 + 1.1
-"""protocol.md: without echo a report blocks 1.0 s, and a soft stop takes 1.1 s more if a frame may be in the buffer."""
+"""docs/reference/protocol.md#stops: without echo a report blocks 1.0 s, and a soft stop takes 1.1 s more if a frame may
+be in the buffer."""
 
 
 def fleets(directory: Path, rounds: int) -> Iterator[Fleet]:

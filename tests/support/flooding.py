@@ -15,7 +15,7 @@ KINDS: Final = ("person", "script", "coordinator")
 FLOOD: Final = Path(__file__).parents[1] / "e2e" / "flood.py"
 WARM_S: Final = 2.0
 FLIGHT_S: Final = 0.06
-"""protocol.md: a frame without a block of its own is in flight so long."""
+"""docs/reference/protocol.md#pacing: a frame without a block of its own is in flight so long."""
 STOPS: Final = (b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#")
 """What a stop may begin with."""
 

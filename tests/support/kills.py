@@ -79,7 +79,7 @@ OPERATORS: Final = (
     # Driven by a stream, whose last drive holds for its time to live.
     Operator("a", "arduino", "stream", watched=False, duration_s=0.5),
     Operator("b", "raspberry_pi", "stream", watched=True, duration_s=10.0),
-    # protocol.md: front servo 0.65 s, whistle 0.3 s
+    # Front servo 0.65 s, whistle 0.3 s (docs/reference/protocol.md#blocking-times).
     Operator("c", "arduino", "stream", watched=False, duration_s=0.5, also=SERVO, block_s=0.65),
     Operator("d", "arduino", "stream", watched=True, duration_s=10.0, also=WHISTLE, block_s=0.3),
     # Driven by one command; the command line's.
@@ -114,7 +114,7 @@ def kill_operators(fleet: Fleet, operators: tuple[Operator, ...] = OPERATORS, wo
 
 @dataclass(frozen=True, slots=True)
 class Doing:
-    """What a car does when its gateway is killed, and protocol.md's time for the recovery that follows."""
+    """What a car does when its gateway is killed, and the time of the recovery (docs/reference/protocol.md#stops)."""
 
     car: str
     what: str
@@ -143,8 +143,8 @@ MODE_DIGITS: Final = {
     "light_seeking": 5,
     "following": 6,
 }
-# protocol.md, "Stopping", recovery: idle 0.06 s, and a report under way takes 0.04 s; else the rest of the block; in
-# theory 7.3 s outside avoidance, which blocks 4.3 s.
+# Recovery (docs/reference/protocol.md#stops): idle 0.06 s, and a report under way takes 0.04 s; else the rest of the
+# block; in theory 7.3 s outside avoidance, which blocks 4.3 s.
 DOINGS: Final = (
     Doing("a", "driving", 0.1),
     Doing("b", "driving with a servo on its way", 0.65 + 0.1),

@@ -179,7 +179,7 @@ MANUAL: tuple[Callable[[Run], None], ...] = (_drives, _joystick, _acts, _whistle
 def normal(run: Run, mode: Mode, seconds: float) -> None:
     """The car lives in a mode, and comes back to mode 0 now and then for what only works there."""
     end = run.pair.now + seconds
-    for_ever = mode is Mode.OBSTACLE_AVOIDANCE and run.world == "no-echo"  # protocol.md: deaf for ever
+    for_ever = mode is Mode.OBSTACLE_AVOIDANCE and run.world == "no-echo"  # docs/reference/protocol.md#blocking-times
     while run.pair.now < end:
         run.moments.choice(run.acts)(run)
         run.run(10.0 * run.moments.random())

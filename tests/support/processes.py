@@ -222,9 +222,9 @@ REPORT = b"$4WD,CSB57.00,PV7.91,GS5,LF0000,HW00,GM11#"
 PI_REPORT = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
 """The same of a Raspberry Pi, whose voltage and grayscale are constants."""
 REPORT_S = 0.95
-"""A car in mode 0 reports so often (protocol.md, "about one sensor frame per second")."""
+"""A car in mode 0 reports so often (docs/reference/protocol.md#rates)."""
 CLOSING_S = 1.0
-"""`MODE00` blocks a car for so long (protocol.md, blocks), and so delays its next report."""
+"""`MODE00` blocks a car for so long (docs/reference/protocol.md#blocking-times), and so delays its next report."""
 
 
 class TcpCar:

@@ -36,9 +36,10 @@ NOTICED_S: Final = 4.5
 SHOWN_S: Final = 4.0
 """Its stop, before the mode is opened again, is shown by two pauses in its reports."""
 IN_FORCE_S: Final = 3.5 + 1.0
-"""protocol.md: the longest opening, and issue 5's second."""
+"""The longest opening (docs/reference/protocol.md#blocking-times), and issue 5's second."""
 STRAY_S: Final = 2.5
-"""protocol.md: while a mode closes, 2 s, the motors go on as they were; recovery can only stop them after that."""
+"""A misread MODE frame opens mode 0 for 2.3 s and keeps the motors on (docs/reference/protocol.md#hazards). Recovery
+stops them only after that."""
 _FRAMES: Final = {encode(ModeOpen(mode)): mode for mode, _ in ROLES.values()}
 
 

@@ -461,7 +461,8 @@ def state_of(pair: Pair) -> str:
         return f"{kind[style]}{Mode.MANUAL}, {what}"
     if now < control.pacing.block_until:
         return f"{kind[style]}opening {mode}"
-    # protocol.md gives these one row, "up to 0.1 s per turn"; the infrared remote is taken as one of them.
+    # docs/reference/protocol.md#blocking-times gives these one row, "up to 0.1 s per turn"; the infrared remote is
+    # taken as one of them.
     return f"{kind[style]}in {'a mode that reads pins' if mode in READS_PINS else mode}"
 
 

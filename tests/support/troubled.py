@@ -114,7 +114,8 @@ class Trouble:
         def judge() -> None:
             truth = self.up.simulator(ask="truth", car=car)
             if not truth["alive"]:
-                # The program of a Raspberry Pi dies of a damaged frame (protocol.md). A person switches it off and on.
+                # A damaged frame kills the program of a Raspberry Pi. A person switches it off and on.
+                # See docs/reference/protocol.md#hazards-of-raspberry-pi-programs.
                 self.counts["programs that died"] += 1
                 for fields in (
                     {"fault": "brownout"},

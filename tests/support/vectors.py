@@ -1,4 +1,7 @@
-"""Reads tests/vectors/*.tsv: one row per line of protocol.md's tables, its `source` naming the section and row."""
+"""Reads tests/vectors/*.tsv: one row per line of the tables of docs/reference/protocol.md.
+
+Its `source` names the section and row.
+"""
 
 from pathlib import Path
 

@@ -21,7 +21,8 @@ from tests.support import vectors
 
 ROOT = Path(__file__).parent.parent.parent
 README = ROOT / "README.md"
-STOP_EVIDENCE = ROOT / "docs" / "reference" / "stop-evidence.md"
+STOP_EVIDENCE = ROOT / "docs/reference/stop-evidence.md"
+KEYS = ROOT / "docs/reference/keys.md"
 _COMMON = {"sender", "kind", "id", "asked", "take", "ttl_s"}
 _ABOUT = {
     "drive": "hold a motion for `duration_s` (0.5 s by default, at most 10 or what its gateway allows), then stop",
@@ -49,6 +50,30 @@ def topic_table() -> str:
         stale = f"{topic.stale_after_s:g} s" if topic.stale_after_s is not None else "-"
         key = topic.name if topic.name.startswith("@") else f"<car>/{topic.name}"
         rows.append(f"| `fleet/{key}` | {topic.message} | {topic.about} | {units} | {stale} |")
+    return "\n".join(rows)
+
+
+def key_table() -> str:
+    """Return the table of topics with how each is published, kept and shown."""
+    rows = [
+        "| key | message | what | units | rate | stale after | class | history | cache | Rerun entity |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for topic in topics.TOPICS.values():
+        units = ", ".join(f"{name} {unit}" for name, unit in topic.units.items())
+        cells = (
+            f"`<fleet>/{topic.name if topic.name.startswith('@') else f'<car>/{topic.name}'}`",
+            topic.message,
+            topic.about,
+            units,
+            f"{topic.rate_hz:g}/s" if topic.rate_hz else "",
+            f"{topic.stale_after_s:g} s" if topic.stale_after_s is not None else "",
+            topic.qos,
+            str(topic.kept or ""),
+            str(topic.held),
+            f"`{topic.entity}`" if topic.entity else "",
+        )
+        rows.append(f"| {' | '.join(cell or '-' for cell in cells)} |")
     return "\n".join(rows)
 
 
@@ -351,19 +376,25 @@ PARTS = {
 }
 
 
-def generated(text: str) -> str:
-    """`text` with every generated part made anew."""
-    for name, make in PARTS.items():
+PAGES = {README: PARTS, KEYS: {"topics": key_table}}
+"""Pages with generated parts, and the function that makes each part."""
+
+
+def generated(page: Path) -> str:
+    """Return the text of `page` with every generated part made anew."""
+    text = page.read_text(encoding="utf-8")
+    for name, make in PAGES[page].items():
         begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
         before, found, rest = text.partition(begin)
         _, closed, after = rest.partition(end)
-        assert found, f"README.md has no {begin}"
-        assert closed, f"README.md has no {end}"
+        assert found, f"{page.name} has no {begin}"
+        assert closed, f"{page.name} has no {end}"
         text = f"{before}{begin}\n{make()}\n{end}{after}"
     return text
 
 
 if __name__ == "__main__":
-    README.write_text(generated(README.read_text(encoding="utf-8")), encoding="utf-8")
+    for each in PAGES:
+        each.write_text(generated(each), encoding="utf-8")
     STOP_EVIDENCE.parent.mkdir(parents=True, exist_ok=True)
     STOP_EVIDENCE.write_text(stop_evidence_page(), encoding="utf-8")

@@ -14,7 +14,7 @@ from fleet.client.commands import CarCommands
 from fleet.client.lease import Lease
 from schemas import bus, keys
 
-PATH = Path(client.__file__).parent.parent / "REFERENCE.md"
+PATH = Path(client.__file__).parent.parent.parent / "fleet/REFERENCE.md"
 _HEAD = """# The SDK
 
 Generated from the docstrings by `make readme`; examples that run are in [examples](examples). Times are seconds,

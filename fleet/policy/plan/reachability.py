@@ -1,6 +1,7 @@
 """In which modes a plan brings its cars, and whether a condition can be seen to be so there. Pure.
 
-What a car measures depends on its mode (protocol.md, "From the car: readings"); which findings follow is check.py's.
+What a car measures depends on its mode (docs/reference/protocol.md#placeholders); which findings follow is
+check.py's.
 """
 
 from collections.abc import Iterable, Iterator, Mapping

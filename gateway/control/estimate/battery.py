@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-EMPTY_V: Final = 6.4  # protocol.md: two Li-ion cells, 6.4 V empty
+EMPTY_V: Final = 6.4  # docs/reference/protocol.md#readings: two Li-ion cells, 6.4 V empty
 FULL_V: Final = 8.4  # to 8.4 V full
 LOW_V: Final = 7.0
 CRITICAL_V: Final = 6.6

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-BYTES_PER_S: Final = 960  # protocol.md: UART 9600 8N1
+BYTES_PER_S: Final = 960  # docs/reference/protocol.md#framing: UART 9600 8N1
 AIRTIME_WINDOW_S: Final = 10.0
 STALE_S: Final = 3.0
 

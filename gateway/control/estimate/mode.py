@@ -16,7 +16,8 @@ from gateway.protocol.platforms import Profile
 from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S, RATE_HZ
 
 CONTRADICTING_FRAMES: Final = 3
-"""Frames running with another mode's signature that contradict the asked one (design.md, "Truth about a car")."""
+"""Frames running with another mode's signature that contradict the asked one
+(docs/explanation/how-sure-is-a-mode.md#contradiction)."""
 MANUAL_SILENCE_S: Final = 3.0
 RUNNING_SILENCE_S: Final = 1.0
 """Silence that contradicts mode 0, and modes 2, 5 and 6, outside known blocks and a running fan."""

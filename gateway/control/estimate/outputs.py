@@ -18,7 +18,7 @@ class StateEstimate:
     motion: Motion = Motion.STOP
     """The last that was sent."""
     repeat: bool = False
-    """The motion changed, and was not sent again alone yet (protocol.md: the 1.1 s rule)."""
+    """The motion changed, and was not sent again alone yet (docs/reference/protocol.md#pacing)."""
     fan: bool | None = None
     fan_at: float = float("-inf")
     """When the fan was last toggled."""

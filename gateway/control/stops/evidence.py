@@ -1,6 +1,7 @@
 """What shows that a stop arrived: one table of the cases, and the watch on the car's readings that decides. Pure.
 
-The car acknowledges nothing (protocol.md, "What shows that a stop arrived"). Three things show that it obeyed `MODE00`:
+The car acknowledges nothing (docs/reference/protocol.md#evidence-of-a-stop). Three things show that it obeyed
+`MODE00`:
 it left a mode that it was seen in, it left a silent mode that was opened from a shown rest, or its reports paused.
 Docs and README print `EVIDENCE`; `tests/tools/readme.py` writes them.
 """
@@ -33,10 +34,12 @@ OPENING_SILENCE_S: Final = 2.3
 """Minimum silence before the report that shows that a silent mode was left: opening alone blocks for 2.5 s. A slow link
 delivers older reports meanwhile, one a second."""
 OPENED_S: Final = 2.5
-"""Minimum time that opening a mode blocks (protocol.md): the car can report that it left the mode no sooner."""
+"""Minimum time that opening a mode blocks (docs/reference/protocol.md#blocking-times): the car can report that it
+left the mode no sooner."""
 PAUSE_MIN_S: Final = 1.88
 PAUSE_MAX_S: Final = 2.6
-"""Two reports around a `MODE00` that was obeyed are 1.9 s apart or a little more (protocol.md)."""
+"""Two reports around a `MODE00` that was obeyed are 1.9 s apart or a little more
+(docs/reference/protocol.md#evidence-of-a-stop)."""
 NORMAL_MIN_S: Final = 0.8
 NORMAL_MAX_S: Final = 1.4
 """Two reports with nothing between them. Closer ones were delayed by the link, so their times show nothing."""

@@ -1,4 +1,4 @@
-"""The stops, as tables of frames and times: what protocol.md, "Stopping, from the hazards", prescribes. No state."""
+"""The stops, as tables of frames and times: what docs/reference/protocol.md#stops prescribes. No state."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -51,22 +51,22 @@ class StopSequence:
 _STOP: Final = General(Motion.STOP)
 _MANUAL: Final = ModeClose()
 
-# protocol.md, stopping, soft
+# docs/reference/protocol.md#stops, soft
 SOFT: Final = StopSequence("soft", 1, (Step(_STOP, Gate.FLIGHT), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
 
-# protocol.md, stopping, full
+# docs/reference/protocol.md#stops, full
 FULL: Final = StopSequence("full", 2, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
 
 # The same where a frame of ours may lie in the buffer: `MODE00` behind it would be read at the wrong place, and waits.
 # The general stop need not: behind that frame it is lost without harm, and mostly there is none.
 FULL_BEHIND: Final = StopSequence("full_behind", 2, (Step(_STOP, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
 
-# protocol.md, stopping, Raspberry Pi
+# docs/reference/protocol.md#stops, Raspberry Pi
 _PI_STEPS: Final = (Step(_STOP, Gate.FLIGHT), Step(_STOP, after_s=0.06), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S))
 PI_SOFT: Final = StopSequence("raspberry_pi_soft", 1, _PI_STEPS)
 PI: Final = StopSequence("raspberry_pi", 2, _PI_STEPS)
 
-# protocol.md, stopping, recovery
+# docs/reference/protocol.md#stops, recovery
 RECOVERY: Final = StopSequence(
     "recovery",
     3,
@@ -78,7 +78,7 @@ RECOVERY: Final = StopSequence(
     ),
 )
 
-# protocol.md, stopping, platform unknown
+# docs/reference/protocol.md#stops, platform unknown
 UNKNOWN: Final = StopSequence(
     "unknown_platform",
     3,

@@ -14,8 +14,8 @@ from gateway.protocol.frames import Frame, ModeClose
 from gateway.protocol.platforms import Profile, StopStyle
 from gateway.protocol.timing import FRAME_S, MODE_TURN_S
 
-WIRE_S: Final = 0.02  # protocol.md: 20 ms of wire for a frame of 19 bytes at 960 B/s
-RECOVERY_WORST_S: Final = 7.3  # protocol.md, "recovery": theory, never over 7.3 s outside avoidance
+WIRE_S: Final = 0.02  # docs/reference/protocol.md#stops: 20 ms of wire for a frame of 19 bytes at 960 B/s
+RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory never longer outside avoidance
 _AVOIDING_S: Final = MODE_TURN_S[Mode.OBSTACLE_AVOIDANCE]
 """Of a car in an unknown state it is not known that it is not avoiding obstacles."""
 SHOW_S: Final = 12.0
@@ -209,8 +209,9 @@ def soft(situation: StopContext) -> StopSequence:
 
 
 def worst_s(recipe: StopSequence, situation: StopContext, pacing: Pacing, now: float) -> float:
-    """How long a recipe that begins now takes at worst until the motors are off for good (protocol.md, stopping).
+    """How long a recipe that begins now takes at worst until the motors are off for good.
 
+    See docs/reference/protocol.md#stops.
     What it waits for + the rest of the block it meets + the wire; and where its first frames may be lost, because a
     frame of ours lies unread in the car's buffer, the wait until the one that is alone there.
     """

@@ -1,7 +1,7 @@
 """The Arduino car's program (the STM32 car's is the same): one loop, one string, modes.
 
 It reads its string by position as the real program does and knows nothing of our codec. "Row" in a comment means the
-row of that name in protocol.md.
+row of that name in docs/reference/protocol.md.
 """
 
 import re

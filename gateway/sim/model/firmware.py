@@ -16,7 +16,7 @@ from gateway.sim.model.ir_remote import Button
 from gateway.sim.model.scheduler import EventScheduler
 
 BYTES_PER_S: Final = 960.0
-"""9600 baud, 8N1: ten bits a byte (protocol.md, "Framing")."""
+"""9600 baud, 8N1: ten bits a byte (docs/reference/protocol.md#framing)."""
 CHUNK: Final = 20
 """Bytes are handed on in pieces of at most this many, as a Bluetooth 4.0 module does."""
 

@@ -1,7 +1,7 @@
 """The infrared remote's buttons, and what each does to a car that is in remote control mode.
 
-protocol.md says who obeys (nobody but a car in mode 1) and not which buttons there are: these are what the other ways
-of driving have in common.
+docs/reference/protocol.md#modes says who obeys (nobody but a car in mode 1) and not which buttons there are: these
+are what the other ways of driving have in common.
 """
 
 from enum import StrEnum

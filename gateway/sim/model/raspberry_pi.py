@@ -1,6 +1,6 @@
 """The Raspberry Pi car's two programs: the TCP server and the one behind a Bluetooth module. Neither knows modes.
 
-"Row" in a comment means the row of that name in protocol.md.
+"Row" in a comment means the row of that name in docs/reference/protocol.md.
 """
 
 from collections.abc import Generator

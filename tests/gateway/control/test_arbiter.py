@@ -197,7 +197,7 @@ def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
         ("arduino", 150.0, SpeedStep.UP, 0.78, True),
         ("arduino", 150.0, SpeedStep.UP, 0.79, False),
         ("arduino", 150.0, SpeedStep.DOWN, 0.1, False),
-        ("arduino", 50.0, SpeedStep.DOWN, 0.3, True),  # protocol.md: that step goes up, to 100
+        ("arduino", 50.0, SpeedStep.DOWN, 0.3, True),  # docs/reference/protocol.md#platforms: that step goes up, to 100
         ("raspberry_pi", 50.0, SpeedStep.UP, 0.6, True),
     ],
 )

@@ -1,4 +1,4 @@
-"""What a battery voltage means; 6.4 V empty to 8.4 V full (protocol.md, readings)."""
+"""What a battery voltage means; 6.4 V empty to 8.4 V full (docs/reference/protocol.md#readings)."""
 
 import random
 

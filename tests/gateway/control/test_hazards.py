@@ -1,4 +1,4 @@
-"""Every row of protocol.md's hazards tables, careless against ours: the same situation, the same wish.
+"""Every row of the hazards tables of docs/reference/protocol.md, careless against ours: the same situation, same wish.
 
 The careless half writes frames straight to the simulated car (tests/gateway/sim/hazards.py asserts what that does);
 ours asks the gateway's control for the same. The judge of both is the simulated car's motors.
@@ -21,7 +21,7 @@ from tests.gateway.sim.strangers import virtual
 from tests.support.virtual import Pair
 
 RECOVERED_S = 7.3
-"""protocol.md, recovery: theory, never over 7.3 s outside avoidance."""
+"""docs/reference/protocol.md#stops: in theory recovery never takes longer outside avoidance."""
 SETTLED_S = 9.0
 """Long enough for every stop, and for a car that drives on to be seen."""
 

@@ -389,7 +389,7 @@ assert NORMAL_MAX_S < PAUSE_MIN_S
 
 
 def test_line_ends_between_reports_hide_no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    """protocol.md, framing: CR and LF after `#` are junk that happens."""
+    """docs/reference/protocol.md#framing: CR and LF after `#` are junk that happens."""
     desk = Desk().ready()
     hear = desk.hear
 

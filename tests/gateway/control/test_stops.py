@@ -81,11 +81,11 @@ def test_avoiding_without_an_echo_the_car_is_deaf_with_its_motors_braked() -> No
         asked_at = pair.now
         pair.run(20.0)
         assert pair.off_for_good_at() < asked_at
-        assert pair.car.truth.mode is AVOIDANCE, "protocol.md: for ever"
+        assert pair.car.truth.mode is AVOIDANCE, "docs/reference/protocol.md#blocking-times: forever"
         assert pair.control.motors == "unknown", "it is not heard"
 
 
-@pytest.mark.xfail(reason="protocol.md's recovery has no frame that clears this string; a colour frame alone would")
+@pytest.mark.xfail(reason="docs/reference/protocol.md#hazards: no frame of recovery clears this string")
 def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
     """A half frame, and the ranging ends when of recovery's `MODE00` only the `$` has come.
 
@@ -108,7 +108,7 @@ def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
 @pytest.mark.parametrize("world", [World.room, World.open_field], ids=["echo", "no-echo"])
 def test_a_drive_that_is_over_stops_the_car_softly(platform: str, world: Callable[[], World]) -> None:
-    """protocol.md, soft: 0.02 s; with no echo up to 1.0 s, with a frame of ours in the buffer 1.1 s more."""
+    """Soft: 0.02 s; no echo up to 1.0 s, a frame of ours in the buffer 1.1 s (docs/reference/protocol.md#stops)."""
     bound = 0.1 if world is World.room else 1.0 + 1.1 + 0.1
     for seed in range(MOMENTS):
         moments = random.Random(seed)
@@ -158,7 +158,7 @@ def certain(situation: stopping.StopContext) -> bool:
     return situation.known and situation.mode is Mode.MANUAL and not situation.contradicted
 
 
-# protocol.md, stopping: the first row that fits.
+# The first row that fits (docs/reference/protocol.md#stops).
 FULL: tuple[tuple[Callable[[stopping.StopContext], bool], sequences.StopSequence], ...] = (
     (lambda it: (it.doubted or it.profile.kind is Platform.UNKNOWN) and certain(it), sequences.UNKNOWN_MANUAL),
     (lambda it: it.doubted or it.profile.kind is Platform.UNKNOWN, sequences.UNKNOWN),

@@ -159,7 +159,7 @@ def deaf(pair: Pair) -> list[bytes]:
 
 @pytest.mark.parametrize("platform", ["arduino", "stm32"])
 def test_a_stop_that_is_lost_on_the_way_is_never_said_to_be_complete_and_goes_on(platform: str) -> None:
-    """protocol.md: `MODE00` blocks for 1.0 s. The reports of a deaf car come on, or no pause shows it."""
+    """docs/reference/protocol.md#evidence-of-a-stop: the reports of a deaf car come on, or no pause shows it."""
     tries = 40
     for seed in range(tries):
         pair = Pair(platform, seed=seed, start_s=2.0).ready()

@@ -77,7 +77,7 @@ def test_another_writer_brings_the_car_to_another_mode(row: Row, world: str, pla
         pair.car.feed(frame_of(true), pair.now)
         if asked is Mode.OBSTACLE_AVOIDANCE and world == "no-echo":
             pair.run(LONG_S)
-            assert pair.car.truth.mode is asked, "protocol.md: with no echo at all it is deaf for ever"
+            assert pair.car.truth.mode is asked, "docs/reference/protocol.md#blocking-times: deaf without an echo"
             assert pair.control.mode.verdict is Verdict.ASSUMED
             return
         pair.until(lambda: pair.car.truth.mode is true, 6.0)
@@ -131,7 +131,7 @@ def told_again(pair: Pair, world: str) -> None:
         assert pair.control.motors in ("stopping", "unknown")
         pair.run(0.01)
     if true is Mode.OBSTACLE_AVOIDANCE and world == "no-echo":
-        assert pair.car.truth.mode is true, "protocol.md: with no echo at all it is deaf for ever"
+        assert pair.car.truth.mode is true, "docs/reference/protocol.md#blocking-times: deaf without an echo"
         return
     pair.until(lambda: pair.control.mode.confirmed is Mode.MANUAL, LONG_S)
     assert pair.car.truth.mode is Mode.MANUAL

@@ -22,7 +22,7 @@ MEASURED = {
     Mode.LIGHT_SEEKING: frozenset({"light"}),
     Mode.FOLLOWING: frozenset({"obstacle"}),
 }
-"""protocol.md, observed placeholders; of mode 0 of a raspberry_pi car battery and grayscale are constants."""
+"""docs/reference/protocol.md#placeholders; of mode 0 of a raspberry_pi car battery and grayscale are constants."""
 
 
 class Sent(NamedTuple):

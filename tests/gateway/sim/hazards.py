@@ -1,4 +1,4 @@
-"""Every row of the two hazards tables of protocol.md as a scenario, for virtual time and for real links."""
+"""Every row of the two hazards tables of docs/reference/protocol.md as a scenario, for virtual time and real links."""
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass

@@ -29,7 +29,7 @@ def opening(mode: int) -> bytes:
 
 
 def opening_s(mode: int) -> float:
-    """protocol.md, block table."""
+    """docs/reference/protocol.md#blocking-times."""
     return 2.1 + 0.2 * (mode + 1)
 
 

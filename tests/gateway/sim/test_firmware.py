@@ -1,4 +1,4 @@
-"""Blocks, modes, readings, speed and resets of the programs, on virtual time; sources are the tables of protocol.md."""
+"""Blocks, modes, readings, speed and resets of the programs, on virtual time; sources: docs/reference/protocol.md."""
 
 import math
 import random

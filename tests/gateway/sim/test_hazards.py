@@ -75,7 +75,7 @@ def test_over_the_wire(hazard: Hazard, outcomes: dict[str, BaseException | None]
 
 
 async def test_without_echo_a_run_and_a_stop_60_ms_apart_lose_the_stop_about_every_second_time() -> None:
-    """protocol.md saw it 6 times in 10."""
+    """docs/reference/protocol.md#hazards: 6 times in 10."""
     moments = random.Random(5)
     lost = 0
     for _ in range(400):

@@ -174,7 +174,8 @@ async def test_a_lossy_link_to_the_car_only(cars: Simulation) -> None:
 
 
 async def test_a_write_that_is_cut_reaches_the_car_and_then_the_link_is_gone(cars: Simulation) -> None:
-    """The half frame is still in the car: the row of protocol.md in which the stop after it is lost."""
+    """The half frame is still in the car: the row of docs/reference/protocol.md#hazards in which the stop after it is
+    lost."""
     host, port = address(cars)
     reader, writer = await asyncio.open_connection(host, port)
     await cars.inflict(Fault(FaultKind.CUT_WRITE, "green", for_s=0.1, bytes=8))

@@ -52,7 +52,7 @@ async def opened(world: World, mode: int) -> VirtualStranger:
     return car
 
 
-# protocol.md, "From the car: readings": mode 6 has HW only, inverted: 0 = object seen.
+# Mode 6 has HW only, inverted: 0 = object seen (docs/reference/protocol.md#placeholders).
 FOLLOWING = [
     ("straight ahead, near", (0.30, 0.0), b"HW00", (200, 200)),
     ("straight ahead, 16 cm between the two", (0.42, 0.0), b"HW00", (200, 200)),
@@ -85,7 +85,7 @@ async def test_a_thing_is_followed_as_a_car_is(thing: MovingObject) -> None:
     assert (car.truth.motor_left, car.truth.motor_right) == (200, 200)
 
 
-# protocol.md: mode 5 has GM only, 1 = sees light.
+# Mode 5 has GM only, 1 = sees light (docs/reference/protocol.md#placeholders).
 SEEKING = [
     ("ahead", lit(Lamp(0.8, 0.0)), b"GM11", (200, 200)),
     ("left", lit(Lamp(0.5, 0.6)), b"GM10", (0, 200)),

@@ -1,5 +1,6 @@
-"""protocol.md's stops, written by a stranger: begun at random moments in every load, motors off in time and for good.
+"""The stops of docs/reference/protocol.md#stops, written by a stranger.
 
+Begun at random moments in every load: motors off in time and for good.
 The gateway's own recipes live in gateway.control and are tested there; here the car has to honour the table.
 """
 
@@ -176,7 +177,10 @@ async def test_a_stop_begun_at_a_random_moment(case: Case) -> None:
 
 
 async def test_a_stop_and_mode00_every_1_1_s_keep_a_car_that_opens_a_mode_driving() -> None:
-    """protocol.md: "More is not better": in the one string that piles up the stop hides the digits, again and again."""
+    """More frames are not better (docs/reference/protocol.md#stops).
+
+    In the one string that piles up the stop hides the digits, again and again.
+    """
     moments = random.Random(1)
     ran_on = 0
     for _ in range(MOMENTS):
