@@ -46,17 +46,22 @@ def hundred(directory: Path, seconds: float) -> Iterator[Up]:
         yield up
 
 
-def at_rest(up: Up) -> int:
-    """Cars that are known to stand."""
-    answers = list(up.bus.query("fleet/*/state/safety", timeout_s=5.0))
-    return sum(isinstance(each, Sample) and each.message().motors == "off" for each in answers)  # type: ignore[attr-defined]
+def moving(up: Up) -> list[str]:
+    """The cars that are not known to stand, and what is known of each."""
+    states = {
+        each.key.split("/")[1]: each.message()
+        for each in up.bus.query("fleet/*/state/safety", timeout_s=5.0)
+        if isinstance(each, Sample)
+    }
+    missing = [f"{CARS - len(states)} cars did not answer"] if len(states) < CARS else []
+    return missing + [str(state) for state in states.values() if state.motors != "off"]  # type: ignore[attr-defined]
 
 
 def wait_until_at_rest(up: Up, seconds: float) -> None:
     """Look once a second: to answer costs a hundred gateways what they need to start."""
     deadline = time.monotonic() + seconds
-    while (count := at_rest(up)) < CARS:
-        assert time.monotonic() < deadline, f"{count} cars are at rest"
+    while left := moving(up):
+        assert time.monotonic() < deadline, f"{len(left)} are not at rest:\n" + "\n".join(left)
         time.sleep(1.0)
 
 
