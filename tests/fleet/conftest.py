@@ -55,6 +55,12 @@ def asked(drive: Callable[[], Outcome]) -> Outcome:
             return outcome
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Run a module's tests that share a fleet in one worker: each further worker would start a fleet of its own."""
+    if "cars" in getattr(item, "fixturenames", ()):
+        item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+
 @pytest.fixture(scope="module")
 def cars(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cars]:
     fleet = Cars(free_endpoint(), tmp_path_factory.mktemp("fleet"))

@@ -1,6 +1,7 @@
-"""`fleet init, check, bind, schema` as processes, at a terminal where they ask; with simulated cars on real PTYs."""
+"""`fleet init, check, bind, schema`, in a process at a terminal where they ask; with simulated cars on real PTYs."""
 
 import fcntl
+import io
 import json
 import os
 import pty
@@ -18,12 +19,12 @@ from fleet.fleetfile.editor import CannotEdit, with_link
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.fleetfile.scan import NewCar, new_file
 from schemas.yaml_document.document import BadFile
+from tests.support import in_process
 from tests.support.ports import free_endpoint
 from tests.support.processes import Fleet, Process, TcpCar, wait_for
 from tests.support.terminal import Terminal
 
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
-PATIENCE_S = 90
 
 
 @pytest.fixture
@@ -32,20 +33,15 @@ def endpoint() -> str:
 
 
 @pytest.fixture
-def command(tmp_path: Path, endpoint: str) -> Command:
+def command(tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Command:
     """Run `fleet ...` to its end, in a directory of its own, with nobody to answer."""
 
     def run(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
-        done = subprocess.run(
-            [sys.executable, "-m", "fleet.cli", *map(str, arguments)],
-            check=False,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            stdin=subprocess.DEVNULL,
-            cwd=tmp_path,
-            env=os.environ | {"FLEET_ENDPOINT": endpoint, "COLUMNS": "200", "PYTHONPATH": str(Path.cwd())},
-        )
+        with monkeypatch.context() as here:
+            here.setenv("FLEET_ENDPOINT", endpoint)
+            here.setenv("COLUMNS", "200")
+            here.setattr(sys, "stdin", io.StringIO())
+            done = in_process.fleet(*arguments, cwd=tmp_path)
         assert "Traceback" not in done.stderr, done.stderr
         return done
 

@@ -477,7 +477,7 @@ def play(case: Case, seed: int) -> Seen:
     settled_at = asked_at
     end = asked_at + (22.0 if "restored" in state else 9.0)
     while pair.car.truth.mode is not Mode.MANUAL and pair.now < end:
-        pair.run(0.001)
+        pair.turn(end)
         settled_at = pair.now
     pair.run(end - pair.now)
     while pair.last_of("the-stop") is None and pair.now < asked_at + ENDS_S:

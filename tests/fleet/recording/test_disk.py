@@ -20,6 +20,7 @@ from fleet.recording.tools.verify import verify
 from fleet.recording.writing.session_writer import MB, Options, SessionWriter
 from schemas.bus import Bus, Failure, Sample
 from schemas.gen import fleet_v1_pb2 as pb
+from tests.support import in_process
 
 from .conftest import heard, popen, publisher, wait_for
 from .test_command import ready
@@ -89,8 +90,7 @@ def disk(kind: str, place: Path) -> Iterator[Disk]:
 
 
 def fleet(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "fleet.cli", *arguments, "--connect", endpoint]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return in_process.fleet(*arguments, "--connect", endpoint)
 
 
 def record(endpoint: str, out: Path, *options: str) -> "subprocess.Popen[str]":

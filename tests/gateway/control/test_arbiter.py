@@ -1,5 +1,6 @@
 """The arbiter over the whole product of what it looks at: stop wins everywhere, and nobody moves what they may not."""
 
+import functools
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
@@ -73,7 +74,13 @@ RANK = [SenderKind.COORDINATOR, SenderKind.SCRIPT, SenderKind.PERSON]
 ESTOP = Estop("e1", "eve", "smoke", 1, fleet_wide=False)
 
 
-def situations() -> Iterator[CommandContext]:
+@functools.cache
+def situations() -> tuple[CommandContext, ...]:
+    """Return them, made once: each of 96 tests goes through all of them twice."""
+    return tuple(_situations())
+
+
+def _situations() -> Iterator[CommandContext]:
     """30,720 states: link, answering, closing, hold, e-stop, lease, battery, queue; mode and verdict; platform."""
     for (
         (link, answering, closing, held, estopped, lease, battery, queued),
@@ -176,7 +183,7 @@ def test_the_table_has_every_command() -> None:
 @pytest.mark.parametrize("what", [what for what in WHATS if not isinstance(what, Stop | EmergencyStop)], ids=repr)
 def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
     calm = replace(
-        next(situations()),
+        situations()[0],
         profile=PROFILES["stm32+arm"],
         asked=Mode.MANUAL,
         closing=False,
@@ -204,7 +211,7 @@ def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
 def test_no_step_beyond_the_speed_that_is_allowed(
     platform: str, speed: float, step: SpeedStep, limit: float, refused: bool
 ) -> None:
-    calm = replace(next(situations()), profile=PROFILES[platform], asked=Mode.MANUAL, closing=False)
+    calm = replace(situations()[0], profile=PROFILES[platform], asked=Mode.MANUAL, closing=False)
     refusal = refuse(
         Command("c", "speed", Sender("ann"), ChangeSpeed(step)), replace(calm, speed=speed, speed_max=limit)
     )

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -20,21 +19,15 @@ from fleet.recording.reading.mcap_reader import MAGIC
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.transform import recover
 from fleet.recording.tools.verify import verify
+from tests.support import in_process
 
 from ..damaged import Original, written  # noqa: TID252 - beside this package's tests
 from . import every_type
 
 
 def fleet(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """The command as a process of its own: its exit code, and no traceback whatever happens."""
-    done = subprocess.run(
-        [sys.executable, "-m", "fleet.cli", "sessions", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[4])},
-    )
+    """`fleet sessions`: its exit code, and no traceback whatever happens."""
+    done = in_process.fleet("sessions", *arguments, cwd=cwd)
     assert "Traceback" not in done.stderr, done.stderr
     return done
 

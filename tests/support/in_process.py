@@ -1,0 +1,27 @@
+"""`fleet` in the process of the test: the whole command but its start, which costs half a second of a processor."""
+
+import contextlib
+import io
+import subprocess
+import sys
+from pathlib import Path
+from unittest.mock import patch
+
+from fleet.cli import main
+
+
+def fleet(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the command; return its exit code and its words. What would be a traceback is raised."""
+    words = ["fleet", *map(str, arguments)]
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(cwd or Path.cwd()),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        patch.object(sys, "argv", words),
+    ):
+        try:
+            main()
+        except SystemExit as ended:
+            return subprocess.CompletedProcess(words, int(ended.code or 0), out.getvalue(), err.getvalue())
+    raise AssertionError("it ends without an exit code")
