@@ -12,7 +12,8 @@ export XDG_STATE_HOME := $(CURDIR)/.state
 export XDG_DATA_HOME := $(CURDIR)/.state/share
 export TMPDIR := $(CURDIR)/.tmp
 export FLEET_STATE_DIR := $(CURDIR)/.state
-# Without bytecode caches each of the suite's processes compiles every module anew: a third of its start.
+
+# Tests start hundreds of Python processes. Each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo test soak lint bench proto pictures readme clean

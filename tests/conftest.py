@@ -1,8 +1,9 @@
-"""How many tests run at once, how long an example of Hypothesis may take, and what a Ctrl-C is."""
+"""How many tests run at once and where, how long an example of Hypothesis may take, and what a Ctrl-C is."""
 
 import os
 import signal
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 # By default an example that takes 200 ms fails, and so do examples that take a second to make: a machine that stalls
@@ -23,3 +24,17 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 def pytest_xdist_auto_num_workers() -> int:
     """Twice the processors: most tests wait, for processes, cars and seconds."""
     return 2 * (os.cpu_count() or 1)
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep tests that share a fixture of their module on one worker.
+
+    Without a group every worker gets some of them, and starts the fleet or records the session once more.
+    """
+    for item in items:
+        if isinstance(item, pytest.Function) and item.get_closest_marker("xdist_group") is None:
+            definitions = item._fixtureinfo.name2fixturedefs.values()
+            used = (each for several in definitions for each in several if each.baseid.startswith("tests"))
+            if any(each.scope == "module" for each in used):
+                item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))

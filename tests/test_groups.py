@@ -1,4 +1,4 @@
-"""Tests that must not run at once do not."""
+"""Tests that must not run at once do not, and tests that share what is costly run on one worker."""
 
 import pytest
 
@@ -8,3 +8,16 @@ def test_groups_are_in_force(request: pytest.FixtureRequest) -> None:
     """pytest-xdist tells nobody when a newer pytest makes `--dist loadgroup` group nothing (pytest-xdist#1386)."""
     if getattr(request.config.option, "loadgroup", False):
         assert request.node.nodeid.endswith("@together"), "xdist_group has no effect with this pytest: see constraints"
+
+
+@pytest.fixture(scope="module")
+def costly() -> str:
+    return "a fleet of processes, or a recorded session"
+
+
+@pytest.mark.usefixtures("costly")
+def test_who_shares_a_fixture_of_the_module_is_in_its_group(request: pytest.FixtureRequest) -> None:
+    (mark,) = request.node.iter_markers("xdist_group")
+    assert mark.args == ("tests/test_groups.py",)
+    if getattr(request.config.option, "loadgroup", False):
+        assert request.node.nodeid.endswith("@tests/test_groups.py")

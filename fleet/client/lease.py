@@ -4,11 +4,12 @@
 """
 
 import threading
+import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
 from fleet.client.commands import drive_request, lease_request
-from fleet.client.outcome import LeaseLost, NotCarriedOut, Outcome
+from fleet.client.outcome import MARGIN_S, LeaseLost, NotCarriedOut, Outcome
 from schemas import keys, messages
 from schemas.bus import BusError, Sample
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 RENEW_S: Final = 0.8
 """A gateway's lease ends 2 s after the last that was asked for: one renewal may be lost."""
+LOOK_DELAY_S: Final = 0.2
+"""Delay of a second question to a gateway that did not answer the first."""
 _STOPPED_ANYWAY: Final = frozenset({"leased", "estopped", "superseded"})
 """Why the stop at the end is not carried out, and need not be: the car is another's, or is being stopped."""
 
@@ -134,8 +137,11 @@ class Lease:
             self._ours.refused(outcome)
 
     def _look(self) -> None:
-        """Ask the gateway how it is now."""
-        for reading in self._fleet.get(f"{self._name}/state/safety"):
+        """Ask the gateway for the state of the car now. A gateway that is held up is asked again for a while."""
+        until = time.monotonic() + MARGIN_S
+        while not (readings := self._fleet.get(f"{self._name}/state/safety")) and time.monotonic() < until:
+            time.sleep(LOOK_DELAY_S)
+        for reading in readings:
             with self._hearing:
                 self._ours.heard(reading.value)
 

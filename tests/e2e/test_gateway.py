@@ -7,6 +7,7 @@ import socket
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import serial
 from schemas import bus
 from tests.support.judge import Judge
 from tests.support.kills import BUSY_S
+from tests.support.ports import free_endpoint
 from tests.support.processes import (
     MODE00,
     PATIENCE_S,
@@ -388,33 +390,55 @@ def test_the_one_that_remains_gets_the_port_from_the_one_that_yields(fleet: Flee
     assert remaining(fleet, [yields, stays]) is stays
 
 
+FOUR = ("red:arduino:pty", "green:arduino:tcp", "blue:raspberry_pi:tcp", "white:arduino:pty")
+
+
+@dataclass
+class Four:
+    """Four cars with their gateways."""
+
+    fleet: Fleet
+    sim: Process
+    gateways: dict[str, Process]
+    judges: dict[str, Judge]
+
+
+@pytest.fixture(scope="module")
+def four(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Four]:
+    fleet = Fleet(free_endpoint(), tmp_path_factory.mktemp("four"))
+    try:
+        names = [each.split(":")[0] for each in FOUR]
+        judges = {car: Judge.follow(fleet.bus, car) for car in names}
+        sim, links = fleet.simulate(*FOUR, truth=True)
+        gateways = {
+            car: fleet.gateway(link, car=car, platform=each.split(":")[1])
+            for car, each, link in zip(names, FOUR, links, strict=True)
+        }
+        yield Four(fleet, sim, gateways, judges)
+    finally:
+        fleet.close()
+
+
 @pytest.mark.parametrize(
     ("number", "car"),
-    [
-        (signal.SIGINT, "red:arduino:pty"),
-        (signal.SIGTERM, "red:arduino:tcp"),
-        (signal.SIGTERM, "red:raspberry_pi:tcp"),
-        (signal.SIGHUP, "red:arduino:pty"),
-    ],
+    [(signal.SIGINT, "red"), (signal.SIGTERM, "green"), (signal.SIGTERM, "blue"), (signal.SIGHUP, "white")],
     ids=["SIGINT-arduino", "SIGTERM-arduino", "SIGTERM-raspberry_pi", "SIGHUP-arduino"],
 )
-def test_a_signal_stops_the_car_first(fleet: Fleet, number: int, car: str) -> None:
-    judge = Judge.follow(fleet.bus)
-    sim, (link,) = fleet.simulate(car, truth=True)
-    gateway = fleet.gateway(link, platform=car.split(":")[1])
-    fleet.ready()
-    assert fleet.ask("drive", motion="forward", duration_s=10)["status"] in TAKEN
+def test_a_signal_stops_the_car_first(four: Four, number: int, car: str) -> None:
+    fleet, sim, gateway, judge = four.fleet, four.sim, four.gateways[car], four.judges[car]
+    fleet.ready(car)
+    assert fleet.ask("drive", car, motion="forward", duration_s=10)["status"] in TAKEN
     wait_for(lambda: judge.driving, "it drives")
     asked_ns = time.time_ns()
     assert gateway.end(number) == 0, gateway.stderr
     ended_s = (time.time_ns() - asked_ns) / 1e9
-    assert not driving(sim)
+    assert not driving(sim, car)
     took_s = judge.wait_off(asked_ns, watched_s=0.5)
     assert took_s < min(1.2 + BUSY_S, ended_s), "its recipe, on a machine that is busy, and before it ends"
     assert ended_s < SHOWN_S + 1.0 + 2 * BUSY_S, "the evidence, one second, and a process that ends on such a machine"
     assert "Traceback" not in gateway.stderr
     assert fleet.left() == []
-    assert wait_for(lambda: not fleet.get("fleet/red/**"), "nobody answers for it")
+    assert wait_for(lambda: not fleet.get(f"fleet/{car}/**"), "nobody answers for it")
 
 
 def test_who_drives_is_told_at_once_that_the_gateway_was_killed(fleet: Fleet) -> None:
@@ -543,6 +567,15 @@ def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: Fleet) 
         wait_for(lambda car=car: not driving(sim, car), f"{car} stands")
 
 
+@pytest.fixture(scope="module")
+def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    """A hub for gateways that do not get as far as a car."""
+    started = Fleet(free_endpoint(), tmp_path_factory.mktemp("hub"))
+    assert started.bus.connected, "a hub without a client ends by itself"
+    yield started
+    started.close()
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
@@ -564,10 +597,10 @@ def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: Fleet) 
     ],
     ids=lambda value: " ".join(value)[:40] if isinstance(value, list) else "",
 )
-def test_bad_input_is_one_line(fleet: Fleet, arguments: list[str], code: int, words: str) -> None:
+def test_bad_input_is_one_line(only_a_hub: Fleet, arguments: list[str], code: int, words: str) -> None:
     given = {"--car": "red", "--link": "/dev/null", "--platform": "arduino"}
     given |= dict(zip(arguments[::2], arguments[1::2], strict=True))
-    process = fleet.start("-m", "gateway.cli", "run", *(word for pair in given.items() for word in pair))
+    process = only_a_hub.start("-m", "gateway.cli", "run", *(word for pair in given.items() for word in pair))
     assert process.wait() == code, process.stderr
     (line,) = process.stderr.splitlines()
     assert line.startswith("gateway: ")

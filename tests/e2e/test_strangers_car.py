@@ -3,6 +3,8 @@
 The car's own program judges (strangers_car.py). Many more gaps: tests/soak/test_strangers_car.py.
 """
 
+import json
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,10 +15,8 @@ from tests.support.foreign_cars import MODES, STANDS_S, ForeignLot, gaps, report
 from tests.support.gap_proxy import ByteGap, GapDirection
 from tests.support.kills import BUSY_S
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet, wait_for
+from tests.support.processes import TAKEN, Fleet, wait_for
 from tests.support.up import Up
-
-pytestmark = pytest.mark.xdist_group("strangers")
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,50 @@ def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_n
             wrong.append(f"{car.mode}: exit code 0 on a dead wire")
         found += report(car, gap, began, wrong)
     assert not found, "\n\n".join(found)
+
+
+@pytest.mark.timeout(240)
+def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_stand_or_a_second_ctrl_c(
+    tmp_path: Path, fleet: Fleet
+) -> None:
+    """The wires pass what the cars send, and lose all that is written: red's for some seconds, blue's for good.
+
+    That `fleet up` ends by itself when the last car stands is shown in test_up.py.
+    """
+    cars = start(fleet, ["obstacle_avoidance"] * 2, seed=50)
+    by_name = dict(zip(("red", "blue"), cars, strict=True))
+    (tmp_path / "up").mkdir()
+    file = tmp_path / "fleet.yaml"
+    links = "".join(f"  {name}: {{link: '{car.wire.link}', platform: arduino}}\n" for name, car in by_name.items())
+    file.write_text(f"cars:\n{links}")
+    try:
+        with Up(tmp_path / "up", free_endpoint(), str(file), "--no-record") as up:
+            for name, car in by_name.items():
+                up.ready(name)
+                assert up.ask("mode", name, mode="obstacle_avoidance")["status"] in TAKEN
+                wait_for(lambda car=car: car.true_mode == MODES["obstacle_avoidance"], f"{name} avoids obstacles")
+            for car in cars:
+                car.wire.arm(ByteGap(GapDirection.TO_CAR, 3600.0, early=True))
+            up.process.popen.send_signal(signal.SIGINT)
+            tried = up.until("end", "red", "A fresh gateway tries to stop the car")
+            assert tried["words"].startswith("not stopped: ")
+            assert by_name["red"].true_mode == MODES["obstacle_avoidance"]
+            by_name["red"].wire.mend()
+            up.until("end", "red", "stopped")
+            at = time.time()
+            wait_for(lambda: by_name["red"].stays(at), "red stands, and stays")
+            up.process.popen.send_signal(signal.SIGINT)
+            assert up.process.wait() == 1
+            ended = [*up.heard, *map(json.loads, up.process.lines())]
+            words = {each["name"]: each["words"] for each in ended if each["what"] == "end"}
+            assert words["red"] == "stopped"
+            assert words["blue"].startswith("not stopped: ")
+            assert words["@supervisor"] == "not stopped: blue: look whether they drive"
+            assert by_name["blue"].true_mode == MODES["obstacle_avoidance"]
+            for name in by_name:
+                assert "may still be moving" in up.fleet("logs", name).stdout
+    finally:
+        cars.close()
 
 
 @pytest.mark.timeout(240)

@@ -5,10 +5,12 @@ Each operator is a process of its own; the simulated car says what it truly does
 
 import json
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from tests.support.ports import free_endpoint
 from tests.support.processes import LONG_S, Fleet, Process, driving, wait_for
 
 SCRIPT = """
@@ -87,9 +89,9 @@ def listed(fleet: Fleet) -> dict[str, Any]:
     return row
 
 
-def drives(fleet: Fleet, who: str) -> bool:
-    """Whether the gateway says that the motion is theirs."""
-    motion = fleet.state("motion")
+def drives(fleet: Fleet, who: str, car: str = "red") -> bool:
+    """Return True if the gateway says that the motion is theirs."""
+    motion = fleet.state("motion", car)
     return motion is not None and motion.owner.startswith(who)
 
 
@@ -137,13 +139,30 @@ def test_on_the_command_line(fleet: Fleet, sim: Process) -> None:
     assert f"from {row['driver']} (person)" in taken
 
 
-@pytest.mark.parametrize("verb", [("mode", "red", "tracking"), ("servo", "red", "front", "90"), ("fan", "red")])
-def test_what_moves_a_car_can_be_taken(fleet: Fleet, sim: Process, verb: tuple[str, ...]) -> None:
-    ann = operator(fleet, "ann", "drive", "red", "forward", "--for", LONG)
-    wait_for(lambda: drives(fleet, "ann@"), "ann drives")
-    code, words = ended(operator(fleet, "bob", *verb))
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    """Three cars, one for each thing that moves a car."""
+    fleet = Fleet(free_endpoint(), tmp_path_factory.mktemp("several"))
+    try:
+        names = ("red", "green", "blue")
+        _, links = fleet.simulate(*(f"{car}:arduino:tcp" for car in names))
+        for car, link in zip(names, links, strict=True):
+            fleet.gateway(link, "--longest-drive", f"{LONG_S:g}", car=car)
+        yield fleet
+    finally:
+        fleet.close()
+
+
+@pytest.mark.parametrize(
+    ("car", "verb", "more"), [("red", "mode", ("tracking",)), ("green", "servo", ("front", "90")), ("blue", "fan", ())]
+)
+def test_what_moves_a_car_can_be_taken(several: Fleet, car: str, verb: str, more: tuple[str, ...]) -> None:
+    several.ready(car)
+    ann = operator(several, "ann", "drive", car, "forward", "--for", LONG)
+    wait_for(lambda: drives(several, "ann@", car), "ann drives")
+    code, words = ended(operator(several, "bob", verb, car, *more))
     assert (code, words.endswith("(--take)")) == (1, True), words
-    assert ended(operator(fleet, "bob", *verb, "--take"))[0] == 0
+    assert ended(operator(several, "bob", verb, car, *more, "--take"))[0] == 0
     code, words = ended(ann)
     assert code == 1
     assert "by bob@" in words

@@ -18,9 +18,7 @@ from fleet.supervisor.service import ask_status
 from schemas import bus
 from tests.support.ports import free_endpoint, free_port
 from tests.support.processes import PATIENCE_S, TAKEN, Fleet, driving, wait_for
-from tests.support.up import Up
-
-pytestmark = pytest.mark.xdist_group("up")
+from tests.support.up import Up, fleet_command
 
 IN_ITS_PLACE_S = 9.5
 """A gateway that hangs has its time to end, 7 s, is killed, and another stops the car: nothing else does, it has no
@@ -36,6 +34,26 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
         for name in ("@hub", "@recorder", "@simulator", "red", "green"):
             started.running(name)
         yield started
+
+
+@pytest.fixture(scope="module")
+def jobs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
+    """Two simulated cars of a file, with a plan: `_job`."""
+    directory = tmp_path_factory.mktemp("job")
+    with Up(directory, free_endpoint(), str(_job(directory)), "--no-record") as started:
+        yield started
+
+
+@pytest.fixture
+def job(jobs: Up) -> Up:
+    """Restore files and plan, whatever the test before has made of them."""
+    jobs.running("@coordinator")
+    _job(jobs.directory)
+    restored = wait_for(lambda: (done := jobs.fleet("reload")).returncode == 0 and done, "reload")
+    assert restored.returncode == 0, restored.stderr
+    for car, mode in (("ann", "tracking"), ("bob", "light_seeking")):
+        wait_for(lambda car=car, mode=mode: _asked(jobs, car) == mode, f"{car} does its role")
+    return jobs
 
 
 @pytest.mark.parametrize("name", ["@hub", "@recorder", "@simulator", "red"])
@@ -297,7 +315,7 @@ def test_fleet_down_names_the_car_that_was_not_stopped_and_fails(fleet: Fleet, t
         started.ready("red")
         sim.say({"car": "red", "fault": "link_drop"})
         wait_for(lambda: started.get("red/state/link").state == "lost", "its link is gone")
-        first = threading.Thread(target=lambda: started.fleet("down"))
+        first = threading.Thread(target=lambda: started.fleet_process("down"))
         first.start()
         started.until("end", "red", "A fresh gateway tries to stop the car")
         second = started.fleet("down")
@@ -380,37 +398,30 @@ def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: Flee
         assert started.running("red") == before["red"]
 
 
-def test_another_plan_is_taken_by_the_coordinator_that_runs_and_a_bad_one_by_nobody(
-    fleet: Fleet, tmp_path: Path
-) -> None:
-    _, (link,) = fleet.simulate("red:arduino:tcp")
-    plan = tmp_path / "plan.yaml"
-    plan.write_text("cars: {red: tracking}\n")
-    with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--plan", str(plan), "--no-record") as started:
-        wait_for(lambda: _asked(started, "red") == "tracking", "red is told to track")
-        pid = started.running("@coordinator")
-        plan.write_text("cars: {red: trakking}\n")
-        refused = started.fleet("reload")
-        assert refused.returncode == 2
-        assert "trakking" in refused.stderr
-        plan.write_text("cars: {red: light_seeking}\n")
-        assert started.fleet("reload").stdout == "the plan is changed\n"
-        wait_for(lambda: _asked(started, "red") == "light_seeking", "red seeks light")
-        os.kill(pid, signal.SIGKILL)
-        assert started.running("@coordinator", but=pid)
-        answer = started.get("@coordinator/plan")
-        assert answer is None or "light_seeking" in answer.text, "the one after it has the new plan, too"
+def test_another_plan_is_taken_by_the_coordinator_that_runs_and_a_bad_one_by_nobody(job: Up) -> None:
+    plan = job.directory / "plan.yaml"
+    pid = job.running("@coordinator")
+    plan.write_text("roles: {follow: {mode: trakking}, seek: {mode: light_seeking}}\n")
+    refused = job.fleet("reload")
+    assert refused.returncode == 2
+    assert "trakking" in refused.stderr
+    plan.write_text("roles: {follow: {mode: light_seeking}, seek: {mode: light_seeking}}\n")
+    assert job.fleet("reload").stdout == "the plan is changed\n"
+    wait_for(lambda: _asked(job, "ann") == "light_seeking", "ann seeks light")
+    assert job.running("@coordinator") == pid
+    job.kill(pid)
+    assert job.running("@coordinator", but=pid)
+    answer = job.get("@coordinator/plan")
+    assert answer is None or "follow: {mode: light_seeking}" in answer.text, "the one after it has the new plan, too"
 
 
-def test_the_coordinator_goes_by_what_was_accepted_not_by_what_the_files_have_become(tmp_path: Path) -> None:
-    file = _job(tmp_path)
-    with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
-        pid = started.running("@coordinator")
-        file.write_text("cars: [\n")
-        (tmp_path / "plan.yaml").unlink()
-        assert started.fleet("reload").stderr.startswith("nothing was changed: ")
-        started.kill(pid)
-        assert started.running("@coordinator", but=pid)
+def test_the_coordinator_goes_by_what_was_accepted_not_by_what_the_files_have_become(job: Up) -> None:
+    pid = job.running("@coordinator")
+    (job.directory / "fleet.yaml").write_text("cars: [\n")
+    (job.directory / "plan.yaml").unlink()
+    assert job.fleet("reload").stderr.startswith("nothing was changed: ")
+    job.kill(pid)
+    assert job.running("@coordinator", but=pid)
 
 
 def test_simulated_cars_that_have_no_link_yet_do_a_plan(tmp_path: Path) -> None:
@@ -419,72 +430,63 @@ def test_simulated_cars_that_have_no_link_yet_do_a_plan(tmp_path: Path) -> None:
             wait_for(lambda car=car, mode=mode: _asked(started, car) == mode, f"{car} is told its role")
 
 
-def test_reload_tells_the_coordinator_what_the_cars_may_do_now(tmp_path: Path) -> None:
-    file = _job(tmp_path)
-    with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
-        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
-        _job(tmp_path, ann="seek", bob="follow")
-        told = started.fleet("reload").stdout
-        assert told == "ann: its roles changed, for the coordinator\nbob: its roles changed, for the coordinator\n"
-        wait_for(lambda: _asked(started, "bob") == "tracking", "bob follows")
-        assert started.fleet("reload").stdout == "nothing has changed\n"
+def test_reload_tells_the_coordinator_what_the_cars_may_do_now(job: Up) -> None:
+    _job(job.directory, ann="seek", bob="follow")
+    told = job.fleet("reload").stdout
+    assert told == "ann: its roles changed, for the coordinator\nbob: its roles changed, for the coordinator\n"
+    wait_for(lambda: _asked(job, "bob") == "tracking", "bob follows")
+    assert job.fleet("reload").stdout == "nothing has changed\n"
 
 
-def test_reload_restores_a_plan_that_was_replaced_over_the_bus(tmp_path: Path) -> None:
-    with Up(tmp_path, free_endpoint(), str(_job(tmp_path)), "--no-record") as started:
-        pid = _given_another_job(started)
-        wait_for(lambda: _asked(started, "ann") == "obstacle_avoidance", "ann does as the plan over the bus says")
-        told = started.fleet("reload").stdout
-        assert "which was given over the bus, is replaced by " in told
-        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows again")
-        assert started.running("@coordinator") == pid
-        assert started.fleet("reload").stdout == "nothing has changed\n"
+def test_reload_restores_a_plan_that_was_replaced_over_the_bus(job: Up) -> None:
+    pid = _given_another_job(job)
+    wait_for(lambda: _asked(job, "ann") == "obstacle_avoidance", "ann does as the plan over the bus says")
+    told = job.fleet("reload").stdout
+    assert "which was given over the bus, is replaced by " in told
+    wait_for(lambda: _asked(job, "ann") == "tracking", "ann follows again")
+    assert job.running("@coordinator") == pid
+    assert job.fleet("reload").stdout == "nothing has changed\n"
 
 
-def test_a_plan_that_was_given_over_the_bus_outlives_its_coordinator(tmp_path: Path) -> None:
-    with Up(tmp_path, free_endpoint(), str(_job(tmp_path)), "--no-record") as started:
-        pid = _given_another_job(started)
-        started.until("process", "@coordinator", "was given over the bus: it is in force until a reload")
-        started.kill(pid)
-        assert started.running("@coordinator", but=pid)
-        plan = wait_for(lambda: started.get("@coordinator/plan"), "a coordinator answers")
-        assert plan.text == OTHER_JOB
-        wait_for(lambda: _asked(started, "ann") == "obstacle_avoidance", "ann does as the plan over the bus says")
+def test_a_plan_that_was_given_over_the_bus_outlives_its_coordinator(job: Up) -> None:
+    pid = _given_another_job(job)
+    job.until("process", "@coordinator", "was given over the bus: it is in force until a reload")
+    job.kill(pid)
+    assert job.running("@coordinator", but=pid)
+    plan = wait_for(lambda: job.get("@coordinator/plan"), "a coordinator answers")
+    assert plan.text == OTHER_JOB
+    wait_for(lambda: _asked(job, "ann") == "obstacle_avoidance", "ann does as the plan over the bus says")
 
 
-def test_reload_on_a_full_disk_changes_nothing(tmp_path: Path) -> None:
+def test_reload_on_a_full_disk_changes_nothing(job: Up) -> None:
     """A run's directory that takes no more file is as a full disk, also for root: it is away."""
-    file = _job(tmp_path)
-    with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
-        wait_for(lambda: _asked(started, "ann") == "tracking", "ann follows")
-        (run,) = (tmp_path / "state" / "buses").glob("*/runs/fleet/*")
-        run.rename(run.with_name("away"))
+    file = job.directory / "fleet.yaml"
+    (run,) = (job.directory / "state" / "buses").glob("*/runs/fleet/*")
+    run.rename(run.with_name("away"))
+    try:
         text = file.read_text()
         file.write_text(text + "  eve: {link: tcp://127.0.0.1:9}\n")
-        (tmp_path / "plan.yaml").write_text(OTHER_JOB)
-        refused = started.fleet("reload")
+        (job.directory / "plan.yaml").write_text(OTHER_JOB)
+        refused = job.fleet("reload")
         assert refused.returncode == 2
         assert refused.stderr.startswith("nothing was changed: the coordinator's copies cannot be written in ")
-        assert started.state("eve") is None
+        assert job.state("eve") is None
+    finally:
         run.with_name("away").rename(run)
-        done = started.fleet("reload")
-        assert "eve is added" in done.stdout
-        assert "the plan is changed" in done.stdout
-        wait_for(lambda: _asked(started, "ann") == "obstacle_avoidance", "ann does as the new plan says")
+    done = job.fleet("reload")
+    assert "eve is added" in done.stdout
+    assert "the plan is changed" in done.stdout
+    wait_for(lambda: _asked(job, "ann") == "obstacle_avoidance", "ann does as the new plan says")
 
 
-def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(tmp_path: Path) -> None:
-    file, bad = _job(tmp_path), "roles: {follow: {mode: tracking, cars: [eve]}, seek: {mode: light_seeking}}\n"
-    with Up(tmp_path, free_endpoint(), str(file), "--no-record") as started:
-        started.running("@coordinator")
-        (tmp_path / "plan.yaml").write_text(bad)
-        refused = started.fleet("reload")
-        assert refused.returncode == 2
-        assert refused.stderr.startswith("nothing was changed: the plan can never work:\n")
-        assert "plan.yaml: role follow: no car can fill it" in refused.stderr
-    second = subprocess.run(
-        [sys.executable, "-m", "fleet.cli", "up", str(file)], capture_output=True, text=True, check=False
-    )
+def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(job: Up) -> None:
+    bad = "roles: {follow: {mode: tracking, cars: [eve]}, seek: {mode: light_seeking}}\n"
+    (job.directory / "plan.yaml").write_text(bad)
+    refused = job.fleet("reload")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("nothing was changed: the plan can never work:\n")
+    assert "plan.yaml: role follow: no car can fill it" in refused.stderr
+    second = fleet_command("up", str(job.directory / "fleet.yaml"), environment={})
     assert second.returncode == 2
     assert "plan.yaml: role follow: no car can fill it" in second.stderr
 
@@ -501,9 +503,11 @@ def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(tmp_path: Path) -
         (("--sim", "1", "--connect", f"tcp/0.0.0.0:{free_port()}"), "accept it with --insecure-lan"),
     ],
 )
-def test_wrong_use_starts_nothing(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
-    command = [sys.executable, "-m", "fleet.cli", "up", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+def test_wrong_use_starts_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = fleet_command("up", *arguments, environment={})
     assert done.returncode == 2
     assert words in done.stderr
     assert "Traceback" not in done.stderr

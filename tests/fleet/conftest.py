@@ -55,12 +55,6 @@ def asked(drive: Callable[[], Outcome]) -> Outcome:
             return outcome
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """Run a module's tests that share a fleet in one worker: each further worker would start a fleet of its own."""
-    if "cars" in getattr(item, "fixturenames", ()):
-        item.add_marker(pytest.mark.xdist_group(item.path.stem))
-
-
 @pytest.fixture(scope="module")
 def cars(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cars]:
     fleet = Cars(free_endpoint(), tmp_path_factory.mktemp("fleet"))
@@ -78,6 +72,10 @@ def nobody_has_a_car(request: pytest.FixtureRequest) -> None:
 
         def free() -> bool:
             states = cars.get("fleet/*/state/safety")
-            return not any(isinstance(each, str) or each.HasField("lease") for each in states)
+            leased = [each.car for each in states if not isinstance(each, str) and each.HasField("lease")]
+            for car in leased:  # a person takes the car, and gives it back at once
+                for what in ({"take": True}, {"release": True}):
+                    cars.ask_all("lease", car, sender="between-tests", kind="person", **what)
+            return not leased and not any(isinstance(each, str) for each in states)
 
         wait_for(free, "nobody drives")

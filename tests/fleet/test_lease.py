@@ -1,8 +1,10 @@
 """A lease: the car is stopped and given back on any exit, and who lost it is told by whom, never driving on."""
 
 import asyncio
+import signal
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -94,6 +96,10 @@ TAKEN = r"{} (was taken|is driven) by mia \(person\)"
 """As it was published, or as what is asked for meanwhile is refused: either may be here first."""
 
 
+PAUSED_S = 2.5
+"""Longer than an answer is waited for once."""
+
+
 def holder(cars: Cars, car: str) -> str:
     found: str = cars.state("safety", car).lease.holder
     return found
@@ -172,27 +178,46 @@ def go_on(car: Car) -> None:
     wait_for(lambda: not car.led(1, 2, 3).ok, "the lease is lost")
 
 
-@pytest.mark.parametrize("deaf", [False, True])
-def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars, deaf: bool) -> None:
-    """Deaf: what its gateway publishes comes too late."""
+@pytest.mark.parametrize("late", ["nothing", "what is published", "what is asked for, too"])
+def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars, late: str) -> None:
+    """Late: what its gateway publishes comes too late, or the gateway answers only after some seconds."""
+    paused = threading.Timer(PAUSED_S, lambda: cars.gateways["blue"].popen.send_signal(signal.SIGCONT))
+
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
 
         async def at_once() -> None:
             async with AsyncFleet(cars.endpoint, sender="eve") as other:
-                lease = other.car("blue").lease()
-                if deaf:
-                    setattr(lease._lease, "_heard", lambda _: None)  # noqa: B010 - mypy lets nobody assign a method
-                async with lease as car:
+                leased = other.car("blue").lease()
+                lease = leased._lease
+                if late != "nothing":
+                    setattr(lease, "_heard", lambda _: None)  # noqa: B010 - mypy lets nobody assign a method
+                async with leased as car:
+                    if late == "what is asked for, too":
+                        setattr(lease, "_look", lambda look=lease._look: paused_look(look))  # noqa: B010 - likewise
                     await stopped(car)
 
+        def paused_look(look: Callable[[], None]) -> None:
+            cars.gateways["blue"].popen.send_signal(signal.SIGSTOP)
+            paused.start()
+            look()
+
         async def stopped(car: AsyncCar) -> None:
-            drive = asyncio.create_task(car.drive("forward", LONG_S))
-            await asyncio.to_thread(wait_for, lambda: driving(cars.sim, "blue"), "blue drives")
+            drive = asyncio.create_task(driven(car))
+            await asyncio.to_thread(wait_for, lambda: drive.done() or driving(cars.sim, "blue"), "blue drives")
             await asyncio.to_thread(mia.stop, ["blue"])
             await drive
 
+        async def driven(car: AsyncCar) -> None:
+            while True:  # a drive that arrives half a second old is refused, see `asked`
+                with pytest.raises(NotCarriedOut) as refused:
+                    await car.drive("forward", LONG_S)
+                if refused.value.outcome.reason != "stale":
+                    raise refused.value
+
         with pytest.raises(LeaseLost, match="blue was stopped by mia"):
             asyncio.run(at_once())
+    if paused.ident is not None:
+        paused.join()
     fleet.resume(["blue"])
 
 

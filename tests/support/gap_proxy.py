@@ -71,6 +71,11 @@ class GapProxy:
             self._count, self._until, self._chance = 0, float("inf"), random.Random(gap.seed)
             self._gap = gap
 
+    def mend(self) -> None:
+        """Pass everything again."""
+        with self._lock:
+            self._gap = None
+
     @property
     def whole_at(self) -> float | None:
         """When the wire passes everything again, s since the epoch; None while that is not known."""

@@ -27,12 +27,22 @@ LONG_S = 60.0
 """A drive that is still on when the next process has been started, and has asked for something."""
 
 
+SHORTEST_POLL_S = 0.01
+LONGEST_POLL_S = 0.05
+POLL_SHARE = 0.05
+"""Interval of the questions while something is waited for, as a share of the time that was waited so far.
+
+A question is a query of the bus: a hundred a second, of each of four workers, took half of two processors.
+"""
+
+
 def wait_for(so: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> Any:
     """Ask until it is so; returns what was so."""
-    deadline = time.monotonic() + seconds
+    began = time.monotonic()
     while not (found := so()):
-        assert time.monotonic() < deadline, f"never: {what}"
-        time.sleep(0.01)
+        waited_s = time.monotonic() - began
+        assert waited_s < seconds, f"never: {what}"
+        time.sleep(min(LONGEST_POLL_S, max(SHORTEST_POLL_S, POLL_SHARE * waited_s)))
     return found
 
 
