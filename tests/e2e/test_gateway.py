@@ -362,17 +362,19 @@ def test_of_two_that_start_at_the_same_moment_one_remains(fleet: Fleet, tcp_car:
 SEES_NOBODY_FIRST = """
 import os
 os.urandom = bytes([0]).__mul__
-from gateway import cli, doors
-looks = iter([lambda _: [], *[doors.Doors.others] * 99])
-doors.Doors.others = lambda self: next(looks)(self)
+from gateway import cli
+from gateway.bus import service
+looks = iter([lambda _: [], *[service.CarService.others] * 99])
+service.CarService.others = lambda self: next(looks)(self)
 cli.main()
 """
 LOOKS_AGAIN_AT_THE_WORD = """
 import os, sys
 os.urandom = bytes([255]).__mul__
-from gateway import cli, doors
-look, before = doors.Doors.others, iter([lambda: None, sys.stdin.readline])
-doors.Doors.others = lambda self: (next(before)(), look(self))[1]
+from gateway import cli
+from gateway.bus import service
+look, before = service.CarService.others, iter([lambda: None, sys.stdin.readline])
+service.CarService.others = lambda self: (next(before)(), look(self))[1]
 cli.main()
 """
 
