@@ -1,4 +1,7 @@
-"""`python -m tests.bench [NAME...] [--json]`: run the benchmarks, print a table. Ends 0 unless something broke."""
+"""`python -m tests.bench [NAME...] [--small] [--json]`: run the benchmarks, print a table.
+
+Ends 0 unless something broke.
+"""
 
 import argparse
 import importlib
@@ -6,7 +9,7 @@ import json
 import platform
 import sys
 
-from tests.bench.measured import RUNS, Measured
+from tests.bench.measured import FULL, SMALL, Measured
 
 BENCHMARKS = {
     "decode": "decoding",
@@ -38,15 +41,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"which: {', '.join(BENCHMARKS)} (default all)")
     parser.add_argument("--json", action="store_true", help="one JSON object per line instead of a table")
+    parser.add_argument("--small", action="store_true", help="one small round of each, to see that it runs")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.names if name not in BENCHMARKS]
     if unknown:
         parser.error(f"there is no benchmark {', '.join(unknown)}: allowed are {', '.join(BENCHMARKS)}")
+    scale = SMALL if arguments.small else FULL
     if not arguments.json:
-        print(f"Python {platform.python_version()}, {platform.machine()}; medians of {RUNS} runs, in turns")
+        print(f"Python {platform.python_version()}, {platform.machine()}; medians of {scale.runs} runs, in turns")
         print(f"{'':54} {'ours':>8} {'floor':>8} {'':3} {'ratio':>8}   {'goal':13}", flush=True)
     for name in arguments.names or BENCHMARKS:
-        for one in importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run():
+        for one in importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run(scale):
             print(json.dumps(one.to_dict()) if arguments.json else _row(one), flush=True)
     return 0
 

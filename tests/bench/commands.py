@@ -5,7 +5,7 @@ from itertools import cycle
 from statistics import median
 from time import monotonic, sleep
 
-from tests.bench.measured import Measured, in_turns
+from tests.bench.measured import Measured, Scale, in_turns
 from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, stage
 from tests.support.processes import PATIENCE_S
 
@@ -15,9 +15,9 @@ GAP_S = 0.1
 TURNS = cycle([("left", b"$3,0,0,0,0,0,0,0,0#"), ("right", b"$4,0,0,0,0,0,0,0,0#")])
 
 
-def _command(here: Stage, port: Tty) -> float:
+def _command(here: Stage, port: Tty, count: int) -> float:
     times = []
-    for _ in range(COMMANDS):
+    for _ in range(count):
         motion, frame = next(TURNS)
         payload = json.dumps({"motion": motion, "duration_s": 5})
         sleep(GAP_S)
@@ -34,9 +34,9 @@ def _command(here: Stage, port: Tty) -> float:
     return median(times[1:])  # the first may have met the stop of what was held before
 
 
-def _query(here: Stage) -> float:
+def _query(here: Stage, count: int) -> float:
     times = []
-    for _ in range(COMMANDS):
+    for _ in range(count):
         sleep(GAP_S)
         began = perf_counter()
         replies = here.session.get("bench/answer", payload=b'{"motion": "left"}', encoding="application/json")
@@ -45,7 +45,7 @@ def _query(here: Stage) -> float:
     return median(times)
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     with stage() as here:
         port, alive = here.tty(), Arrival()
         here.gateway(port)
@@ -53,6 +53,7 @@ def run() -> list[Measured]:
         here.bare("answer", "bench/answer")
         alive.wait()
         with frames(port, READING, rate_hz=1.0):  # a car that is silent for long is not driven
-            ours, floor = in_turns(lambda: _command(here, port), lambda: _query(here))
+            count = scale.count(COMMANDS, 3)
+            ours, floor = in_turns(scale, lambda: _command(here, port, count), lambda: _query(here, count))
         watch.undeclare()
     return [Measured("command to tty, p50", tuple(ours), tuple(floor), "ms", 1.5, slack=1.0)]

@@ -11,7 +11,7 @@ from time import perf_counter
 
 from fleet.client.client import Fleet
 from schemas.bus import Sample
-from tests.bench.measured import Measured, percentile
+from tests.bench.measured import Measured, Scale, percentile
 from tests.bench.stage import scratch
 from tests.support.judge import stamp_ns
 from tests.support.ports import free_endpoint
@@ -20,7 +20,7 @@ from tests.support.up import Up
 
 SIZES = (1, 50, 100)
 GOALS = 50
-"""The size that issue 5 sets its goals for."""
+"""The fleet's size for questions and stops; in a small round its only one."""
 QUERIES = 40
 STOPS = 12
 WINDOW_S = 5.0
@@ -51,8 +51,9 @@ def _pss_mb(pid: int) -> float:
 class _Fleet:
     """So many cars, up and at rest."""
 
-    def __init__(self, up: Up, size: int) -> None:
+    def __init__(self, up: Up, size: int, scale: Scale) -> None:
         self.up = up
+        self.scale = scale
         self.size = size
         while self.at_rest() < size:
             assert perf_counter() - up.began < LONGEST_UP_S, f"{self.at_rest()} of {size} cars are at rest"
@@ -74,7 +75,7 @@ class _Fleet:
         """Of one gateway, percent of a core."""
         pids = self.pids()
         before, began = _cpu_s(pids), perf_counter()
-        time.sleep(WINDOW_S)
+        time.sleep(self.scale.seconds(WINDOW_S, 1.2))  # a report comes once a second
         return (_cpu_s(pids) - before) / (perf_counter() - began) / self.size * 100
 
     def pss(self) -> float:
@@ -84,7 +85,7 @@ class _Fleet:
     def queries(self) -> list[float]:
         """A wildcard query for one reading of every car, until its last answer, ms."""
         times = []
-        for _ in range(QUERIES):
+        for _ in range(self.scale.count(QUERIES, 3)):
             began = perf_counter()
             answers = list(self.up.bus.query("fleet/*/state/link", timeout_s=5.0))
             times.append((perf_counter() - began) * 1e3)
@@ -118,20 +119,22 @@ class _Fleet:
         return [(at - asked) / 1e6 for at in wires.values()]
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     found: list[Measured] = []
     idle: dict[int, tuple[float, float]] = {}
-    for size in SIZES:
+    sizes = sorted({scale.count(size) for size in SIZES})
+    goals = scale.count(GOALS)
+    for size in sizes:
         with scratch() as directory, Up(directory, free_endpoint(), "--sim", str(size), "--no-record") as up:
-            fleet = _Fleet(up, size)
+            fleet = _Fleet(up, size, scale)
             idle[size] = fleet.cpu(), fleet.pss()
-            first = idle[SIZES[0]]
+            first = idle[sizes[0]]
             found += [
                 Measured(f"fleet up until at rest, {size} cars", (fleet.up_s,), (UP_S,), "s", 1.0),
                 Measured(f"gateway CPU, 1 report/s, {size} cars", (idle[size][0],), (first[0],), "%", None),
                 Measured(f"gateway PSS, {size} cars", (idle[size][1],), (first[1],), "MB", None),
             ]
-            if size == GOALS:
+            if size == goals:
                 found += _goals(fleet)
     return found
 
@@ -146,7 +149,11 @@ def _goals(fleet: _Fleet) -> list[Measured]:
                 found.append(Measured(f"gateway CPU, tracking, {fleet.size} cars", (fleet.cpu(),), (1.0,), "%", None))
             p50 = percentile(fleet.queries(), 0.5)
             found.append(Measured(f"wildcard query p50, {fleet.size} cars, {what}", (p50,), (QUERY_MS,), "ms", 1.0))
-            stops = [each for _ in range(STOPS if what == "1 report/s" else 1) for each in fleet.stops(client)]
+            stops = [
+                each
+                for _ in range(fleet.scale.count(STOPS) if what == "1 report/s" else 1)
+                for each in fleet.stops(client)
+            ]
             p95 = percentile(stops, 0.95)
             found.append(Measured(f"stop on all wires p95, {fleet.size} cars, {what}", (p95,), (STOP_MS,), "ms", 1.0))
     return found

@@ -9,7 +9,7 @@ import threading
 from pathlib import Path
 from time import sleep
 
-from tests.bench.measured import Measured
+from tests.bench.measured import Measured, Scale
 from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, stage
 from tests.support.processes import PATIENCE_S, TAKEN, wait_for
 
@@ -68,10 +68,10 @@ def _drives(here: Stage, sender: str) -> bool:
     return any(reply.ok is not None and json.loads(reply.ok.payload.to_bytes())["status"] in TAKEN for reply in drive)
 
 
-def _stops(here: Stage, car: _Car) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _stops(here: Stage, car: _Car, count: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Drive and stop; each stop's time from its question to the tty, ms, and that of a bare query before it."""
     times, bare = [], []
-    for number in range(STOPS):
+    for number in range(count):
         sleep(RESTED_S)
         wait_for(lambda number=number: _drives(here, f"bench{number}"), "it drives: at rest nothing has to be stopped")
         sleep(0.2)
@@ -85,7 +85,7 @@ def _stops(here: Stage, car: _Car) -> tuple[tuple[float, ...], tuple[float, ...]
     return tuple(times), tuple(bare)
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     found = []
     with stage() as here:
         port = here.tty()
@@ -96,19 +96,21 @@ def run() -> list[Measured]:
         alive.wait()
         watch.undeclare()
         with frames(port, READING, rate_hz=500.0):
-            wait_for(lambda: here.fleet.state("link").rx_frames > KEPT, "every ring is full")
-        car = _Car(port)
+            wait_for(lambda: here.fleet.state("link").rx_frames > scale.count(KEPT), "every ring is full")
+        car, count = _Car(port), scale.count(STOPS)
+        rates = dict(list(RATES.items())[: scale.count(len(RATES))])
+        warm_s = scale.seconds(WARM_S)
         try:
-            sleep(WARM_S)
-            (floor, bare_floor), held = _stops(here, car), (gateway.rss_mb(),)
-            for kind, rate in RATES.items():
+            sleep(warm_s)
+            (floor, bare_floor), held = _stops(here, car, count), (gateway.rss_mb(),)
+            for kind, rate in rates.items():
                 flooders = 3 if kind == "drives" else 1
-                seconds = WARM_S + STOPS * (RESTED_S + 1.0)
+                seconds = warm_s + count * (RESTED_S + 1.0)
                 flood = [
                     here.fleet.start(str(FLOODER), kind, str(rate / flooders), str(seconds)) for _ in range(flooders)
                 ]
-                sleep(WARM_S)
-                ours, bare = _stops(here, car)
+                sleep(warm_s)
+                ours, bare = _stops(here, car, count)
                 found.append(Measured(f"stop under a flood of {kind}", ours, floor, "ms", 1.0, slack=50.0))
                 found.append(Measured(f"RSS under a flood of {kind}", (gateway.rss_mb(),), held, "MB", 1.0, slack=30.0))
                 if kind in TOKENS:

@@ -9,8 +9,8 @@ from pathlib import Path
 from time import monotonic, sleep
 
 from tests.bench.commands import GAP_S, TURNS
-from tests.bench.measured import Measured, in_turns, percentile
-from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, stage
+from tests.bench.measured import Measured, Scale, in_turns, percentile
+from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, play_car, stage
 from tests.support.processes import PATIENCE_S, Process
 
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
@@ -37,29 +37,32 @@ def cpu_s(process: Process) -> float:
     return int(minutes or 0) * 60 + float(seconds)
 
 
-def _cpu(process: Process, port: Tty) -> float:
+def _cpu(process: Process, port: Tty, window_s: float) -> float:
     """Share of a core, in percent."""
     with frames(port, TRACKING, RATE_HZ):
         sleep(0.5)
         before, began = cpu_s(process), monotonic()
-        sleep(WINDOW_S)
+        sleep(window_s)
         return (cpu_s(process) - before) / (monotonic() - began) * 100
 
 
 def _track(here: Stage, port: Tty) -> None:
     """Bring the gateway's car into tracking, and have it confirmed."""
     here.fleet.ask("mode", mode="tracking")
-    deadline = monotonic() + PATIENCE_S
-    while (mode := here.fleet.state("mode")).verdict != "confirmed" or mode.asked != "tracking":
-        assert monotonic() < deadline, mode
-        port.drain(0.2)
-        port.write(TRACKING if mode.asked == "tracking" else READING)
+
+    def opened() -> bool:
+        return bool(here.fleet.state("mode").asked == "tracking")
+
+    def confirmed() -> bool:
+        return opened() and here.fleet.state("mode").verdict == "confirmed"
+
+    play_car(port, confirmed, lambda: TRACKING if opened() else READING)
 
 
-def _commands(here: Stage, port: Tty) -> list[float]:
+def _commands(here: Stage, port: Tty, count: int) -> list[float]:
     """From asking to the tty, ms, while mode-0 frames (six readings each) come at the same rate."""
     times = []
-    for _ in range(COMMANDS):
+    for _ in range(count):
         motion, frame = next(TURNS)
         sleep(GAP_S)
         port.drain()
@@ -75,9 +78,9 @@ def _commands(here: Stage, port: Tty) -> list[float]:
     return times[1:]  # the first may have met the stop of what was held before
 
 
-def _queries(here: Stage) -> list[float]:
+def _queries(here: Stage, count: int) -> list[float]:
     times = []
-    for _ in range(COMMANDS):
+    for _ in range(count):
         sleep(GAP_S)
         began = perf_counter()
         assert next(iter(here.session.get("bench/answer", payload=b"{}"))).ok is not None
@@ -101,7 +104,7 @@ def _feed(here: Stage, port: Tty, count: int) -> None:
         sleep(0.05)
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     with stage() as here:
         port, bare_port, alive, answering = here.tty(), here.tty(), Arrival(), Arrival()
         gateway = here.gateway(port)
@@ -114,12 +117,14 @@ def run() -> list[Measured]:
         alive.wait()
         answering.wait()
         with frames(port, READING, RATE_HZ):
-            ours, floor = in_turns(lambda: _commands(here, port), lambda: _queries(here))
+            count = scale.count(COMMANDS, 3)
+            ours, floor = in_turns(scale, lambda: _commands(here, port, count), lambda: _queries(here, count))
         _track(here, port)
-        cpu, bare_cpu = in_turns(lambda: _cpu(gateway, port), lambda: _cpu(bare, bare_port))
-        _feed(here, port, SETTLED)
+        window_s = scale.seconds(WINDOW_S, 1.2)  # a state comes once a second
+        cpu, bare_cpu = in_turns(scale, lambda: _cpu(gateway, port, window_s), lambda: _cpu(bare, bare_port, window_s))
+        _feed(here, port, scale.count(SETTLED))
         before = gateway.rss_mb()
-        _feed(here, port, HOUR)
+        _feed(here, port, scale.count(HOUR))
         after = gateway.rss_mb()
         for each in kept:
             each.undeclare()

@@ -1,13 +1,35 @@
-"""A measured cost and the floor under it; five runs of each, in turns, so that both see the same machine."""
+"""A measured cost and the floor under it; runs of each take turns, so that both see the same machine."""
 
+import math
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-RUNS = 5
-
 T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """How much a benchmark does."""
+
+    runs: int
+    """Runs of ours, and of the floor."""
+    share: float = 1.0
+    """Share of the full count, time or size of one run."""
+
+    def count(self, full: int, least: int = 1) -> int:
+        """Return this share of a full count."""
+        return max(least, round(full * self.share))
+
+    def seconds(self, full: float, least: float = 0.2) -> float:
+        """Return this share of a full time."""
+        return max(least, full * self.share)
+
+
+FULL = Scale(runs=5)
+SMALL = Scale(runs=1, share=0.01)
+"""One round that shows that a benchmark runs, in seconds. Its figures say nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +55,7 @@ class Measured:
 
     @property
     def ratio(self) -> float:
-        return self.ours_median / self.floor_median
+        return self.ours_median / self.floor_median if self.floor_median else math.inf
 
     @property
     def met(self) -> bool:
@@ -55,12 +77,13 @@ class Measured:
         }
 
 
-def in_turns(ours: Callable[[], T], floor: Callable[[], T]) -> tuple[list[T], list[T]]:
-    """Five results of each; who goes first changes, and one turn before them warms both up."""
-    ours(), floor()
+def in_turns(scale: Scale, ours: Callable[[], T], floor: Callable[[], T]) -> tuple[list[T], list[T]]:
+    """Run both in turns and return the results of each. Who goes first changes; an extra turn warms both up."""
+    if scale.runs > 1:
+        ours(), floor()
     mine: list[T] = []
     least: list[T] = []
-    for turn in range(RUNS):
+    for turn in range(scale.runs):
         for run, found in ((ours, mine), (floor, least))[:: 1 if turn % 2 else -1]:
             found.append(run())
     return mine, least

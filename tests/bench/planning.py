@@ -7,7 +7,7 @@ from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Observation
 from fleet.policy.state import PolicyState
-from tests.bench.measured import Measured, in_turns, percentile
+from tests.bench.measured import Measured, Scale, in_turns, percentile
 
 CARS = tuple(f"car{number:02}" for number in range(50))
 PLAN = parse(
@@ -27,10 +27,10 @@ HERE = CarSnapshot(present=True, mode="manual", verdict="confirmed", link="onlin
 STEPS = 100
 
 
-def _pictures() -> list[FleetSnapshot]:
+def _pictures(count: int) -> list[FleetSnapshot]:
     """New readings from every car in each; one car more or less in every second."""
     found = []
-    for number in range(STEPS):
+    for number in range(count):
         readings = {
             car: {
                 "sensor/battery": Observation({"voltage_v": 7.4}, number * 0.1),
@@ -44,23 +44,20 @@ def _pictures() -> list[FleetSnapshot]:
     return found
 
 
-PICTURES = _pictures()
-
-
-def _ours() -> float:
+def _ours(pictures: list[FleetSnapshot]) -> float:
     memory = PolicyState()
     took = []
-    for number, picture in enumerate(PICTURES):
+    for number, picture in enumerate(pictures):
         began = perf_counter()
         memory = step(PLAN, picture, memory, number * 0.1).memory
         took.append(perf_counter() - began)
     return percentile(took, 0.95) * 1e3
 
 
-def _floor() -> float:
-    seen = PICTURES[0].readings
+def _floor(pictures: list[FleetSnapshot]) -> float:
+    seen = pictures[0].readings
     took = []
-    for _ in range(STEPS):
+    for _ in pictures:
         began = perf_counter()
         for _ in PLAN.rules:
             for car in CARS:
@@ -71,6 +68,9 @@ def _floor() -> float:
     return percentile(took, 0.95) * 1e3
 
 
-def run() -> list[Measured]:
-    ours, floor = in_turns(_ours, _floor)
-    return [Measured("one decision, 50 cars, 20 rules: p95 of 100", tuple(ours), tuple(floor), "ms", 0.0, 10.0)]
+def run(scale: Scale) -> list[Measured]:
+    pictures = _pictures(scale.count(STEPS, 5))
+    ours, floor = in_turns(scale, lambda: _ours(pictures), lambda: _floor(pictures))
+    return [
+        Measured(f"one decision, 50 cars, 20 rules: p95 of {len(pictures)}", tuple(ours), tuple(floor), "ms", 0.0, 10.0)
+    ]

@@ -5,7 +5,7 @@ Ours is timed to `sensor/range`, the first of the six readings and the frame tha
 
 from time import sleep
 
-from tests.bench.measured import Measured, in_turns, percentile
+from tests.bench.measured import Measured, Scale, in_turns, percentile
 from tests.bench.stage import READING, Arrival, Stage, Tty, perf_counter, stage
 
 FRAMES = 100
@@ -13,9 +13,9 @@ GAP_S = 0.02
 """Between two frames; a car sends at most one in 37 ms."""
 
 
-def _times(port: Tty, arrival: Arrival) -> list[float]:
+def _times(port: Tty, arrival: Arrival, count: int) -> list[float]:
     times = []
-    for _ in range(FRAMES):
+    for _ in range(count):
         sleep(GAP_S)
         began = perf_counter()
         port.write(READING)
@@ -23,9 +23,9 @@ def _times(port: Tty, arrival: Arrival) -> list[float]:
     return times
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     with stage() as here:
-        ours, floor = _measure(here)
+        ours, floor = _measure(here, scale)
     return [
         Measured(
             f"tty to callback, {name}",
@@ -38,7 +38,7 @@ def run() -> list[Measured]:
     ]
 
 
-def _measure(here: Stage) -> tuple[list[list[float]], list[list[float]]]:
+def _measure(here: Stage, scale: Scale) -> tuple[list[list[float]], list[list[float]]]:
     port, bare_port = here.tty(), here.tty()
     here.gateway(port)
     came, bare_came, alive = Arrival(), Arrival(), Arrival()
@@ -49,7 +49,8 @@ def _measure(here: Stage) -> tuple[list[list[float]], list[list[float]]]:
     ]
     here.bare("tty_to_bus", bare_port.path, "bench/floor")
     alive.wait()
-    found = in_turns(lambda: _times(port, came), lambda: _times(bare_port, bare_came))
+    count = scale.count(FRAMES, 5)
+    found = in_turns(scale, lambda: _times(port, came, count), lambda: _times(bare_port, bare_came, count))
     for each in kept:
         each.undeclare()
     return found

@@ -14,7 +14,7 @@ from schemas import bus, keys
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.bench.load import cpu_s
-from tests.bench.measured import Measured, in_turns
+from tests.bench.measured import Measured, Scale, in_turns
 from tests.bench.stage import READING, Stage, perf_counter, stage
 from tests.support.lossless import all_there
 from tests.support.processes import Process
@@ -39,7 +39,7 @@ def _publishers(opened: bus.Bus, fleet: str) -> list[bus.Publisher]:
     ]
 
 
-def _cost(here: Stage, fleet: str, start: Callable[[Path], Process]) -> float:
+def _cost(here: Stage, fleet: str, rounds: int, start: Callable[[Path], Process]) -> float:
     """CPU microseconds per message."""
     publishers = _publishers(here.fleet.bus, fleet)
     line = pb.Line(left_outer=True)
@@ -48,7 +48,7 @@ def _cost(here: Stage, fleet: str, start: Callable[[Path], Process]) -> float:
         process = start(Path(directory))
         assert process.line()["ready"]
         due = perf_counter()
-        for number in range(ROUNDS * len(publishers)):
+        for number in range(rounds * len(publishers)):
             if number % len(TOPIC_NAMES) == 0:  # the next car's turn
                 due += ROUND_S / CARS
                 sleep(max(0.0, due - perf_counter()))
@@ -56,8 +56,8 @@ def _cost(here: Stage, fleet: str, start: Callable[[Path], Process]) -> float:
             publisher.put(line if publisher.topic.name == "sensor/line" else frame, time_ns())
         sleep(SETTLE_S)
         found: Any = _told_to_end(process)
-    assert found["messages"] >= ROUNDS * len(publishers), found
-    return float(found["cpu_s"]) / (ROUNDS * len(publishers)) * 1e6
+    assert found["messages"] >= rounds * len(publishers), found
+    return float(found["cpu_s"]) / (rounds * len(publishers)) * 1e6
 
 
 def _told_to_end(process: Process) -> Any:
@@ -69,12 +69,13 @@ def _told_to_end(process: Process) -> Any:
     return found
 
 
-def _crowd(here: Stage) -> list[Measured]:
-    """A hundred cars that track, their readings and raw frames, for a minute: nothing is dropped or missed."""
+def _crowd(here: Stage, scale: Scale) -> list[Measured]:
+    """Record cars that track, their readings and raw frames: the recorder drops and misses nothing."""
+    cars, crowd_s, floor_s = scale.count(CROWD), scale.seconds(CROWD_S, 1.0), scale.seconds(CROWD_FLOOR_S, 1.0)
     directory = here.fleet.directory / "crowd"
     recording = Recording(here.fleet, directory)
-    with Load(here.fleet.endpoint, CROWD) as load:
-        ours, rate = _share(recording.process, load, CROWD_S)
+    with Load(here.fleet.endpoint, cars) as load:
+        ours, rate = _share(recording.process, load, crowd_s)
         load.rest()
         all_there(load, [recording.session])
         found = recording.end()
@@ -82,12 +83,12 @@ def _crowd(here: Stage) -> list[Measured]:
     assert (found["drops"], found["missed"]) == ({}, {}), found
     bare = here.bare("record", "fleet/**", str(here.fleet.directory / "crowd.mcap"))
     assert bare.line()["ready"]
-    with Load(here.fleet.endpoint, CROWD) as load:
-        floor, _ = _share(bare, load, CROWD_FLOOR_S)
+    with Load(here.fleet.endpoint, cars) as load:
+        floor, _ = _share(bare, load, floor_s)
     _told_to_end(bare)
-    asked = CROWD * len(TOPIC_NAMES) / ROUND_S
+    asked = cars * len(TOPIC_NAMES) / ROUND_S
     return [
-        Measured("recorder CPU, 100 cars at 25/s and frames, a minute", (ours,), (floor,), "%", None),
+        Measured(f"recorder CPU, {cars} cars at 25/s and frames, {crowd_s:g} s", (ours,), (floor,), "%", None),
         Measured("... which published, and all was recorded", (rate,), (asked,), "/s", None),
     ]
 
@@ -101,15 +102,18 @@ def _share(process: Process, load: Load, seconds: float) -> tuple[float, float]:
     return (cpu_s(process) - before) / took * 100, (load.count() - count) / took
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     with stage() as here:
+        rounds = scale.count(ROUNDS, 3)
         ours, floor = in_turns(
+            scale,
             lambda: _cost(
                 here,
                 "ours",
+                rounds,
                 lambda d: here.fleet.start("-m", "tests.bench.record_ours", here.fleet.endpoint, "ours", str(d)),
             ),
-            lambda: _cost(here, "floor", lambda d: here.bare("record", "floor/**", str(d / "floor.mcap"))),
+            lambda: _cost(here, "floor", rounds, lambda d: here.bare("record", "floor/**", str(d / "floor.mcap"))),
         )
-        crowd = _crowd(here)
+        crowd = _crowd(here, scale)
     return [Measured("record a message (CPU)", tuple(ours), tuple(floor), "us", 1.3), *crowd]

@@ -8,26 +8,27 @@ from mcap.writer import Writer
 
 from fleet.recording.reading.session import Session
 from fleet.replay.rerun.export import export
-from tests.bench.measured import Measured, in_turns
+from tests.bench.measured import Measured, Scale, in_turns
 from tests.bench.stage import scratch
 from tests.fleet.replay.make_session import CARS, Made, drive_about
 
 SECONDS = 1200
+SHORTEST_S = 20
 
 
-def _session(path: Path) -> int:
-    """Three cars for twenty minutes; the number of messages."""
+def write_session(path: Path, seconds: int) -> int:
+    """Write a session of three cars; return its number of messages."""
     made = Made(path, Writer)
     for index, car in enumerate(CARS):
-        drive_about(made, car, index, SECONDS)
+        drive_about(made, car, index, seconds)
     made.close()
     return sum(made.counts.values())
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     with scratch() as directory:
         source = directory / "session.mcap"
-        count = _session(source)
+        count = write_session(source, scale.count(SECONDS, SHORTEST_S))
 
         def ours() -> float:
             began = perf_counter()
@@ -42,5 +43,5 @@ def run() -> list[Measured]:
             stream.write_rrd(directory / "floor.rrd", application_id="floor", recording_id="floor")
             return (perf_counter() - began) / count * 1e6
 
-        mine, least = in_turns(ours, floor)
+        mine, least = in_turns(scale, ours, floor)
     return [Measured("export a message to Rerun", tuple(mine), tuple(least), "us", 2.0)]

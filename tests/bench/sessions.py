@@ -14,8 +14,8 @@ from fleet.recording.reading.session import Session
 from fleet.recording.tools.export import export
 from fleet.recording.tools.table_formats import FORMATS
 from schemas import messages
-from tests.bench.measured import Measured, in_turns
-from tests.bench.replaying import _session
+from tests.bench.measured import Measured, Scale, in_turns
+from tests.bench.replaying import SECONDS, SHORTEST_S, write_session
 from tests.bench.stage import scratch
 from tests.fleet.replay.make_session import START_NS
 
@@ -25,18 +25,18 @@ KEYS = 60
 MINUTE_NS = 60_000_000_000
 
 
-def _long(path: Path) -> int:
-    """A gigabyte at 1,000 messages a second, flushed each second as the recorder does; its end in ns."""
+def _long(path: Path, size: int, rate: int) -> int:
+    """Write a session of this size, flushed each second as the recorder does. Return its end, ns."""
     with path.open("wb") as file:
         writer: Any = Writer(file, enable_data_crcs=True)
         writer.start()
         schema = writer.register_schema("fleet.v1.RxFrame", "protobuf", messages.descriptor_set("fleet.v1.RxFrame"))
         channels = [writer.register_channel(f"fleet/car{n}/frame/rx", "protobuf", schema) for n in range(KEYS)]
         at_ns, number = START_NS, 0
-        while file.tell() < BYTES:
-            for _ in range(RATE):
+        while file.tell() < size:
+            for _ in range(rate):
                 number += 1
-                at_ns += 1_000_000_000 // RATE
+                at_ns += 1_000_000_000 // rate
                 # Random, so that it does not shrink: field 5, bytes.
                 payload = b"\x2a\x50" + os.urandom(80)
                 writer.add_message(channels[number % KEYS], at_ns, payload, at_ns, number // KEYS)
@@ -45,33 +45,37 @@ def _long(path: Path) -> int:
     return at_ns
 
 
-def _last_minute(directory: Path) -> Measured:
+def _last_minute(directory: Path, scale: Scale) -> Measured:
     path = directory / "long.mcap"
-    end_ns = _long(path)
+    rate = scale.count(RATE)
+    size = scale.count(BYTES) * rate // RATE
+    end_ns = _long(path, size, rate)
     start_ns = end_ns - MINUTE_NS
 
     def ours() -> float:
         began = perf_counter()
         count = sum(1 for _ in Session.open(path).messages(start_ns=start_ns))
         took = perf_counter() - began
-        assert count == 60 * RATE + 1
+        assert count == 60 * rate + 1
         return took
 
     def floor() -> float:
         began = perf_counter()
         with path.open("rb") as file:
-            count = sum(1 for _ in make_reader(file).iter_messages(start_time=start_ns))
+            count = sum(1 for _ in make_reader(file).iter_messages(starting_at=start_ns))
         took = perf_counter() - began
-        assert count == 60 * RATE + 1
+        assert count == 60 * rate + 1
         return took
 
-    mine, least = in_turns(ours, floor)
+    mine, least = in_turns(scale, ours, floor)
     path.unlink()
     # The goal is a second, whatever the stock reader takes.
-    return Measured("read the last minute of a 1 GB session", tuple(mine), tuple(least), "s", 0.0, slack=1.0)
+    return Measured(
+        f"read the last minute of a {size / 1e9:g} GB session", tuple(mine), tuple(least), "s", 0.0, slack=1.0
+    )
 
 
-def _tables(directory: Path, name: str, source: Path, count: int) -> Measured:
+def _tables(directory: Path, name: str, source: Path, count: int, scale: Scale) -> Measured:
     def ours() -> float:
         out = directory / name
         shutil.rmtree(out, ignore_errors=True)
@@ -88,14 +92,14 @@ def _tables(directory: Path, name: str, source: Path, count: int) -> Measured:
         stream.write_rrd(directory / "floor.rrd", application_id="floor", recording_id="floor")
         return (perf_counter() - began) / count * 1e6
 
-    mine, least = in_turns(ours, floor)
+    mine, least = in_turns(scale, ours, floor)
     # The goal of twice the importer is the .rrd's (replaying.py); what a table costs beside it is only told.
     return Measured(f"export a message to {name}", tuple(mine), tuple(least), "us", None)
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     with scratch() as directory:
         source = directory / "session.mcap"
-        count = _session(source)
-        tables = [_tables(directory, name, source, count) for name in FORMATS]
-        return [*tables, _last_minute(directory)]
+        count = write_session(source, scale.count(SECONDS, SHORTEST_S))
+        tables = [_tables(directory, name, source, count, scale) for name in FORMATS]
+        return [*tables, _last_minute(directory, scale)]

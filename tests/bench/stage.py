@@ -6,7 +6,7 @@ import select
 import tempfile
 import threading
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import monotonic, perf_counter
 from typing import Any
@@ -14,13 +14,13 @@ from typing import Any
 import zenoh
 
 from tests.support.ports import free_endpoint
-from tests.support.processes import PATIENCE_S, Fleet, Process
+from tests.support.processes import CLOSING_S, MODE00, PATIENCE_S, REPORT_S, Fleet, Process
 
 FLOORS = Path(__file__).parent / "floors"
 SCRATCH = Path(__file__).resolve().parents[2] / ".tmp"
 READING = b"$4WD,CSB57.24,PV7.91,GS214,LF1011,HW01,GM10#"
-BLOCKED_S = 2.0
-"""How long a car is silent that gets `MODE00`: the second of its beep, and the one until its next report."""
+LOOK_S = 0.1
+"""Interval at which the gateway is asked for its state."""
 
 
 @contextlib.contextmanager
@@ -77,6 +77,18 @@ def frames(port: Tty, frame: bytes, rate_hz: float) -> Iterator[None]:
         thread.join()
 
 
+def play_car(port: Tty, until: Callable[[], bool], report: Callable[[], bytes] = lambda: READING) -> None:
+    """Report as a car in mode 0 does, and pause after each `MODE00`, until it is so."""
+    deadline = monotonic() + PATIENCE_S
+    report_at = monotonic()
+    while not until():
+        assert monotonic() < deadline, "the gateway does not take this for a car that obeys"
+        report_at += CLOSING_S * port.read(max(0.0, min(report_at - monotonic(), LOOK_S))).count(MODE00)
+        if monotonic() >= report_at:
+            port.write(report())
+            report_at = monotonic() + REPORT_S
+
+
 class Stage:
     """A hub, its endpoint and a bare session at it."""
 
@@ -101,14 +113,14 @@ class Stage:
         return self._ttys[-1]
 
     def gateway(self, port: Tty) -> Process:
-        """A gateway whose car has been brought to a known state."""
+        """Start a gateway and play the car until the gateway knows that the car stands."""
         process = self.fleet.gateway(port.path)
-        deadline = monotonic() + PATIENCE_S
-        while (safety := self.fleet.state("safety")) is None or safety.motors != "off":
-            assert monotonic() < deadline, process.stderr
-            if b"MODE00" in port.read(0.2):
-                port.drain(BLOCKED_S)
-            port.write(READING)
+
+        def known() -> bool:
+            safety = self.fleet.state("safety")
+            return safety is not None and safety.motors == "off"
+
+        play_car(port, known)
         return process
 
     def close(self) -> None:

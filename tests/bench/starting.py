@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Callable
 from time import sleep
 
-from tests.bench.measured import Measured, in_turns
+from tests.bench.measured import Measured, Scale, in_turns
 from tests.bench.stage import Arrival, Stage, perf_counter, stage
 from tests.support.processes import Process
 
@@ -40,10 +40,11 @@ def _start(here: Stage, token: str, asked: str, start: Callable[[], Process]) ->
     return (token_at - began) * 1e3, (answered_at - began) * 1e3, memory
 
 
-def run() -> list[Measured]:
+def run(scale: Scale) -> list[Measured]:
     with stage() as here:
         port = here.tty()
         ours, floor = in_turns(
+            scale,
             lambda: _start(here, "fleet/red", "fleet/red/state/health", lambda: here.fleet.gateway(port.path)),
             lambda: _start(here, "bench/answer/alive", "bench/answer", lambda: here.bare("answer", "bench/answer")),
         )

@@ -68,12 +68,16 @@ def fleet_back(fleet: Fleet, cars: int) -> None:
     time.sleep(2 * SECOND_S)  # the recorder asks for the last time some seconds after a hub is back
 
 
+def all_there(load: Load, sessions: list[Path]) -> None:
+    """Wait until the sessions hold all that a load published: a recorder at its end waits only for a moment."""
+    wait_for(lambda: not faults(load, sessions)[0], "all that was published is recorded")
+
+
 def ends_whole(fleet: Fleet, load: Load, cars: int, recording: Recording, sessions: list[Path]) -> None:
     """End a load, and then its recording: nothing is lost, nothing is there twice, and nothing is said to be."""
     fleet_back(fleet, cars)
     load.rest()
-    # A recorder that is told to end waits only for a moment.
-    wait_for(lambda: not faults(load, sessions)[0], "all that was published is recorded")
+    all_there(load, sessions)
     last = recording.end()
     assert (last["drops"], last["missed"]) == ({}, {})
     assert faults(load, sessions) == ({}, {})

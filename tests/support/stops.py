@@ -562,11 +562,19 @@ def _play(chosen: tuple[int, int]) -> Seen:
     return play((*CASES, *RESTORED)[number], seed)
 
 
-def distribution(moments: int) -> list[Row]:
-    """Every case at so many moments, on all processors."""
-    chosen = product(range(len(CASES) + len(RESTORED)), range(moments))
+PLAYED = range(len(CASES) + len(RESTORED))
+"""Numbers of all cases."""
+CHUNK = 50
+"""Stops that a process plays at a time."""
+
+
+def distribution(moments: int, cases: range = PLAYED) -> list[Row]:
+    """Play each case at so many moments, on all processors, and return the distribution."""
+    chosen = list(product(cases, range(moments)))
+    if len(chosen) <= CHUNK:  # one process has all the work
+        return rows(map(_play, chosen))
     with ProcessPoolExecutor() as pool:
-        return rows(pool.map(_play, chosen, chunksize=50))
+        return rows(pool.map(_play, chosen, chunksize=CHUNK))
 
 
 def tsv(table: Iterable[Row]) -> str:

@@ -1,0 +1,32 @@
+"""Each benchmark runs: one small round of it, as `python -m tests.bench --small` does. No speed is asserted."""
+
+import importlib
+import math
+from pathlib import Path
+
+import pytest
+
+from tests.bench.__main__ import BENCHMARKS
+from tests.bench.measured import SMALL, Measured
+
+BENCH = Path(__file__).parent
+PARTS = {"__init__", "__main__", "measured", "record_ours", "stage", "test_rounds"}
+"""Modules that are not benchmarks."""
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_a_small_round(name: str) -> None:
+    rows: list[Measured] = importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run(SMALL)
+    assert rows
+    for row in rows:
+        assert row.name
+        assert row.unit in {"us", "ms", "s", "/s", "%", "MB"}, row
+        assert row.ours, row
+        assert row.floor, row
+        assert all(math.isfinite(value) and value >= 0 for value in (*row.ours, *row.floor)), row
+        assert {*row.to_dict()} >= {"name", "ours", "floor", "unit", "ratio", "goal", "slack", "met"}
+    assert len({row.name for row in rows}) == len(rows), "two rows have one name"
+
+
+def test_the_command_knows_each_benchmark() -> None:
+    assert {path.stem for path in BENCH.glob("*.py")} - PARTS == {*BENCHMARKS.values()}
