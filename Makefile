@@ -16,7 +16,7 @@ export FLEET_STATE_DIR := $(CURDIR)/.state
 # Tests start hundreds of Python processes. Each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test soak lint bench proto pictures readme clean
+.PHONY: help demo test soak lint bench vectors proto pictures readme clean
 help: ## what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
@@ -49,6 +49,9 @@ lint: .venv/.ready ## ruff, mypy, import-linter, generated files up to date
 bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in the same run
 	@mkdir -p .tmp
 	$(BIN)/python -m tests.bench
+
+vectors: .venv/.ready ## write tests/vectors/stops.tsv, the distribution of stops of which the README tells
+	$(BIN)/python -m tests.tools.vectors
 
 proto: .venv/.ready ## generate schemas/gen from schemas/proto
 	$(BIN)/python -m schemas.generate

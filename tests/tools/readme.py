@@ -18,6 +18,7 @@ from gateway.control.stops.evidence import EVIDENCE
 from gateway.control.stops.sequences import REPEAT_S
 from schemas import messages, topics
 from tests.support import vectors
+from tests.tools.vectors import STOPS
 
 ROOT = Path(__file__).parent.parent.parent
 README = ROOT / "README.md"
@@ -133,8 +134,8 @@ _STATES = {
 
 
 def stops() -> list[dict[str, str]]:
-    """The distribution of stops that `make bench` wrote."""
-    with (ROOT / "tests" / "vectors" / "stops.tsv").open(encoding="utf-8", newline="") as file:
+    """Return the distribution of stops that `make vectors` wrote."""
+    with STOPS.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file, delimiter="\t"))
 
 
