@@ -16,7 +16,7 @@ export FLEET_STATE_DIR := $(CURDIR)/.state
 # Tests start hundreds of Python processes. Each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test soak lint bench vectors proto pictures readme clean
+.PHONY: help demo test stress soak lint bench vectors proto pictures readme clean
 help: ## what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
@@ -34,6 +34,10 @@ demo: .venv/.ready ## three simulated cars do a job, recorded, checked, ready fo
 test: .venv/.ready ## the test suite (under ten minutes)
 	@mkdir -p .tmp
 	$(BIN)/python -m pytest $(TESTS) -m 'not soak' -n auto --dist loadgroup
+
+stress: .venv/.ready ## the suite twice at once while its processes are paused at random (TESTS=..., STRESS_SEED=...)
+	@mkdir -p .tmp
+	$(BIN)/python -m tests.tools.stress $(if $(STRESS_SEED),--seed $(STRESS_SEED)) $(TESTS)
 
 soak: .venv/.ready ## what takes longer than a test may
 	@mkdir -p .tmp

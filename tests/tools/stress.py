@@ -1,0 +1,156 @@
+"""Runs the suite twice at once while its processes are paused at random: `make stress` (POSIX).
+
+A paused process is what a busy machine makes of any process: late, at any line. All processes of both suites are
+paused but the two controllers of pytest: workers, hubs, gateways, cars and what they leave behind.
+A seed repeats the times and the draws, not the processes that run at those times.
+
+A process that a test itself has stopped is left alone. If a test stops a process during a pause, the end of the pause
+resumes it; that test may fail for this reason only.
+"""
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+import psutil
+
+ROOT = Path(__file__).parents[2]
+SUITES = ("first", "second")
+RUN = "STRESS_RUN"
+"""Variable in the environment of all processes of a run: a hub has left the family of the test that needed it."""
+PAUSE_S = (0.010, 0.900)
+"""Range of the length of a pause. Zenoh drops a session that is silent for 2 s, so a pause alone never does that."""
+GAP_S = (0.0, 0.4)
+"""Range from the begin of a pause to the begin of the next: two processes are paused on average."""
+LOOK_S = 1.0
+"""Interval at which the processes of the run are listed."""
+TURN_S = 0.01
+
+
+class Pauses:
+    """Pauses processes at random, and resumes each."""
+
+    def __init__(self, chance: random.Random, find: Callable[[], Iterable[psutil.Process]]) -> None:
+        self._chance = chance
+        self._find = find
+        self._found: list[psutil.Process] = []
+        self._look_at = self._next_at = 0.0
+        self._paused: dict[psutil.Process, float] = {}
+        """When each paused process resumes."""
+        self.count = 0
+        self.total_s = 0.0
+        self.processes: set[int] = set()
+
+    def step(self, now: float) -> None:
+        """Do what is due: resume, list, pause."""
+        for process in [each for each, until in self._paused.items() if until <= now]:
+            self._resume(process)
+        if now >= self._look_at:
+            self._look_at = now + LOOK_S
+            self._found = sorted(self._find(), key=lambda each: each.pid)
+        if now >= self._next_at and self._found:
+            self._next_at = now + self._chance.uniform(*GAP_S)
+            self._pause(self._chance.choice(self._found), self._chance.uniform(*PAUSE_S), now)
+
+    def resume_all(self) -> None:
+        """Resume every process that is paused."""
+        for process in list(self._paused):
+            self._resume(process)
+
+    def _pause(self, process: psutil.Process, seconds: float, now: float) -> None:
+        if process in self._paused:
+            return
+        with suppress(psutil.Error):  # it has ended
+            if process.status() == psutil.STATUS_STOPPED:
+                return
+            self._paused[process] = now + seconds  # first, so that an interrupt here leaves nothing paused
+            process.suspend()
+            self.count += 1
+            self.total_s += seconds
+            self.processes.add(process.pid)
+
+    def _resume(self, process: psutil.Process) -> None:
+        with suppress(psutil.Error):
+            process.resume()
+        self._paused.pop(process, None)
+
+
+def of_run(run: str, spared: Iterable[int]) -> list[psutil.Process]:
+    """Return the processes of a run but those that are spared."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):  # it has ended, or belongs to somebody else
+            if process.pid not in spared and process.environ().get(RUN) == run:
+                found.append(process)
+    return found
+
+
+def _start(name: str, tests: list[str], directory: Path) -> subprocess.Popen[bytes]:
+    options = ["-m", "not soak", "-n", "auto", "--dist", "loadgroup", "-p", "no:cacheprovider"]
+    words = [sys.executable, "-m", "pytest", *tests, *options, "--basetemp", str(directory / name)]
+    with (directory / f"{name}.log").open("wb") as log:
+        environment = os.environ | {RUN: str(directory)}
+        # In a session of its own, so that a Ctrl-C reaches a suite once, from here.
+        return subprocess.Popen(
+            words, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+        )
+
+
+def _ended(*_: int | FrameType | None) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def main() -> int:
+    """Run both suites; 0 if both pass."""
+    parser = argparse.ArgumentParser(prog="python -m tests.tools.stress", description=__doc__)
+    parser.add_argument("tests", nargs="*", default=["tests"], help="what pytest runs (default tests)")
+    parser.add_argument("--seed", type=int, help="repeats the times and draws of a run (default a new one)")
+    arguments = parser.parse_args()
+    seed = random.SystemRandom().randrange(10**6) if arguments.seed is None else arguments.seed
+    directory = ROOT / ".tmp" / f"stress-{seed}"
+    directory.mkdir(parents=True, exist_ok=True)
+    print(f"seed {seed} (make stress STRESS_SEED={seed}), logs in {directory.relative_to(ROOT)}", flush=True)
+    signal.signal(signal.SIGTERM, _ended)
+    began = time.monotonic()
+    suites: dict[str, subprocess.Popen[bytes]] = {}
+    controllers: set[int] = set()
+    pauses = Pauses(random.Random(seed), lambda: of_run(str(directory), controllers))
+    try:
+        for name in SUITES:
+            suites[name] = _start(name, arguments.tests, directory)
+            controllers.add(suites[name].pid)
+        while any(suite.poll() is None for suite in suites.values()):
+            pauses.step(time.monotonic())
+            time.sleep(TURN_S)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+        for suite in suites.values():
+            suite.send_signal(signal.SIGINT)
+    finally:
+        pauses.resume_all()
+    codes = [suite.wait() for suite in suites.values()]
+    for process in of_run(str(directory), ()):  # hubs in their last seconds, and what an interrupted test left
+        with suppress(psutil.Error):
+            process.terminate()
+    for name, code in zip(suites, codes, strict=True):
+        lines = (directory / f"{name}.log").read_text(errors="replace").splitlines()
+        failed = [line for line in lines if line.startswith(("FAILED ", "ERROR"))]
+        print("\n".join([*failed, f"{name} suite: exit {code}: {lines[-1].strip('= ') if lines else 'no output'}"]))
+    print(
+        f"{pauses.count} pauses of {len(pauses.processes)} processes, {pauses.total_s:.0f} s in total, "
+        f"within {time.monotonic() - began:.0f} s; seed {seed}"
+    )
+    return 0 if codes == [0] * len(SUITES) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

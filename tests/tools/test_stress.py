@@ -1,0 +1,54 @@
+"""`make stress` resumes each process that it paused, and leaves alone what a test has stopped."""
+
+import random
+import signal
+import subprocess
+from collections.abc import Iterator
+
+import psutil
+import pytest
+
+from tests.support.processes import wait_for
+from tests.tools.stress import PAUSE_S, Pauses, of_run
+
+
+@pytest.fixture
+def sleepers() -> Iterator[list[psutil.Process]]:
+    """Two processes that do nothing."""
+    started = [subprocess.Popen(["sleep", "600"], env={"STRESS_RUN": "one-test"}) for _ in range(2)]
+    # Until it has been executed, a child still has the environment of its parent.
+    wait_for(lambda: len(of_run("one-test", ())) == 2, "both can be found")
+    yield [psutil.Process(each.pid) for each in started]
+    for each in started:
+        each.kill()
+        each.wait()
+
+
+def stopped(process: psutil.Process) -> bool:
+    return bool(process.status() == psutil.STATUS_STOPPED)
+
+
+def test_what_is_paused_is_resumed(sleepers: list[psutil.Process]) -> None:
+    pauses = Pauses(random.Random(1), lambda: sleepers[:1])
+    pauses.step(0.0)
+    wait_for(lambda: stopped(sleepers[0]), "a pause")
+    pauses.resume_all()
+    wait_for(lambda: not stopped(sleepers[0]), "it goes on")
+    assert pauses.count == 1
+    assert PAUSE_S[0] <= pauses.total_s <= PAUSE_S[1]
+    assert pauses.processes == {sleepers[0].pid}
+
+
+def test_what_a_test_has_stopped_stays_stopped(sleepers: list[psutil.Process]) -> None:
+    sleepers[0].send_signal(signal.SIGSTOP)
+    wait_for(lambda: stopped(sleepers[0]), "it stands")
+    pauses = Pauses(random.Random(1), lambda: sleepers[:1])
+    for number in range(10):
+        pauses.step(number * 1.0)
+    pauses.resume_all()
+    assert pauses.count == 0
+    assert stopped(sleepers[0])
+
+
+def test_who_is_spared_is_not_found(sleepers: list[psutil.Process]) -> None:
+    assert of_run("one-test", {sleepers[0].pid}) == sleepers[1:]
