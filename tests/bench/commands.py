@@ -3,10 +3,10 @@
 import json
 from itertools import cycle
 from statistics import median
-from time import monotonic, sleep
+from time import monotonic, perf_counter, sleep
 
 from tests.bench.measured import Measured, Scale, in_turns
-from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, stage
+from tests.bench.stage import READING, Arrival, Stage, Tty, frames, stage
 from tests.support.processes import PATIENCE_S
 
 COMMANDS = 30
@@ -55,5 +55,5 @@ def run(scale: Scale) -> list[Measured]:
         with frames(port, READING, rate_hz=1.0):  # a car that is silent for long is not driven
             count = scale.count(COMMANDS, 3)
             ours, floor = in_turns(scale, lambda: _command(here, port, count), lambda: _query(here, count))
-        watch.undeclare()
+        watch.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
     return [Measured("command to tty, p50", tuple(ours), tuple(floor), "ms", 1.5, slack=1.0)]

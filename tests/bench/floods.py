@@ -7,10 +7,10 @@ answer under the same flood of tokens is told with it: Zenoh's own work for a to
 import json
 import threading
 from pathlib import Path
-from time import sleep
+from time import perf_counter, sleep
 
 from tests.bench.measured import Measured, Scale
-from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, stage
+from tests.bench.stage import READING, Arrival, Stage, Tty, frames, stage
 from tests.support.processes import PATIENCE_S, TAKEN, wait_for
 
 FLOODER = Path(__file__).parents[1] / "support" / "flooder.py"
@@ -94,7 +94,7 @@ def run(scale: Scale) -> list[Measured]:
         watch = here.session.liveliness().declare_subscriber("bench/answer/alive", alive.note, history=True)
         here.bare("answer", "bench/answer", "fleet/*", "fleet/@operator/*")
         alive.wait()
-        watch.undeclare()
+        watch.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
         with frames(port, READING, rate_hz=500.0):
             wait_for(lambda: here.fleet.state("link").rx_frames > scale.count(KEPT), "every ring is full")
         car, count = _Car(port), scale.count(STOPS)

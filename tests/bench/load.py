@@ -6,11 +6,11 @@ The floors: a bare loop that publishes the same; a query that a bare process ans
 import json
 import subprocess
 from pathlib import Path
-from time import monotonic, sleep
+from time import monotonic, perf_counter, sleep
 
 from tests.bench.commands import GAP_S, TURNS
 from tests.bench.measured import Measured, Scale, in_turns, percentile
-from tests.bench.stage import READING, Arrival, Stage, Tty, frames, perf_counter, play_car, stage
+from tests.bench.stage import READING, Arrival, Stage, Tty, frames, play_car, stage
 from tests.support.processes import PATIENCE_S, Process
 
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
@@ -127,7 +127,7 @@ def run(scale: Scale) -> list[Measured]:
         _feed(here, port, scale.count(HOUR))
         after = gateway.rss_mb()
         for each in kept:
-            each.undeclare()
+            each.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
     return [
         Measured("gateway CPU, 25 frames/s", tuple(cpu), tuple(bare_cpu), "%", 2.0),
         Measured(

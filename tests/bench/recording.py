@@ -7,7 +7,7 @@ Everything that a process does is in its CPU time, so ours pays for its flushes,
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from time import sleep, time_ns
+from time import perf_counter, sleep, time_ns
 from typing import Any
 
 from schemas import bus, keys
@@ -15,7 +15,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.bench.load import cpu_s
 from tests.bench.measured import Measured, Scale, in_turns
-from tests.bench.stage import READING, Stage, perf_counter, stage
+from tests.bench.stage import READING, Stage, stage
 from tests.support.lossless import all_there
 from tests.support.processes import Process
 from tests.support.recording import Load, Recording, faults

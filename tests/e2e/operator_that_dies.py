@@ -16,7 +16,7 @@ def ask(opened: bus.Bus, verb: str, payload: bytes) -> None:
     """Give a command, and show the answer."""
     key = keys.command_key("fleet", car, verb)
     for answer in opened.query(key, payload=payload, encoding=messages.JSON, timeout_s=20.0):
-        sys.stdout.write(json.dumps(json.loads(answer.payload)) + "\n")  # type: ignore[union-attr]  # or it fails
+        sys.stdout.write(json.dumps(json.loads(answer.payload)) + "\n")
         sys.stdout.flush()
 
 

@@ -78,7 +78,7 @@ def test_a_link_that_takes_all_and_delivers_nothing(fleet: Fleet, tcp_car: TcpCa
     assert (answer["status"], answer["reason"]) == ("rejected", "link_down"), answer
     for _ in range(2):
         written = len(tcp_car.received)
-        wait_for(lambda written=written: tcp_car.received[written:].count(MODE00) >= 2, "recovery goes on")  # type: ignore[misc]  # bound at once
+        wait_for(lambda written=written: tcp_car.received[written:].count(MODE00) >= 2, "recovery goes on")
     assert RUN not in tcp_car.received
     tcp_car.obey()
     fleet.ready()

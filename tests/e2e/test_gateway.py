@@ -272,7 +272,7 @@ def test_bad_commands_are_answered_and_nothing_dies(fleet: Fleet, tcp_car: TcpCa
         ("led", {"r": 1, "g": 2, "b": 300}, "bad_value"),
         ("light", {"light": "yellow"}, "unsupported"),
     ]:
-        answer = fleet.ask(verb, **fields)
+        answer = fleet.ask(verb, **fields)  # type: ignore[arg-type]  # joined to object
         assert (answer["status"], answer["reason"]) == ("rejected", reason), verb
         assert answer["words"]
     for selector in ("fleet/*/@cmd/drive", "fleet/red/@cmd/*"):
@@ -350,8 +350,8 @@ def test_of_two_that_start_at_the_same_moment_one_remains(fleet: Fleet, tcp_car:
         for one in both:
             one.line()
         for one in both:
-            one.popen.stdin.write("\n")  # type: ignore[union-attr]  # a pipe
-            one.popen.stdin.flush()  # type: ignore[union-attr]
+            one.popen.stdin.write("\n")
+            one.popen.stdin.flush()
         stays = remaining(fleet, both)
         if tcp_car.connections > attempt:
             return
@@ -387,8 +387,8 @@ def test_the_one_that_remains_gets_the_port_from_the_one_that_yields(fleet: Flee
     fleet.ready()
     stays = fleet.start("-c", SEES_NOBODY_FIRST, *arguments)
     wait_for(lambda: "in use" in stays.stderr, "it cannot have the port")
-    yields.popen.stdin.write("\n")  # type: ignore[union-attr]  # a pipe
-    yields.popen.stdin.flush()  # type: ignore[union-attr]
+    yields.popen.stdin.write("\n")
+    yields.popen.stdin.flush()
     assert remaining(fleet, [yields, stays]) is stays
 
 

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,7 +29,7 @@ class Terminal:
     """A shell in the clone: each command is a line of the README, and must succeed."""
 
     def __init__(self, clone: Path, environment: dict[str, str]) -> None:
-        self._where = {"cwd": clone, "env": environment, "text": True}
+        self._where: dict[str, Any] = {"cwd": clone, "env": environment, "text": True}
         self._activated = ""
 
     def run(self, command: str) -> str:
@@ -61,7 +62,7 @@ def walk(clone: Path, tmp_path: Path) -> None:
     up = terminal.start(first[-1], log)
     try:
         for words in ("role patrol: 2 of 2", "role guide: 1 of 1", "mode tracking, confirmed"):
-            wait_for(lambda words=words: words in log.read_text(), words, 90.0)  # type: ignore[misc]  # bound at once
+            wait_for(lambda words=words: words in log.read_text(), words, 90.0)
         told = [(command, other.run(command)) for command in second]
         assert up.wait(60) == 0, log.read_text()
     finally:

@@ -73,13 +73,13 @@ def anything(moments: random.Random) -> Action:
         case 3:
             return OneShot(General(Motion.STOP, servo=moments.choice(list(ServoAction))))
         case 4:
-            return OneShot(moments.choice([Ptz(moments.randrange(181)), ColorLed(255, 0, 7), ArmSet((90,) * 6)]))
+            return OneShot(moments.choice([Ptz(moments.randrange(181)), ColorLed(255, 0, 7), ArmSet((90,) * 6)]))  # type: ignore[arg-type]  # joined to object
         case 5:
             return ChangeSpeed(moments.choice(list(SpeedStep)))
         case 6:
             return Fan(moments.choice([None, True, False]))
         case 7:
-            return moments.choice([Find(), TakeLease(), TakeLease(release=True)])
+            return moments.choice([Find(), TakeLease(), TakeLease(release=True)])  # type: ignore[return-value]  # joined to object
         case 8:
             return Stop()
         case 9:
@@ -104,6 +104,8 @@ def noise(moments: random.Random) -> bytes:
 
 class Wild:
     """A controller to which anything happens. `step` does one thing and checks what must hold."""
+
+    control: Controller
 
     def __init__(self, seed: int) -> None:
         self.moments = random.Random(seed)
@@ -356,7 +358,7 @@ def sizes(thing: object, name: str = "", depth: int = 4) -> list[tuple[str, int]
     names: list[str] = [*getattr(thing, "__dict__", ()), *getattr(type(thing), "__slots__", ())]
     for each in names:
         value: Any = getattr(thing, each, None)
-        if not isinstance(value, str | int | float | Callable | None):  # type: ignore[arg-type]
+        if not isinstance(value, str | int | float | Callable | None):
             found += sizes(value, f"{name}.{each}", depth - 1)
     return found
 

@@ -102,7 +102,7 @@ def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> N
     assert len(command.id) == 32
     if payload is not None:
         message: Any = messages.message_class(COMMANDS[verb])(**payload)
-        for encoding in (messages.PROTOBUF, messages.encoding_of(COMMANDS[verb])):
+        for encoding in (PROTOBUF, messages.encoding_of(COMMANDS[verb])):
             assert ask(verb, message.SerializeToString(), encoding).what == what
 
 
@@ -225,7 +225,7 @@ def test_another_verbs_message_is_refused() -> None:
     assert words == "drive: the payload is a fleet.v1.LedCommand, this key takes fleet.v1.DriveCommand"
 
 
-@pytest.mark.parametrize("encoding", ["", messages.JSON, messages.PROTOBUF])
+@pytest.mark.parametrize("encoding", ["", messages.JSON, PROTOBUF])
 def test_zero_bytes_are_a_message_without_fields(encoding: str) -> None:
     assert ask("whistle", b"", encoding).what == general(whistle=True)
     assert ask("stop", b"", encoding).what == Stop()
@@ -257,7 +257,7 @@ def test_age_is_from_asked_else_from_the_sample_else_fresh(
     message = pb.DriveCommand(motion="forward", ttl_s=7)
     if asked_ns is not None:
         message.asked.seconds, message.asked.nanos = divmod(asked_ns, 1_000_000_000)
-    command = ask("drive", message.SerializeToString(), messages.PROTOBUF, sampled_ns=sampled_ns)
+    command = ask("drive", message.SerializeToString(), PROTOBUF, sampled_ns=sampled_ns)
     assert command.age_s == (None if age_s is None else pytest.approx(age_s))
     assert command.ttl_s == 7
     assert command.streamed is (sampled_ns is not None)
@@ -288,7 +288,7 @@ WIRE = st.binary(max_size=40).map(lambda tail: pb.DriveCommand(motion="forward",
 @given(
     st.sampled_from([*COMMANDS, "jump"]),
     st.one_of(st.none(), st.binary(), st.text().map(lambda text: text.encode(errors="replace")), JSONS, WIRE),
-    st.one_of(st.sampled_from([messages.JSON, messages.PROTOBUF, ""]), st.text()),
+    st.one_of(st.sampled_from([messages.JSON, PROTOBUF, ""]), st.text()),
     st.one_of(st.none(), st.integers(0, 1 << 63)),
     st.booleans(),
 )

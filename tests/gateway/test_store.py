@@ -95,4 +95,4 @@ def test_any_bytes_are_a_hold_or_none_never_an_error(tmp_path: Path, content: by
         assert 0 <= held.since_ns <= NOW
 
 
-SAVED = json.dumps({"hold": {"by": "mia", "since_ns": NOW}}).encode()
+SAVED: bytes = json.dumps({"hold": {"by": "mia", "since_ns": NOW}}).encode()

@@ -56,7 +56,7 @@ def test_what_was_not_measured_is_not_in_the_json() -> None:
         (b'{"motoin": "forward"}', messages.JSON, "motoin"),
         (b'{"duration_s": "soon"}', messages.JSON, "duration_s"),
         (b"\xff\xfe", messages.JSON, "is not the JSON"),
-        (b"\xff\xff", messages.PROTOBUF, "does not parse as fleet.v1.DriveCommand"),
+        (b"\xff\xff", topics.PROTOBUF, "does not parse as fleet.v1.DriveCommand"),
         (b"", "application/protobuf;fleet.v1.ModeCommand", "this key takes fleet.v1.DriveCommand"),
     ],
 )

@@ -12,7 +12,7 @@ MARK = "pytest.mark." + "soak"
 def test_each_soak_is_collected() -> None:
     # Only files that name the mark are given to pytest: collecting all others takes half a minute on a busy machine.
     marked = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if MARK in path.read_text())
-    words = [*marked, "-m", "soak", "--collect-only", "-q", "-p", "no:cacheprovider"]
+    words: list[str | Path] = [*marked, "-m", "soak", "--collect-only", "-q", "-p", "no:cacheprovider"]
     listed = subprocess.run(
         [sys.executable, "-m", "pytest", *words], cwd=ROOT, capture_output=True, text=True, check=False
     )

@@ -47,10 +47,10 @@ def judged(rounds: Iterable[dict[str, Took]]) -> None:
         for what, took in each.items():
             found.setdefault(what, []).append(took)
     print(f"\n{'what':60} {'best':>7} {'worst':>7} {'limit':>7}")
-    for what, took in found.items():
-        times = sorted(each.took_s for each in took)
-        print(f"{what:60} {times[0]:7.3f} {times[-1]:7.3f} {took[0].limit_s:7.2f}")
-    assert not [f"{what}: {each}" for what, took in found.items() for each in took if each.late]
+    for what, every in found.items():
+        times = sorted(each.took_s for each in every)
+        print(f"{what:60} {times[0]:7.3f} {times[-1]:7.3f} {every[0].limit_s:7.2f}")
+    assert not [f"{what}: {each}" for what, every in found.items() for each in every if each.late]
 
 
 @pytest.mark.soak

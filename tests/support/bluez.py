@@ -488,7 +488,7 @@ async def _received(reader: asyncio.StreamReader) -> Message:
     head = await reader.readexactly(16)
     body, fields = struct.unpack("<4xI4xI" if head[:1] == b"l" else ">4xI4xI", head)
     rest = await reader.readexactly(fields + -fields % 8 + body)
-    message = Unmarshaller(io.BytesIO(head + rest)).unmarshall()
+    message = Unmarshaller(io.BytesIO(head + rest)).unmarshall()  # type: ignore[arg-type]  # any reader will do
     assert message is not None
     return message
 

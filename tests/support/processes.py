@@ -36,7 +36,7 @@ A question is a query of the bus: a hundred a second, of each of four workers, t
 """
 
 
-def wait_for(so: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> Any:
+def wait_for(so: Callable[..., Any], what: str, seconds: float = PATIENCE_S) -> Any:
     """Ask until it is so; returns what was so."""
     began = time.monotonic()
     while not (found := so()):

@@ -24,7 +24,7 @@ class Terminal:
             stdin=device,
             stdout=device,
             stderr=device,
-            env=os.environ | {"COLUMNS": "200", "TERM": "xterm"} | environment,
+            env=os.environ | {"COLUMNS": "200", "TERM": "xterm", **environment},
             cwd=directory,
             start_new_session=True,
         )

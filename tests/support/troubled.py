@@ -52,7 +52,7 @@ class Trouble:
     counts: Counter[str] = field(default_factory=Counter)
     driving: list[str] = field(default_factory=list)
     """Cars that did not stand in time, in words."""
-    _due: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
+    _due: list[tuple[float, int, Callable[..., object]]] = field(default_factory=list)
     _numbers: "itertools.count[int]" = field(default_factory=itertools.count)
     _killed: dict[str, float] = field(default_factory=dict)
     """When a car's gateway was killed last."""
@@ -70,7 +70,7 @@ class Trouble:
             time.sleep(max(0.0, at - time.monotonic()))
             act()
 
-    def _after(self, seconds: float, act: Callable[[], None]) -> None:
+    def _after(self, seconds: float, act: Callable[..., object]) -> None:
         heapq.heappush(self._due, (time.monotonic() + seconds, next(self._numbers), act))
 
     def _begin(self, car: str) -> None:

@@ -93,7 +93,7 @@ class Pair:
         while self.now < end - 1e-9:
             self.turn(end, linked=linked)
 
-    def until(self, condition: Callable[[], bool], seconds: float) -> float:
+    def until(self, condition: Callable[..., bool], seconds: float) -> float:
         """Let time pass until a condition holds; returns how long it took, fails if it takes longer."""
         began = self.now
         end = began + seconds

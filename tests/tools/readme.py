@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from google.protobuf.descriptor import FieldDescriptor
 
@@ -82,7 +83,7 @@ def verb_table() -> str:
     """The table of commands, with the fields of each message."""
     rows = ["| verb | fields | what |", "|---|---|---|"]
     for verb, name in topics.COMMANDS.items():
-        fields = messages.message_class(name).DESCRIPTOR.fields
+        fields: Any = messages.message_class(name).DESCRIPTOR.fields
         own = [_field(field) for field in fields if field.name not in _COMMON]
         rows.append(f"| `{verb}` | {', '.join(own) or '-'} | {_ABOUT[verb]} |")
     return "\n".join(rows)
@@ -235,11 +236,11 @@ def mode_table() -> str:
             every = set(true) == everything - {asked}
             others = ("any other",) if every else tuple("the same" if each == asked else each for each in true)
             alike.setdefault(others, []).append(asked)
-        for others, asked in alike.items():
+        for others, named in alike.items():
             limit = (
                 "never" if within == "-" and verdict == "assumed" else "its first" if within == "-" else f"{within} s"
             )
-            rows.append(f"| {', '.join(asked)} | {', '.join(others)} | {verdict} | {by} | {limit} |".replace("_", " "))
+            rows.append(f"| {', '.join(named)} | {', '.join(others)} | {verdict} | {by} | {limit} |".replace("_", " "))
     return "\n".join(rows)
 
 

@@ -36,7 +36,7 @@ with opened(endpoint) as session, Path(path).open("wb") as file:
     sys.stdin.readline()
     cpu_s = time.process_time() - before
     subscriber.undeclare()
-    writer.finish()
-with Path(path).open("rb") as file:
-    count = make_reader(file).get_summary().statistics.message_count
+    writer.finish()  # type: ignore[no-untyped-call]
+with Path(path).open("rb") as written:
+    count = make_reader(written).get_summary().statistics.message_count
 print(json.dumps({"messages": count, "cpu_s": cpu_s}), flush=True)

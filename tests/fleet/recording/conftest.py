@@ -69,7 +69,7 @@ def publisher(bus: Bus, car: str, topic: str) -> Publisher:
     """A publisher that knows of the recorder: a session that was there before it is told a moment later."""
     made = bus.publisher(keys.topic_key("fleet", car, topic), TOPICS[topic], car)
     with bus._session.declare_publisher(made.key) as plain:  # zenoh.ext's publishers cannot be asked this
-        wait_for(lambda: plain.matching_status.matching, f"a subscriber of {made.key}")
+        wait_for(lambda: plain.matching_status.matching, f"a subscriber of {made.key}")  # type: ignore[attr-defined]
     return made
 
 

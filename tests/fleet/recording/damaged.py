@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from fleet.recording.reading.mcap_reader import LIMIT
+from fleet.recording.reading.mcap_index import LIMIT
 from fleet.recording.reading.session import NoSession, Recorded, Session
 from fleet.recording.writing.segment_writer import Segment
 from schemas import messages

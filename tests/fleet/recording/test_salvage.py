@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from fleet.recording.reading.mcap_reader import LIMIT, McapReader, NotMcap
+from fleet.recording.reading.mcap_index import LIMIT
+from fleet.recording.reading.mcap_reader import McapReader, NotMcap
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.writing.recorder import LIMIT_BYTES
 from fleet.recording.writing.segment_writer import Segment
@@ -226,7 +227,7 @@ def test_a_chunk_that_grows_when_uncompressed_is_not_followed(tmp_path: Path) ->
         writer.start()
         channel = writer.register_channel("fleet/red/x", "json", 0)
         writer.add_message(channel, 1, b"small", 1, 1)
-        writer.flush()
+        writer.flush()  # type: ignore[no-untyped-call]
         at = out.tell()
         writer.add_message(channel, 2, bytes(2 * LIMIT), 2, 2)
         writer.finish()  # type: ignore[no-untyped-call]  # it has no return type

@@ -24,7 +24,7 @@ def write(path: Path, first: int = 0) -> None:
                 rare = writer.register_channel("fleet/green/event/log", "json", 0)
                 writer.add_message(rare, first + number, b"rare", number, 1)
             if number % PER_CHUNK == PER_CHUNK - 1:
-                writer.flush()
+                writer.flush()  # type: ignore[no-untyped-call]
         writer.finish()  # type: ignore[no-untyped-call]  # it has no return type
 
 

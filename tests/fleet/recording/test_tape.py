@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -95,7 +96,7 @@ def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("limit", [{"session_bytes": 100_000}, {"root_bytes": MB}])
-def test_a_session_that_has_enough_begins_no_other_file(limit: dict[str, int], tmp_path: Path) -> None:
+def test_a_session_that_has_enough_begins_no_other_file(limit: dict[str, Any], tmp_path: Path) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(segment_bytes=100_000, **limit), BEGUN_NS)
     feed(tape, BEGUN_NS, count=200)
     tape.tick(BEGUN_NS)

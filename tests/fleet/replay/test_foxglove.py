@@ -30,7 +30,7 @@ def test_every_path_is_a_field_of_a_topic_and_every_topic_is_shown() -> None:
             topic = of_key(match["quoted"] or match["plain"])
             assert topic is not None, path
             shown.add(topic.name)
-            descriptor = message_class(topic.message).DESCRIPTOR
+            descriptor: Any = message_class(topic.message).DESCRIPTOR
             for field in re.findall(r"[a-z_]+", match["fields"]):
                 assert field in descriptor.fields_by_name, path
                 descriptor = descriptor.fields_by_name[field].message_type

@@ -124,7 +124,7 @@ def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None
             super().add_message(*arguments, **named)  # type: ignore[arg-type]
             self.count = getattr(self, "count", 0) + 1
             if self.count % 100 == 0:
-                self.flush()
+                self.flush()  # type: ignore[no-untyped-call]
 
     path = tmp_path / "0001.mcap"
     make(path, writer=Flushing)

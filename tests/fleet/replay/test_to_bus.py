@@ -44,7 +44,7 @@ class InOrder(Writer):
     def finish(self) -> None:
         for message in sorted(self._given, key=itemgetter(1)):
             super().add_message(*message)
-        super().finish()
+        super().finish()  # type: ignore[no-untyped-call]
 
 
 @pytest.fixture

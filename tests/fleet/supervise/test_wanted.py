@@ -119,9 +119,9 @@ def test_cars_come_go_and_change() -> None:
         (replace(OLD, world=Path("w")), "the world"),
         (replace(OLD, recordings=Path("r")), "where recordings go"),
         (replace(OLD, record=False), "whether it records"),
-        (replace(OLD, cars=OLD.cars | {"two": CarProcessSpec("two", SIMULATED)}), "two, a simulated car,"),
-        (replace(OLD, cars=OLD.cars | {"sim": CarProcessSpec("sim", SIMULATED, "stm32")}), "sim, a simulated car,"),
-        (replace(OLD, cars=OLD.cars | {"sim": CarProcessSpec("sim", "/dev/sim")}), "sim, a simulated car,"),
+        (replace(OLD, cars={**OLD.cars, "two": CarProcessSpec("two", SIMULATED)}), "two, a simulated car,"),
+        (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", SIMULATED, "stm32")}), "sim, a simulated car,"),
+        (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", "/dev/sim")}), "sim, a simulated car,"),
     ],
 )
 def test_what_the_processes_are_bound_to_stays_and_is_said(new: FleetSpec, words: str) -> None:

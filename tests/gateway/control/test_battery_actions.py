@@ -35,8 +35,8 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
         refused = desk.ask(what)
         assert (refused.status, refused.reason) == (Phase.REJECTED, Reason.BATTERY_LOW)
         assert "charge it" in refused.words
-    for what in (Drive(Motion.STOP), SetMode(Mode.MANUAL), Stop(), OneShot(General(Motion.STOP, light=Light.RED))):
-        assert desk.ask(what).status is not Phase.REJECTED
+    for still in (Drive(Motion.STOP), SetMode(Mode.MANUAL), Stop(), OneShot(General(Motion.STOP, light=Light.RED))):
+        assert desk.ask(still).status is not Phase.REJECTED
         desk.run(3.0)
     drained(desk, 8.0)
     assert desk.logs[-1].code == "battery_ok"

@@ -710,7 +710,7 @@ def test_a_link_that_goes_during_the_last_stop_is_said(desk: Desk) -> None:
 
 
 def anything(moments: random.Random) -> Action:
-    return moments.choice(
+    return moments.choice(  # type: ignore[return-value]  # joined to object
         [
             *(Drive(motion, moments.choice([0.1, 0.5, 3.0])) for motion in Motion),
             *(SetMode(mode) for mode in (Mode.MANUAL, Mode.TRACKING, Mode.COLOR_LED)),
@@ -792,7 +792,7 @@ def test_what_is_asked_while_a_mode_is_left_is_not_lost(mode: Mode) -> None:
         pair.run(6.0 + 2.0 * random.Random(seed).random())
         pair.ask(SetMode(Mode.MANUAL))
         control = pair.control
-        pair.until(lambda control=control: control.running is None, 20.0)  # type: ignore[misc]  # bound at once
+        pair.until(lambda control=control: control.running is None, 20.0)
         before = pair.car.truth.fan
         pair.ask(Fan())
         pair.run(7.0)

@@ -257,7 +257,7 @@ def test_no_stop_that_was_obeyed_is_thought_to_be_lost(platform: str, world: Cal
     pair = Pair(platform, world=world(), start_s=2.0).ready()
     moments = random.Random(7)
     for _ in range(60):
-        pair.ask(moments.choice([Drive(Motion.FORWARD, 2.0), OneShot(ColorLed(1, 2, 3)), SetMode(Mode.MANUAL)]))
+        pair.ask(moments.choice([Drive(Motion.FORWARD, 2.0), OneShot(ColorLed(1, 2, 3)), SetMode(Mode.MANUAL)]))  # type: ignore[arg-type]
         pair.run(2.5 * moments.random())
         pair.ask(Stop())
         pair.run(4.0 * moments.random())

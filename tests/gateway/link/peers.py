@@ -151,7 +151,7 @@ class BlePeer(Peer):
         self._before = os.environ.get(SYSTEM_BUS)
         os.environ[SYSTEM_BUS] = self.bluez.address
         self._write_s = ble.WRITE_S
-        ble.WRITE_S = PATIENCE_S  # a busy machine keeps both ends from running for longer than a command may take
+        ble.WRITE_S = PATIENCE_S  # type: ignore[misc]  # a busy machine keeps both ends from running for longer than a command may take
 
     def send(self, data: bytes) -> None:
         self.bluez.notify(self.module, data)
@@ -171,11 +171,11 @@ class BlePeer(Peer):
     def stall_after(self, pieces: int) -> None:
         """Take so many more."""
         self.module.takes = pieces
-        ble.WRITE_S = self._write_s
+        ble.WRITE_S = self._write_s  # type: ignore[misc]
 
     def close(self) -> None:
         self.bluez.close()
-        ble.WRITE_S = self._write_s
+        ble.WRITE_S = self._write_s  # type: ignore[misc]
         if self._before is None:
             del os.environ[SYSTEM_BUS]
         else:

@@ -35,8 +35,11 @@ class Hazard:
 HAZARDS: list[Hazard] = []
 
 
-def hazard(row: str, *, platform: str = "arduino", tcp: bool = False, echo: bool = True):
-    def keep(play: Callable[[Stranger], Awaitable[None]]) -> Callable[[Stranger], Awaitable[None]]:
+Play = Callable[[Stranger], Awaitable[None]]
+
+
+def hazard(row: str, *, platform: str = "arduino", tcp: bool = False, echo: bool = True) -> Callable[[Play], Play]:
+    def keep(play: Play) -> Play:
         HAZARDS.append(Hazard(row, play, platform, tcp, echo))
         return play
 

@@ -40,7 +40,7 @@ class Stranger(Protocol):
 
     async def wait(self, seconds: float) -> None: ...
 
-    async def until(self, so: Callable[[Truth], bool], within: float = 8.0) -> None: ...
+    async def until(self, so: Callable[..., bool], within: float = 8.0) -> None: ...
 
     async def until_received(self, count: int, within: float = 8.0) -> None: ...
 
@@ -70,7 +70,7 @@ class VirtualStranger:
         for _, data in self.car.advance(self.now):
             self.received += data
 
-    async def until(self, so: Callable[[Truth], bool], within: float = 8.0) -> None:
+    async def until(self, so: Callable[..., bool], within: float = 8.0) -> None:
         end = self.now + within
         while not so(self.truth):
             assert self.now < end, f"never so within {within} s: {self.truth}"
@@ -154,7 +154,7 @@ class WireStranger:
     async def wait(self, seconds: float) -> None:
         await asyncio.sleep(seconds)
 
-    async def until(self, so: Callable[[Truth], bool], within: float = 8.0) -> None:
+    async def until(self, so: Callable[..., bool], within: float = 8.0) -> None:
         end = self._loop.time() + within + 10
         while not so(self.truth):
             assert self._loop.time() < end, f"never so within {within} s: {self.truth}"
@@ -178,7 +178,9 @@ class WireStranger:
 
     @property
     def truth(self) -> Truth:
-        return self._car.truth
+        truth = self._car.truth
+        assert truth is not None
+        return truth
 
     async def leave(self) -> None:
         if self._port is not None:

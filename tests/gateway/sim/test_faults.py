@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.sim.car_spec import BadSpec, parse_car, parse_replay
+from gateway.sim.car_spec import BadSpec, CarSpec, ReplaySpec, parse_car, parse_replay
 from gateway.sim.cli import EPILOG
 from gateway.sim.faults import (
     Fault,
@@ -130,7 +130,7 @@ def test_bad_presses_on_stdin(fields: dict[str, object]) -> None:
         press_of(fields)
 
 
-CARS = [
+CARS: list[CarSpec | ReplaySpec] = [
     parse_car("red:arduino:pty:/tmp/red"),
     parse_car("blue:raspberry_pi:tcp"),
     parse_car("green:stm32:pty:/tmp/green"),

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from gateway.protocol.enums import Mode
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.car_body import CarBody
 from gateway.sim.model.firmware import CarBodyState, Pose, Truth
@@ -384,7 +385,7 @@ async def test_a_brown_out_boots_to_mode_0_with_the_motors_off() -> None:
     await car.write(b"$1,0,0")
     await car.wait(0.1)
     car.car.brown_out(car.now)
-    assert car.truth == Truth("manual", 0, 0, False, False, "off", 90, 150, True)
+    assert car.truth == Truth(Mode.MANUAL, 0, 0, False, False, "off", 90, 150, True)
     await car.write(RUN)  # while it boots
     await car.wait(0.6)
     assert not car.truth.driving

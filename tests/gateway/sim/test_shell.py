@@ -61,9 +61,9 @@ async def test_a_pty_is_paced_at_9600_baud_both_ways(pair: Simulation) -> None:
         for _ in range(4):
             port.write(RUN + STOP)
         port.write(b"$1,0,0,0,0,0,0,0,0#")
-        await until(lambda: len(car.firmware.motor_log) == 10, "all nine frames obeyed, each by itself")
+        await until(lambda: len(car.firmware.motor_log) == 10, "all nine frames obeyed, each by itself")  # type: ignore[attr-defined]
         assert time.monotonic() - begun >= 9 * 19 / 960 - 0.005
-        log = list(car.firmware.motor_log)
+        log = list(car.firmware.motor_log)  # type: ignore[attr-defined]
         assert all(b[0] - a[0] >= 19 / 960 - 1e-6 for a, b in itertools.pairwise(log[1:]))
         port.write(FAN)
         await until(lambda: not car.truth.fan, "the fan is off")
@@ -508,16 +508,16 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[Proce
                 time.sleep(0.01)
             with serial.Serial(link.removeprefix("serial://")) as port:
                 port.write(RUN)
-                while not any(sample.message().motor_left == 150 for sample in list(seen)):
+                while not any(sample.message().motor_left == 150 for sample in list(seen)):  # type: ignore[attr-defined]
                     assert time.monotonic() < end
                     time.sleep(0.01)
         assert seen[0].key == "mine/red/sim/truth"
-        truth = seen[0].message()
+        truth: Any = seen[0].message()
         assert (truth.car, truth.mode, truth.led) == ("red", "manual", "off")
         assert truth.y_m == pytest.approx(-1.05)
         sequences = [sample.sequence for sample in seen]
         assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
-        world = worlds[0].message()
+        world: Any = worlds[0].message()
         assert (len(world.walls), bool(world.line), len(world.lamps), len(world.things)) == (8, True, 0, 0)
     finally:
         sim.popen.terminate()
@@ -540,7 +540,7 @@ def test_lamps_and_things_are_on_the_bus_too(started: list[Process]) -> None:
             while not seen:
                 assert time.monotonic() < end
                 time.sleep(0.01)
-            message = seen[0].message()
+            message: Any = seen[0].message()
             assert (message.car, len(message.walls), message.lamps[0].name, message.lamps[0].on) == (
                 "@sim",
                 4,
@@ -550,7 +550,7 @@ def test_lamps_and_things_are_on_the_bus_too(started: list[Process]) -> None:
             assert (message.lamps[0].x_m, message.lamps[0].y_m) == (message.things[0].x_m, message.things[0].y_m)
             assert message.things[0].radius_m == pytest.approx(0.06)
             assert sim.ask(lamp="beacon", on=False)["ok"]
-            while seen[-1].message().lamps[0].on:
+            while seen[-1].message().lamps[0].on:  # type: ignore[attr-defined]
                 assert time.monotonic() < end
                 time.sleep(0.01)
     finally:

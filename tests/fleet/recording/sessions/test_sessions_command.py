@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from fleet.recording import open_session, session_dir
-from fleet.recording.reading.mcap_reader import MAGIC
+from fleet.recording.reading.mcap_scan import MAGIC
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.transform import recover
 from fleet.recording.tools.verify import verify
