@@ -68,7 +68,7 @@ class Measured:
             "ours": self.ours_median,
             "floor": self.floor_median,
             "unit": self.unit,
-            "ratio": self.ratio,
+            "ratio": self.ratio if self.floor_median else None,  # JSON has no infinity
             "goal": self.goal,
             "slack": self.slack,
             "met": self.met,
