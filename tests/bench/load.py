@@ -11,7 +11,7 @@ from time import monotonic, perf_counter, sleep
 from tests.bench.commands import GAP_S, TURNS
 from tests.bench.measured import Measured, Scale, in_turns, percentile
 from tests.bench.stage import READING, Arrival, Stage, Tty, frames, play_car, stage
-from tests.support.processes import PATIENCE_S, Process
+from tests.support.processes import PATIENCE_S, GatewayProcess
 
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
 RATE_HZ = 25
@@ -24,7 +24,7 @@ SETTLED = HOUR // 10
 AT_ONCE = 100
 
 
-def cpu_s(process: Process) -> float:
+def cpu_s(process: GatewayProcess) -> float:
     """Time on a processor, user and system: by the scheduler's own count (Linux), elsewhere by `ps` in hundredths.
 
     Ticks of 10 ms, as /proc/PID/stat has them, miss most of what runs for a fraction of one.
@@ -37,7 +37,7 @@ def cpu_s(process: Process) -> float:
     return int(minutes or 0) * 60 + float(seconds)
 
 
-def _cpu(process: Process, port: Tty, window_s: float) -> float:
+def _cpu(process: GatewayProcess, port: Tty, window_s: float) -> float:
     """Share of a core, in percent."""
     with frames(port, TRACKING, RATE_HZ):
         sleep(0.5)

@@ -17,7 +17,7 @@ from tests.bench.load import cpu_s
 from tests.bench.measured import Measured, Scale, in_turns
 from tests.bench.stage import READING, Stage, stage
 from tests.support.lossless import all_there
-from tests.support.processes import Process
+from tests.support.processes import GatewayProcess
 from tests.support.recording import Load, Recording, faults
 
 CARS = 40
@@ -39,7 +39,7 @@ def _publishers(opened: bus.Bus, fleet: str) -> list[bus.Publisher]:
     ]
 
 
-def _cost(here: Stage, fleet: str, rounds: int, start: Callable[[Path], Process]) -> float:
+def _cost(here: Stage, fleet: str, rounds: int, start: Callable[[Path], GatewayProcess]) -> float:
     """CPU microseconds per message."""
     publishers = _publishers(here.fleet.bus, fleet)
     line = pb.Line(left_outer=True)
@@ -60,7 +60,7 @@ def _cost(here: Stage, fleet: str, rounds: int, start: Callable[[Path], Process]
     return float(found["cpu_s"]) / (rounds * len(publishers)) * 1e6
 
 
-def _told_to_end(process: Process) -> Any:
+def _told_to_end(process: GatewayProcess) -> Any:
     assert process.popen.stdin is not None
     process.popen.stdin.write("\n")
     process.popen.stdin.flush()
@@ -93,7 +93,7 @@ def _crowd(here: Stage, scale: Scale) -> list[Measured]:
     ]
 
 
-def _share(process: Process, load: Load, seconds: float) -> tuple[float, float]:
+def _share(process: GatewayProcess, load: Load, seconds: float) -> tuple[float, float]:
     """Share of a core, in percent, and messages a second."""
     sleep(SETTLE_S)
     count, before, began = load.count(), cpu_s(process), perf_counter()

@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from tests.support.ports import free_endpoint
-from tests.support.processes import CLOSING_S, MODE00, PATIENCE_S, REPORT_S, Fleet, Process
+from tests.support.processes import CLOSING_S, MODE00, PATIENCE_S, REPORT_S, FleetProcesses, GatewayProcess
 
 FLOORS = Path(__file__).parent / "floors"
 SCRATCH = Path(__file__).resolve().parents[2] / ".tmp"
@@ -93,7 +93,7 @@ class Stage:
     """A hub, its endpoint and a bare session at it."""
 
     def __init__(self, directory: Path) -> None:
-        self.fleet = Fleet(free_endpoint(), directory)
+        self.fleet = FleetProcesses(free_endpoint(), directory)
         # Where Python may not keep what it has compiled, every start would be measured as the first one ever.
         self.fleet.environment["PYTHONDONTWRITEBYTECODE"] = ""
         self._ttys: list[Tty] = []
@@ -103,7 +103,7 @@ class Stage:
         config.insert_json5("scouting/multicast/enabled", "false")
         self.session = zenoh.open(config)
 
-    def bare(self, name: str, *arguments: str) -> Process:
+    def bare(self, name: str, *arguments: str) -> GatewayProcess:
         """Start one of the floors: a program that knows nothing of ours."""
         return self.fleet.start(str(FLOORS / f"{name}.py"), self.fleet.endpoint, *arguments)
 
@@ -112,7 +112,7 @@ class Stage:
         self._ttys.append(Tty())
         return self._ttys[-1]
 
-    def gateway(self, port: Tty) -> Process:
+    def gateway(self, port: Tty) -> GatewayProcess:
         """Start a gateway and play the car until the gateway knows that the car stands."""
         process = self.fleet.gateway(port.path)
 

@@ -9,7 +9,7 @@ from time import perf_counter, sleep
 
 from tests.bench.measured import Measured, Scale, in_turns
 from tests.bench.stage import Arrival, Stage, stage
-from tests.support.processes import Process
+from tests.support.processes import GatewayProcess
 
 SETTLED_S = 1.0
 
@@ -19,7 +19,7 @@ def _rss_mb(pid: int) -> float:
     return int(listed.stdout) / 1024
 
 
-def _start(here: Stage, token: str, asked: str, start: Callable[[], Process]) -> tuple[float, float, float]:
+def _start(here: Stage, token: str, asked: str, start: Callable[[], GatewayProcess]) -> tuple[float, float, float]:
     """(ms until the token, ms until the answer to what is asked then, MB of memory a second later)."""
     alive, gone = Arrival(), Arrival()
     watch = here.session.liveliness().declare_subscriber(

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet, TcpCar
+from tests.support.processes import FleetProcesses, TcpCar
 
 
 @pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[Fleet]:
-    started = Fleet(free_endpoint(), tmp_path)
+def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
+    started = FleetProcesses(free_endpoint(), tmp_path)
     yield started
     started.close()
 

@@ -3,15 +3,15 @@
 import time
 
 from fleet.client.client import Fleet as Client
-from tests.support.processes import TAKEN, Fleet, driving, wait_for
+from tests.support.processes import TAKEN, FleetProcesses, driving, wait_for
 
 
-def estops(fleet: Fleet, car: str) -> list[str]:
+def estops(fleet: FleetProcesses, car: str) -> list[str]:
     state = fleet.state("safety", car)
     return [] if state is None else [estop.id for estop in state.estops]
 
 
-def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gateway(fleet: Fleet) -> None:
+def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gateway(fleet: FleetProcesses) -> None:
     sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     gateways = [fleet.gateway(red), fleet.gateway(blue, car="blue")]
     for car in ("red", "blue"):
@@ -42,7 +42,7 @@ def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gatew
     assert fleet.ask("drive", "blue", motion="forward")["status"] in TAKEN
 
 
-def test_an_e_stop_of_all_without_an_id_is_one_and_one_resume_ends_it(fleet: Fleet) -> None:
+def test_an_e_stop_of_all_without_an_id_is_one_and_one_resume_ends_it(fleet: FleetProcesses) -> None:
     _, links = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp", "green:arduino:tcp")
     cars = ("red", "blue", "green")
     for car, link in zip(cars, links, strict=True):
@@ -56,7 +56,7 @@ def test_an_e_stop_of_all_without_an_id_is_one_and_one_resume_ends_it(fleet: Fle
     wait_for(lambda: not any(estops(fleet, car) for car in cars), "ended for all")
 
 
-def test_an_e_stop_of_one_car_is_its_own(fleet: Fleet) -> None:
+def test_an_e_stop_of_one_car_is_its_own(fleet: FleetProcesses) -> None:
     _, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     for car, link in (("red", red), ("blue", blue)):
         fleet.gateway(link, car=car)
@@ -71,7 +71,7 @@ def test_an_e_stop_of_one_car_is_its_own(fleet: Fleet) -> None:
         assert client.car("red").drive("forward").ok
 
 
-def test_the_next_command_line_need_not_wait_for_the_last_ones_lease(fleet: Fleet) -> None:
+def test_the_next_command_line_need_not_wait_for_the_last_ones_lease(fleet: FleetProcesses) -> None:
     _, (red,) = fleet.simulate("red:arduino:tcp")
     fleet.gateway(red)
     fleet.ready()
@@ -85,7 +85,7 @@ def test_the_next_command_line_need_not_wait_for_the_last_ones_lease(fleet: Flee
         wait_for(lambda: not fleet.state("safety").HasField("lease"), "given back")
 
 
-def test_a_stop_with_a_broken_payload_stops(fleet: Fleet) -> None:
+def test_a_stop_with_a_broken_payload_stops(fleet: FleetProcesses) -> None:
     sim, (red,) = fleet.simulate("red:arduino:tcp")
     fleet.gateway(red)
     fleet.ready()

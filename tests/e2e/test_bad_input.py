@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.support.kills import BUSY_S
-from tests.support.processes import MODE00, TAKEN, Fleet, Process, TcpCar, driving, wait_for
+from tests.support.processes import MODE00, TAKEN, FleetProcesses, GatewayProcess, TcpCar, driving, wait_for
 
 RUN = b"$1,0,0,0,0,0,0,0,0#"
 STOP = b"$0,0,0,0,0,0,0,0,0#"
@@ -24,7 +24,7 @@ NEVER_ENDING = b"$" + b"9" * MEGABYTE
 NUMBERS = itertools.count(100)
 
 
-def good_frame_counts(fleet: Fleet, send: Callable[[bytes], None]) -> None:
+def good_frame_counts(fleet: FleetProcesses, send: Callable[[bytes], None]) -> None:
     """The next good frame is a reading; one that is still in the nonsense need not be, so it is sent as a car would."""
     distance = next(NUMBERS)
     due = 0.0
@@ -41,7 +41,7 @@ def good_frame_counts(fleet: Fleet, send: Callable[[bytes], None]) -> None:
 
 
 @pytest.fixture
-def gateway(fleet: Fleet, tcp_car: TcpCar) -> Process:
+def gateway(fleet: FleetProcesses, tcp_car: TcpCar) -> GatewayProcess:
     started = fleet.gateway(tcp_car.link)
     wait_for(lambda: MODE00 in tcp_car.received, "it is on the link")
     good_frame_counts(fleet, tcp_car.send)
@@ -54,7 +54,7 @@ def gateway(fleet: Fleet, tcp_car: TcpCar) -> Process:
     ids=["random", "a frame that never ends"],
 )
 def test_a_megabyte_of_nonsense(
-    fleet: Fleet, tcp_car: TcpCar, gateway: Process, nonsense: bytes, causes: set[str]
+    fleet: FleetProcesses, tcp_car: TcpCar, gateway: GatewayProcess, nonsense: bytes, causes: set[str]
 ) -> None:
     before_mb = gateway.rss_mb()
     tcp_car.send(nonsense)
@@ -69,7 +69,7 @@ def test_a_megabyte_of_nonsense(
 
 
 @pytest.mark.soak
-def test_a_link_that_takes_all_and_delivers_nothing(fleet: Fleet, tcp_car: TcpCar) -> None:
+def test_a_link_that_takes_all_and_delivers_nothing(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     """It is said that the car is not heard, every drive is refused, and recovery goes on for ever."""
     gateway = fleet.gateway(tcp_car.link)
     wait_for(lambda: "was not heard since the stop began" in gateway.stderr, "it is said")
@@ -85,7 +85,7 @@ def test_a_link_that_takes_all_and_delivers_nothing(fleet: Fleet, tcp_car: TcpCa
     assert fleet.state("safety").motors_basis == "shown"
 
 
-def test_a_car_that_echoes_everything_says_nothing(fleet: Fleet) -> None:
+def test_a_car_that_echoes_everything_says_nothing(fleet: FleetProcesses) -> None:
     car = TcpCar(echoes=True)
     try:
         gateway = fleet.gateway(car.link)
@@ -114,7 +114,7 @@ def plugged_in(kept: list[int]) -> Path:
     return Path(os.ttyname(slave))
 
 
-def test_a_device_that_comes_back_as_another_number(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_device_that_comes_back_as_another_number(fleet: FleetProcesses, tmp_path: Path) -> None:
     """Its by-id path, a symlink, is what stays."""
     sim, (link,) = fleet.simulate(f"red:arduino:pty:{tmp_path / 'by-id'}")
     fleet.gateway(link)
@@ -149,7 +149,7 @@ main()
 """
 
 
-def test_a_wall_clock_that_jumps_changes_no_motion(fleet: Fleet) -> None:
+def test_a_wall_clock_that_jumps_changes_no_motion(fleet: FleetProcesses) -> None:
     """What moves and stops a car is counted on the monotonic clock; the wall clock only stamps, and dates commands."""
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
     gateway = fleet.start("-c", A_CLOCK_THAT_JUMPS, "run", "--car", "red", "--link", link, "--platform", "raspberry_pi")
@@ -190,7 +190,9 @@ def test_a_wall_clock_that_jumps_changes_no_motion(fleet: Fleet) -> None:
     [b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM11#" * 500, b"$" * 20_000],
     ids=["readings", "starts"],
 )
-def test_a_firehose_of_10_megabytes_a_second(fleet: Fleet, tcp_car: TcpCar, gateway: Process, nonsense: bytes) -> None:
+def test_a_firehose_of_10_megabytes_a_second(
+    fleet: FleetProcesses, tcp_car: TcpCar, gateway: GatewayProcess, nonsense: bytes
+) -> None:
     before_mb = gateway.rss_mb()
     published = []
     fleet.bus.subscribe("fleet/red/frame/rx", lambda _: published.append(1))

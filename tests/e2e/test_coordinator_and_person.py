@@ -3,8 +3,10 @@
 from pathlib import Path
 
 from tests.support.authority import want_for_ever
-from tests.support.processes import Fleet
+from tests.support.processes import FleetProcesses
 
 
-def test_a_stopped_car_stays_stopped_over_restarts_of_gateway_and_coordinator(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_stopped_car_stays_stopped_over_restarts_of_gateway_and_coordinator(
+    fleet: FleetProcesses, tmp_path: Path
+) -> None:
     assert want_for_ever(fleet, tmp_path, ["gateway and coordinator"]) == []

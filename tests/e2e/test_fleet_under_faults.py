@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.ports import free_endpoint
-from tests.support.roles import PLAN, Stage, unexplained
+from tests.support.roles import PLAN, RoleStage, unexplained
 from tests.support.up import Up
 
 
@@ -16,7 +16,7 @@ def test_a_plan_survives_faults(tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN)
     with Up(tmp_path, free_endpoint(), "--sim", "8", "--plan", str(plan)) as up:
-        stage = Stage(up, random.Random(5))
+        stage = RoleStage(up, random.Random(5))
         stage.begin()
         for what in ("coordinator", "gateway", "hub", "link", "brownout"):
             stage.strike(what)

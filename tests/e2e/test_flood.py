@@ -5,10 +5,10 @@ The same for a minute, with nothing added for a busy machine, is in tests/soak/t
 
 from tests.support.flooding import FLIGHT_S, flood
 from tests.support.kills import BUSY_S
-from tests.support.processes import Fleet
+from tests.support.processes import FleetProcesses
 
 
-def test_a_flood_of_drives(fleet: Fleet) -> None:
+def test_a_flood_of_drives(fleet: FleetProcesses) -> None:
     found = flood(fleet, seconds=4.0, stops=2)
     assert found.published > 10_000
     assert min(found.apart_s) > FLIGHT_S - 0.001, "the next frame waits until the last is no more in flight"

@@ -5,20 +5,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.processes import Fleet, Process, wait_for
+from tests.support.processes import FleetProcesses, GatewayProcess, wait_for
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 ROW = ("red", "green", "blue")
 MODES = {"red": "light_seeking", "green": "following", "blue": "following"}
 
 
-def _truth(sim: Process) -> dict[str, tuple[str, tuple[float, float]]]:
+def _truth(sim: GatewayProcess) -> dict[str, tuple[str, tuple[float, float]]]:
     said = {car: sim.say({"car": car, "ask": "truth"}) for car in ROW}
     return {car: (str(each["mode"]), (float(each["x_m"]), float(each["y_m"]))) for car, each in said.items()}
 
 
 @pytest.mark.timeout(240)
-def test_who_sees_the_lamp_leads_and_the_others_follow(fleet: Fleet) -> None:
+def test_who_sees_the_lamp_leads_and_the_others_follow(fleet: FleetProcesses) -> None:
     sim, links = fleet.simulate(*(f"{car}:arduino:pty" for car in ROW), world=str(DEPLOY / "world.follow.yaml"))
     for car, link in zip(ROW, links, strict=True):
         fleet.gateway(link, car=car)

@@ -23,8 +23,8 @@ from tests.support.processes import (
     PATIENCE_S,
     PI_REPORT,
     TAKEN,
-    Fleet,
-    Process,
+    FleetProcesses,
+    GatewayProcess,
     TcpCar,
     driving,
     wait_for,
@@ -126,7 +126,7 @@ OF_A_RASPBERRY_PI: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
     ids=["arduino", "raspberry_pi"],
 )
 def test_a_tcp_server_that_knows_nothing_of_us(
-    fleet: Fleet,
+    fleet: FleetProcesses,
     tcp_car: TcpCar,
     platform: str,
     recording: list[tuple[bytes, dict[str, dict[str, Any]]]],
@@ -212,7 +212,7 @@ def strip(data: bytes | bytearray) -> bytes:
     return bytes(data).translate(None, b"\r\n \t")
 
 
-def test_any_zenoh_client_reads_and_drives(fleet: Fleet) -> None:
+def test_any_zenoh_client_reads_and_drives(fleet: FleetProcesses) -> None:
     assert len([line for line in ANY_CLIENT.read_text().splitlines() if line]) <= 10
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
     fleet.gateway(link, platform="raspberry_pi")
@@ -228,7 +228,7 @@ def test_any_zenoh_client_reads_and_drives(fleet: Fleet) -> None:
     wait_for(lambda: not driving(sim), "and stops by itself")
 
 
-def test_history(fleet: Fleet, tcp_car: TcpCar) -> None:
+def test_history(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     fleet.gateway(tcp_car.link, platform="raspberry_pi")
     wait_for(lambda: tcp_car.received, "it is on the link")
     for number in range(1, 6):
@@ -254,7 +254,7 @@ def test_history(fleet: Fleet, tcp_car: TcpCar) -> None:
     assert fleet.get("fleet/red/sensor/nonsense") == []
 
 
-def test_bad_commands_are_answered_and_nothing_dies(fleet: Fleet, tcp_car: TcpCar) -> None:
+def test_bad_commands_are_answered_and_nothing_dies(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     told: list[Any] = []
     fleet.bus.subscribe("fleet/red/frame/tx", lambda sample: told.append(sample.message()))
     tcp_car.obey(PI_REPORT)
@@ -298,7 +298,7 @@ def test_bad_commands_are_answered_and_nothing_dies(fleet: Fleet, tcp_car: TcpCa
     assert "Traceback" not in gateway.stderr
 
 
-def test_a_second_gateway_refuses_and_names_the_first(fleet: Fleet, tcp_car: TcpCar) -> None:
+def test_a_second_gateway_refuses_and_names_the_first(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     tcp_car.obey(PI_REPORT)
     first = fleet.gateway(tcp_car.link, platform="raspberry_pi")
     fleet.ready()
@@ -312,7 +312,7 @@ def test_a_second_gateway_refuses_and_names_the_first(fleet: Fleet, tcp_car: Tcp
     assert fleet.ask("drive", motion="forward", duration_s=0.1)["status"] in TAKEN
 
 
-def remaining(fleet: Fleet, both: list[Process]) -> Process:
+def remaining(fleet: FleetProcesses, both: list[GatewayProcess]) -> GatewayProcess:
     """Wait until one of two has yielded and the other has looked again."""
     wait_for(lambda: any(one.popen.poll() is not None for one in both), "one yields")
     (yields,) = [one for one in both if one.popen.poll() is not None]
@@ -326,7 +326,7 @@ def remaining(fleet: Fleet, both: list[Process]) -> Process:
     return stays
 
 
-def test_of_two_that_want_one_port_one_remains(fleet: Fleet) -> None:
+def test_of_two_that_want_one_port_one_remains(fleet: FleetProcesses) -> None:
     _, (link,) = fleet.simulate("red:raspberry_pi:pty")
     remaining(fleet, [fleet.gateway(link, platform="raspberry_pi") for _ in range(2)])
 
@@ -341,7 +341,7 @@ gateway.cli.main()
 """
 
 
-def test_of_two_that_start_at_the_same_moment_one_remains(fleet: Fleet, tcp_car: TcpCar) -> None:
+def test_of_two_that_start_at_the_same_moment_one_remains(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     """Whether neither sees the other in time is luck, two times in three: again until it was so, for a while."""
     tcp_car.obey(PI_REPORT)
     arguments = ("run", "--car", "red", "--link", tcp_car.link, "--platform", "raspberry_pi")
@@ -379,7 +379,7 @@ cli.main()
 """
 
 
-def test_the_one_that_remains_gets_the_port_from_the_one_that_yields(fleet: Fleet) -> None:
+def test_the_one_that_remains_gets_the_port_from_the_one_that_yields(fleet: FleetProcesses) -> None:
     """Neither saw the other in time; the one with the higher id was faster to open the port, and looks again later."""
     _, (link,) = fleet.simulate("red:arduino:pty")
     arguments = ("run", "--car", "red", "--link", link, "--platform", "arduino")
@@ -399,15 +399,15 @@ FOUR = ("red:arduino:pty", "green:arduino:tcp", "blue:raspberry_pi:tcp", "white:
 class Four:
     """Four cars with their gateways."""
 
-    fleet: Fleet
-    sim: Process
-    gateways: dict[str, Process]
+    fleet: FleetProcesses
+    sim: GatewayProcess
+    gateways: dict[str, GatewayProcess]
     judges: dict[str, Judge]
 
 
 @pytest.fixture(scope="module")
 def four(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Four]:
-    fleet = Fleet(free_endpoint(), tmp_path_factory.mktemp("four"))
+    fleet = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("four"))
     try:
         names = [each.split(":")[0] for each in FOUR]
         judges = {car: Judge.follow(fleet.bus, car) for car in names}
@@ -443,7 +443,7 @@ def test_a_signal_stops_the_car_first(four: Four, number: int, car: str) -> None
     assert wait_for(lambda: not fleet.get(f"fleet/{car}/**"), "nobody answers for it")
 
 
-def test_who_drives_is_told_at_once_that_the_gateway_was_killed(fleet: Fleet) -> None:
+def test_who_drives_is_told_at_once_that_the_gateway_was_killed(fleet: FleetProcesses) -> None:
     """Nothing stops the car then but a person, who would be told when the drive is over."""
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     gateway = fleet.gateway(link)
@@ -456,7 +456,7 @@ def test_who_drives_is_told_at_once_that_the_gateway_was_killed(fleet: Fleet) ->
     assert driving(sim)
 
 
-def test_a_joystick_that_dies_stops_the_car(fleet: Fleet) -> None:
+def test_a_joystick_that_dies_stops_the_car(fleet: FleetProcesses) -> None:
     """A stream of drives by a sender with a token, killed: the car stops long before the last drive is over."""
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
     fleet.gateway(link, platform="raspberry_pi")
@@ -477,7 +477,7 @@ def test_a_joystick_that_dies_stops_the_car(fleet: Fleet) -> None:
     assert records[-1].count > 1
 
 
-def test_a_killed_gateway_leaves_a_car_that_drives_and_its_successor_stops_it(fleet: Fleet) -> None:
+def test_a_killed_gateway_leaves_a_car_that_drives_and_its_successor_stops_it(fleet: FleetProcesses) -> None:
     sim, (link,) = fleet.simulate("red:arduino:pty")
     gateway = fleet.gateway(link)
     fleet.ready()
@@ -507,7 +507,7 @@ def test_a_killed_gateway_leaves_a_car_that_drives_and_its_successor_stops_it(fl
     assert not fleet.state("safety").HasField("hold"), "its end survives too"
 
 
-def test_a_link_that_drops_comes_back_by_itself(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_link_that_drops_comes_back_by_itself(fleet: FleetProcesses, tmp_path: Path) -> None:
     sim, (link,) = fleet.simulate(f"red:arduino:pty:{tmp_path / 'tty'}")
     gateway = fleet.gateway(link)
     fleet.ready()
@@ -532,7 +532,7 @@ def test_a_link_that_drops_comes_back_by_itself(fleet: Fleet, tmp_path: Path) ->
     assert gateway.end() == 0
 
 
-def test_a_link_that_opens_and_dies_at_once_is_not_opened_many_times_a_second(fleet: Fleet) -> None:
+def test_a_link_that_opens_and_dies_at_once_is_not_opened_many_times_a_second(fleet: FleetProcesses) -> None:
     """Each opening of a real port may reset the car's board; and a log that says it each time says nothing else."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(PATIENCE_S)
@@ -550,7 +550,7 @@ def test_a_link_that_opens_and_dies_at_once_is_not_opened_many_times_a_second(fl
     gateway.end()
 
 
-def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: Fleet) -> None:
+def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: FleetProcesses) -> None:
     sim, links = fleet.simulate("red:raspberry_pi:tcp", "blue:raspberry_pi:tcp")
     fleet.gateway(links[0], platform="raspberry_pi")
     fleet.gateway(links[1], platform="raspberry_pi", car="blue")
@@ -570,9 +570,9 @@ def test_a_hub_that_was_killed_comes_back_and_commands_work_again(fleet: Fleet) 
 
 
 @pytest.fixture(scope="module")
-def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses]:
     """A hub for gateways that do not get as far as a car."""
-    started = Fleet(free_endpoint(), tmp_path_factory.mktemp("hub"))
+    started = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("hub"))
     assert started.bus.connected, "a hub without a client ends by itself"
     yield started
     started.close()
@@ -599,7 +599,7 @@ def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     ],
     ids=lambda value: " ".join(value)[:40] if isinstance(value, list) else "",
 )
-def test_bad_input_is_one_line(only_a_hub: Fleet, arguments: list[str], code: int, words: str) -> None:
+def test_bad_input_is_one_line(only_a_hub: FleetProcesses, arguments: list[str], code: int, words: str) -> None:
     given = {"--car": "red", "--link": "/dev/null", "--platform": "arduino"}
     given |= dict(zip(arguments[::2], arguments[1::2], strict=True))
     process = only_a_hub.start("-m", "gateway.cli", "run", *(word for pair in given.items() for word in pair))
@@ -609,7 +609,7 @@ def test_bad_input_is_one_line(only_a_hub: Fleet, arguments: list[str], code: in
     assert words in line
 
 
-def test_a_port_in_use_is_said(fleet: Fleet) -> None:
+def test_a_port_in_use_is_said(fleet: FleetProcesses) -> None:
     _, (link,) = fleet.simulate("red:arduino:pty")
     with serial.Serial(link.removeprefix("serial://"), exclusive=True):
         process = fleet.gateway(link)
@@ -618,14 +618,14 @@ def test_a_port_in_use_is_said(fleet: Fleet) -> None:
     assert "the port is in use by another program (a second gateway?): end that one first" in line
 
 
-def test_what_listens_there_is_no_router(tmp_path: Path, fleet: Fleet, tcp_car: TcpCar) -> None:
+def test_what_listens_there_is_no_router(tmp_path: Path, fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     process = fleet.gateway("/dev/null", "--connect", tcp_car.link.replace("tcp://", "tcp/"))
     assert process.wait() == 1
     (line,) = process.stderr.splitlines()
     assert "is no Zenoh router" in line
 
 
-def test_a_link_that_is_not_there_yet_is_waited_for(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_link_that_is_not_there_yet_is_waited_for(fleet: FleetProcesses, tmp_path: Path) -> None:
     gateway = fleet.gateway(str(tmp_path / "tty"), "--retry", platform="raspberry_pi")
     wait_for(lambda: (link := fleet.state("link")) and "no such port" in link.reason, "it says what is missing")
     fleet.simulate(f"red:raspberry_pi:pty:{tmp_path / 'tty'}")
@@ -633,7 +633,7 @@ def test_a_link_that_is_not_there_yet_is_waited_for(fleet: Fleet, tmp_path: Path
     assert gateway.end() == 0
 
 
-def test_a_signal_while_nothing_is_connected_ends_at_once(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_signal_while_nothing_is_connected_ends_at_once(fleet: FleetProcesses, tmp_path: Path) -> None:
     gateway = fleet.gateway(str(tmp_path / "tty"), "--retry")
     wait_for(lambda: fleet.state("link"), "it runs")
     assert gateway.end(signal.SIGINT) == 1, gateway.stderr
@@ -641,7 +641,7 @@ def test_a_signal_while_nothing_is_connected_ends_at_once(fleet: Fleet, tmp_path
     assert words in gateway.stderr, "the one before may have left it driving"
 
 
-def test_it_imports_nothing_that_it_does_not_need(fleet: Fleet, tcp_car: TcpCar) -> None:
+def test_it_imports_nothing_that_it_does_not_need(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     code = (
         "import sys\nfrom gateway.cli import main\n"
         "try:\n    main()\nfinally:\n    import json\n"
@@ -656,7 +656,7 @@ def test_it_imports_nothing_that_it_does_not_need(fleet: Fleet, tcp_car: TcpCar)
     assert not loaded & {"click", "pydantic", "rich", "mcap", "rerun", "yaml", "fleet", "serial", "numpy", "pyarrow"}
 
 
-def test_a_gateway_ends_with_its_starter(fleet: Fleet) -> None:
+def test_a_gateway_ends_with_its_starter(fleet: FleetProcesses) -> None:
     """Killed without a word, a supervisor leaves gateways that stop their cars and end."""
     sim, (link,) = fleet.simulate("red:arduino:pty")
     arguments = ["-m", "gateway.cli", "run", "--car", "red", "--link", link, "--platform", "arduino", "--with-parent"]

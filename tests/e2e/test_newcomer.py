@@ -25,7 +25,7 @@ def blocks() -> tuple[list[str], list[str]]:
     return first.splitlines(), second.splitlines()
 
 
-class Terminal:
+class NewcomersTerminal:
     """A shell in the clone: each command is a line of the README, and must succeed."""
 
     def __init__(self, clone: Path, environment: dict[str, str]) -> None:
@@ -56,7 +56,11 @@ def walk(clone: Path, tmp_path: Path) -> None:
     first, second = blocks()
     assert first[0].startswith("git clone "), "what the copy stands for"
     assert first[1] == "cd zenoh-car-fleet"
-    terminal, other, log = Terminal(clone, environment), Terminal(clone, environment), tmp_path / "up.txt"
+    terminal, other, log = (
+        NewcomersTerminal(clone, environment),
+        NewcomersTerminal(clone, environment),
+        tmp_path / "up.txt",
+    )
     for command in first[2:-1]:
         terminal.run(command)
     up = terminal.start(first[-1], log)

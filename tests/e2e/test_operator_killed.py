@@ -4,10 +4,10 @@ And + 1 s where only its token told (issue 4, "Done when"). The simulator's trut
 """
 
 from tests.support.kills import BUSY_S, kill_operators
-from tests.support.processes import Fleet
+from tests.support.processes import FleetProcesses
 
 
-def test_a_killed_operator_stops_its_car(fleet: Fleet) -> None:
+def test_a_killed_operator_stops_its_car(fleet: FleetProcesses) -> None:
     took = kill_operators(fleet)
     late = {case: found for case, found in took.items() if found.took_s > found.limit_s + BUSY_S}
     assert not late, late

@@ -11,7 +11,7 @@ import pytest
 from tests.support.kills import BUSY_S
 from tests.support.lossless import hub_killed, recorder_killed
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet
+from tests.support.processes import FleetProcesses
 
 RARELY_HZ = 5.0
 """So that publishers hold fifty seconds: on a busy machine a hub alone may take ten to start."""
@@ -19,7 +19,7 @@ RARELY_HZ = 5.0
 
 @pytest.mark.timeout(240)
 def test_of_a_hub_that_is_killed_nothing_is_lost_and_nothing_comes_twice(tmp_path: Path) -> None:
-    fleet = Fleet(free_endpoint(), tmp_path)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         hub_killed(fleet, tmp_path / "sessions", cars=10, times=3, chance=random.Random(6), rate_hz=RARELY_HZ)
     finally:
@@ -28,7 +28,7 @@ def test_of_a_hub_that_is_killed_nothing_is_lost_and_nothing_comes_twice(tmp_pat
 
 @pytest.mark.timeout(240)
 def test_of_a_recorder_that_is_killed_the_last_second_is_missing_and_the_next_one_has_it(tmp_path: Path) -> None:
-    fleet = Fleet(free_endpoint(), tmp_path)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         recorder_killed(fleet, tmp_path / "sessions", cars=10, times=5, chance=random.Random(7), slack_s=BUSY_S)
     finally:

@@ -6,14 +6,14 @@ from typing import Any
 
 from schemas import bus
 from tests.support.judge import Judge
-from tests.support.processes import Fleet, wait_for
+from tests.support.processes import FleetProcesses, wait_for
 from tests.support.tap import Tap
 
 
 class Records:
     """Every record of commands and events, as a subscriber gets them."""
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: FleetProcesses) -> None:
         self.events: list[Any] = []
         self.logs: list[Any] = []
         fleet.bus.subscribe("fleet/red/event/command", lambda sample: self.events.append(sample.message()))
@@ -22,7 +22,7 @@ class Records:
     def phases(self, identity: str) -> list[str]:
         return [event.phase for event in self.events if event.id == identity]
 
-    def recall(self, fleet: Fleet) -> None:
+    def recall(self, fleet: FleetProcesses) -> None:
         """As whoever came back to the bus later than the gateway: ask for what was told."""
         for sample in fleet.bus.recall("fleet/red/event/log", 30.0):
             self.logs.append(bus.sample_of(sample).message())
@@ -31,7 +31,7 @@ class Records:
         return [log.name.removeprefix("red ") for log in self.logs]
 
 
-def test_a_gateway_that_slept_longer_than_the_bus_waits_tells_of_it(fleet: Fleet) -> None:
+def test_a_gateway_that_slept_longer_than_the_bus_waits_tells_of_it(fleet: FleetProcesses) -> None:
     records, judge = Records(fleet), Judge.follow(fleet.bus)
     _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
     gateway = fleet.gateway(link)
@@ -46,7 +46,7 @@ def test_a_gateway_that_slept_longer_than_the_bus_waits_tells_of_it(fleet: Fleet
     wait_for(lambda: not judge.driving, "it stands")  # the car's own word comes another way
 
 
-def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(fleet: Fleet) -> None:
+def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(fleet: FleetProcesses) -> None:
     _, (link,) = fleet.simulate("red:arduino:tcp")
     tap = Tap(link)
     try:

@@ -15,7 +15,7 @@ from tests.support.foreign_cars import MODES, STANDS_S, ForeignLot, gaps, report
 from tests.support.gap_proxy import ByteGap, GapDirection
 from tests.support.kills import BUSY_S
 from tests.support.ports import free_endpoint
-from tests.support.processes import TAKEN, Fleet, wait_for
+from tests.support.processes import TAKEN, FleetProcesses, wait_for
 from tests.support.up import Up
 
 
@@ -64,7 +64,7 @@ def test_a_gateway_that_is_told_to_end_has_stopped_its_car_or_says_that_it_has_n
 
 @pytest.mark.timeout(240)
 def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_stand_or_a_second_ctrl_c(
-    tmp_path: Path, fleet: Fleet
+    tmp_path: Path, fleet: FleetProcesses
 ) -> None:
     """The wires pass what the cars send, and lose all that is written: red's for some seconds, blue's for good.
 
@@ -107,7 +107,7 @@ def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_s
 
 
 @pytest.mark.timeout(240)
-def test_fleet_down_says_stopped_of_cars_that_stand(tmp_path: Path, fleet: Fleet) -> None:
+def test_fleet_down_says_stopped_of_cars_that_stand(tmp_path: Path, fleet: FleetProcesses) -> None:
     modes = ["manual", "tracking", "obstacle_avoidance", "remote_control"]
     endpoint = free_endpoint()
     cars = start(fleet, modes, seed=30)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.support.ports import free_endpoint
-from tests.support.processes import LONG_S, Fleet, Process, driving, wait_for
+from tests.support.processes import LONG_S, FleetProcesses, GatewayProcess, driving, wait_for
 
 SCRIPT = """
 import sys, time
@@ -35,7 +35,7 @@ LONG = f"{LONG_S:g}s"
 class Record:
     """What is published of commands and events while a test runs."""
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: FleetProcesses) -> None:
         self._lock = threading.Lock()
         self._events: list[Any] = []
         self._logs: list[Any] = []
@@ -62,26 +62,26 @@ class Record:
 
 
 @pytest.fixture
-def sim(fleet: Fleet) -> Process:
+def sim(fleet: FleetProcesses) -> GatewayProcess:
     started, (red,) = fleet.simulate("red:arduino:tcp")
     fleet.gateway(red, "--longest-drive", f"{LONG_S:g}")
     fleet.ready()
     return started
 
 
-def operator(fleet: Fleet, who: str, *arguments: str) -> Process:
+def operator(fleet: FleetProcesses, who: str, *arguments: str) -> GatewayProcess:
     """A person's command line."""
     fleet.environment["LOGNAME"] = who
     return fleet.start("-m", "fleet.cli", *arguments)
 
 
-def ended(process: Process) -> tuple[int, str]:
+def ended(process: GatewayProcess) -> tuple[int, str]:
     """Its exit code and what it said of it; a success says it on stdout."""
     code = process.wait()
     return code, (process.stderr or "\n".join(process.lines())).strip()
 
 
-def listed(fleet: Fleet) -> dict[str, Any]:
+def listed(fleet: FleetProcesses) -> dict[str, Any]:
     """The car as `fleet list --json` shows it."""
     process = operator(fleet, "eve", "list", "--json")
     assert process.wait() == 0, process.stderr
@@ -89,13 +89,13 @@ def listed(fleet: Fleet) -> dict[str, Any]:
     return row
 
 
-def drives(fleet: Fleet, who: str, car: str = "red") -> bool:
+def drives(fleet: FleetProcesses, who: str, car: str = "red") -> bool:
     """Return True if the gateway says that the motion is theirs."""
     motion = fleet.state("motion", car)
     return motion is not None and motion.owner.startswith(who)
 
 
-def test_on_the_command_line(fleet: Fleet, sim: Process) -> None:
+def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     record = Record(fleet)
     ann = operator(fleet, "ann", "drive", "red", "forward", "--for", LONG)
     wait_for(lambda: drives(fleet, "ann@"), "ann drives")
@@ -140,9 +140,9 @@ def test_on_the_command_line(fleet: Fleet, sim: Process) -> None:
 
 
 @pytest.fixture(scope="module")
-def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses]:
     """Three cars, one for each thing that moves a car."""
-    fleet = Fleet(free_endpoint(), tmp_path_factory.mktemp("several"))
+    fleet = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("several"))
     try:
         names = ("red", "green", "blue")
         _, links = fleet.simulate(*(f"{car}:arduino:tcp" for car in names))
@@ -156,7 +156,7 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
 @pytest.mark.parametrize(
     ("car", "verb", "more"), [("red", "mode", ("tracking",)), ("green", "servo", ("front", "90")), ("blue", "fan", ())]
 )
-def test_what_moves_a_car_can_be_taken(several: Fleet, car: str, verb: str, more: tuple[str, ...]) -> None:
+def test_what_moves_a_car_can_be_taken(several: FleetProcesses, car: str, verb: str, more: tuple[str, ...]) -> None:
     several.ready(car)
     ann = operator(several, "ann", "drive", car, "forward", "--for", LONG)
     wait_for(lambda: drives(several, "ann@", car), "ann drives")
@@ -168,7 +168,7 @@ def test_what_moves_a_car_can_be_taken(several: Fleet, car: str, verb: str, more
     assert "by bob@" in words
 
 
-def test_a_person_and_a_script(fleet: Fleet, sim: Process) -> None:
+def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     record = Record(fleet)
     script = fleet.start("-c", SCRIPT)
     wait_for(lambda: drives(fleet, "bot"), "the script drives")
@@ -191,7 +191,7 @@ def test_a_person_and_a_script(fleet: Fleet, sim: Process) -> None:
     assert taken.endswith("from bot (script)")
 
 
-def test_a_script_that_is_killed_leaves_no_car_driving_and_no_lease(fleet: Fleet, sim: Process) -> None:
+def test_a_script_that_is_killed_leaves_no_car_driving_and_no_lease(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     script = fleet.start("-c", SCRIPT.replace('drive("spin_left", 0.5)', 'drive("spin_left", 10)'))
     wait_for(lambda: drives(fleet, "bot") and driving(sim), "the script drives")
     script.kill()

@@ -17,7 +17,7 @@ import pytest
 from fleet.supervisor.service import ask_status
 from schemas import bus
 from tests.support.ports import free_endpoint, free_port
-from tests.support.processes import PATIENCE_S, TAKEN, Fleet, driving, wait_for
+from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, wait_for
 from tests.support.up import Up, fleet_command
 
 IN_ITS_PLACE_S = 9.5
@@ -227,7 +227,7 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
         reader.join()
 
 
-def test_a_car_that_is_off_holds_up_nobody_and_costs_no_restart(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_car_that_is_off_holds_up_nobody_and_costs_no_restart(fleet: FleetProcesses, tmp_path: Path) -> None:
     _, (link,) = fleet.simulate("red:arduino:tcp")
     off = f"tcp://127.0.0.1:{free_port()}"
     file = _file(tmp_path, blue=off, red=link)
@@ -243,7 +243,7 @@ def test_a_car_that_is_off_holds_up_nobody_and_costs_no_restart(fleet: Fleet, tm
         assert started.state("@hub").state == "elsewhere"
 
 
-def test_killed_its_cars_are_stopped(fleet: Fleet, tmp_path: Path) -> None:
+def test_killed_its_cars_are_stopped(fleet: FleetProcesses, tmp_path: Path) -> None:
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link))) as started:
         started.ready("red")
@@ -258,7 +258,7 @@ def test_killed_its_cars_are_stopped(fleet: Fleet, tmp_path: Path) -> None:
 
 
 def test_the_end_stops_cars_whose_gateways_hang_or_were_killed_and_says_which_it_could_not(
-    fleet: Fleet, tmp_path: Path
+    fleet: FleetProcesses, tmp_path: Path
 ) -> None:
     sims = {car: fleet.simulate(f"{car}:arduino:tcp") for car in ("red", "green", "blue")}
     file = _file(tmp_path, **{car: link for car, (_, (link,)) in sims.items()})
@@ -291,7 +291,7 @@ def test_the_end_stops_cars_whose_gateways_hang_or_were_killed_and_says_which_it
 
 
 def test_a_car_that_cannot_be_reached_at_the_end_is_told_by_fresh_gateways_until_it_is_stopped(
-    fleet: Fleet, tmp_path: Path
+    fleet: FleetProcesses, tmp_path: Path
 ) -> None:
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--no-record") as started:
@@ -309,7 +309,7 @@ def test_a_car_that_cannot_be_reached_at_the_end_is_told_by_fresh_gateways_until
         assert started.process.wait() == 0
 
 
-def test_fleet_down_names_the_car_that_was_not_stopped_and_fails(fleet: Fleet, tmp_path: Path) -> None:
+def test_fleet_down_names_the_car_that_was_not_stopped_and_fails(fleet: FleetProcesses, tmp_path: Path) -> None:
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     with Up(tmp_path, fleet.endpoint, str(_file(tmp_path, red=link)), "--no-record") as started:
         started.ready("red")
@@ -345,7 +345,7 @@ def test_no_path_of_a_killed_simulator_is_left_to_lead_to_somebody_elses_car(tmp
         assert not [each for each in run.glob("*.tty") if each.is_symlink()]
 
 
-def test_a_car_that_is_taken_out_is_stopped_though_its_gateway_hangs(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_car_that_is_taken_out_is_stopped_though_its_gateway_hangs(fleet: FleetProcesses, tmp_path: Path) -> None:
     sim, links = fleet.simulate("red:arduino:tcp", "green:arduino:tcp")
     file = _file(tmp_path, red=links[0], green=links[1])
     with Up(tmp_path, fleet.endpoint, str(file), "--no-record") as started:
@@ -362,7 +362,7 @@ def test_a_car_that_is_taken_out_is_stopped_though_its_gateway_hangs(fleet: Flee
         wait_for(lambda: started.state("green") is None, "its gateway has ended")
 
 
-def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: Fleet, tmp_path: Path) -> None:
+def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: FleetProcesses, tmp_path: Path) -> None:
     _, links = fleet.simulate("red:arduino:tcp", "green:arduino:tcp", "blue:arduino:tcp")
     red, green, blue = links
     file = _file(tmp_path, red=red, green=green)

@@ -9,12 +9,12 @@ import pytest
 
 from fleet.client.outcome import NotCarriedOut, Outcome
 from tests.support.ports import free_endpoint
-from tests.support.processes import LONG_S, Fleet, Process, wait_for
+from tests.support.processes import LONG_S, FleetProcesses, GatewayProcess, wait_for
 
 CARS = {"red": "arduino", "green": "raspberry_pi", "blue": "raspberry_pi"}
 
 
-class Cars(Fleet):
+class Cars(FleetProcesses):
     """Red, green and blue."""
 
     def __init__(self, endpoint: str, directory: Path) -> None:
@@ -23,11 +23,11 @@ class Cars(Fleet):
         specs = (f"{car}:{platform}:pty:{directory / car}.tty" for car, platform in CARS.items())
         self.sim, links = self.simulate(*specs)
         self.links = dict(zip(CARS, links, strict=True))
-        self.gateways: dict[str, Process] = {car: self.serve(car) for car in CARS}
+        self.gateways: dict[str, GatewayProcess] = {car: self.serve(car) for car in CARS}
         for car in CARS:
             self.ready(car)
 
-    def serve(self, car: str) -> Process:
+    def serve(self, car: str) -> GatewayProcess:
         """Start the gateway of a car."""
         return self.gateway(self.links[car], "--longest-drive", f"{LONG_S:g}", car=car, platform=CARS[car])
 

@@ -1,7 +1,7 @@
 """Search for a stop that is claimed and false: the real control, a simulated car, and a link that fails at random.
 
 One episode: a car is brought into a state, the link fails around a stop, and the car's true motors judge what control
-claims. `Plan` is all that is random about an episode, so a failure can be shrunk to the faults that it needs.
+claims. `EpisodePlan` is all that is random about an episode, so a failure can be shrunk to the faults that it needs.
 Everything runs on virtual time.
 """
 
@@ -80,7 +80,7 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class LinkFault:
     """One failure of the link, s from the stop."""
 
     kind: Kind
@@ -110,7 +110,7 @@ class Ending(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class EpisodePlan:
     """All that is random about one episode."""
 
     seed: int
@@ -121,7 +121,7 @@ class Plan:
     """`rest`, `drive`, `steer`, `acts`, or a mode."""
     load_s: float
     ending: Ending
-    faults: tuple[Fault, ...]
+    faults: tuple[LinkFault, ...]
     opening: bool = False
     """The stop comes `load_s` after the frame that opens the mode, else so long after the mode is open."""
     report_every_s: float = 0.9
@@ -139,7 +139,7 @@ class Plan:
 class Report:
     """What one episode showed."""
 
-    plan: Plan
+    plan: EpisodePlan
     violations: list[str] = field(default_factory=list)
     ends: Counter[str] = field(default_factory=Counter)
     """How stops ended, by what they rest on."""
@@ -149,89 +149,91 @@ class Report:
     wedged: bool = False
 
 
-def draw(seed: int) -> Plan:
+def draw(seed: int) -> EpisodePlan:
     """Return an episode: every other one of a theme that is known to be hard, the others of anything."""
     moments = random.Random(f"episode {seed}")
     return _any(seed, moments) if seed % 2 else THEMES[seed // 2 % len(THEMES)](seed, moments)
 
 
-def _theme(seed: int, load: str, load_s: float, faults: tuple[Fault, ...], **more: Any) -> Plan:
+def _theme(seed: int, load: str, load_s: float, faults: tuple[LinkFault, ...], **more: Any) -> EpisodePlan:
     world, ending = more.pop("world", "echo"), more.pop("ending", Ending.STOP)
-    return Plan(seed, "arduino", "arduino", world, load, load_s, ending, faults, **more)
+    return EpisodePlan(seed, "arduino", "arduino", world, load, load_s, ending, faults, **more)
 
 
-def _report_swallowed(seed: int, moments: random.Random) -> Plan:
+def _report_swallowed(seed: int, moments: random.Random) -> EpisodePlan:
     """The link swallows the stop and the report after it, so that the reports pause as if it had been obeyed."""
-    gap = Fault(Kind.DEAD, Way.BOTH, moments.uniform(-0.2, 0.0), moments.uniform(0.5, 1.9))
+    gap = LinkFault(Kind.DEAD, Way.BOTH, moments.uniform(-0.2, 0.0), moments.uniform(0.5, 1.9))
     return _theme(
         seed, moments.choice(["drive", "steer"]), moments.uniform(0.5, 4.0), (gap,),
         report_every_s=moments.uniform(0.93, 1.0), ending=moments.choice([Ending.STOP, Ending.STOP, Ending.SHUTDOWN]),
     )  # fmt: skip
 
 
-def _digit_lost(seed: int, moments: random.Random) -> Plan:
+def _digit_lost(seed: int, moments: random.Random) -> EpisodePlan:
     """`MODE00` loses a digit: it opens mode 0, with the motors on. What follows is lost."""
-    lost = Fault(Kind.DEAD, Way.TO_CAR, moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S)
-    later = Fault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(1.0, 8.0))
+    lost = LinkFault(Kind.DEAD, Way.TO_CAR, moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S)
+    later = LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(1.0, 8.0))
     load = moments.choice(["tracking", "light_seeking", "following", "obstacle_avoidance", "color_led"])
     return _theme(seed, load, moments.uniform(0.5, 6.0), (lost, later), report_every_s=moments.uniform(0.9, 1.0))
 
 
-def _stop_while_opening(seed: int, moments: random.Random) -> Plan:
+def _stop_while_opening(seed: int, moments: random.Random) -> EpisodePlan:
     """Old reports come late while a silent mode opens, and the stop is lost."""
-    slow = Fault(Kind.SLOW, Way.TO_HOST, -3.0, 30.0, delay_s=1.2)  # in two steps: a gap of 3 s would show
-    slower = Fault(Kind.SLOW, Way.TO_HOST, -1.5, 28.5, delay_s=moments.uniform(1.8, 2.5))
-    lost = Fault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
+    slow = LinkFault(Kind.SLOW, Way.TO_HOST, -3.0, 30.0, delay_s=1.2)  # in two steps: a gap of 3 s would show
+    slower = LinkFault(Kind.SLOW, Way.TO_HOST, -1.5, 28.5, delay_s=moments.uniform(1.8, 2.5))
+    lost = LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
     load_s = moments.uniform(0.05, 0.4)
     return _theme(seed, "obstacle_avoidance", load_s, (slow, slower, lost), opening=True, early=True)
 
 
-def _mode_over_a_lost_stop(seed: int, moments: random.Random) -> Plan:
+def _mode_over_a_lost_stop(seed: int, moments: random.Random) -> EpisodePlan:
     """Without an echo nothing shows the stop before a mode. That stop, the opening and the next stop are lost."""
     load_s = moments.uniform(0.1, 2.0)
-    lost = Fault(Kind.DEAD, Way.TO_CAR, -load_s - 0.01, moments.uniform(12.0, 20.0))
-    unheard = Fault(Kind.DEAD, Way.TO_HOST, moments.uniform(-1.0, 0.5), moments.uniform(1.0, 2.5))
+    lost = LinkFault(Kind.DEAD, Way.TO_CAR, -load_s - 0.01, moments.uniform(12.0, 20.0))
+    unheard = LinkFault(Kind.DEAD, Way.TO_HOST, moments.uniform(-1.0, 0.5), moments.uniform(1.0, 2.5))
     return _theme(
         seed, moments.choice(["obstacle_avoidance", "color_led", "remote_control"]), load_s, (lost, unheard),
         world=moments.choice(["no-echo", "no-echo", "flickering"]), opening=True, early=True, driven=True,
     )  # fmt: skip
 
 
-def _half_a_frame(seed: int, moments: random.Random) -> Plan:
+def _half_a_frame(seed: int, moments: random.Random) -> EpisodePlan:
     """The first frame of the stop is cut, so what follows is read behind it; later tries are lost."""
-    cut = Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(1, 18) / BYTES_PER_S, 0.03)
-    later = Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(1.3, 1.9), moments.uniform(6.0, 15.0))
+    cut = LinkFault(Kind.DEAD, Way.TO_CAR, moments.uniform(1, 18) / BYTES_PER_S, 0.03)
+    later = LinkFault(Kind.DEAD, Way.TO_CAR, moments.uniform(1.3, 1.9), moments.uniform(6.0, 15.0))
     load = moments.choice(["steer", "steer", "tracking", "light_seeking", "acts"])
     return _theme(seed, load, moments.uniform(0.5, 4.0), (cut, later) if moments.random() < 0.7 else (cut,))
 
 
-def _short_gap(seed: int, moments: random.Random) -> Plan:
+def _short_gap(seed: int, moments: random.Random) -> EpisodePlan:
     """The fault that began this: 0.6 s of bytes swallowed around a stop, in any mode."""
-    gap = Fault(Kind.DEAD, moments.choice(list(Way)), moments.uniform(-0.5, 0.0), moments.uniform(0.3, 6.0))
+    gap = LinkFault(Kind.DEAD, moments.choice(list(Way)), moments.uniform(-0.5, 0.0), moments.uniform(0.3, 6.0))
     load = moments.choice(["drive", *(mode.value for mode in Mode if mode is not Mode.MANUAL)])
     ending = moments.choice([Ending.STOP, Ending.STOP, Ending.SHUTDOWN, Ending.MANUAL])
     return _theme(seed, load, moments.uniform(0.5, 9.0), (gap,), ending=ending)
 
 
-def _damaged_reports(seed: int, moments: random.Random) -> Plan:
+def _damaged_reports(seed: int, moments: random.Random) -> EpisodePlan:
     """The stop is lost, and the link drops digits of the car's frames, so that some look like reports of mode 0."""
-    lossy = Fault(Kind.LOSSY, Way.TO_HOST, -0.1, moments.uniform(3.0, 9.0), share=moments.choice([0.01, 0.02, 0.04]))
-    lost = Fault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(1.0, 8.0))
+    lossy = LinkFault(
+        Kind.LOSSY, Way.TO_HOST, -0.1, moments.uniform(3.0, 9.0), share=moments.choice([0.01, 0.02, 0.04])
+    )
+    lost = LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(1.0, 8.0))
     return _theme(seed, moments.choice(["light_seeking", "following"]), moments.uniform(0.5, 6.0), (lossy, lost))
 
 
-def _misread_and_lost(seed: int, moments: random.Random) -> Plan:
+def _misread_and_lost(seed: int, moments: random.Random) -> EpisodePlan:
     """Half a general frame and `MODE00` in one string open a silent mode while driving. Later tries are lost."""
-    cut = Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(2, 18) / BYTES_PER_S, 0.03)
-    later = Fault(Kind.DEAD, Way.TO_CAR, 1.5, moments.uniform(9.0, 15.0))
+    cut = LinkFault(Kind.DEAD, Way.TO_CAR, moments.uniform(2, 18) / BYTES_PER_S, 0.03)
+    later = LinkFault(Kind.DEAD, Way.TO_CAR, 1.5, moments.uniform(9.0, 15.0))
     again_s = moments.uniform(0.02, 0.2) if moments.random() < 0.5 else 0.0
     return _theme(seed, "steer", moments.uniform(0.5, 4.0), (cut, later), again_s=again_s)
 
 
-def _driven_over(seed: int, moments: random.Random) -> Plan:
+def _driven_over(seed: int, moments: random.Random) -> EpisodePlan:
     """Nothing shows the stop, since the link is mute or the car hears nothing; then somebody drives all the same."""
     way = moments.choice([Way.TO_CAR, Way.TO_CAR, Way.TO_HOST])
-    fault = Fault(Kind.DEAD, way, -0.1, moments.uniform(14.0, 24.0))
+    fault = LinkFault(Kind.DEAD, way, -0.1, moments.uniform(14.0, 24.0))
     return _theme(
         seed, "drive", 1.0, (fault,), again_s=moments.uniform(2.0, 6.0), drive_again_s=moments.uniform(10.0, 16.0)
     )  # fmt: skip
@@ -250,7 +252,7 @@ THEMES = (
 )
 
 
-def _any(seed: int, moments: random.Random) -> Plan:
+def _any(seed: int, moments: random.Random) -> EpisodePlan:
     platform, told = moments.choices(
         [
             ("arduino", "arduino"),
@@ -277,7 +279,7 @@ def _any(seed: int, moments: random.Random) -> Plan:
     if load in ("drive", "steer"):
         endings += [Ending.EXPIRY, Ending.RELEASE, Ending.LOST_SENDER]
     opening = load in modes and moments.random() < 0.25
-    return Plan(
+    return EpisodePlan(
         seed,
         platform,
         told,
@@ -304,31 +306,33 @@ _FRAME_S = 12 / BYTES_PER_S
 """`$4WD,MODE00#` on the wire."""
 
 
-def _faults(moments: random.Random) -> tuple[Fault, ...]:
+def _faults(moments: random.Random) -> tuple[LinkFault, ...]:
     """Return faults: half of the time one that hits the stop itself, else any."""
     chance = moments.random()
     if chance < 0.25:  # a gap around the stop
         for_s = 0.1 * 60 ** moments.random()
-        return (Fault(Kind.DEAD, moments.choice(list(Way)), moments.uniform(-min(for_s, 1.0), 0.1), for_s),)
+        return (LinkFault(Kind.DEAD, moments.choice(list(Way)), moments.uniform(-min(for_s, 1.0), 0.1), for_s),)
     if chance < 0.45:  # the stop's first frame is cut, or lacks bytes
         at_s = moments.uniform(0.0, _FRAME_S)
         for_s = moments.choice([1 / BYTES_PER_S, 2 / BYTES_PER_S, 0.02 * 100 ** moments.random()])
-        cut = Fault(Kind.DEAD, moments.choice([Way.TO_CAR, Way.TO_CAR, Way.BOTH]), at_s, for_s)
+        cut = LinkFault(Kind.DEAD, moments.choice([Way.TO_CAR, Way.TO_CAR, Way.BOTH]), at_s, for_s)
         return (cut, _fault(moments)) if moments.random() < 0.3 else (cut,)
     if chance < 0.55:  # the car's frames are damaged, and the stop is lost
-        lossy = Fault(Kind.LOSSY, Way.TO_HOST, -0.5, moments.uniform(1.0, 9.0), share=moments.choice([0.02, 0.05, 0.1]))
-        return (lossy, Fault(Kind.DEAD, Way.TO_CAR, moments.uniform(-0.3, 0.01), moments.uniform(0.1, 6.0)))
+        lossy = LinkFault(
+            Kind.LOSSY, Way.TO_HOST, -0.5, moments.uniform(1.0, 9.0), share=moments.choice([0.02, 0.05, 0.1])
+        )
+        return (lossy, LinkFault(Kind.DEAD, Way.TO_CAR, moments.uniform(-0.3, 0.01), moments.uniform(0.1, 6.0)))
     if chance < 0.6:  # old reports come late, and the stop is lost
-        slow = Fault(Kind.SLOW, Way.TO_HOST, -4.0, 30.0, delay_s=moments.uniform(0.5, 1.5))
-        return (slow, Fault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(0.05, 3.0)))
+        slow = LinkFault(Kind.SLOW, Way.TO_HOST, -4.0, 30.0, delay_s=moments.uniform(0.5, 1.5))
+        return (slow, LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(0.05, 3.0)))
     return tuple(_fault(moments) for _ in range(moments.choices([1, 2, 3], [5, 3, 1])[0]))
 
 
-def _fault(moments: random.Random) -> Fault:
+def _fault(moments: random.Random) -> LinkFault:
     for_s = 0.05 * 400 ** moments.random()  # 0.05 to 20 s, short ones as often as long ones
     at_s = moments.uniform(-min(for_s, 4.0), 2.5)
     kind = moments.choices(list(Kind), [8, 4, 2, 2, 1])[0]
-    return Fault(
+    return LinkFault(
         kind,
         moments.choice(list(Way)),
         at_s,
@@ -338,10 +342,10 @@ def _fault(moments: random.Random) -> Fault:
     )
 
 
-class Direction:
+class SearchedDirection:
     """One direction of the link: pieces of bytes go in, later and fewer come out."""
 
-    def __init__(self, faults: Sequence[Fault], moments: random.Random) -> None:
+    def __init__(self, faults: Sequence[LinkFault], moments: random.Random) -> None:
         self._faults = faults
         self._moments = moments
         self._held: deque[tuple[float, bytes]] = deque()
@@ -391,7 +395,7 @@ class Direction:
 class Episode:
     """Plays one plan."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: EpisodePlan) -> None:
         self.plan = plan
         moments = self._moments = random.Random(f"chances {plan.seed}")
         self.report = Report(plan)
@@ -406,7 +410,7 @@ class Episode:
         """When the stop is asked."""
         down = [fault for fault in plan.faults if fault.way is not Way.TO_HOST]
         up = [fault for fault in plan.faults if fault.way is not Way.TO_CAR]
-        self._down, self._up = Direction(down, moments), Direction(up, moments)
+        self._down, self._up = SearchedDirection(down, moments), SearchedDirection(up, moments)
         self.whole_s = max((fault.end_s for fault in plan.faults), default=0.0)
         self._next_tick = 0.0
         self._linked = False
@@ -826,11 +830,11 @@ def play(seed: int) -> Report:
         raise
 
 
-def shrink(plan: Plan) -> Plan:
+def shrink(plan: EpisodePlan) -> EpisodePlan:
     """Return the plan without the faults and second acts that its violations do not need."""
     wanted = {words[:3] for words in Episode(plan).play().violations}
 
-    def fails(candidate: Plan) -> bool:
+    def fails(candidate: EpisodePlan) -> bool:
         return bool(wanted & {words[:3] for words in Episode(candidate).play().violations})
 
     smaller = True

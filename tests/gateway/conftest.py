@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.processes import Process
+from tests.support.processes import GatewayProcess
 
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
-Started = Callable[..., Process]
+Started = Callable[..., GatewayProcess]
 PATIENCE_S = 60
 
 
@@ -37,11 +37,11 @@ def command() -> Command:
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Started]:
     """Start `gateway ...`; what still runs at the end is ended."""
-    started: list[Process] = []
+    started: list[GatewayProcess] = []
 
-    def begin(*arguments: str | Path) -> Process:
+    def begin(*arguments: str | Path) -> GatewayProcess:
         log = tmp_path / f"{len(started)}.log"
-        started.append(Process(["-m", "gateway.cli", *map(str, arguments)], log, {}))
+        started.append(GatewayProcess(["-m", "gateway.cli", *map(str, arguments)], log, {}))
         return started[-1]
 
     yield begin
@@ -52,10 +52,10 @@ def start(tmp_path: Path) -> Iterator[Started]:
 
 
 @pytest.fixture
-def simulate(start: Started) -> Callable[..., tuple[Process, list[str]]]:
+def simulate(start: Started) -> Callable[..., tuple[GatewayProcess, list[str]]]:
     """Simulated cars (NAME:PLATFORM:LINK), and their links."""
 
-    def begin(*cars: str) -> tuple[Process, list[str]]:
+    def begin(*cars: str) -> tuple[GatewayProcess, list[str]]:
         described = [word for car in cars for word in ("--car", car)]
         sim = start("sim", "--no-truth", "--seed", "3", *described)
         return sim, [sim.line()["link"] for _ in cars]

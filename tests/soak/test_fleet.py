@@ -14,7 +14,7 @@ from fleet.supervisor.spec import NAMES
 from tests.support.claims import KINDS, Claims
 from tests.support.ports import free_endpoint
 from tests.support.processes import wait_for
-from tests.support.roles import PLAN, Stage, unexplained
+from tests.support.roles import PLAN, RoleStage, unexplained
 from tests.support.troubled import Trouble
 from tests.support.up import Up
 
@@ -31,7 +31,7 @@ def test_ten_minutes_of_faults(tmp_path: Path) -> None:
     chance = random.Random(SEED)
     with Up(tmp_path, free_endpoint(), "--sim", "8", "--plan", str(plan)) as up:
         claims = Claims.follow(up.bus)
-        stage = Stage(up, chance)
+        stage = RoleStage(up, chance)
         stage.begin()
         print(f"\nseed {SEED}\n{'fault':24} {'filled':>7} {'limit':>6} {'in force':>9}")
         ends = time.monotonic() + SECONDS

@@ -20,7 +20,7 @@ from tests.support.kills import (
     stop_in_every_mode,
 )
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet
+from tests.support.processes import FleetProcesses
 
 ROUNDS = 5
 NO_ECHO_S = 1.0 + 1.1
@@ -28,12 +28,12 @@ NO_ECHO_S = 1.0 + 1.1
 be in the buffer."""
 
 
-def fleets(directory: Path, rounds: int) -> Iterator[Fleet]:
+def fleets(directory: Path, rounds: int) -> Iterator[FleetProcesses]:
     """A new fleet for each round."""
     for number in range(rounds):
         place = directory / str(number)
         place.mkdir()
-        fleet = Fleet(free_endpoint(), place)
+        fleet = FleetProcesses(free_endpoint(), place)
         try:
             yield fleet
         finally:

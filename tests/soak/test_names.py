@@ -8,7 +8,7 @@ import pytest
 from fleet.coordinator.coordinator import AGAIN_S
 from fleet.coordinator.observer import FORGOTTEN_S, MOST_GONE
 from tests.support.ports import free_endpoint
-from tests.support.processes import PATIENCE_S, Fleet, wait_for
+from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 
 FLOODER = Path(__file__).parents[1] / "support" / "flooder.py"
 SECONDS = 10.0
@@ -18,7 +18,7 @@ PER_S = 1000.0
 @pytest.mark.soak
 @pytest.mark.parametrize("kind", ["names", "talkers"])
 def test_ten_thousand_names_in_ten_seconds(kind: str, tmp_path: Path) -> None:
-    fleet = Fleet(free_endpoint(), tmp_path)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         plan = tmp_path / "plan.yaml"
         plan.write_text("roles: {scout: {mode: manual}}\n")

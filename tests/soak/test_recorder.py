@@ -12,7 +12,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.support.lossless import ends_whole, hub_killed, recorder_killed
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet, wait_for
+from tests.support.processes import FleetProcesses, wait_for
 from tests.support.recording import Load, Recording
 
 CARS = 20
@@ -29,7 +29,7 @@ GROWN = 1.1
 
 @pytest.mark.soak
 def test_the_hub_killed_twenty_times(tmp_path: Path) -> None:
-    fleet = Fleet(free_endpoint(), tmp_path)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         told = hub_killed(fleet, tmp_path / "sessions", cars=CARS, times=20, chance=random.Random())
     finally:
@@ -40,7 +40,7 @@ def test_the_hub_killed_twenty_times(tmp_path: Path) -> None:
 @pytest.mark.soak
 def test_what_publishers_hold_is_had_again_however_long_the_hub_was_away(tmp_path: Path) -> None:
     """Of what comes twice a second a hundred seconds are held."""
-    fleet = Fleet(free_endpoint(), tmp_path)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         recording = Recording(fleet, tmp_path / "sessions")
         with Load(fleet.endpoint, CARS, rate_hz=2.0) as load:
@@ -58,7 +58,7 @@ def test_what_publishers_hold_is_had_again_however_long_the_hub_was_away(tmp_pat
 
 @pytest.mark.soak
 def test_the_recorder_killed_fifty_times(tmp_path: Path) -> None:
-    fleet = Fleet(free_endpoint(), tmp_path)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         told = recorder_killed(fleet, tmp_path / "sessions", cars=CARS, times=50, chance=random.Random())
     finally:
@@ -72,7 +72,7 @@ def test_the_recorder_killed_fifty_times(tmp_path: Path) -> None:
 
 @pytest.mark.soak
 def test_memory_is_flat_over_ten_million_messages(tmp_path: Path) -> None:
-    fleet = Fleet(free_endpoint(), tmp_path)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
     began = time.monotonic()
     try:
         recording = Recording(fleet, tmp_path / "sessions")

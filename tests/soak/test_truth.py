@@ -5,7 +5,7 @@ import time
 import pytest
 
 from gateway.protocol.enums import Mode
-from tests.support.normal import Run, normal
+from tests.support.normal import NormalRun, normal
 from tests.support.truth import WORLDS
 
 HOUR_S = 3600.0
@@ -18,7 +18,7 @@ PART_S = 10 * HOUR_S / len(WORLDS)
 @pytest.mark.parametrize("mode", Mode)
 def test_no_false_alarm_in_ten_hours(mode: Mode, world: str) -> None:
     began = time.process_time()
-    run = Run(world, seed=1)
+    run = NormalRun(world, seed=1)
     normal(run, mode, PART_S)
     cpu_s = time.process_time() - began
     print(

@@ -6,20 +6,20 @@ from pathlib import Path
 
 from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
-from tests.support.processes import Fleet, Process, wait_for
+from tests.support.processes import FleetProcesses, GatewayProcess, wait_for
 
 PLAN = "cars: {red: tracking}\n"
 
 
-def want_for_ever(fleet: Fleet, directory: Path, killed: Sequence[str]) -> list[float]:
+def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str]) -> list[float]:
     """When motors went on after the person's stop was complete, s: never. `killed`: what is, round by round."""
     plan = directory / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
 
-    def coordinate() -> Process:
+    def coordinate() -> GatewayProcess:
         return fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(plan), "--json")
 
-    def decided(process: Process, mode: str | None) -> None:
+    def decided(process: GatewayProcess, mode: str | None) -> None:
         while (line := process.line())["car"] is None or line["mode"] != mode:
             pass
 

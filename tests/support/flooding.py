@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.support.judge import Judge
-from tests.support.processes import TAKEN, Fleet, frames, wait_for
+from tests.support.processes import TAKEN, FleetProcesses, frames, wait_for
 from tests.support.tap import Tap
 
 PER_S: Final = 10_000
@@ -42,7 +42,7 @@ class Flooded:
     left_out: int = 0
 
 
-def flood(fleet: Fleet, *, seconds: float, stops: int) -> Flooded:
+def flood(fleet: FleetProcesses, *, seconds: float, stops: int) -> Flooded:
     """Three operators drive one car, each in its own direction every 0.3 ms; a fourth stops it now and then."""
     judge = Judge.follow(fleet.bus)
     _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)

@@ -18,7 +18,7 @@ from tests.support.gap_proxy import ByteGap, GapDirection, GapProxy
 from tests.support.judge import stamp_ns
 from tests.support.kills import BUSY_S
 from tests.support.ports import free_endpoint
-from tests.support.processes import TAKEN, Fleet, Process, wait_for
+from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, wait_for
 from tests.support.up import Up
 
 PROGRAM: Final = Path(__file__).parents[1] / "e2e" / "strangers_car.py"
@@ -93,7 +93,7 @@ class ForeignCar:
 
     mode: str
     """The mode in which it is stopped; also its name."""
-    process: Process
+    process: GatewayProcess
     wire: GapProxy
     truths: list[tuple[float, bool, int]] = field(default_factory=list)
     """When the motors or the mode changed."""
@@ -251,7 +251,7 @@ class ForeignCars:
     def __iter__(self) -> Iterator[ForeignCar]:
         return iter(self.cars)
 
-    def enter_modes(self, fleet: Fleet | Up) -> None:
+    def enter_modes(self, fleet: FleetProcesses | Up) -> None:
         """Bring each car into the mode in which it is to be stopped.
 
         A gap may have left half a general stop in the car's buffer, in which the first command is lost: ask twice.
@@ -284,7 +284,7 @@ class ForeignCars:
             car.wire.close()
 
 
-def _enter_mode(fleet: Fleet | Up, car: str) -> None:
+def _enter_mode(fleet: FleetProcesses | Up, car: str) -> None:
     if car == "manual":
         answer = fleet.ask("drive", car, motion="forward", duration_s=60)
     else:
@@ -292,7 +292,7 @@ def _enter_mode(fleet: Fleet | Up, car: str) -> None:
     assert answer["status"] in TAKEN, answer
 
 
-def start(fleet: Fleet, modes: list[str], seed: int) -> ForeignCars:
+def start(fleet: FleetProcesses, modes: list[str], seed: int) -> ForeignCars:
     """Start cars and wires, without gateways."""
     cars = []
     for number, mode in enumerate(modes):
@@ -305,11 +305,11 @@ class ForeignLot:
     """Seven cars, one for each mode, with their gateways."""
 
     def __init__(self, directory: Path) -> None:
-        self.fleet = Fleet(free_endpoint(), directory)
+        self.fleet = FleetProcesses(free_endpoint(), directory)
         self.cars = start(self.fleet, list(MODES), seed=1)
         for car in self.cars:
             car.follow(self.fleet.bus)
-        self.gateways: dict[str, Process] = {
+        self.gateways: dict[str, GatewayProcess] = {
             car.mode: self.fleet.gateway(car.wire.link, "--longest-drive", "60", car=car.mode) for car in self.cars
         }
 

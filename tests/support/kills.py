@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.support.judge import Judge
-from tests.support.processes import TAKEN, Fleet, Process, wait_for
+from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, wait_for
 from tests.support.tap import Tap
 
 BUSY_S: Final = 2.0
@@ -61,7 +61,7 @@ class Operator:
         also = f", {self.also[0]}" if self.also else ""
         return f"{self.platform}, {self.how} of {self.duration_s:g} s, {'token' if self.watched else 'no token'}{also}"
 
-    def start(self, fleet: Fleet) -> Process:
+    def start(self, fleet: FleetProcesses) -> GatewayProcess:
         """Begin to drive."""
         if self.how == "fleet drive":
             return fleet.start("-m", "fleet.cli", "drive", self.car, "forward", "--for", f"{self.duration_s:g}s")
@@ -88,7 +88,9 @@ OPERATORS: Final = (
 )
 
 
-def kill_operators(fleet: Fleet, operators: tuple[Operator, ...] = OPERATORS, world: str = "room") -> dict[str, Took]:
+def kill_operators(
+    fleet: FleetProcesses, operators: tuple[Operator, ...] = OPERATORS, world: str = "room"
+) -> dict[str, Took]:
     """All at once, each with a car of its own: how long each car went on after its operator's death."""
     judges = {each.car: Judge.follow(fleet.bus, each.car) for each in operators}
     _, links = fleet.simulate(*(f"{each.car}:{each.platform}:tcp" for each in operators), truth=True, world=world)
@@ -120,7 +122,7 @@ class Doing:
     what: str
     limit_s: float
 
-    def begin(self, fleet: Fleet, judge: Judge) -> None:
+    def begin(self, fleet: FleetProcesses, judge: Judge) -> None:
         """Bring the car to it."""
         if self.what.startswith("driving"):
             fleet.ask("drive", self.car, motion="forward", duration_s=10)
@@ -160,7 +162,7 @@ MORE_DOINGS: Final = (
 )
 
 
-def kill_gateways(fleet: Fleet, doings: tuple[Doing, ...] = DOINGS) -> dict[str, Took]:
+def kill_gateways(fleet: FleetProcesses, doings: tuple[Doing, ...] = DOINGS) -> dict[str, Took]:
     """Kill every car's gateway, then start new ones: how soon each begins, and how long the car goes on from there."""
     judges = {each.car: Judge.follow(fleet.bus, each.car) for each in doings}
     _, links = fleet.simulate(*(f"{each.car}:arduino:pty" for each in doings), truth=True)
@@ -197,7 +199,7 @@ def kill_gateways(fleet: Fleet, doings: tuple[Doing, ...] = DOINGS) -> dict[str,
 # ---------------------------------------------------------------------- links
 
 
-def cut_links(fleet: Fleet, directory: Path) -> dict[str, Took]:
+def cut_links(fleet: FleetProcesses, directory: Path) -> dict[str, Took]:
     """Cut the links of cars that drive, in three ways, then bring them back: as kill_gateways."""
     cuts = {"a": "pty closed", "b": "tcp reset", "c": "tcp stuck"}
     judges = {car: Judge.follow(fleet.bus, car) for car in cuts}
@@ -253,7 +255,7 @@ STOPPED: Final = {
 """A car for each mode, and one that knows only mode 0."""
 
 
-def stop_in_every_mode(fleet: Fleet, rounds: int, moments: random.Random) -> dict[str, list[Took]]:
+def stop_in_every_mode(fleet: FleetProcesses, rounds: int, moments: random.Random) -> dict[str, list[Took]]:
     """Ask `stop` at random moments, in each mode: how long the motors went on, and what the answer had announced."""
     cars = {what: f"car{number}" for number, what in enumerate(STOPPED)}
     judges = {what: Judge.follow(fleet.bus, car) for what, car in cars.items()}

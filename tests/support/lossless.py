@@ -12,7 +12,7 @@ from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.transform import recover
 from fleet.recording.tools.verify import verify
 from schemas.bus import BusError
-from tests.support.processes import Fleet, wait_for
+from tests.support.processes import FleetProcesses, wait_for
 from tests.support.recording import RATE_HZ, Load, Recording, faults, kill_hub, numbers
 
 SECOND_S = 1.0
@@ -36,7 +36,7 @@ class Told:
 
 
 def hub_killed(
-    fleet: Fleet, out: Path, *, cars: int, times: int, chance: random.Random, rate_hz: float = RATE_HZ
+    fleet: FleetProcesses, out: Path, *, cars: int, times: int, chance: random.Random, rate_hz: float = RATE_HZ
 ) -> Told:
     """Kill the hub so often: nothing is lost, nothing is there twice, and nothing is said to be."""
     recording = Recording(fleet, out)
@@ -55,7 +55,7 @@ def hub_killed(
     return Told(load.count(), sum(description.recovered.values()))
 
 
-def fleet_back(fleet: Fleet, cars: int) -> None:
+def fleet_back(fleet: FleetProcesses, cars: int) -> None:
     """Wait until every publisher is back at the hub: who answers holds what the recorder still asks for."""
 
     def answering() -> int:
@@ -73,7 +73,7 @@ def all_there(load: Load, sessions: list[Path]) -> None:
     wait_for(lambda: not faults(load, sessions)[0], "all that was published is recorded")
 
 
-def ends_whole(fleet: Fleet, load: Load, cars: int, recording: Recording, sessions: list[Path]) -> None:
+def ends_whole(fleet: FleetProcesses, load: Load, cars: int, recording: Recording, sessions: list[Path]) -> None:
     """End a load, and then its recording: nothing is lost, nothing is there twice, and nothing is said to be."""
     fleet_back(fleet, cars)
     load.rest()
@@ -84,7 +84,7 @@ def ends_whole(fleet: Fleet, load: Load, cars: int, recording: Recording, sessio
 
 
 def recorder_killed(
-    fleet: Fleet, out: Path, *, cars: int, times: int, chance: random.Random, slack_s: float = SLACK_S
+    fleet: FleetProcesses, out: Path, *, cars: int, times: int, chance: random.Random, slack_s: float = SLACK_S
 ) -> Told:
     """Kill the recorder so often, each time starting the next.
 

@@ -33,7 +33,7 @@ EXPECTED = frozenset({Reason.SUPERSEDED, Reason.EXPIRED, Reason.QUEUE_FULL, Reas
 MOTIONS = tuple(motion for motion in Motion if motion is not Motion.STOP)
 
 
-class Run:
+class NormalRun:
     """One car that nothing happens to, its link watched as a gateway watches it."""
 
     def __init__(
@@ -117,13 +117,13 @@ class Run:
             self.alarms.append(f"at {self.pair.now:.1f} s {words}; {self.pair.car.truth}")
 
 
-def _drives(run: Run) -> None:
+def _drives(run: NormalRun) -> None:
     for _ in range(run.moments.randint(1, 4)):
         run.ask(Drive(run.moments.choice(MOTIONS), 0.3 + 2.0 * run.moments.random()))
         run.run(2.5 * run.moments.random())
 
 
-def _joystick(run: Run) -> None:
+def _joystick(run: NormalRun) -> None:
     """A drive every 0.1 s, the motion now and then another."""
     motion = Motion.FORWARD
     for _ in range(run.moments.randint(5, 80)):
@@ -133,7 +133,7 @@ def _joystick(run: Run) -> None:
         run.run(0.1)
 
 
-def _acts(run: Run) -> None:
+def _acts(run: NormalRun) -> None:
     """One-shots of each kind, as fast as the queue takes them or slower."""
     one_shots: tuple[Action, ...] = (
         OneShot(General(Motion.STOP, whistle=True)),
@@ -149,14 +149,14 @@ def _acts(run: Run) -> None:
         run.run(run.moments.choice((0.0, 0.35, 1.0)) + 0.01)
 
 
-def _whistles(run: Run) -> None:
+def _whistles(run: NormalRun) -> None:
     """Whistles without a pause for half a minute: the loop of the car hardly turns."""
     for _ in range(80):
         run.ask(OneShot(General(Motion.STOP, whistle=True)))
         run.run(0.36)
 
 
-def _fan(run: Run) -> None:
+def _fan(run: NormalRun) -> None:
     """The fan on for a while, in mode 0 and perhaps into a mode and back."""
     run.ask(Fan())
     run.run(1.5 + 40.0 * run.moments.random())
@@ -167,16 +167,16 @@ def _fan(run: Run) -> None:
     run.run(2.5)
 
 
-def _stops(run: Run) -> None:
+def _stops(run: NormalRun) -> None:
     for _ in range(run.moments.randint(1, 6)):
         run.ask(Stop())
         run.run(4.0 * run.moments.random())
 
 
-MANUAL: tuple[Callable[[Run], None], ...] = (_drives, _joystick, _acts, _whistles, _fan, _stops)
+MANUAL: tuple[Callable[[NormalRun], None], ...] = (_drives, _joystick, _acts, _whistles, _fan, _stops)
 
 
-def normal(run: Run, mode: Mode, seconds: float) -> None:
+def normal(run: NormalRun, mode: Mode, seconds: float) -> None:
     """The car lives in a mode, and comes back to mode 0 now and then for what only works there."""
     end = run.pair.now + seconds
     for_ever = mode is Mode.OBSTACLE_AVOIDANCE and run.world == "no-echo"  # docs/reference/protocol.md#blocking-times

@@ -46,7 +46,7 @@ def wait_for(so: Callable[..., Any], what: str, seconds: float = PATIENCE_S) -> 
     return found
 
 
-class Process:
+class GatewayProcess:
     """One `gateway` process."""
 
     def __init__(self, arguments: list[str], log: Path, environment: dict[str, str]) -> None:
@@ -124,33 +124,33 @@ class Process:
             self._lines.put(line)
 
 
-class Fleet:
+class FleetProcesses:
     """Processes at one endpoint, and a client of their bus."""
 
     def __init__(self, endpoint: str, directory: Path) -> None:
         self.endpoint = endpoint
         self.directory = directory
         self.environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(directory / "state")}
-        self._started: list[Process] = []
+        self._started: list[GatewayProcess] = []
         self._bus: bus.Bus | None = None
         # On a busy machine the first that is its client may come later than a hub waits for one.
         self.hub = self.start("-m", "schemas.bus.hub", "--endpoint", endpoint, "--idle-s", str(2 * PATIENCE_S))
         wait_for(lambda: bus.accepts(endpoint), "the hub listens")
 
-    def start(self, *arguments: str) -> Process:
+    def start(self, *arguments: str) -> GatewayProcess:
         """Start Python with these arguments."""
-        started = Process(list(arguments), self.directory / f"{len(self._started)}.log", self.environment)
+        started = GatewayProcess(list(arguments), self.directory / f"{len(self._started)}.log", self.environment)
         self._started.append(started)
         return started
 
-    def simulate(self, *cars: str, truth: bool = False, world: str = "room") -> tuple[Process, list[str]]:
+    def simulate(self, *cars: str, truth: bool = False, world: str = "room") -> tuple[GatewayProcess, list[str]]:
         """Simulated cars, and their links; without `truth` they publish none, and are asked."""
         described = [word for car in cars for word in ("--car", car)]
         published = () if truth else ("--no-truth",)
         sim = self.start("-m", "gateway.cli", "sim", *published, "--seed", "3", "--world", world, *described)
         return sim, [sim.line()["link"] for _ in cars]
 
-    def gateway(self, link: str, *more: str, car: str = "red", platform: str = "arduino") -> Process:
+    def gateway(self, link: str, *more: str, car: str = "red", platform: str = "arduino") -> GatewayProcess:
         """Start `gateway run`."""
         return self.start("-m", "gateway.cli", "run", "--car", car, "--link", link, "--platform", platform, *more)
 
@@ -215,7 +215,7 @@ class Fleet:
                 os.kill(int(pid), signal.SIGTERM)
 
 
-def driving(sim: Process, car: str = "red") -> bool:
+def driving(sim: GatewayProcess, car: str = "red") -> bool:
     """Whether the motors of a simulated car are on, says the car."""
     truth = sim.say({"car": car, "ask": "truth"})
     return bool(truth["motor_left"] or truth["motor_right"])

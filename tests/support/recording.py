@@ -16,7 +16,7 @@ from schemas import keys
 from schemas.bus import Bus, Publisher
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
-from tests.support.processes import PATIENCE_S, Fleet, Process, wait_for
+from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, wait_for
 
 RATE_HZ = 25.0
 CARS_PER_SESSION = 5
@@ -93,8 +93,8 @@ class Load:
 class Recording:
     """`fleet record` as a process: its session, once nothing can be missed."""
 
-    def __init__(self, fleet: Fleet, out: Path, *options: str) -> None:
-        self.process: Process = fleet.start(
+    def __init__(self, fleet: FleetProcesses, out: Path, *options: str) -> None:
+        self.process: GatewayProcess = fleet.start(
             "-m", "fleet.cli", "record", "--out", str(out), "--connect", fleet.endpoint, "--json", *options
         )
         self.session = Path(self.process.line()["session"])
@@ -105,7 +105,7 @@ class Recording:
         return self.process.line()
 
 
-def kill_hub(fleet: Fleet, chance: random.Random, settled_s: float = 0.3) -> None:
+def kill_hub(fleet: FleetProcesses, chance: random.Random, settled_s: float = 0.3) -> None:
     """Kill the hub; return when there is another, which the recorder starts."""
     if fleet.hub.popen.poll() is None:
         fleet.hub.kill()

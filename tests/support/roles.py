@@ -147,7 +147,7 @@ class Watcher:
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class JudgedFault:
     """What was done, and what came of it, s after it; None: no role was left."""
 
     what: str
@@ -163,14 +163,14 @@ class Fault:
         return self.filled_s > self.limit_s or self.in_force_s > self.filled_s + IN_FORCE_S
 
 
-class Stage:
+class RoleStage:
     """A fleet with a plan, a held car, and faults one after another, each judged."""
 
     def __init__(self, up: Up, chance: random.Random) -> None:
         self.up = up
         self.chance = chance
         self.watcher = Watcher.follow(up.bus)
-        self.faults: list[Fault] = []
+        self.faults: list[JudgedFault] = []
         self.held_ns = 0
 
     def begin(self) -> None:
@@ -182,7 +182,7 @@ class Stage:
         self.up.ready(HELD)  # it may have had a role, and its stop takes longer than another car to take that
         self.held_ns = time.time_ns()
 
-    def strike(self, what: str) -> Fault:
+    def strike(self, what: str) -> JudgedFault:
         """One fault, and what came of it; returns when the fleet is whole again."""
         watcher = self.watcher
         car = self.chance.choice(ABLE)
@@ -212,7 +212,7 @@ class Stage:
             changed = [other for opened in before for at, other in watcher.opened_after(at_ns, opened)]
             assert not changed, f"{what}: a needless switch of {changed}"
             assert before == {opened: set(watcher.truly(opened)) for opened in before}, what
-        fault = Fault(f"{what} {car if hit else ''}", filled_s, in_force_s, limit_s)
+        fault = JudgedFault(f"{what} {car if hit else ''}", filled_s, in_force_s, limit_s)
         self.faults.append(fault)
         return fault
 

@@ -207,7 +207,7 @@ def closing(mode: Mode) -> Load:
 
 
 @dataclass(frozen=True)
-class Case:
+class StopTestCase:
     """One load on one car in one world."""
 
     name: str
@@ -263,31 +263,31 @@ IN_MODES: list[tuple[str, Load]] = [
 TRANSPORTS = tuple(Transport)
 
 
-def _cases() -> Iterable[Case]:
+def _cases() -> Iterable[StopTestCase]:
     for world in WORLDS:
         for name, load in (*EVERY_CAR, *NAMED):
-            yield Case(name, load, world=world)
+            yield StopTestCase(name, load, world=world)
         for name, load in IN_MODES:
             # Avoiding without an echo it is deaf for ever, with the motors braked (test_stops.py).
             if AVOIDANCE not in name or world == "echo":
-                yield Case(name, load, world=world)
+                yield StopTestCase(name, load, world=world)
         for name, load in EVERY_CAR:
-            yield Case(name, load, world=world, told="unknown")
+            yield StopTestCase(name, load, world=world, told="unknown")
             for transport in TRANSPORTS:
-                yield Case(name, load, "raspberry_pi", world, transport=transport)
+                yield StopTestCase(name, load, "raspberry_pi", world, transport=transport)
         for transport in TRANSPORTS:
             for name, load in NAMED:
-                yield Case(name, load, "raspberry_pi", world, transport=transport)
+                yield StopTestCase(name, load, "raspberry_pi", world, transport=transport)
             for name, load in MOVING:
-                yield Case(name, load, "raspberry_pi", world, told="unknown", transport=transport)
+                yield StopTestCase(name, load, "raspberry_pi", world, told="unknown", transport=transport)
         for name, load in MOVING:
-            yield Case(name, load, "stm32", world)
-    yield Case(f"inside-{Mode.TRACKING}", inside(Mode.TRACKING), world="black", where=on_black)
-    yield Case(f"opening-{AVOIDANCE}-at-its-end", last_moment(AVOIDANCE), world="pen", where=in_a_pen)
-    yield Case(f"inside-{AVOIDANCE}", inside(AVOIDANCE), world="pen", where=in_a_pen)
-    yield Case(f"closing-{AVOIDANCE}", closing(AVOIDANCE), world="pen", where=in_a_pen)
-    yield Case(f"inside-{Mode.FOLLOWING}", inside(Mode.FOLLOWING), world="wall", where=before_a_wall)
-    yield Case(f"closing-{Mode.FOLLOWING}", closing(Mode.FOLLOWING), world="wall", where=before_a_wall)
+            yield StopTestCase(name, load, "stm32", world)
+    yield StopTestCase(f"inside-{Mode.TRACKING}", inside(Mode.TRACKING), world="black", where=on_black)
+    yield StopTestCase(f"opening-{AVOIDANCE}-at-its-end", last_moment(AVOIDANCE), world="pen", where=in_a_pen)
+    yield StopTestCase(f"inside-{AVOIDANCE}", inside(AVOIDANCE), world="pen", where=in_a_pen)
+    yield StopTestCase(f"closing-{AVOIDANCE}", closing(AVOIDANCE), world="pen", where=in_a_pen)
+    yield StopTestCase(f"inside-{Mode.FOLLOWING}", inside(Mode.FOLLOWING), world="wall", where=before_a_wall)
+    yield StopTestCase(f"closing-{Mode.FOLLOWING}", closing(Mode.FOLLOWING), world="wall", where=before_a_wall)
 
 
 CASES = tuple(_cases())
@@ -381,25 +381,27 @@ LOST_NAMED: list[tuple[str, Load]] = [
     *((f"in-{mode}", cut_off(inside(mode))) for mode in OPENED),
 ]
 RESTORED = (
-    *(Case(f"restored-{name}", load, world=world) for world in WORLDS for name, load in LOST),
+    *(StopTestCase(f"restored-{name}", load, world=world) for world in WORLDS for name, load in LOST),
     *(
-        Case(f"restored-{name}", load, world=world)
+        StopTestCase(f"restored-{name}", load, world=world)
         for world in WORLDS
         for name, load in LOST_NAMED
         if AVOIDANCE not in name or world == "echo"
     ),
     # Ended by `#` and with two `MODE00` behind it, all within one turn of 4.3 s, this half opens the colour LED mode.
     *(
-        Case(f"restored-half-mode-{count}", then(inside(AVOIDANCE), half_closing(count)), world="pen", where=in_a_pen)
+        StopTestCase(
+            f"restored-half-mode-{count}", then(inside(AVOIDANCE), half_closing(count)), world="pen", where=in_a_pen
+        )
         for count in (4, 7, 9)
     ),
     *(
-        Case(f"restored-found-{mode}", found(mode), world="pen", where=in_a_pen, told=told)
+        StopTestCase(f"restored-found-{mode}", found(mode), world="pen", where=in_a_pen, told=told)
         for mode in OPENED
         for told in (None, "unknown")
     ),
-    *(Case(f"restored-{name}", load, world=world, told="unknown") for world in WORLDS for name, load in LOST),
-    *(Case(f"restored-{name}", load, "raspberry_pi", world) for world in WORLDS for name, load in LOST),
+    *(StopTestCase(f"restored-{name}", load, world=world, told="unknown") for world in WORLDS for name, load in LOST),
+    *(StopTestCase(f"restored-{name}", load, "raspberry_pi", world) for world in WORLDS for name, load in LOST),
 )
 
 
@@ -466,7 +468,7 @@ def state_of(pair: Pair) -> str:
     return f"{kind[style]}in {'a mode that reads pins' if mode in READS_PINS else mode}"
 
 
-def play(case: Case, seed: int) -> Seen:
+def play(case: StopTestCase, seed: int) -> Seen:
     """Bring a car into the case's load, ask for a stop at a random moment, and watch until it is over."""
     moments = random.Random(f"{case} {seed}")
     pair = case.pair(seed).ready()
@@ -505,7 +507,7 @@ def play(case: Case, seed: int) -> Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StopRow:
     """All stops that were asked for in one state; s."""
 
     state: str
@@ -528,7 +530,7 @@ class Row:
     """Where the worst was seen."""
 
 
-def rows(seen: Iterable[Seen]) -> list[Row]:
+def rows(seen: Iterable[Seen]) -> list[StopRow]:
     """The distribution per state."""
     states: dict[str, list[Seen]] = {}
     for one in seen:
@@ -536,12 +538,12 @@ def rows(seen: Iterable[Seen]) -> list[Row]:
     return [_row(state, states[state]) for state in sorted(states)]
 
 
-def _row(state: str, stops: list[Seen]) -> Row:
+def _row(state: str, stops: list[Seen]) -> StopRow:
     stops = sorted(stops, key=lambda one: one.settled_s)
     worst = stops[-1]
     announced = max(one.announced_s for one in stops)
     shown = sorted(one.shown_s for one in stops if one.shown_s < float("inf"))
-    return Row(
+    return StopRow(
         state,
         len(stops),
         stops[len(stops) // 2].settled_s,
@@ -568,7 +570,7 @@ CHUNK = 50
 """Stops that a process plays at a time."""
 
 
-def distribution(moments: int, cases: range = PLAYED) -> list[Row]:
+def distribution(moments: int, cases: range = PLAYED) -> list[StopRow]:
     """Play each case at so many moments, on all processors, and return the distribution."""
     chosen = list(product(cases, range(moments)))
     if len(chosen) <= CHUNK:  # one process has all the work
@@ -577,9 +579,9 @@ def distribution(moments: int, cases: range = PLAYED) -> list[Row]:
         return rows(pool.map(_play, chosen, chunksize=CHUNK))
 
 
-def tsv(table: Iterable[Row]) -> str:
+def tsv(table: Iterable[StopRow]) -> str:
     """The rows as tab-separated text with a heading."""
-    lines = ["\t".join(field.name for field in fields(Row))]
+    lines = ["\t".join(field.name for field in fields(StopRow))]
     for row in table:
         lines.append("\t".join(f"{v:.3f}" if isinstance(v, float) else str(v) for v in asdict(row).values()))
     return "\n".join(lines) + "\n"

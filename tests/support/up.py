@@ -17,7 +17,7 @@ from fleet import cli
 from fleet.supervisor.service import ask_status
 from schemas import messages
 from schemas.bus import Bus, BusError, Sample
-from tests.support.processes import Process, wait_for
+from tests.support.processes import GatewayProcess, wait_for
 
 
 def fleet_command(*arguments: str, environment: dict[str, str]) -> "subprocess.CompletedProcess[str]":
@@ -50,7 +50,7 @@ class Up:
         self.out = directory / "sessions"
         self.began = time.perf_counter()
         words = ["-m", "fleet.cli", "up", *arguments, "--out", str(self.out), "--json"]
-        self.process = Process(words, directory / "up.log", self.environment)
+        self.process = GatewayProcess(words, directory / "up.log", self.environment)
         self.heard: list[dict[str, Any]] = []
         self._bus: Bus | None = None
 

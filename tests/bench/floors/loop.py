@@ -20,7 +20,7 @@ STATES = 5
 endpoint, path, key = sys.argv[1:]
 
 
-class Publisher:
+class FloorPublisher:
     def __init__(self, session: zenoh.Session, name: str, priority: zenoh.Priority) -> None:
         encoding = zenoh.Encoding("application/protobuf;bench.Message")
         drop = zenoh.CongestionControl.DROP
@@ -37,8 +37,8 @@ class Publisher:
 
 
 async def main(session: zenoh.Session, port: serial.Serial) -> None:
-    readings, frames = (Publisher(session, name, zenoh.Priority.DATA) for name in ("reading", "frame"))
-    states = [Publisher(session, str(number), zenoh.Priority.DATA_HIGH) for number in range(STATES)]
+    readings, frames = (FloorPublisher(session, name, zenoh.Priority.DATA) for name in ("reading", "frame"))
+    states = [FloorPublisher(session, str(number), zenoh.Priority.DATA_HIGH) for number in range(STATES)]
     token = session.liveliness().declare_token(f"{key}/alive")
 
     def read() -> None:

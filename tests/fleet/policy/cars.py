@@ -16,7 +16,7 @@ def seen(at: float, **topics: dict[str, Any]) -> dict[str, Observation]:
     return {f"sensor/{name}": Observation(fields, at) for name, fields in topics.items()}
 
 
-class Run:
+class PolicyRun:
     """A coordinator that is told what it sees, and whose cars obey at once if `obey`."""
 
     def __init__(self, plan: Plan, *cars: str, obey: bool = True) -> None:

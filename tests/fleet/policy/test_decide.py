@@ -13,7 +13,7 @@ from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from fleet.policy.state import HUB_BACK_S, PolicyState, carried, hub_back, restored, to_keep
-from tests.fleet.policy.cars import GONE, HERE, Run
+from tests.fleet.policy.cars import GONE, HERE, PolicyRun
 
 FIXED = parse("cars: {red: tracking}")
 ONE = parse("roles: {scout: {mode: tracking}}")
@@ -59,7 +59,7 @@ def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarSnapshot, mode: str 
 
 
 def test_a_role_goes_to_another_after_a_moment_and_does_not_come_back() -> None:
-    run = Run(ONE, "green", "red")
+    run = PolicyRun(ONE, "green", "red")
     assert run.at(0.0).roles == {"green": "scout"}
     run.change("green", present=False, mode="")
     run.until(1.5)
@@ -74,7 +74,7 @@ def test_a_role_goes_to_another_after_a_moment_and_does_not_come_back() -> None:
 
 
 def test_a_car_that_is_away_for_less_keeps_its_role() -> None:
-    run = Run(ONE, "green", "red")
+    run = PolicyRun(ONE, "green", "red")
     run.at(0.0)
     for begin in (1.0, 4.0, 7.0):
         run.until(begin)
@@ -87,14 +87,14 @@ def test_a_car_that_is_away_for_less_keeps_its_role() -> None:
 
 
 def test_a_persons_word_frees_a_role_at_once() -> None:
-    run = Run(ONE, "green", "red")
+    run = PolicyRun(ONE, "green", "red")
     run.at(0.0)
     run.change("green", held_by="ann")
     assert run.at(0.1).roles == {"red": "scout"}
 
 
 def test_the_higher_priority_is_filled_first_and_by_whom_it_costs_least() -> None:
-    run = Run(TWO, "blue", "green", "red")
+    run = PolicyRun(TWO, "blue", "green", "red")
     run.change("red", mode="tracking")
     assert run.at(0.0).roles == {"blue": "patrol", "green": "patrol", "red": "scout"}
     run.change("blue", held_by="ann")
@@ -105,7 +105,7 @@ def test_the_higher_priority_is_filled_first_and_by_whom_it_costs_least() -> Non
 
 
 def test_needs_that_flicker_change_nothing_and_old_values_count_where_nothing_measures_them() -> None:
-    run = Run(STRONG, "green", "red")
+    run = PolicyRun(STRONG, "green", "red")
     for car in ("green", "red"):
         run.sees(car, battery={"voltage_v": 7.4})
     run.at(0.0)
@@ -124,14 +124,14 @@ def test_needs_that_flicker_change_nothing_and_old_values_count_where_nothing_me
 
 
 def test_a_car_of_which_a_need_is_not_known_does_not_take_the_role() -> None:
-    run = Run(STRONG, "red")
+    run = PolicyRun(STRONG, "red")
     run.at(0.0)
     assert run.roles == {}
     assert "that is not known" in run.of("role scout").why
 
 
 def test_a_contradicted_mode_is_asked_for_ever_more_slowly_and_then_another_car_takes_over() -> None:
-    run = Run(ONE, "green", "red", obey=False)
+    run = PolicyRun(ONE, "green", "red", obey=False)
     run.change("green", mode="tracking", verdict="contradicted", evidence="silent for 3.1 s")
     run.change("red", mode="manual", held_by="ann")
     run.until(20.0)
@@ -144,7 +144,7 @@ def test_a_contradicted_mode_is_asked_for_ever_more_slowly_and_then_another_car_
 
 
 def test_what_a_car_refuses_another_does() -> None:
-    run = Run(ONE, "green", "red", obey=False)
+    run = PolicyRun(ONE, "green", "red", obey=False)
     run.at(0.0)
     run.change("green", refused=Refusal("tracking", "battery_low", "battery critical: 6.4 V", 0.2))
     run.at(0.2)
@@ -152,7 +152,7 @@ def test_what_a_car_refuses_another_does() -> None:
 
 
 def test_the_car_that_sees_the_lamp_leads_and_goes_on_while_it_changes_its_mode() -> None:
-    run = Run(LAMP, "blue", "green", "red")
+    run = PolicyRun(LAMP, "blue", "green", "red")
     for car in run.cars:
         run.sees(car, light={"left": False, "right": False})
     run.at(0.0)
@@ -174,7 +174,7 @@ rules:
   - {when: {car: red, is: range.range_m < 0.3, for_s: 1}, then: {who: blue, mode: obstacle_avoidance}}
   - {when: {car: red, is: battery.level == 'critical'}, then: {who: blue, mode: color_led}}
 """)
-    run = Run(plan, "red", "blue")
+    run = PolicyRun(plan, "red", "blue")
     run.sees("red", range={"range_m": 0.2}, battery={"level": "critical"})
     run.at(0.0)
     assert run.of("blue").mode == "color_led"
@@ -187,7 +187,7 @@ rules:
 @pytest.mark.parametrize(("back_s", "kept"), [(0.3, True), (HUB_BACK_S - 0.2, True), (HUB_BACK_S + 0.2, False)])
 def test_after_a_hub_was_away_a_role_waits_for_the_car_that_is_back_last(back_s: float, kept: bool) -> None:
     """Without one the coordinator decides nothing; a car that nobody could hear was not lost."""
-    run = Run(ONE, "blue", "green", "red")
+    run = PolicyRun(ONE, "blue", "green", "red")
     run.until(1.0)
     (scout,) = run.roles
     here = dict(run.cars)
@@ -213,7 +213,7 @@ phases:
   run: {roles: [go], timeout_s: 5, next: search}
   give_up: {roles: [look]}
 """)
-    run = Run(plan, "red")
+    run = PolicyRun(plan, "red")
     run.at(0.0)
     run.until(2.0)
     run.sees("red", light={"left": True})
@@ -232,7 +232,7 @@ def test_phases_with_the_shortest_time_outs_do_not_flap() -> None:
 roles: {look: {mode: manual}, go: {mode: tracking}}
 phases: {a: {roles: [look], timeout_s: 0.01, next: b}, b: {roles: [go], timeout_s: 0.01, next: a}}
 """)
-    run = Run(plan, "red")
+    run = PolicyRun(plan, "red")
     run.at(0.0)
     run.until(15.0)
     assert all(after - before >= 1.5 for (before, *_), (after, *_) in pairwise(run.asked))
@@ -244,7 +244,7 @@ roles:
   strong: {mode: tracking, cars: [red], fallback: weak}
   weak: {mode: following, on_call: true}
 """)
-    run = Run(plan, "blue", "red")
+    run = PolicyRun(plan, "blue", "red")
     assert run.at(0.0).roles == {"red": "strong"}
     run.change("red", held_by="ann")
     assert run.at(0.1).roles == {"blue": "weak"}
@@ -258,7 +258,7 @@ def test_a_colour_is_asked_for_once_when_the_car_is_in_the_mode_in_which_it_obey
 cars: {red: tracking, green: manual}
 rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led: [9, 0, 0]}}]
 """)
-    run, coloured = Run(plan, "green", "red", obey=False), list[float]()
+    run, coloured = PolicyRun(plan, "green", "red", obey=False), list[float]()
 
     def until(end: float) -> None:
         while run.now < end:
@@ -290,7 +290,7 @@ roles:
   pair: {{mode: following, count: 3, priority: {priority}, fallback: rest}}
   rest: {{mode: manual, on_call: true}}
 """)
-    run = Run(plan, "blue", "green", "pi")
+    run = PolicyRun(plan, "blue", "green", "pi")
     run.change("pi", platform="raspberry_pi")
     run.change("green", held_by="ann")
     assert run.at(0.0).roles == {"blue": "scout", "pi": "rest"}
@@ -304,7 +304,7 @@ roles:
 
 
 def test_a_restarted_coordinator_switches_no_mode() -> None:
-    run = Run(TWO, "blue", "green", "red")
+    run = PolicyRun(TWO, "blue", "green", "red")
     run.change("red", mode="obstacle_avoidance")
     run.at(0.0)
     before, asked = run.roles, len(run.asked)
@@ -313,7 +313,7 @@ def test_a_restarted_coordinator_switches_no_mode() -> None:
     assert len(run.asked) == asked
     assert run.roles == before
     same = parse("roles: {a: {mode: tracking}, b: {mode: tracking}}")
-    run = Run(same, "green", "red")
+    run = PolicyRun(same, "green", "red")
     run.at(0.0)
     kept = replace(to_keep(same, run.memory, 1.0, 100.0), roles={"green": "b", "red": "a"})
     run.memory = restored(same, FleetSnapshot(run.cars), kept, 2.0, 101.0)
@@ -323,7 +323,7 @@ def test_a_restarted_coordinator_switches_no_mode() -> None:
 
 
 def test_a_new_plan_keeps_the_roles_that_it_has_too() -> None:
-    run = Run(TWO, "blue", "green", "red")
+    run = PolicyRun(TWO, "blue", "green", "red")
     run.at(0.0)
     before, asked = run.roles, len(run.asked)
     after = parse(TWO.text + "\nrules: [{when: {any: light.left}, then: {who: that, mode: manual}}]")
@@ -333,7 +333,7 @@ def test_a_new_plan_keeps_the_roles_that_it_has_too() -> None:
 
 
 def test_roles_wait_at_the_start_for_cars_that_have_not_said_how_they_are() -> None:
-    run = Run(ONE, "green", "red")
+    run = PolicyRun(ONE, "green", "red")
     run.change("red", mode="")
     assert run.at(0.0).decisions == ()
     run.change("red", mode="tracking")
@@ -346,12 +346,12 @@ PATROL = "patrol: {mode: tracking, count: 1}"
 
 
 def test_a_role_for_all_that_are_left_starves_none_of_its_priority() -> None:
-    run = Run(parse(f"roles: {{{REST}}}"), "blue", "green", "red")
+    run = PolicyRun(parse(f"roles: {{{REST}}}"), "blue", "green", "red")
     run.until(2.0)
     assert set(run.roles.values()) == {"rest"}
     for roles in (f"{PATROL}, {REST}", f"{REST}, {PATROL}"):
         after = parse(f"roles: {{{roles}}}")
-        memory, again = carried(run.memory, run.plan, after), Run(after, *run.cars)
+        memory, again = carried(run.memory, run.plan, after), PolicyRun(after, *run.cars)
         again.memory, again.now = memory, run.now
         again.until(4.0)
         assert sorted(again.roles.values()) == ["patrol", "rest", "rest"]
@@ -359,7 +359,7 @@ def test_a_role_for_all_that_are_left_starves_none_of_its_priority() -> None:
 
 
 def test_after_all_were_stopped_the_counted_role_is_filled_first() -> None:
-    run = Run(parse(f"roles: {{{PATROL}, {REST}}}"), "blue", "green", "red")
+    run = PolicyRun(parse(f"roles: {{{PATROL}, {REST}}}"), "blue", "green", "red")
     run.at(0.0)
     for car in run.cars:
         run.change(car, held_by="ann", mode="manual")
@@ -377,7 +377,7 @@ def test_in_the_next_phase_cars_leave_a_role_for_all_that_are_left() -> None:
 roles: {a: {mode: tracking}, b: {mode: following, count: 2}, c: {mode: manual, count: all}}
 phases: {one: {roles: [a, c], timeout_s: 5, next: two}, two: {roles: [b, c]}}
 """)
-    run = Run(plan, "blue", "green", "red")
+    run = PolicyRun(plan, "blue", "green", "red")
     run.until(4.0)
     assert sorted(run.roles.values()) == ["a", "c", "c"]
     run.until(6.0)
@@ -385,7 +385,7 @@ phases: {one: {roles: [a, c], timeout_s: 5, next: two}, two: {roles: [b, c]}}
 
 
 def test_a_car_that_does_not_do_its_role_gives_it_to_one_that_has_a_role_for_all() -> None:
-    run = Run(parse(f"roles: {{{PATROL}, {REST}}}"), "blue", "red", obey=False)
+    run = PolicyRun(parse(f"roles: {{{PATROL}, {REST}}}"), "blue", "red", obey=False)
     run.change("blue", mode="tracking")
     run.until(1.0)
     assert run.roles == {"blue": "patrol", "red": "rest"}
@@ -433,8 +433,8 @@ changes = st.tuples(
 )
 
 
-def _run(plan: Any, course: list[Any]) -> tuple[list[Any], Run]:
-    run = Run(plan, *CARS)
+def _run(plan: Any, course: list[Any]) -> tuple[list[Any], PolicyRun]:
+    run = PolicyRun(plan, *CARS)
     told = []
     for car, fields, wait_s in course:
         if "light" in fields:
@@ -453,7 +453,7 @@ def test_whatever_happens(plan: Any, course: list[Any]) -> None:
     told, _ = _run(plan, course)
     again, _ = _run(plan, course)
     assert told == again, "the same input gives the same decisions"
-    run = Run(plan, *CARS)
+    run = PolicyRun(plan, *CARS)
     for (car, fields, wait_s), result in zip(course, told, strict=True):
         if not {"light", "voltage"} & set(fields):
             run.change(car, **fields)
@@ -493,7 +493,7 @@ LINE = dict.fromkeys(("left_outer", "left_inner", "right_inner", "right_outer"),
 
 
 def test_the_starting_plans_guide_stands_while_it_sees_no_line() -> None:
-    run = Run(DEPLOYED, "blue", "green", "red")
+    run = PolicyRun(DEPLOYED, "blue", "green", "red")
     for car in run.cars:
         run.sees(car, battery={"voltage_v": 7.9, "level": "ok"})
     run.until(2.0)
@@ -509,7 +509,7 @@ def test_the_starting_plans_guide_stands_while_it_sees_no_line() -> None:
 
 
 def test_the_starting_plan_shows_which_car_is_too_weak() -> None:
-    run = Run(DEPLOYED, "blue", "red")
+    run = PolicyRun(DEPLOYED, "blue", "red")
     run.sees("blue", battery={"voltage_v": 7.9, "level": "ok"})
     asked = []
     while run.now < 8.0:

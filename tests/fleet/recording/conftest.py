@@ -10,7 +10,7 @@ from schemas import keys
 from schemas.bus import Bus, Publisher, router_config
 from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint
-from tests.support.processes import Fleet
+from tests.support.processes import FleetProcesses
 
 
 def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = 30.0) -> Any:
@@ -51,7 +51,7 @@ def hub_apart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     The sessions of one process share two threads that receive: while the hub waits on one of them for room on the way
     to a recorder, and the other sleeps, that recorder does not receive, and after five seconds the hub gives it up.
     """
-    fleet = Fleet(free_endpoint(), tmp_path_factory.mktemp("hub"))
+    fleet = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("hub"))
     try:
         yield fleet.endpoint
     finally:

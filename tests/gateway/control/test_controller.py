@@ -32,7 +32,18 @@ from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, ModeOpen, Ptz, parse_sent
-from tests.gateway.control.desk import BACK, COORDINATOR, MODE00, PERSON, RUN, SCRIPT, SHOWN_STOP, STOP, TRACKING, Desk
+from tests.gateway.control.workbench import (
+    BACK,
+    COORDINATOR,
+    MODE00,
+    PERSON,
+    RUN,
+    SCRIPT,
+    SHOWN_STOP,
+    STOP,
+    TRACKING,
+    Workbench,
+)
 from tests.support.stops import ENDS_S
 from tests.support.virtual import Pair
 
@@ -43,8 +54,8 @@ FORWARD = Drive(Motion.FORWARD, 5.0)
 
 
 @pytest.fixture
-def desk() -> Desk:
-    return Desk().ready()
+def desk() -> Workbench:
+    return Workbench().ready()
 
 
 # ---------------------------------------------------------------------- the life of each command
@@ -78,7 +89,7 @@ def desk() -> Desk:
     ],
     ids=str,
 )
-def test_the_life_of_a_command(desk: Desk, what: Action, frames: list[bytes], life: list[Phase]) -> None:
+def test_the_life_of_a_command(desk: Workbench, what: Action, frames: list[bytes], life: list[Phase]) -> None:
     answer = desk.ask(what, identity="it")
     assert answer.status in (QUEUED, SENT)
     desk.run(4.0)
@@ -89,7 +100,7 @@ def test_the_life_of_a_command(desk: Desk, what: Action, frames: list[bytes], li
     assert all(b.at >= a.at for a, b in zip(desk.records, desk.records[1:], strict=False))
 
 
-def test_an_opened_mode_is_seen_when_its_reading_comes(desk: Desk) -> None:
+def test_an_opened_mode_is_seen_when_its_reading_comes(desk: Workbench) -> None:
     desk.ask(SetMode(Mode.TRACKING), identity="it")
     desk.run(2.4)
     assert desk.life("it")[-1] is SENT
@@ -103,7 +114,7 @@ def test_an_opened_mode_is_seen_when_its_reading_comes(desk: Desk) -> None:
 # ---------------------------------------------------------------------- motion is a state
 
 
-def test_a_changed_motion_is_sent_again_once_alone_and_never_more(desk: Desk) -> None:
+def test_a_changed_motion_is_sent_again_once_alone_and_never_more(desk: Workbench) -> None:
     began = desk.now
     desk.ask(FORWARD)
     desk.run(4.9)
@@ -113,7 +124,7 @@ def test_a_changed_motion_is_sent_again_once_alone_and_never_more(desk: Desk) ->
     ]
 
 
-def test_the_same_motion_held_on_is_not_written_again(desk: Desk) -> None:
+def test_the_same_motion_held_on_is_not_written_again(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD), identity="first")
     for number in range(20):
         desk.run(0.25)
@@ -130,7 +141,7 @@ def test_the_same_motion_held_on_is_not_written_again(desk: Desk) -> None:
     assert desk.end("hers") == (COMPLETE, None)
 
 
-def test_the_newest_motion_wins_and_only_it_is_written(desk: Desk) -> None:
+def test_the_newest_motion_wins_and_only_it_is_written(desk: Workbench) -> None:
     desk.ask(WHISTLE)  # blocks for 0.3 s: what comes now waits
     for number, motion in enumerate([Motion.FORWARD, Motion.LEFT, Motion.RIGHT, Motion.BACK]):
         assert desk.ask(Drive(motion, 2.0), identity=f"m{number}").status is QUEUED
@@ -141,7 +152,7 @@ def test_the_newest_motion_wins_and_only_it_is_written(desk: Desk) -> None:
     assert desk.life("m3") == [ASKED, QUEUED, SENT]
 
 
-def test_motion_overtakes_what_queues(desk: Desk) -> None:
+def test_motion_overtakes_what_queues(desk: Workbench) -> None:
     for _ in range(3):
         desk.ask(WHISTLE)
     desk.ask(Drive(Motion.FORWARD, 3.0))
@@ -159,7 +170,7 @@ def test_motion_overtakes_what_queues(desk: Desk) -> None:
     ],
     ids=str,
 )
-def test_a_one_shot_while_driving_carries_the_motion(desk: Desk, what: Action, frame: bytes) -> None:
+def test_a_one_shot_while_driving_carries_the_motion(desk: Workbench, what: Action, frame: bytes) -> None:
     desk.ask(FORWARD)
     desk.run(2.0)
     desk.ask(what)
@@ -167,7 +178,7 @@ def test_a_one_shot_while_driving_carries_the_motion(desk: Desk, what: Action, f
     assert desk.frames == [RUN, RUN, frame]
 
 
-def test_the_repetition_after_a_one_shot_repeats_the_motion_alone(desk: Desk) -> None:
+def test_the_repetition_after_a_one_shot_repeats_the_motion_alone(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(0.5)
     desk.ask(Fan())
@@ -175,7 +186,7 @@ def test_the_repetition_after_a_one_shot_repeats_the_motion_alone(desk: Desk) ->
     assert desk.frames == [RUN, b"$1,0,0,0,0,0,0,1,0#", RUN], "a toggle is never repeated"
 
 
-def test_a_drive_expires_and_stops_softly(desk: Desk) -> None:
+def test_a_drive_expires_and_stops_softly(desk: Workbench) -> None:
     began = desk.now
     desk.ask(Drive(Motion.BACK, 0.7), identity="it")
     desk.run(3.0)
@@ -184,7 +195,7 @@ def test_a_drive_expires_and_stops_softly(desk: Desk) -> None:
     assert (desk.control.motors, desk.control.basis) == ("off", Basis.SENT)
 
 
-def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Desk) -> None:
+def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Workbench) -> None:
     desk.ask(Drive(Motion.BACK, 0.7))
     desk.run(2.0)
     began, sent = desk.sent[-1][0], len(desk.sent)
@@ -198,12 +209,12 @@ def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Desk
     assert set(gaps[2:]) == {RENEW_S[-1]}
 
 
-def test_a_rest_that_was_shown_is_left_alone(desk: Desk) -> None:
+def test_a_rest_that_was_shown_is_left_alone(desk: Workbench) -> None:
     desk.run(60.0)
     assert (desk.frames, desk.control.basis) == ([], Basis.SHOWN)
 
 
-def test_a_drive_that_had_to_wait_says_how_long_the_car_was_driven(desk: Desk) -> None:
+def test_a_drive_that_had_to_wait_says_how_long_the_car_was_driven(desk: Workbench) -> None:
     desk.ask(SetMode(Mode.MANUAL))
     desk.run(0.1)
     desk.ask(Drive(Motion.BACK, 4.5), identity="it")
@@ -212,7 +223,7 @@ def test_a_drive_that_had_to_wait_says_how_long_the_car_was_driven(desk: Desk) -
     assert re.fullmatch(r"its time is over, of which red was driven for [23]\.\d\d s: it was busy before", words)
 
 
-def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Desk) -> None:
+def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 0.3))
     desk.run(0.6)
     desk.ask(Drive(Motion.FORWARD, 1.0), identity="on")
@@ -223,7 +234,7 @@ def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Desk) -> None:
     assert desk.frames[3:] == [STOP, STOP]
 
 
-def test_a_drive_within_a_full_stop_waits_for_its_end_or_is_refused(desk: Desk) -> None:
+def test_a_drive_within_a_full_stop_waits_for_its_end_or_is_refused(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(1.0)
     desk.ask(Stop())
@@ -235,7 +246,7 @@ def test_a_drive_within_a_full_stop_waits_for_its_end_or_is_refused(desk: Desk) 
     assert desk.frames == [RUN, *SHOWN_STOP, BACK], "not before the stop is shown"
 
 
-def test_a_drive_released_by_hand(desk: Desk) -> None:
+def test_a_drive_released_by_hand(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it")
     desk.run(0.5)
     assert desk.ask(Drive(Motion.STOP), identity="off").status is QUEUED
@@ -251,7 +262,7 @@ def test_a_drive_released_by_hand(desk: Desk) -> None:
 # ---------------------------------------------------------------------- senders, stalls
 
 
-def test_a_sender_that_is_away_for_a_second_is_lost(desk: Desk) -> None:
+def test_a_sender_that_is_away_for_a_second_is_lost(desk: Workbench) -> None:
     desk.control.sender_alive("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
     desk.run(2.0)
@@ -268,7 +279,7 @@ def test_a_sender_that_is_away_for_a_second_is_lost(desk: Desk) -> None:
     assert desk.records[-1].words == "its sender mia is gone"
 
 
-def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Desk) -> None:
+def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
     desk.run(0.01)
     desk.control.sender_alive("mia", alive=True, now=desk.now)
@@ -281,14 +292,14 @@ def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Desk) -> No
     assert desk.records[-1].words == "its sender mia is gone"
 
 
-def test_a_sender_without_a_token_is_not_watched(desk: Desk) -> None:
+def test_a_sender_without_a_token_is_not_watched(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 5.0), PERSON)
     desk.control.sender_alive("ann", alive=False, now=desk.now)
     desk.run(4.0)
     assert desk.frames == [RUN, RUN]
 
 
-def test_a_stalled_loop_stops_the_car_first(desk: Desk) -> None:
+def test_a_stalled_loop_stops_the_car_first(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it")
     desk.run(2.0)
     desk.control.stalled(0.4, desk.now)
@@ -307,7 +318,7 @@ def test_a_stalled_loop_stops_the_car_first(desk: Desk) -> None:
 # ---------------------------------------------------------------------- one-shots
 
 
-def test_one_shots_queue_so_many_and_no_more_each_once(desk: Desk) -> None:
+def test_one_shots_queue_so_many_and_no_more_each_once(desk: Workbench) -> None:
     answers = [desk.ask(Fan() if number % 2 else ChangeSpeed(SpeedStep.UP)) for number in range(12)]
     accepted = [answer for answer in answers if answer.status is not Phase.REJECTED]
     assert len(accepted) == 9, "one was written, eight wait"
@@ -317,7 +328,7 @@ def test_one_shots_queue_so_many_and_no_more_each_once(desk: Desk) -> None:
 
 
 def test_a_drive_that_would_be_over_before_a_recovery_is_is_refused_at_once() -> None:
-    desk = Desk()
+    desk = Workbench()
     desk.control.link_up(desk.now)
     desk.pump()
     desk.ask(Drive(Motion.FORWARD, 8.0), identity="it")
@@ -328,7 +339,7 @@ def test_a_drive_that_would_be_over_before_a_recovery_is_is_refused_at_once() ->
 
 @pytest.mark.parametrize("what", [WHISTLE, SetMode(Mode.TRACKING)], ids=str)
 def test_what_waits_too_long_for_a_busy_car_expires(what: Action) -> None:
-    desk = Desk()
+    desk = Workbench()
     desk.control.link_up(desk.now)
     desk.pump()
     desk.ask(what, identity="it")
@@ -337,7 +348,7 @@ def test_what_waits_too_long_for_a_busy_car_expires(what: Action) -> None:
     assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
 
 
-def test_one_shots_asked_before_a_mode_are_sent_before_it(desk: Desk) -> None:
+def test_one_shots_asked_before_a_mode_are_sent_before_it(desk: Workbench) -> None:
     desk.ask(WHISTLE)
     desk.ask(OneShot(Ptz(30)))
     desk.ask(SetMode(Mode.TRACKING))
@@ -346,7 +357,7 @@ def test_one_shots_asked_before_a_mode_are_sent_before_it(desk: Desk) -> None:
     assert desk.frames == [b"$0,0,1,0,0,0,0,0,0#", b"$4WD,PTZ30#", b"$4WD,MODE21#"]
 
 
-def test_a_mode_asked_while_driving_stops_first_then_what_waits_then_opens(desk: Desk) -> None:
+def test_a_mode_asked_while_driving_stops_first_then_what_waits_then_opens(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(2.0)
     desk.ask(WHISTLE)
@@ -360,7 +371,7 @@ def test_a_mode_asked_while_driving_stops_first_then_what_waits_then_opens(desk:
 # ---------------------------------------------------------------------- hold
 
 
-def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Desk) -> None:
+def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Workbench) -> None:
     assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
     desk.ask(Stop(), PERSON)
     assert desk.control.hold == Hold("mia", int(desk.now * 1e9))
@@ -381,7 +392,7 @@ def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Desk) -> Non
 
 @pytest.mark.parametrize("what", [FORWARD, SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), Resume()])
 @pytest.mark.parametrize("sender", [PERSON, SCRIPT], ids=["person", "script"])
-def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Desk, what: Action, sender: Sender) -> None:
+def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Workbench, what: Action, sender: Sender) -> None:
     desk.ask(Stop(), PERSON)
     desk.run(2.0)
     assert desk.ask(what, sender).status is not Phase.REJECTED
@@ -389,7 +400,7 @@ def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Desk, wha
     assert desk.logs[-1].code == "hold_ended"
 
 
-def test_a_refused_command_does_not_end_the_hold(desk: Desk) -> None:
+def test_a_refused_command_does_not_end_the_hold(desk: Workbench) -> None:
     desk.ask(Stop(), PERSON)
     assert desk.ask(FORWARD, age_s=9.0).reason is Reason.STALE
     desk.control.link_down("unplugged", desk.now)
@@ -399,7 +410,7 @@ def test_a_refused_command_does_not_end_the_hold(desk: Desk) -> None:
     assert desk.control.hold is None
 
 
-def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Desk) -> None:
+def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Workbench) -> None:
     desk.ask(Stop(), COORDINATOR)
     assert desk.control.hold is None
     desk.run(2.0)
@@ -408,7 +419,7 @@ def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Desk) -
 
 
 def test_a_hold_from_before_a_restart_counts() -> None:
-    desk = Desk(kept=PersistedSafety(Hold("mia", 1))).ready()
+    desk = Workbench(kept=PersistedSafety(Hold("mia", 1))).ready()
     assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
     assert desk.ask(FORWARD, PERSON).status is QUEUED
 
@@ -417,7 +428,7 @@ def test_a_hold_from_before_a_restart_counts() -> None:
 
 
 @pytest.mark.parametrize("what", [FORWARD, LIGHT, OneShot(Ptz(1)), Fan(), ChangeSpeed(SpeedStep.UP), Find()], ids=str)
-def test_in_another_mode_the_car_would_ignore_it(desk: Desk, what: Action) -> None:
+def test_in_another_mode_the_car_would_ignore_it(desk: Workbench, what: Action) -> None:
     desk.ask(SetMode(Mode.TRACKING))
     desk.run(3.0)
     answer = desk.ask(what)
@@ -444,7 +455,7 @@ def test_in_another_mode_the_car_would_ignore_it(desk: Desk, what: Action) -> No
     ids=str,
 )
 def test_what_the_platform_does_not_know_is_never_sent(platform: str, what: Action) -> None:
-    desk = Desk(platform).ready()
+    desk = Workbench(platform).ready()
     assert desk.ask(what, identity="it").reason is Reason.UNSUPPORTED
     desk.run(2.0)
     assert set(desk.frames) <= {STOP, MODE00}, "a rest that nothing has shown is renewed"
@@ -452,7 +463,7 @@ def test_what_the_platform_does_not_know_is_never_sent(platform: str, what: Acti
     assert desk.life("it") == [ASKED, Phase.REJECTED]
 
 
-def test_duplicate_and_stale(desk: Desk) -> None:
+def test_duplicate_and_stale(desk: Workbench) -> None:
     assert desk.ask(Fan(), identity="x").status is QUEUED
     life = desk.life("x")
     assert desk.ask(Fan(), identity="x").reason is Reason.DUPLICATE
@@ -466,7 +477,7 @@ def test_duplicate_and_stale(desk: Desk) -> None:
 # ---------------------------------------------------------------------- streams
 
 
-def test_a_stream_is_recorded_at_its_start_its_changes_and_its_end(desk: Desk) -> None:
+def test_a_stream_is_recorded_at_its_start_its_changes_and_its_end(desk: Workbench) -> None:
     for motion in [Motion.FORWARD] * 10 + [Motion.LEFT] * 5:
         desk.ask(Drive(motion, 0.5), PERSON, streamed=True)
         desk.run(0.05)
@@ -481,7 +492,7 @@ def test_a_stream_is_recorded_at_its_start_its_changes_and_its_end(desk: Desk) -
     ]
 
 
-def test_a_refused_stream_is_recorded_once_per_cause(desk: Desk) -> None:
+def test_a_refused_stream_is_recorded_once_per_cause(desk: Workbench) -> None:
     desk.ask(Stop(), PERSON)
     before = len(desk.records)
     for _ in range(50):
@@ -492,7 +503,7 @@ def test_a_refused_stream_is_recorded_once_per_cause(desk: Desk) -> None:
 # ---------------------------------------------------------------------- link and recovery
 
 
-def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Desk) -> None:
+def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="held")
     desk.ask(WHISTLE, identity="act")
     desk.control.link_down("unplugged", desk.now)
@@ -507,7 +518,7 @@ def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Desk) -> None:
     assert desk.frames == [RUN]
 
 
-def test_a_failed_write_fails_its_command_and_what_waits(desk: Desk) -> None:
+def test_a_failed_write_fails_its_command_and_what_waits(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it", pump=False)
     desk.ask(WHISTLE, identity="act", pump=False)
     write = desk.control.poll(desk.now)
@@ -522,7 +533,7 @@ def test_a_failed_write_fails_its_command_and_what_waits(desk: Desk) -> None:
     assert desk.frames == [b"#"], "recovery"
 
 
-def test_a_stop_under_way_fails_with_its_link(desk: Desk) -> None:
+def test_a_stop_under_way_fails_with_its_link(desk: Workbench) -> None:
     desk.ask(Stop(), identity="it")
     desk.control.link_down("unplugged", desk.now)
     desk.take()
@@ -530,7 +541,7 @@ def test_a_stop_under_way_fails_with_its_link(desk: Desk) -> None:
 
 
 def test_a_recovery_that_nobody_answers_goes_on_for_ever_with_growing_pauses() -> None:
-    desk = Desk()
+    desk = Workbench()
     began = desk.now
     desk.control.link_up(began)
     desk.pump()
@@ -557,7 +568,7 @@ def test_a_recovery_that_nobody_answers_goes_on_for_ever_with_growing_pauses() -
 
 
 def test_reports_alone_confirm_nothing_and_two_pauses_do() -> None:
-    desk = Desk()
+    desk = Workbench()
     desk.control.link_up(desk.now)
     desk.pump()
     for _ in range(4):
@@ -573,29 +584,29 @@ def test_reports_alone_confirm_nothing_and_two_pauses_do() -> None:
 # ---------------------------------------------------------------------- the end
 
 
-def idle(desk: Desk) -> None:
+def idle(desk: Workbench) -> None:
     pass
 
 
-def driving(desk: Desk) -> None:
+def driving(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it")
 
 
-def acting(desk: Desk) -> None:
+def acting(desk: Workbench) -> None:
     desk.ask(Find(), identity="it")
     desk.ask(OneShot(Ptz(1)))
 
 
-def opening(desk: Desk) -> None:
+def opening(desk: Workbench) -> None:
     desk.ask(SetMode(Mode.TRACKING), identity="it")
 
 
-def stopping(desk: Desk) -> None:
+def stopping(desk: Workbench) -> None:
     desk.ask(Stop())
     desk.run(0.3)
 
 
-def recovering(desk: Desk) -> None:
+def recovering(desk: Workbench) -> None:
     desk.control.link_down("gone", desk.now)
     desk.control.link_up(desk.now)
     desk.run(1.0, reports=False)
@@ -606,8 +617,8 @@ STATES = [idle, driving, acting, opening, stopping, recovering]
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi", "unknown"])
-def test_a_shutdown_ends_when_its_stop_is_shown_or_sent(platform: str, state: Callable[[Desk], None]) -> None:
-    desk = Desk(platform).ready()
+def test_a_shutdown_ends_when_its_stop_is_shown_or_sent(platform: str, state: Callable[[Workbench], None]) -> None:
+    desk = Workbench(platform).ready()
     state(desk)
     began, sent = desk.now, len(desk.sent)
     desk.control.shutdown(desk.now)
@@ -630,9 +641,9 @@ def test_a_shutdown_ends_when_its_stop_is_shown_or_sent(platform: str, state: Ca
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("platform", ["arduino", "unknown"])
 def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_stopped(
-    platform: str, state: Callable[[Desk], None]
+    platform: str, state: Callable[[Workbench], None]
 ) -> None:
-    desk = Desk(platform).ready()
+    desk = Workbench(platform).ready()
     state(desk)
     if desk.control.basis is not None:
         desk.ask(Drive(Motion.FORWARD, 0.2))
@@ -650,7 +661,7 @@ def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_st
     assert desk.control.basis is None
 
 
-def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped(desk: Desk) -> None:
+def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped(desk: Workbench) -> None:
     desk.control.link_down("unplugged", desk.now)
     desk.control.shutdown(desk.now)
     assert desk.control.finished
@@ -662,7 +673,7 @@ def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_sto
 
 def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() -> None:
     """The gateway before this one may have left it driving."""
-    desk = Desk()
+    desk = Workbench()
     desk.control.shutdown(desk.now)
     assert desk.control.finished
     desk.take()
@@ -695,7 +706,7 @@ def test_a_gateway_that_ends_while_its_car_tracks_waits_until_it_has_shown_that_
     assert not pair.control.not_stopped
 
 
-def test_a_link_that_goes_during_the_last_stop_is_said(desk: Desk) -> None:
+def test_a_link_that_goes_during_the_last_stop_is_said(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.control.shutdown(desk.now)
     desk.run(0.5)
@@ -725,7 +736,7 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
     stops = {b"#", STOP, MODE00}
     for seed in range(60):
         moments = random.Random(seed)
-        desk = Desk(platform).ready()
+        desk = Workbench(platform).ready()
         links = {0}
         for _ in range(moments.randrange(5, 40)):
             desk.ask(anything(moments), moments.choice([PERSON, SCRIPT, COORDINATOR]), streamed=False)

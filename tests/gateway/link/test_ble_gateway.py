@@ -8,7 +8,7 @@ import pytest
 
 from tests.gateway.link.peers import BlePeer
 from tests.support.ports import free_endpoint
-from tests.support.processes import TAKEN, Fleet, Process, driving, wait_for
+from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, driving, wait_for
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's; elsewhere bleak asks the system")
 
@@ -21,28 +21,28 @@ def peer() -> Iterator[BlePeer]:
 
 
 @pytest.fixture
-def fleet(tmp_path: Path, peer: BlePeer) -> Iterator[Fleet]:
+def fleet(tmp_path: Path, peer: BlePeer) -> Iterator[FleetProcesses]:
     """Its processes are told of the private bus, which must outlive them."""
-    started = Fleet(free_endpoint(), tmp_path)
+    started = FleetProcesses(free_endpoint(), tmp_path)
     yield started
     started.close()
 
 
 @pytest.fixture
-def sim(fleet: Fleet, peer: BlePeer) -> Process:
+def sim(fleet: FleetProcesses, peer: BlePeer) -> GatewayProcess:
     """A simulated car, wired to the module."""
     simulated, (link,) = fleet.simulate("red:arduino:pty")
     peer.bluez.wire(peer.module, link.removeprefix("serial://"))
     return simulated
 
 
-def drive(fleet: Fleet, sim: Process) -> None:
+def drive(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     answer = fleet.ask("drive", motion="forward", duration_s=10, sender="mia", kind="person")
     assert answer["status"] in TAKEN, answer
     wait_for(lambda: driving(sim), "it drives")
 
 
-def test_it_drives_and_stops(fleet: Fleet, peer: BlePeer, sim: Process) -> None:
+def test_it_drives_and_stops(fleet: FleetProcesses, peer: BlePeer, sim: GatewayProcess) -> None:
     gateway = fleet.gateway(str(peer.url))
     fleet.ready()
     drive(fleet, sim)
@@ -56,7 +56,7 @@ def test_it_drives_and_stops(fleet: Fleet, peer: BlePeer, sim: Process) -> None:
     assert not peer.module.connected
 
 
-def test_out_of_range_while_it_drives(fleet: Fleet, peer: BlePeer, sim: Process) -> None:
+def test_out_of_range_while_it_drives(fleet: FleetProcesses, peer: BlePeer, sim: GatewayProcess) -> None:
     fleet.gateway(str(peer.url))
     fleet.ready()
     drive(fleet, sim)
@@ -71,7 +71,7 @@ def test_out_of_range_while_it_drives(fleet: Fleet, peer: BlePeer, sim: Process)
 
 
 def test_a_killed_gateways_successor_takes_the_module_over_and_stops_the_car(
-    fleet: Fleet, peer: BlePeer, sim: Process
+    fleet: FleetProcesses, peer: BlePeer, sim: GatewayProcess
 ) -> None:
     gateway = fleet.gateway(str(peer.url))
     fleet.ready()

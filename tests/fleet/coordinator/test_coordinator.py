@@ -1,0 +1,308 @@
+"""`fleet coordinate` as a process, with real gateways: a plan is kept, and never against a hold."""
+
+import re
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet.client.client import Fleet
+from schemas import bus
+from tests.fleet.conftest import Cars, asked
+from tests.support.processes import LONG_S, GatewayProcess, wait_for
+
+PLAN = """
+cars: {red: tracking, green: manual}
+rules:
+  - when: {car: green, is: motion.motion == 'spin_left'}
+    then: {who: red, mode: light_seeking}
+"""
+
+
+STARTED: list[GatewayProcess] = []
+
+
+class Lines:
+    """What a coordinator has decided, for each car in order: which of two cars is decided first is chance."""
+
+    def __init__(self, process: GatewayProcess) -> None:
+        self.process = process
+        self._passed: dict[str, list[Any]] = {}
+
+    def until(self, car: str, mode: str | None, why: str) -> Any:
+        while True:
+            line = self._next(car)
+            if line["mode"] == mode and why in line["why"]:
+                return line
+
+    def _next(self, car: str) -> Any:
+        """The next line of this car; those of others are kept for when they are asked for."""
+        if passed := self._passed.get(car):
+            return passed.pop(0)
+        while (line := self.process.line())["car"] != car:
+            self._passed.setdefault(line["car"], []).append(line)
+        return line
+
+
+def coordinator(cars: Cars, path: Path, plan: str = PLAN, *more: str) -> GatewayProcess:
+    path.write_text(plan, encoding="utf-8")
+    process = cars.start("-m", "fleet.cli", "coordinate", "--plan", str(path), "--json", *more)
+    STARTED.append(process)
+    return process
+
+
+@pytest.fixture(autouse=True)
+def none_outlives_its_test() -> Iterator[None]:
+    """There is one at a time: that of a test that failed would fail all that follow."""
+    yield
+    while STARTED:
+        STARTED.pop().end()
+
+
+def truth(cars: Cars, car: str) -> str:
+    return str(cars.sim.say({"car": car, "ask": "truth"})["mode"])
+
+
+def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> None:
+    seen: list[bus.Sample] = []
+    cars.bus.subscribe("fleet/@coordinator/**", seen.append)
+    process = coordinator(cars, tmp_path / "plan.yaml")
+    lines = Lines(process)
+    lines.until("red", "tracking", "role tracking")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    with Fleet(cars.endpoint, sender="ann", kind="person") as client:
+        # Someone's stop: the coordinator leaves the car alone, also when its mode is not the planned one.
+        assert client.car("red").stop().ok
+        held = lines.until("red", None, "on hold by ann")
+        assert held["would_change"] == "a drive, mode or resume by a person or script"
+        assert client.get("red/state/mode")[0].value.asked == "manual"
+        # The end of the hold: the mode is asked for again.
+        assert client.car("red").resume().ok
+        lines.until("red", "tracking", "role tracking")
+        wait_for(lambda: truth(cars, "red") == "tracking", "red tracks again")
+        # A rule.
+        drive = threading.Thread(target=lambda: asked(lambda: client.car("green").drive("spin_left", LONG_S)))
+        drive.start()
+        ruled = lines.until("red", "light_seeking", "rule 1")
+        assert re.match(r"green/state/motion motion=spin_left \(\d+\.", ruled["readings"][0])
+        wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
+        assert client.car("green").drive("stop").ok
+        drive.join()
+        lines.until("red", "tracking", "role tracking")
+        # A gateway that comes back: its car is brought to its mode again.
+        assert cars.gateways["red"].end() == 0
+        lines.until("red", None, "not on the bus")
+        cars.gateways["red"] = cars.serve("red")
+        lines.until("red", "tracking", "role tracking")
+        wait_for(lambda: truth(cars, "red") == "tracking", "red tracks after its gateway's return")
+
+    second = coordinator(cars, tmp_path / "second.yaml")
+    assert second.wait() == 1
+    assert "fleet: fleet fleet has a coordinator already (coordinator-" in second.stderr
+    assert f"-{process.pid}): stop that one first" in second.stderr
+
+    assert process.end(signal.SIGINT) == 0
+    assert "Traceback" not in process.stderr
+    assert truth(cars, "red") == "tracking", "cars keep their modes"
+    messages: dict[str, list[Any]] = {}
+    for sample in seen:
+        messages.setdefault(sample.key, []).append(sample.message())
+    plan, *again = messages["fleet/@coordinator/plan"]
+    assert {each.version for each in again} <= {plan.version}
+    assert plan.text == PLAN
+    assert plan.seq == 1
+    decisions = messages["fleet/@coordinator/decision"]
+    assert [each.seq for each in decisions] == list(range(1, len(decisions) + 1))
+    assert {each.subject for each in decisions} == {"red", "green", "role tracking", "role manual"}
+    last = messages["fleet/@coordinator/assignment"][-1]
+    assert {role.name: list(role.cars) for role in last.roles} == {"manual": ["green"], "tracking": ["red"]}
+
+
+def test_a_car_whose_link_is_lost_is_left_alone_and_brought_to_its_mode_when_it_is_back(
+    cars: Cars, tmp_path: Path
+) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {red: tracking}")
+    lines = Lines(process)
+    lines.until("red", "tracking", "role tracking")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    cars.sim.say({"car": "red", "fault": "link_drop"})
+    lost = lines.until("red", None, "the link of red is lost")
+    assert lost["would_change"] == "its return"
+    cars.sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
+    lines.until("red", "tracking", "role tracking")
+    wait_for(lambda: cars.state("mode").asked == "tracking", "it is asked for again")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks again")
+    assert process.stderr == "", "nothing was asked of a car that could not be reached"
+    assert process.end(signal.SIGTERM) == 0
+
+
+def test_what_a_car_cannot_do_is_said_and_not_asked_for(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {blue: tracking, green: manual, purple: manual}")
+    lines = Lines(process)
+    idle = lines.until("blue", "manual", "raspberry_pi cars do not know mode tracking; they know manual")
+    assert idle["kind"] == "idle"
+    lines.until("purple", None, "purple is not on the bus")
+    assert process.end(signal.SIGTERM) == 0
+    assert process.stderr == ""
+
+
+def test_a_plan_with_a_mistake_is_wrong_use(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {red: fast}")
+    assert process.wait() == 2
+    assert "plan.yaml:1:13: cars.red: there is no role or mode fast: there are manual, " in process.stderr
+    assert process.stderr.count("\n") == 1
+
+
+def test_plan_assignment_and_decisions_can_be_asked_for(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {red: manual}")
+    Lines(process).until("red", "manual", "role manual")
+
+    def known() -> dict[str, Any] | None:
+        answers = [each for each in cars.get("fleet/@coordinator/*") if not isinstance(each, str)]
+        named = {getattr(each, "subject", each.DESCRIPTOR.name): each for each in answers}
+        return named if len(named) == 4 else None
+
+    found = wait_for(known, "all four answer")
+    assert found["Plan"].text == "cars: {red: manual}"
+    assert found["red"].decided == "manual"
+    assert found["role manual"].decided == "1 of 1"
+    assert [role.name for role in found["Assignment"].roles] == ["manual"]
+
+
+TEAM = """
+roles:
+  scout: {mode: tracking}
+  rest: {mode: manual, count: all, priority: -1}
+"""
+
+
+def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_all(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", TEAM)
+    lines = Lines(process)
+    lines.until("green", "manual", "role rest")
+    lines.until("red", "tracking", "role scout")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    why = cars.start("-m", "fleet.cli", "why", "red", "--json")
+    told = why.line()
+    assert (told["decided"], told["kind"], told["role"]) == ("tracking", "role", "scout")
+    assert why.wait() == 0
+    assert told["since"] <= told["stamp"]
+    said = cars.start("-m", "fleet.cli", "why", "red")
+    assert said.wait() == 0
+    assert re.match(r"red: tracking, for 0:0\d:\d\d \(since \d\d:\d\d:\d\d\)", said.lines()[0]), said.stderr
+    nobody = cars.start("-m", "fleet.cli", "why", "purple")
+    assert nobody.wait() == 1
+    assert "nothing was decided of purple; there are decisions of blue, green, red" in nobody.stderr
+
+    key = "fleet/@coordinator/@cmd/plan"
+    (refused,) = cars.bus.query(key, payload=b"cars: {red: fast}\nroles: {x: {}}", timeout_s=5.0)
+    assert isinstance(refused, bus.Sample)
+    answer: Any = refused.message()
+    assert (answer.status, answer.reason) == ("rejected", "bad_value")
+    assert "roles.x.mode: is missing" in answer.words
+    (plan,) = cars.get("fleet/@coordinator/plan")
+    assert plan.text == TEAM, "nothing is half applied"
+
+    changed = TEAM + "  dance: {mode: light_seeking, cars: [red], priority: 5}\n"
+    (taken,) = cars.bus.query(key, payload=changed.encode(), timeout_s=5.0)
+    assert isinstance(taken, bus.Sample)
+    assert taken.message().status == "sent"  # type: ignore[attr-defined]  # a fleet.v1.Result
+    lines.until("red", "light_seeking", "role dance")
+    wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
+    assert process.end(signal.SIGTERM) == 0
+
+
+LISTED = """
+cars:
+  red: {platform: arduino, roles: [scout]}
+  green: {platform: raspberry_pi}
+  blue: {platform: raspberry_pi}
+"""
+NEVER = "cars: {purple: tracking}\nroles: {ghost: {mode: tracking, cars: [green]}}"
+
+
+def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_over_the_bus(
+    cars: Cars, tmp_path: Path
+) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(LISTED, encoding="utf-8")
+    listed = ("--fleet-file", str(file))
+    told = (
+        "car purple: the fleet file has no such car; it has blue, green, red",
+        "role ghost: no car can fill it",
+        "role tracking: no car can fill it",
+    )
+    refused = coordinator(cars, tmp_path / "never.yaml", NEVER, *listed)
+    assert refused.wait() == 2
+    assert all(f"{tmp_path / 'never.yaml'}: {each}" in refused.stderr for each in told), refused.stderr
+    assert "Traceback" not in refused.stderr
+    alone = coordinator(cars, tmp_path / "alone.yaml", "roles: {ghost: {mode: manual, platforms: [stm32]}}", *listed)
+    assert alone.wait() == 2, "nor is one that only the cars of the fleet file cannot do"
+
+    process = coordinator(cars, tmp_path / "plan.yaml", "roles: {scout: {mode: tracking}}", *listed)
+    lines = Lines(process)
+    lines.until("red", "tracking", "role scout")
+    key = "fleet/@coordinator/@cmd/plan"
+    for plan, expected in ((NEVER, told), ("roles: {x: {mode: arm}}", ("roles.x.mode",))):
+        (sample,) = cars.bus.query(key, payload=plan.encode(), timeout_s=5.0)
+        assert isinstance(sample, bus.Sample)
+        answer: Any = sample.message()
+        assert (answer.status, answer.reason) == ("rejected", "bad_value")
+        assert all(each in answer.words for each in expected), answer.words
+    (in_force,) = cars.get("fleet/@coordinator/plan")
+    assert in_force.text == "roles: {scout: {mode: tracking}}"
+    # A role of the fleet file that the plan does not have may be a typo of either: it is told, and no more.
+    (sample,) = cars.bus.query(key, payload=b"roles: {scouts: {mode: manual}}", timeout_s=5.0)
+    assert isinstance(sample, bus.Sample)
+    answer = sample.message()
+    assert answer.status == "sent"
+    assert "warning: car red: the fleet file lets it take role scout, which this plan does not have" in answer.words
+    assert process.end(signal.SIGTERM) == 0
+    assert "the new plan: car red: the fleet file lets it take role scout" in process.stderr
+
+
+def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", TEAM)
+    Lines(process).until("red", "tracking", "role scout")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    asked: list[bus.Sample] = []
+    cars.bus.subscribe("fleet/*/event/command", asked.append)
+    process.kill()
+    process.wait()
+    wait_for(lambda: not cars.bus.tokens("fleet/@coordinator"), "its token is gone")
+    following = coordinator(cars, tmp_path / "plan.yaml", TEAM)
+    Lines(following).until("red", "tracking", "role scout (1 of 1): it had it before")
+    # What it has asked for would have come before what is asked for now.
+    with Fleet(cars.endpoint, sender="ann", kind="person") as client:
+        assert client.car("blue").stop().ok
+    Lines(following).until("blue", None, "on hold by ann")
+
+    def told() -> list[Any]:
+        events: list[Any] = [sample.message() for sample in asked]
+        # What became of a command of the first may be told late.
+        return [each for each in events if not each.sender.endswith(f"-{process.pid}")]
+
+    wait_for(told, "the stop is heard here, too")
+    assert {each.verb for each in told()} == {"stop"}
+    with Fleet(cars.endpoint, sender="ann", kind="person") as client:
+        assert client.car("blue").resume().ok
+    assert truth(cars, "red") == "tracking"
+    assert following.end(signal.SIGTERM) == 0
+
+
+def test_a_role_goes_to_another_car_when_a_gateway_dies(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "roles: {watch: {mode: manual, cars: [green, blue]}}")
+    lines = Lines(process)
+    lines.until("green", "manual", "role watch")
+    killed = cars.gateways["green"]
+    killed.kill()
+    killed.wait()
+    lines.until("green", None, "green is not on the bus; its role watch is kept for 1.5 s")
+    lines.until("blue", "manual", "role watch (1 of 1): in place of green: green is not on the bus")
+    cars.gateways["green"] = cars.serve("green")
+    cars.ready("green")
+    lines.until("green", "manual", "no role for it: watch: it has its car: blue")
+    assert process.end(signal.SIGTERM) == 0

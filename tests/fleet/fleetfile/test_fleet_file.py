@@ -1,0 +1,286 @@
+"""Fleet files: layers resolved, faults across cars told, and links understood as gateways understand them."""
+
+import json
+import time
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
+from fleet.fleetfile.models import CRITICAL_V, EMPTY_V, FULL_V, LONGEST_DRIVE_S, LOW_V, BatteryAction, schema
+from fleet.links import BadLink, LinkKind, LinkUrl, parse_link, shared_ports
+from gateway.bus import requests
+from gateway.control.estimate import battery
+from gateway.link import BadUrl, parse_url
+from schemas.yaml_document.document import BadFile
+
+LAYERS = """\
+name: lab
+endpoint: tcp/127.0.0.1:7000
+plan: plan.yaml
+recordings: ../kept
+record: false
+defaults: {platform: arduino, roles: [patrol, guard], limits: {longest_drive_s: 5, battery_low_v: 7.2}}
+types:
+  slow: {limits: {speed_max: 0.5, longest_drive_s: 3}, colour: "#00FF00", roles: [guard]}
+cars:
+  red: {link: /dev/ttyUSB7}
+  green: {type: slow, link: tcp://Pi:8888, limits: {on_battery_low: stop}}
+  blue: {type: slow, platform: raspberry_pi+arm, link: ble://aa:bb:cc:dd:ee:ff, capabilities: [drive], roles: []}
+"""
+
+
+def _fleet(text: str, *, unbound: bool = False) -> FleetFile:
+    return parse_fleet(text, Path("/nowhere/f.yaml"), unbound=unbound)
+
+
+def _faults(text: str) -> list[str]:
+    with pytest.raises(BadFile) as caught:
+        _fleet(text)
+    return str(caught.value).splitlines()
+
+
+def test_a_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> None:
+    (tmp_path / "plan.yaml").touch()
+    path = tmp_path / "fleet.yaml"
+    path.write_text(LAYERS)
+    fleet = read_fleet(path)
+    assert (fleet.name, fleet.endpoint, fleet.record, fleet.text) == ("lab", "tcp/127.0.0.1:7000", False, LAYERS)
+    assert (fleet.plan, fleet.recordings) == (tmp_path / "plan.yaml", tmp_path.parent / "kept")
+    assert list(fleet.cars) == ["red", "green", "blue"]
+    red, green, blue = fleet.cars.values()
+    assert red.limits == Limits(longest_drive_s=5, battery_low_v=7.2)
+    assert (red.roles, red.colour) == (("patrol", "guard"), "#e01b24")
+    assert red.capabilities == profile_capabilities("arduino")
+    slow = Limits(longest_drive_s=3, battery_low_v=7.2, speed_max=0.5, on_battery_low=BatteryAction.STOP)
+    assert green == FleetCar(
+        "green", "tcp://Pi:8888", "arduino", "#00ff00", profile_capabilities("arduino"), slow, ("guard",)
+    )
+    assert (blue.platform, blue.capabilities, blue.roles) == ("raspberry_pi+arm", frozenset({"drive"}), ())
+
+
+def test_what_is_not_said() -> None:
+    fleet = _fleet("cars: {red: {link: sim, platform: stm32}, b2: {link: COM3}}")
+    assert (fleet.name, fleet.endpoint, fleet.plan, fleet.recordings, fleet.record) == ("fleet", None, None, None, True)
+    assert (fleet.cars["b2"].platform, fleet.cars["b2"].roles, fleet.cars["b2"].limits) == ("auto", None, Limits())
+    assert {"tracking", "servo_vertical", "drive"} <= fleet.cars["b2"].capabilities
+    assert "arm" not in fleet.cars["b2"].capabilities
+
+
+def test_what_is_not_said_is_as_gateways_have_it() -> None:
+    policy = battery.BatteryPolicy()
+    assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.low, policy.critical)
+    assert [*BatteryAction] == [*battery.BatteryReaction]
+    assert (EMPTY_V, FULL_V, LOW_V, CRITICAL_V) == (battery.EMPTY_V, battery.FULL_V, battery.LOW_V, battery.CRITICAL_V)
+    assert requests.LONGEST_DRIVE_S == LONGEST_DRIVE_S
+
+
+def test_all_faults_of_a_fleet_are_told_at_once() -> None:
+    lines = _faults("""\
+name: Lab
+plan: nope.yaml
+defaults: {platform: arduino, limits: {battery_low_v: 6.5}}
+types:
+  small: {capabilities: [drive, servo_vertical], colour: red}
+cars:
+  red: {type: smal, link: /dev/ttyUSB0}
+  green: {type: small, link: "serial:///dev/ttyUSB0?baud=9600", limits: {on_battery_low: stp}}
+  blue: {link: 11:22:33:44:55:10, roles: [Patrol], platfrom: stm32}
+  white: {}
+  black: {link: sim, platform: auto}
+""")
+    found = [line.removeprefix("/nowhere/f.yaml:") for line in lines]
+    assert [line.split(": ")[:2] for line in found] == [
+        ["1:7", "name"],
+        ["2:7", "plan"],
+        ["3:39", "defaults.limits"],
+        ["5:25", "types.small.capabilities"],
+        ["5:58", "types.small.colour"],
+        ["7:15", "cars.red.type"],
+        ["8:30", "cars.green.link"],
+        ["8:90", "cars.green.limits.on_battery_low"],
+        ["9:16", "cars.blue.link"],
+        ["9:43", "cars.blue.roles[0]"],
+        ["9:52", "cars.blue.platfrom"],
+        ["10:3", "cars.white.link"],
+        ["11:32", "cars.black.platform"],
+    ]
+    assert "one of small; did you mean 'small'?" in found[5]
+    assert "may be the port of red" in found[6]
+    assert "did you mean 'platform'?" in found[10]
+    assert "fleet bind" in found[11]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("/dev/ttyUSB0", "serial:///dev/ttyUSB0", True),
+        ("/dev/ttyUSB0", "/dev/../dev/ttyUSB0", True),
+        ("COM3", "serial://com3", True),
+        ("COM3", "COM4", False),
+        ("ble://aa:bb:cc:dd:ee:ff", "BLE://AA:BB:CC:DD:EE:FF", True),
+        ("ble://name=BT04", "ble://name=bt04", False),
+        ("tcp://localhost:8888", "tcp://127.0.0.1:8888", True),
+        ("tcp://PI.local:8888", "tcp://pi.local.:8888", True),
+        ("tcp://pi:8888", "tcp://pi:8889", False),
+        ("serial://?vid=1A86&serial=A", "serial://?vid=0x1a86&serial=A&baud=9600", True),
+        ("serial://?vid=1a86&serial=A", "serial://?serial=A", True),
+        ("serial://?vid=1a86&serial=A", "serial://?vid=1a86&serial=B", False),
+        ("sim", "sim", False),
+    ],
+)
+def test_two_cars_on_one_port(one: str, other: str, same: bool) -> None:
+    text = json.dumps({"defaults": {"platform": "arduino"}, "cars": {"a": {"link": one}, "b": {"link": other}}})
+    if same:
+        (line,) = _faults(text)
+        assert "cars.b.link" in line
+        assert "may be the port of a" in line
+    else:
+        assert len(_fleet(text).cars) == 2
+
+
+def test_a_port_behind_two_names(tmp_path: Path) -> None:
+    (tmp_path / "tty").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "tty")
+    (line,) = _faults(f"cars: {{a: {{link: {tmp_path}/tty}}, b: {{link: {tmp_path}/by-id}}}}")
+    assert "may be the port of a" in line
+
+
+_PORTS = [parse_link(each) for each in ("/dev/a", "/dev/b", "tcp://a:1", "tcp://a:2", "ble://name=a", "sim")] + [
+    parse_link(f"serial://?{ids}")
+    for ids in (
+        "vid=1a86",
+        "pid=7523",
+        "serial=A",
+        "serial=B",
+        "vid=1a86&pid=7523",
+        "vid=1a86&serial=A",
+        "pid=7523&serial=B",
+    )
+]
+
+
+@given(st.lists(st.sampled_from(_PORTS), max_size=12))
+def test_shared_ports_are_those_that_a_comparison_of_each_pair_finds(links: list[LinkUrl]) -> None:
+    named = {f"car{number}": link for number, link in enumerate(links)}
+    first: dict[str, str] = {}
+    for (one, before), (other, after) in combinations(named.items(), 2):
+        if before.may_be(after):
+            first.setdefault(other, one)
+    assert set(shared_ports(named)) == {(one, other) for other, one in first.items()}
+
+
+@pytest.mark.parametrize("link", ["tcp://10.0.{}.{}:8888", "/dev/tty{}.{}", "serial://?vid=1a86&serial={}.{}"])
+def test_a_large_file_takes_time_for_each_car_and_not_for_each_pair(link: str) -> None:
+    lines = "".join(f"  c{n}: {{link: '{link.format(n >> 8, n & 255)}'}}\n" for n in range(4000))
+    began = time.process_time()
+    assert len(_fleet(f"cars:\n{lines}").cars) == 4000
+    assert time.process_time() - began < 4.0, "a comparison of each pair takes 9 to 60 s"
+
+
+def test_a_car_without_a_link_is_let_through_for_who_looks_for_it() -> None:
+    fleet = _fleet("cars: {red: {platform: stm32}, green: {link: COM1}}", unbound=True)
+    assert (fleet.unbound, list(fleet.cars)) == (("red",), ["green"])
+
+
+LINKS = [
+    *(
+        "/dev/ttyUSB0",
+        "serial:///dev/ttyUSB0",
+        "serial:///dev/x?baud=115200",
+        "serial:///dev/x?baud=1",
+        "COM3",
+        "com1234",
+    ),
+    *(
+        "serial://COM3",
+        "serial://x",
+        "serial://",
+        "serial:///",
+        "serial://?vid=1a86",
+        "serial://?vid=1a8",
+        "serial://?",
+    ),
+    *("serial://?serial=", "serial://?serial=A+B", "serial://?serial=A&serial=B", "serial:///dev/x?vid=1a86"),
+    *("serial://?vid=0x1A86&pid=7523&baud=9600", "serial:///dev/x#1", "serial://dev/x", "serial://?speed=1"),
+    *("tcp://pi:8888", "tcp://pi", "tcp://:1", "tcp://pi:0", "tcp://pi:99999", "tcp://[::1]:8888", "tcp://a:1/x"),
+    *("tcp://u@a:1", "tcp://a:1?x", "TCP://a:1", "udp://a:1", "ble://aa:bb:cc:dd:ee:ff", "ble://aabb", "BLE://name=x"),
+    *("ble://name=", "ble://name=%00", "ble://name=" + "x" * 249, "ble://12345678-1234-1234-1234-1234567890ab"),
+    *(
+        "",
+        " ",
+        "x",
+        "11:22:33:44:55:10",
+        "/dev/x\n",
+        "tcp://a:b",
+        "tcp://[::1:8888",
+        "dev/ttyUSB0",
+        "~/x",
+        "serial://?baud=9600",
+    ),
+]
+
+
+def _agree(text: str) -> None:
+    try:
+        parse_url(text)
+    except BadUrl:
+        with pytest.raises(BadLink):
+            parse_link(text)
+    else:
+        parse_link(text)
+
+
+@pytest.mark.parametrize("text", LINKS)
+def test_links_are_as_gateways_take_them(text: str) -> None:
+    _agree(text)
+
+
+_PIECES = [
+    "serial",
+    "tcp",
+    "ble",
+    "://",
+    "/",
+    "?",
+    "&",
+    "vid=",
+    "1a86",
+    "serial=",
+    "baud=",
+    "9600",
+    ":",
+    "[",
+    "]",
+    "a",
+    "%",
+]
+
+
+@given(st.lists(st.sampled_from(_PIECES), max_size=9).map("".join))
+def test_links_of_any_pieces_are_as_gateways_take_them(text: str) -> None:
+    _agree(text)
+
+
+def test_only_fleet_files_know_simulated_links() -> None:
+    assert parse_link("sim").kind is LinkKind.SIMULATED
+    with pytest.raises(BadUrl):
+        parse_url("sim")
+
+
+def test_the_one_in_the_readme_is_right() -> None:
+    readme = (Path(__file__).parents[3] / "README.md").read_text(encoding="utf-8")
+    section = readme.partition("### The fleet file")[2]
+    fleet = _fleet(section.partition("```yaml\n")[2].partition("```")[0])
+    assert {name: car.platform for name, car in fleet.cars.items()} == {"red": "arduino+arm", "blue": "raspberry_pi"}
+
+
+def test_the_schema_is_one_for_editors() -> None:
+    made = schema()
+    assert made["required"] == ["cars"]
+    car = made["$defs"]["CarEntry"]["properties"]
+    assert car["platform"]["pattern"] == "^(auto|arduino|stm32|raspberry_pi|unknown)([+](arm|imu))*$"
+    assert all("description" in field for field in car.values())

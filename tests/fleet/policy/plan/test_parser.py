@@ -1,0 +1,180 @@
+"""What a plan may say, and that every mistake in it is told at once, with line, column and what is allowed."""
+
+from pathlib import Path
+
+import pytest
+
+from fleet.policy.plan.lint import check
+from fleet.policy.plan.parser import parse
+from fleet.policy.plan.plan import Quantifier
+from gateway.protocol.enums import Mode
+from schemas.yaml_document.document import BadFile
+
+DEPLOY = Path(__file__).parents[4] / "deploy"
+
+
+@pytest.mark.parametrize("path", sorted(DEPLOY.glob("plan*.yaml")), ids=lambda path: path.name)
+def test_the_plans_in_deploy_are_some(path: Path) -> None:
+    plan = parse(path.read_text(encoding="utf-8"))
+    assert plan.rules
+    assert check(plan) == ()
+
+
+def test_a_mode_for_a_car_is_a_role_of_its_own() -> None:
+    plan = parse("cars: {red: tracking, blue: tracking, green: patrol}\nroles: {patrol: {mode: following}}")
+    assert plan.roles["tracking"].cars == ("red", "blue")
+    assert plan.roles["tracking"].count == 2
+    assert plan.roles["patrol"].mode is Mode.FOLLOWING
+    assert plan.may("green", plan.roles["patrol"])
+    assert not plan.may("red", plan.roles["patrol"])
+    assert plan.version == parse(plan.text).version != parse(plan.text + "#").version
+
+
+def test_words_that_yaml_1_1_takes_for_something_else_are_words() -> None:
+    plan = parse("cars: {on: manual, no: tracking, 'off': manual, y: manual}")
+    assert list(plan.fixed) == ["on", "no", "off", "y"]
+
+
+def test_a_condition_is_told_as_it_was_meant() -> None:
+    plan = parse(
+        "cars: {red: tracking}\nrules: [{when: {all: not (light.left), for_s: 2}, then: {who: all, mode: manual}}]"
+    )
+    (rule,) = plan.rules
+    assert rule.when.of is Quantifier.ALL
+    assert rule.when.text == "all car: not light.left for 2 s"
+
+
+ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "p:1:1: is empty"),
+        ("{}", "p:1:1: a plan has `cars:` or `roles:`"),
+        ("cars: {red: fast}", "p:1:13: cars.red: there is no role or mode fast: there are manual, "),
+        ("cars: {red: manual, red: tracking}", "p:1:21: cars.red: is given twice"),
+        ("cars: {Red: manual}", "p:1:8: cars.Red"),
+        (
+            "rolls: {}",
+            "there is no such field here: allowed are cars, idle, phases, roles, rules; did you mean 'roles'?",
+        ),
+        (
+            "roles: {a: {mode: tracking, count: 0}}",
+            "p:1:36: roles.a.count: 0 is not allowed: a whole number, at least 1",
+        ),
+        (
+            "roles: {a: {mode: tracking, count: two}}",
+            "'two' is not allowed: a whole number, at least 1 and at most 1000 or the word all",
+        ),
+        ("cars: {Red: manual}", "cars.Red: name 'Red' is not allowed: use 1 to 32 of a-z, 0-9, _ and -, beginning"),
+        ("roles: {a: {}}", "p:1:9: roles.a.mode: is missing: the mode of a car that has it, one of manual, remote_con"),
+        ("roles: {a: {mode: tracking, needs: volts > 7}}", "column 1: there is no volts"),
+        (
+            "roles: {a: {mode: tracking, needs: battery > 7.0}}",
+            "there is no battery: did you mean battery.voltage_v or",
+        ),
+        ("roles: {a: {mode: tracking, platforms: [raspberry_pi]}}", "raspberry_pi cars do not know mode tracking"),
+        ("roles: {a: {mode: tracking, fallback: b}}", "roles.a.fallback: there is no role b: there are a"),
+        ("roles: {a: {mode: tracking, fallback: a}}", "roles that stand in for each other: a -> a"),
+        ("roles: {a: {mode: tracking, capabilities: [wings]}}", "there is no capability wings"),
+        ("roles: {others: {mode: tracking}}", "others is a word of rules"),
+        ("cars: {a: b}\n" + ROLE, "a car has this name"),
+        (
+            ROLE + "rules: [{when: {any: light.left, all: light.left}, then: {phase: x}}]",
+            "exactly one of any, all, car",
+        ),
+        (ROLE + "rules: [{when: {car: red}, then: {who: red, role: a}}]", "car needs `is`"),
+        (ROLE + "rules: [{when: {any: light.left}, then: {who: red}}]", "who with one of role and mode, or led"),
+        (ROLE + "rules: [{when: {any: light.left}, then: {who: red, role: c}}]", "there is no role c: there are a, b"),
+        (ROLE + "rules: [{when: {all: light.left}, then: {who: that, role: a}}]", "with `all` there is no car"),
+        (ROLE + "rules: [{when: {any: light.left}, then: {phase: x}}]", "there is no phase x: there is none"),
+        (
+            ROLE + "phases: {x: {next: y}, y: {next: x}}",
+            "p:2:13: phases.x: a cycle of phases without a condition or a time-out: x -> y -> x",
+        ),
+        (ROLE + "phases: {x: {next: y}, y: {}}", "phases.x.next: nothing ends x: give it until, or timeout_s"),
+        (ROLE + "phases: {x: {until: {any: light.left}}}", "phases.x.until: it needs next"),
+        (ROLE + "phases: {x: {timeout_s: 3}}", "phases.x.timeout_s: it needs on_timeout, or next"),
+        ("cars: !!python/name:os.system {}", "the tag"),
+        (
+            "a: &a [x]\nb: &b [*a,*a,*a,*a,*a,*a,*a,*a]\n"
+            + "".join(
+                f"{name}: &{name} [{','.join(['*' + before] * 9)}]\n"
+                for before, name in zip("bcdefgh", "cdefghi", strict=True)
+            ),
+            "more than 20000 values",
+        ),
+    ],
+)
+def test_a_mistake_is_named(text: str, told: str) -> None:
+    with pytest.raises(BadFile) as raised:
+        parse(text, "p")
+    assert told in str(raised.value)
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    with pytest.raises(BadFile) as raised:
+        parse(
+            "roles:\n  a: {mode: tracking, needs: volts > 7}\n  b: {mode: manual, fallback: c}\ncars: {red: fast}\n",
+            "p",
+        )
+    assert [line.split(":")[1] for line in str(raised.value).splitlines()] == ["2", "3", "4"]
+
+
+EVERYTHING_WRONG = """\
+roles:
+  Big Role: {mode: tracking, needs: volts > 7}
+  a: {mode: dancing, needs: battery > 7.0, count: two}
+  b: {fallback: zed}
+  c: 5
+cars: {red: fast, Blue: manual}
+rules:
+  - 7
+  - {when: {any: light.left}, then: {who: that, role: c}}
+  - {when: {any: light.leftt}, then: {who: that, role: nobody}}
+  - {when: {car: red}, then: {whoo: that, role: a}}
+  - {then: {who: that, mode: flying}}
+  - {when: {any: light.left}, then: [{who: that, mode: 3}, {who: X Y, phase: q}]}
+phases:
+  x: {until: {any: light.left}, nxt: y}
+  y: {timeout_s: soon, next: z}
+"""
+
+
+def test_what_a_field_may_not_be_hides_no_other_fault_and_seems_to_be_none_itself() -> None:
+    """Names, types, references and conditions at once; what looks wrong only because something else is, is left out."""
+    with pytest.raises(BadFile) as raised:
+        parse(EVERYTHING_WRONG, "p")
+    assert [(each.line, each.field) for each in raised.value.problems] == [
+        (2, "roles.'Big Role'"),
+        (2, "roles.'Big Role'.needs"),
+        (3, "roles.a.mode"),
+        (3, "roles.a.needs"),
+        (3, "roles.a.count"),
+        (4, "roles.b.mode"),
+        (4, "roles.b.fallback"),
+        (5, "roles.c"),
+        (6, "cars.red"),
+        (6, "cars.Blue"),
+        (8, "rules[0]"),
+        (10, "rules[2].when.any"),
+        (10, "rules[2].then.role"),
+        (11, "rules[3].when"),
+        (11, "rules[3].then.whoo"),
+        (12, "rules[4].when"),
+        (12, "rules[4].then.mode"),
+        (13, "rules[5].then[0].mode"),
+        (13, "rules[5].then[1]"),
+        (13, "rules[5].then[1].who"),
+        (13, "rules[5].then[1].phase"),
+        (15, "phases.x.nxt"),
+        (16, "phases.y.timeout_s"),
+        (16, "phases.y.next"),
+    ]
+
+
+@pytest.mark.parametrize("text", ["7", "[]", "roles: 7", "roles: [a]\nrules: 3", "cars: {red: !!set {}}", "rules: {}"])
+def test_with_little_that_is_sound_there_is_a_fault_all_the_same(text: str) -> None:
+    with pytest.raises(BadFile):
+        parse(text, "p")

@@ -1,0 +1,86 @@
+"""When the time-out of a phase counts, and what of a plan outlives its coordinator."""
+
+from pathlib import Path
+
+import pytest
+
+from fleet.coordinator.state_file import CoordinatorStateFile
+from fleet.policy.plan.parser import parse
+from fleet.policy.rules import SETTLES_WITHIN_S
+from fleet.policy.snapshot import FleetSnapshot
+from fleet.policy.state import PersistedPolicy, restarted, restored, to_keep
+from tests.fleet.policy.cars import GONE, HERE, PolicyRun
+
+PLAN = parse(
+    "roles: {track: {mode: tracking, cars: [red]}, rest: {mode: manual, cars: [red]}}\n"
+    "phases: {work: {roles: [track], timeout_s: 5, next: done}, done: {roles: [rest]}}"
+)
+
+
+def ends_at(run: PolicyRun) -> float:
+    """When the phase ends, to a tenth."""
+    while run.at(round(run.now + 0.1, 1)).memory.phase.name == "work":
+        assert run.now < 60.0
+    return run.now
+
+
+@pytest.mark.parametrize(
+    ("before", "known_at", "in_mode_at", "ends"),
+    [
+        (HERE, 0.0, 0.1, 5.1),  # obeys at once
+        (HERE, 0.0, 4.0, 9.0),  # the mode takes its time
+        (GONE, 7.0, 8.0, 13.0),  # its gateway comes late
+        (HERE, 0.0, 60.0, SETTLES_WITHIN_S + 5.1),  # it never is: no longer than that
+    ],
+)
+def test_a_time_out_counts_from_when_the_cars_are_in_their_modes(
+    before: object, known_at: float, in_mode_at: float, ends: float
+) -> None:
+    run = PolicyRun(PLAN, "red", obey=False)
+    run.cars["red"] = before  # type: ignore[assignment]  # HERE or GONE
+    run.at(0.1)
+    while run.now < min(in_mode_at, 40.0) and run.memory.phase.name == "work":
+        if run.now >= known_at:
+            run.change("red", present=True, mode="manual", verdict="confirmed", link="online", motors="off")
+        run.at(round(run.now + 0.1, 1))
+    run.change("red", mode="tracking", verdict="assumed")
+    assert (run.now if run.memory.phase.name == "done" else ends_at(run)) == pytest.approx(ends, abs=0.3)
+
+
+def test_a_recovery_during_the_start_of_a_phase_is_waited_for_and_a_hold_is_not() -> None:
+    for fields, ends in (({"motors": "unknown"}, 12.0), ({"held_by": "ann"}, 5.1)):
+        run = PolicyRun(PLAN, "red")
+        run.change("red", **fields)
+        run.until(7.0) if "motors" in fields else run.at(0.1)
+        run.change("red", motors="off")
+        assert ends_at(run) == pytest.approx(ends, abs=0.3), fields
+
+
+def test_phase_and_rules_are_kept_within_one_run_and_roles_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    run = PolicyRun(PLAN, "red")
+    run.until(12.0)
+    assert run.memory.phase.name == "done"
+    CoordinatorStateFile("fleet", "tcp/x", "run-1").save(to_keep(PLAN, run.memory, run.now, 1000.0))
+
+    def begins(name: str) -> str:
+        kept = CoordinatorStateFile("fleet", "tcp/x", name).load()
+        assert kept.roles == {"red": "rest"}
+        memory = restored(PLAN, FleetSnapshot(run.cars), kept, 0.0, 1001.0)
+        run.memory = memory
+        return run.at(0.1).memory.phase.name
+
+    assert begins("run-1") == "done", "its coordinator was killed"
+    assert begins("run-2") == "work", "a new fleet up"
+    assert CoordinatorStateFile("fleet", "tcp/y", "run-1").load() == PersistedPolicy()
+
+
+def test_a_restarted_plan_begins_with_its_first_phase() -> None:
+    run = PolicyRun(PLAN, "red")
+    run.until(12.0)
+    run.memory = restarted(run.memory)
+    step = run.at(12.1)
+    assert step.memory.phase.name == "work"
+    assert [each.decided for each in step.changed if each.subject == "phase"] == ["work"]

@@ -1,0 +1,413 @@
+"""A file of our recorder's, cut and damaged in every place: what is whole is shown, what is not is said, and where."""
+
+import io
+import os
+import random
+import struct
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType, Writer
+
+from fleet.recording.reading.mcap_index import LIMIT
+from fleet.recording.reading.mcap_reader import McapReader, NotMcap
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.writing.recorder import LIMIT_BYTES
+from fleet.recording.writing.segment_writer import Segment
+from tests.fleet.recording.damaged import CHUNKS, PER_CHUNK, Original, judge, places, put, written
+
+ABSURD = (0, 1, 21, 2**16, LIMIT, LIMIT + 1, 2**31 - 1, 2**32, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Original:
+    return written(tmp_path_factory.mktemp("original") / "0001.mcap")
+
+
+def flipped(data: bytes, at: int, bit: int) -> bytes:
+    return data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
+
+
+def sampled(original: Original) -> list[int]:
+    """Offsets: dense where messages and the footer are, a few in the index, which has a checksum as a whole."""
+    end, size = original.chunks[-1][1], len(original.data)
+    first = original.chunks[0]
+    return [
+        *range(first[0] + 60),
+        *range(first[0] + 60, first[1] - 10, 97),
+        *range(first[1] - 10, end + 100, 3),
+        *range(end + 100, size - 60, 401),
+        *range(size - 60, size),
+    ]
+
+
+def cut_it_shows_every_whole_chunk(original: Original, lengths: Iterable[int], path: Path) -> None:
+    for length in lengths:
+        shown = judge(original, original.data[:length], length, path)
+        assert shown == original.until(length), length
+        assert ("is empty" if length == 0 else "is cut") in report(path), length
+
+
+def test_cut_anywhere_it_shows_every_whole_chunk(original: Original, tmp_path: Path) -> None:
+    cut_it_shows_every_whole_chunk(original, sampled(original), tmp_path / "x.mcap")
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+def test_cut_at_every_byte_it_shows_every_whole_chunk(original: Original, tmp_path: Path) -> None:
+    cut_it_shows_every_whole_chunk(original, range(len(original.data)), tmp_path / "x.mcap")
+
+
+def report(path: Path) -> str:
+    try:
+        salvage = McapReader(path)
+    except NotMcap as error:
+        return str(error)
+    salvage.check()
+    return salvage.words
+
+
+def test_a_flipped_bit_anywhere_is_said_and_loses_its_own_chunk_at_most(original: Original, tmp_path: Path) -> None:
+    for at in sampled(original):
+        flipped_it_loses_its_own_chunk_at_most(original, at, [at % 8], tmp_path)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+def test_every_flipped_bit_is_said_and_loses_its_own_chunk_at_most(original: Original, tmp_path: Path) -> None:
+    for at in range(len(original.data)):
+        flipped_it_loses_its_own_chunk_at_most(original, at, range(8), tmp_path)
+
+
+def flipped_it_loses_its_own_chunk_at_most(original: Original, at: int, bits: Iterable[int], tmp_path: Path) -> None:
+    hit = {number for number, (begin, end) in enumerate(original.chunks) if begin <= at < end}
+    for bit in bits:
+        shown = judge(original, flipped(original.data, at, bit), at, tmp_path / "x.mcap")
+        there = set(shown)
+        assert {original.chunk_of(message) for message in set(original.messages) - there} <= hit, (at, bit)
+        assert [message for message in original.messages if message in there] == shown, (at, bit)
+
+
+def test_without_an_index_too_a_flipped_bit_loses_its_own_chunk_at_most(original: Original, tmp_path: Path) -> None:
+    """Cut between chunks and within one; what describes the channels of a lost chunk is lost with it."""
+    described = {0: {"fleet/red/sensor/range", "fleet/red/state/link"}, 1: {"fleet/blue/note"}}
+    heads = [at for begin, end in original.chunks for at in (*range(begin, begin + 60), *range(end, end + 40))]
+    for length in (original.chunks[-1][1], original.chunks[-1][1] - 30, len(original.data) - 9):
+        whole = original.until(length)
+        for at in sorted({*range(8, length, 97), *heads} & {*range(length)}):
+            hit = {number for number, (begin, end) in enumerate(original.chunks) if begin <= at < end}
+            keys = {key for number in hit for key in described.get(number, ())}
+            data = flipped(original.data[:length], at, chance(at))
+            shown = judge(original, data, at, tmp_path / "x.mcap")
+            expected = [one for one in whole if original.chunk_of(one) not in hit and one.key not in keys]
+            known = set(expected)
+            assert [one for one in shown if one in known] == expected, (length, at, report(tmp_path / "x.mcap"))
+
+
+def chance(at: int) -> int:
+    """A bit."""
+    return random.Random(at).randrange(8)
+
+
+def test_a_length_that_leads_nowhere_is_said_and_hides_no_whole_chunk(original: Original, tmp_path: Path) -> None:
+    begin, end = original.chunks[1][0], original.chunks[2][0]
+    data = flipped(original.data[: original.chunks[-1][1]], begin + 1 + 5, 3)
+    shown = judge(original, data, begin, tmp_path / "x.mcap")
+    assert {original.chunk_of(message) for message in shown} == {0, 2, 3, 4}
+    words = report(tmp_path / "x.mcap")
+    assert "is cut (the recorder was killed or is still at work) and damaged: " in words
+    assert f"byte {begin}: no whole record begins there, {end - begin} bytes are passed over" in words
+
+
+@pytest.mark.parametrize("at", range(8))
+@pytest.mark.parametrize("cut", [0, 8, 900])
+def test_a_file_whose_first_bytes_are_damaged_is_no_other_kind_of_file(
+    original: Original, tmp_path: Path, at: int, cut: int
+) -> None:
+    path = tmp_path / "x.mcap"
+    length = len(original.data) - cut
+    put(path, flipped(original.data, at, chance(at))[:length])
+    session = Session.open(path)
+    assert list(session.messages()) == original.until(length)
+    assert "byte 0: the magic bytes of the beginning are damaged" in session.damage_words
+    put(path, bytes(60) + original.data[60:length])  # nor if more than those are
+    assert list(Session.open(path).messages()) == original.until(length)
+
+
+def test_what_looks_like_chunks_and_is_none_takes_no_time(tmp_path: Path) -> None:
+    """Every 57 bytes the head of a chunk that goes on almost to the end of the file."""
+    path = tmp_path / "x.mcap"
+    size = 2_000_000
+    parts = [b"\x89MCAP0\r\n"]
+    for at in range(8, size - 200_000, 57):
+        length = size - 100_000 - at
+        parts.append(struct.pack("<BQQQQII4sQ", 6, length, 1, 2, 2**20, 7, 4, b"zstd", length - 44) + bytes(4))
+    path.write_bytes(b"".join(parts).ljust(size, b"x"))
+    began = time.process_time()
+    assert list(Session.open(path).messages()) == []
+    assert time.process_time() - began < 20
+
+
+def test_what_the_recorder_takes_is_read(tmp_path: Path) -> None:
+    chance = random.Random(1)
+    path = tmp_path / "0001.mcap"
+    segment = Segment(path, {})
+    channel = segment.channel("fleet/red/big", "application/octet-stream")
+    sizes = (2**20 - 100, LIMIT_BYTES, 10, 20_000_000, 5)
+    for number, size in enumerate(sizes):
+        segment.add(channel, number, chance.randbytes(size), number, 0)
+    segment.finish({})
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-8])
+    for each in (path, cut):
+        salvage = McapReader(each)
+        assert [len(row[4]) for row in salvage.messages()] == list(sizes)
+        assert salvage.only_cut or not salvage.damage
+        salvage.check()
+        assert salvage.only_cut or not salvage.damage
+
+
+def test_a_file_in_which_nothing_was_recorded_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "0001.mcap"
+    Segment(path, {}).finish({})
+    salvage = McapReader(path)
+    index = salvage.index()
+    assert index is not None
+    assert index.complete
+    assert list(salvage.messages()) == []
+    assert not salvage.damage
+
+
+def test_a_damaged_chunk_is_named_with_its_place_its_time_and_its_cause(original: Original, tmp_path: Path) -> None:
+    begin, end = original.chunks[2]
+    shown = judge(original, flipped(original.data, end - 2, 0), end - 2, tmp_path / "x.mcap")
+    assert len(shown) == (CHUNKS - 1) * PER_CHUNK
+    words = report(tmp_path / "x.mcap")
+    assert places(words) == [begin]
+    assert "is damaged: " in words
+    assert "checksum" in words or "taken apart" in words
+    assert "14:13:20.000 to 14:13:20.000 UTC, are lost" in words
+
+
+@pytest.mark.parametrize("field", ["length of the record", "size of the records", "length of the data"])
+def test_an_absurd_length_is_not_believed(original: Original, tmp_path: Path, field: str) -> None:
+    begin, _ = original.chunks[2]
+    at = (
+        begin + {"length of the record": 1, "size of the records": 9 + 16, "length of the data": 9 + 16 + 12 + 8}[field]
+    )
+    for length in ABSURD:
+        data = original.data[:at] + struct.pack("<Q", length) + original.data[at + 8 :]
+        judge(original, data, at, tmp_path / "x.mcap")
+        # Without an end there is no index to go by.
+        judge(original, data[:-8], at, tmp_path / "x.mcap")
+
+
+def test_an_absurd_length_of_any_record_is_not_believed(original: Original, tmp_path: Path) -> None:
+    at = 8
+    while at < len(original.data) - 8:
+        (length,) = struct.unpack_from("<Q", original.data, at + 1)
+        for absurd in ABSURD:
+            data = original.data[: at + 1] + struct.pack("<Q", absurd) + original.data[at + 9 :]
+            judge(original, data, at + 1, tmp_path / "x.mcap")
+            judge(original, data[:-8], at + 1, tmp_path / "x.mcap")
+        at += 9 + length
+
+
+def test_a_chunk_that_grows_when_uncompressed_is_not_followed(tmp_path: Path) -> None:
+    for compression in (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE):
+        out = io.BytesIO()
+        writer = Writer(out, compression=compression)
+        writer.start()
+        channel = writer.register_channel("fleet/red/x", "json", 0)
+        writer.add_message(channel, 1, b"small", 1, 1)
+        writer.flush()  # type: ignore[no-untyped-call]
+        at = out.tell()
+        writer.add_message(channel, 2, bytes(2 * LIMIT), 2, 2)
+        writer.finish()  # type: ignore[no-untyped-call]  # it has no return type
+        path = tmp_path / f"{compression.name}.mcap"
+        for data in (out.getvalue(), out.getvalue()[:-8]):
+            path.write_bytes(data)
+            salvage = McapReader(path)
+            assert [row[1] for row in salvage.messages()] == [1]
+            assert f"byte {at}: " in salvage.words
+            assert str(LIMIT) in salvage.words
+
+
+def test_lz4_and_no_compression_and_no_chunks_are_read_too(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    for options in (
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE},
+        {"use_chunking": False},
+        {"enable_crcs": False},
+        {"use_statistics": False},
+    ):
+        with path.open("wb") as file:
+            writer = Writer(file, **options)
+            writer.start()
+            channel = writer.register_channel("fleet/red/x", "json", 0)
+            for number in range(100):
+                writer.add_message(channel, number, b"{}", number, number)
+            writer.finish()  # type: ignore[no-untyped-call]  # it has no return type
+        salvage = McapReader(path)
+        salvage.check()
+        assert [row[1] for row in salvage.messages()] == list(range(100)), options
+        assert not salvage.words, options
+        whole = path.read_bytes()
+        for length in range(8, len(whole), 7):
+            put(path, whole[:length])
+            cut = McapReader(path)
+            list(cut.messages())
+            assert "is cut" in cut.words
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 37, 4096, 100_000])
+@pytest.mark.parametrize("filling", [b"\0", b"\xff", b"\x06"])
+def test_what_follows_the_end_is_said_and_hides_nothing(
+    original: Original, tmp_path: Path, count: int, filling: bytes
+) -> None:
+    """A machine that lost its power leaves zeros at the end of a file."""
+    data = original.data + filling * count
+    assert judge(original, data, len(original.data), tmp_path / "x.mcap") == list(original.messages)
+    assert f"byte {len(original.data)}: {count} bytes follow the end" in report(tmp_path / "x.mcap")
+    end = original.chunks[2][1]
+    shown = judge(original, original.data[:end] + filling * count, end, tmp_path / "x.mcap")
+    assert shown == original.until(end)
+
+
+def test_a_damaged_index_hides_no_chunk(original: Original, tmp_path: Path) -> None:
+    footer = len(original.data) - 37
+    for at in [*range(original.chunks[-1][1] + 600, footer, 401), *range(footer, footer + 29)]:
+        shown = judge(original, flipped(original.data, at, 3), at, tmp_path / "x.mcap")
+        assert shown == list(original.messages), at
+
+
+def test_what_was_described_in_a_lost_chunk_is_said(original: Original, tmp_path: Path) -> None:
+    """Cut, so there is no index that describes the channels again; the first chunk describes two of the three."""
+    begin, end = original.chunks[0]
+    data = flipped(original.data, end - 2, 0)[: original.chunks[-1][1]]
+    path = tmp_path / "x.mcap"
+    shown = judge(original, data, begin, path)
+    assert shown
+    assert {message.key for message in shown} == {"fleet/blue/note"}
+    session = Session.open(path)
+    session.check()
+    list(session.messages())
+    assert "described in what is lost" in session.damage_words
+
+
+def test_many_damages_are_one_short_line(original: Original, tmp_path: Path) -> None:
+    data = original.data
+    for _, end in original.chunks:
+        data = flipped(data, end - 2, 0)
+    assert judge(original, data, original.chunks[0][0], tmp_path / "x.mcap") == []
+    words = report(tmp_path / "x.mcap")
+    assert words.endswith("and in 2 other places")
+    assert len(words) < 500
+
+
+def spliced(original: Original, seed: int) -> tuple[bytes, int]:
+    """Something cut out, put in or copied elsewhere, once or a few times; and the first byte that may differ."""
+    chance = random.Random(seed)
+    data, first = original.data, len(original.data)
+    for _ in range(chance.randint(1, 4)):
+        at, end = sorted(chance.randrange(len(data) + 1) for _ in range(2))
+        begin = chance.randrange(len(data) + 1)
+        piece = chance.choice(
+            [b"", bytes(end - at), chance.randbytes(end - at), data[begin : begin + end - at], data[begin:]]
+        )
+        data = data[:at] + piece + data[end if chance.random() < 0.7 else at :]
+        first = min(first, at)
+        if len(data) > 50_000:
+            data = data[:50_000]
+    return data, first
+
+
+def test_a_spliced_file_makes_nothing_up(original: Original, tmp_path: Path) -> None:
+    for seed in range(200):
+        data, first = spliced(original, seed)
+        judge(original, data, first, tmp_path / "x.mcap")
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+def test_any_spliced_file_makes_nothing_up(original: Original, tmp_path: Path) -> None:
+    for seed in range(200, 100_000):
+        data, first = spliced(original, seed)
+        judge(original, data, first, tmp_path / "x.mcap")
+
+
+@given(opcode=st.sampled_from([*Opcode, 0, 0x20, 0x80, 0xFF]), body=st.binary(max_size=200), data=st.data())
+@settings(max_examples=300)
+def test_any_record_anywhere_gives_no_surprise(
+    original: Original, tmp_path: Path, opcode: int, body: bytes, data: st.DataObject
+) -> None:
+    at = data.draw(st.sampled_from([8, *(begin for begin, _ in original.chunks), len(original.data) - 37]))
+    length = data.draw(st.sampled_from([len(body), *ABSURD]))
+    record = struct.pack("<BQ", opcode, length) + body
+    path = tmp_path / "x.mcap"
+    for tail in (b"", original.data[at:]):
+        put(path, original.data[:at] + record + tail)
+        salvage = McapReader(path)
+        salvage.check()
+        assert salvage.words
+        before = original.until(at)
+        shown = list(Session.open(path).messages())
+        assert set(before) <= set(shown)
+
+
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "directory.mcap").mkdir()
+    os.mkfifo(tmp_path / "fifo.mcap")
+    (tmp_path / "loop.mcap").symlink_to("loop.mcap")
+    for path in (tmp_path / "directory.mcap", tmp_path / "fifo.mcap", Path(os.devnull), Path("/dev/zero")):
+        with pytest.raises(NotMcap, match="is not a regular file"):
+            McapReader(path)
+    for path in (tmp_path / "fifo.mcap", tmp_path / "loop.mcap", Path(os.devnull), tmp_path / ("n" * 300)):
+        with pytest.raises(NoSession) as caught:
+            Session.open(path)
+        assert str(path) in str(caught.value)
+    for name in ("0001.mcap", "0002.mcap"):
+        os.mkfifo(tmp_path / name)
+    with pytest.raises(NoSession, match=r"0001\.mcap is not a regular file; .*0002\.mcap is not"):
+        Session.open(tmp_path)
+
+
+@contextmanager
+def no_superuser(seen: Path) -> Iterator[None]:
+    """As a user who may not read everything; `seen` is opened to them."""
+    if os.geteuid():
+        yield
+        return
+    for path in (seen, *seen.parents):
+        if not path.stat().st_mode & 0o001:
+            path.chmod(path.stat().st_mode | 0o001)
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+def test_what_must_not_be_read_is_said(original: Original, tmp_path: Path) -> None:
+    locked = tmp_path / "locked"
+    locked.mkdir()
+    file = tmp_path / "x.mcap"
+    file.write_bytes(original.data)
+    (locked / "0001.mcap").write_bytes(original.data)
+    file.chmod(0)
+    locked.chmod(0)
+    try:
+        with no_superuser(tmp_path):
+            for path in (file, locked, locked / "0001.mcap"):
+                with pytest.raises(NoSession, match="Permission denied") as caught:
+                    Session.open(path)
+                assert str(path) in str(caught.value)
+    finally:
+        locked.chmod(0o700)

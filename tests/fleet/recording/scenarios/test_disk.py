@@ -1,0 +1,399 @@
+"""A disk that is full, goes away or must not be written to, and a quota: what was written stays, and it is said."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet.recording import session_dir
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.tools.verify import verify
+from fleet.recording.writing.session_writer import MB, Options, SessionWriter
+from schemas.bus import Bus, Failure, Sample
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.fleet.recording.conftest import heard, popen, publisher, wait_for
+from tests.fleet.recording.test_record_command import ready
+from tests.fleet.recording.writing.test_session_writer import BEGUN_NS, SECOND_NS, feed
+from tests.support import in_process
+
+pytestmark = pytest.mark.xdist_group("disk")  # what one fills, another has not
+
+BALLAST = 1_200_000_000
+"""Half of it is more than what others write on the machine's disk meanwhile, where only that can be used."""
+TINY = 6_000_000
+SMALL = 150_000_000
+KEPT = SMALL // 3
+
+
+def can_mount() -> bool:
+    """Whether this user may mount a disk of its own."""
+    return (
+        sys.platform == "linux"
+        and os.geteuid() == 0
+        and not subprocess.run(
+            ["unshare", "-m", "mount", "-t", "tmpfs", "tmpfs", "/mnt"], capture_output=True, check=False
+        ).returncode
+    )
+
+
+MAY_MOUNT = can_mount()
+DISKS = ["keep free", *(["really full"] if MAY_MOUNT else [])]
+"""What fills a disk of its own, where one can be mounted: nobody else has a part in how full that is."""
+
+
+class Disk:
+    """A disk that can be filled, and emptied again."""
+
+    def __init__(self, root: Path, ballast: Path, size: int, options: tuple[str, ...]) -> None:
+        self.root = root
+        self.options = options
+        self._ballast = ballast
+        self._size = size
+
+    def fill(self, but: int = 0) -> None:
+        with self._ballast.open("wb") as file:
+            size = min(self._size, shutil.disk_usage(self._ballast.parent).free) - but
+            os.posix_fallocate(file.fileno(), 0, size)
+
+    def free(self) -> None:
+        self._ballast.unlink()
+
+
+@contextmanager
+def disk(kind: str, place: Path) -> Iterator[Disk]:
+    """One that is kept free, or can be filled to the last byte."""
+    if not MAY_MOUNT:
+        keep = shutil.disk_usage(place).free - BALLAST // 2
+        try:
+            yield Disk(place / "sessions", place / "ballast", BALLAST, ("--keep-free", str(keep)))
+        finally:
+            (place / "ballast").unlink(missing_ok=True)
+        return
+    size, keep, ballast = (TINY, 0, TINY) if kind == "really full" else (SMALL, KEPT, SMALL - KEPT // 2)
+    mounted = place / "disk"
+    mounted.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(mounted)], check=True)
+    try:
+        yield Disk(mounted / "sessions", mounted / "ballast", ballast, ("--keep-free", str(keep)))
+    finally:
+        subprocess.run(["umount", "-l", str(mounted)], check=True)
+
+
+def fleet(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    return in_process.fleet(*arguments, "--connect", endpoint)
+
+
+def record(endpoint: str, out: Path, *options: str) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "fleet.cli", "record", "--out", str(out), "--connect", endpoint, "--json"]
+    return popen([*command, *options])
+
+
+def status(bus: Bus) -> Any:
+    (answer,) = bus.query("fleet/@recorder/status", timeout_s=10.0)
+    assert isinstance(answer, Sample)
+    return answer.message()
+
+
+@pytest.mark.parametrize("kind", DISKS)
+def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_there_is_room(
+    kind: str, endpoint: str, bus: Bus, tmp_path: Path
+) -> None:
+    with disk(kind, tmp_path) as there:
+        process = record(endpoint, there.root, *there.options)
+        session = ready(process)
+        out = publisher(bus, "red", "frame/rx")
+        sent = 0
+
+        def publish() -> None:
+            nonlocal sent
+            out.put(pb.RxFrame(data=os.urandom(2000)), time.time_ns())
+            sent += 1
+            time.sleep(0.001)
+
+        def publish_until(state: str) -> None:
+            def so() -> bool:
+                publish()
+                return sent % 100 == 0 and status(bus).state == state
+
+            wait_for(so, f"the recorder is {state}")
+
+        while sent < 300:
+            publish()
+        wait_for(lambda: status(bus).bytes > 300 * 2000, "that is in the file")
+        there.fill()
+        publish_until("full")
+        before = {message.sequence for message in Session.open(session).messages() if message.key == out.key}
+        assert set(range(1, 301)) <= before
+        found = fleet(endpoint, "record", "status")
+        assert found.returncode == 0
+        assert found.stdout.startswith("full:")
+        assert "nothing is written until there is room" in found.stdout
+        for _ in range(100):
+            publish()
+        there.free()
+        publish_until("recording")
+        heard(bus._session)
+        process.send_signal(signal.SIGTERM)
+        text, errors = process.communicate(timeout=60)
+        end = json.loads(text)
+        numbers = [message.sequence for message in Session.open(session).messages() if message.key == out.key]
+        # What came meanwhile was held, and is here, too.
+        assert numbers == list(range(1, sent + 1))
+        assert (process.returncode, end["drops"], end["missed"]) == (0, {}, {})
+        assert "nothing is written until there is room" in errors
+        assert "there is room again" in errors
+        verdict = verify(Session.open(session))
+        assert (verdict.missing, verdict.twice, verdict.closed) == ([], [], True)
+        # Nearly full, a file is closed in time; where there is no room at all, not even its index can be written.
+        assert list(verdict.damage) == ([] if kind == "keep free" else ["0001.mcap"])
+
+
+def holds(session: Path, key: str) -> list[int]:
+    return [message.sequence for message in Session.open(session).messages() if message.key == key]
+
+
+@pytest.mark.parametrize("kind", DISKS)
+def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_drops(
+    kind: str, endpoint: str, bus: Bus, tmp_path: Path
+) -> None:
+    with disk(kind, tmp_path) as there:
+        process = record(endpoint, there.root, *there.options)
+        session = ready(process)
+        out = publisher(bus, "red", "frame/rx")
+        sent = 0
+        there.fill()
+
+        def publish_until(enough: Callable[[Any], bool]) -> None:
+            def so() -> bool:
+                nonlocal sent
+                for _ in range(100):
+                    out.put(pb.RxFrame(data=os.urandom(2000)), time.time_ns())
+                    time.sleep(0.001)
+                sent += 100
+                return enough(status(bus))
+
+            wait_for(so, "what was published is seen")
+
+        publish_until(lambda seen: seen.state == "full")
+        publish_until(lambda seen: seen.messages > sent // 2 and "messages wait" in seen.error)
+        heard(bus._session)
+        process.send_signal(signal.SIGINT)
+        text, errors = process.communicate(timeout=60)
+        end = json.loads(text)
+        description = session_dir.SessionInfo.read(session)
+        assert description is not None
+        assert description.closed
+        dropped = end["drops"].get(out.key, 0)
+        assert description.drops == end["drops"]
+        assert len(holds(session, out.key)) + dropped == sent
+        assert description.messages == end["messages"] == sum(1 for _ in Session.open(session).messages())
+        assert not (session / session_dir.SPARE).exists()
+        if kind == "keep free":  # there was room, which only was to stay free
+            assert (process.returncode, dropped) == (0, 0)
+            assert verify(Session.open(session)).whole
+        else:
+            assert process.returncode == 1
+            total = sum(end["drops"].values())
+            assert total >= dropped > 100
+            assert f"no room to the end: {total} messages that waited for it are dropped" in errors.splitlines()[-1]
+            assert f"{total} messages that waited" in description.error
+
+
+@pytest.mark.parametrize("kind", DISKS)
+def test_a_disk_that_is_full_at_the_start_is_waited_for_and_nothing_is_left_lying_there(
+    kind: str, endpoint: str, bus: Bus, tmp_path: Path
+) -> None:
+    with disk(kind, tmp_path) as there:
+        there.fill()
+        process = record(endpoint, there.root, *there.options)
+        session = ready(process)
+        assert status(bus).state == "full"
+        out = publisher(bus, "red", "sensor/range")
+        for _ in range(100):
+            out.put(pb.Range(range_m=1.0), time.time_ns())
+        wait_for(lambda: status(bus).messages > 100, "those wait")
+        assert list(there.root.glob("*")) == []
+        assert fleet(endpoint, "mark", "full").returncode == 0
+        there.free()
+        wait_for(lambda: status(bus).state == "recording", "it records")
+        process.send_signal(signal.SIGTERM)
+        text, errors = process.communicate(timeout=60)
+        end = json.loads(text)
+        assert (process.returncode, end["session"], end["drops"]) == (0, str(session), {})
+        assert holds(session, out.key) == list(range(1, 101))
+        opened = Session.open(session)
+        assert verify(opened).whole
+        assert opened.description is not None
+        assert [mark["text"] for mark in opened.description.marks] == ["full"]
+        assert "nothing is written until there is room" in errors
+        assert f"there is room again: recording goes on to {session}" in errors
+
+
+@pytest.mark.parametrize("kind", DISKS)
+def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_nothing(
+    kind: str, endpoint: str, tmp_path: Path
+) -> None:
+    with disk(kind, tmp_path) as there:
+        there.fill()
+        process = record(endpoint, there.root, *there.options)
+        session = ready(process)
+        process.send_signal(signal.SIGTERM)
+        text, errors = process.communicate(timeout=60)
+        if kind == "keep free":
+            assert process.returncode == 0
+            assert verify(Session.open(session)).whole
+            return
+        assert process.returncode == 1
+        dropped = sum(json.loads(text)["drops"].values())
+        assert f"no room to the end: {dropped} messages that waited for it are dropped" in errors.splitlines()[-1]
+        assert list(there.root.glob("*")) == []
+        with pytest.raises(NoSession):
+            Session.open(session)
+
+
+@pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
+def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing(tmp_path: Path) -> None:
+    with disk("really full", tmp_path) as there:
+        tape = SessionWriter(there.root, "fleet", Options(keep_free_bytes=0), BEGUN_NS)
+        there.fill()
+        written = []
+        for second in range(3):
+            feed(tape, BEGUN_NS + second * SECOND_NS, count=500, size=1000)
+            tape.tick(BEGUN_NS + second * SECOND_NS)
+        assert tape.full
+        assert tape.waiting == tape.messages == 1500
+        there.free()
+        there.fill(but=MB)
+        for second in range(3, 10):
+            tape.tick(BEGUN_NS + second * SECOND_NS)
+            written.append(tape.messages - tape.waiting)
+        assert 0 < written[-1] < 1500
+        assert all(any(Session.open(segment).messages()) for segment in tape.path.glob("000[2-9].mcap"))
+        assert tape.segments < 4
+        description = session_dir.SessionInfo.read(tape.path)
+        assert description is not None
+        assert (description.messages, description.error) == (written[-1], tape.full)
+        there.free()
+        tape.tick(BEGUN_NS + 10 * SECOND_NS)
+        assert not tape.full
+        tape.close(BEGUN_NS + 11 * SECOND_NS)
+        assert (tape.drops, tape.cost) == ({}, "")
+        times = [message.recorded_ns for message in Session.open(tape.path).messages()]
+        assert times == [BEGUN_NS + second * SECOND_NS + number for second in range(3) for number in range(500)]
+
+
+def test_a_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    process = record(endpoint, tmp_path, "--quota", "1MB")
+    session = ready(process)
+    out = publisher(bus, "red", "frame/rx")
+    sent = 0
+
+    def gone() -> bool:
+        nonlocal sent
+        for _ in range(10):
+            sent += len(out.put(pb.RxFrame(data=os.urandom(2000)), time.time_ns()))
+            time.sleep(0.002)
+        return not session.exists()
+
+    wait_for(gone, "the oldest session gave way")
+    process.send_signal(signal.SIGTERM)
+    text, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert Path(json.loads(text)["session"]) != session
+    assert f"{session} was removed" in errors
+    assert errors.count("more than its quota") <= 2  # told when it begins, not with every figure
+    assert all(verify(Session.open(path)).whole for path in tmp_path.iterdir())
+
+
+def test_a_directory_that_vanishes_is_said_and_ends_the_recorder(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    states: list[str] = []
+    bus.subscribe("fleet/@recorder/status", lambda sample: states.append(sample.message().state))  # type: ignore[attr-defined]
+    process = record(endpoint, tmp_path / "sessions")
+    session = ready(process)
+    shutil.rmtree(tmp_path / "sessions")
+    text, errors = process.communicate(timeout=60)
+    assert (process.returncode, text) == (1, "")
+    (line,) = errors.splitlines()
+    assert f"recording to {session} failed: " in line
+    assert "No such file or directory" in line
+    wait_for(lambda: "failed" in states, "that on the bus")
+
+
+def test_a_file_in_the_way_is_one_line(endpoint: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    process = record(endpoint, tmp_path / "file" / "sessions")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert len(errors.splitlines()) == 1
+    assert "name another with --out" in errors
+
+
+def test_it_is_stopped_started_and_marked_over_the_bus(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    process = record(endpoint, tmp_path)
+    first = ready(process)
+    marked = fleet(endpoint, "mark", "the cat came", "--by", "me")
+    assert (marked.returncode, marked.stdout) == (0, f"marked in {first}\n")
+    assert fleet(endpoint, "record", "start").stderr.startswith("fleet: the recorder says: fleet 'fleet' is being")
+    stopped = fleet(endpoint, "record", "stop")
+    assert stopped.stdout.startswith(f"stopped: {first}")
+    assert verify(Session.open(first)).whole
+    refused = fleet(endpoint, "mark", "nobody hears it")
+    assert refused.returncode == 1
+    assert "nothing is being recorded" in refused.stderr
+    started = json.loads(fleet(endpoint, "record", "start", "--json").stdout)
+    assert started["state"] == "recording"
+    second = Path(started["session"])
+    assert second != first
+    process.send_signal(signal.SIGTERM)
+    text, _ = process.communicate(timeout=60)
+    assert json.loads(text)["session"] == str(second)
+    description = Session.open(first).description
+    assert description is not None
+    assert description.kept
+    assert [(mark["text"], mark["by"]) for mark in description.marks] == [("the cat came", "me")]
+    marks = [message for message in Session.open(first).messages() if message.key == "fleet/@recorder/mark"]
+    assert len(marks) == 1
+    assert marks[0].message == "foxglove.Log"
+
+
+def test_a_mark_that_cannot_be_is_refused(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    process = record(endpoint, tmp_path)
+    ready(process)
+    for payload in (b"", b"{", b"[]", b'{"text": 3}', b'{"text": ""}', b'{"text": "x", "by": 1}', b"\xff"):
+        (answer,) = bus.query("fleet/@recorder/@cmd/mark", payload=payload, timeout_s=10.0)
+        assert isinstance(answer, Failure), payload
+    (answer,) = bus.query("fleet/@recorder/@cmd/explode", timeout_s=10.0)
+    assert isinstance(answer, Failure)
+    assert "allowed are start, stop, status, mark" in answer.words
+    process.send_signal(signal.SIGTERM)
+    assert process.communicate(timeout=60)[1] == ""
+    assert fleet(endpoint, "mark", " ").returncode == 2
+    assert "no recorder of fleet" in fleet(endpoint, "record", "status").stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (("--segment-size", "3"), "1 MB to 1000 TB"),
+        (("--quota", "much"), "1 MB to 1000 TB"),
+        (("--keep-free=-1",), "0 to 1000 TB"),
+        (("--segment-time", "0s"), "more than 0"),
+        (("--quota", "5GB", "--session-size", "3GB"), "at most 2500 MB are allowed"),
+        (("--quota", "5GB", "status"), "--quota goes behind 'status'"),
+    ],
+)
+def test_options_that_cannot_be_are_one_line(option: tuple[str, ...], words: str) -> None:
+    command = [sys.executable, "-m", "fleet.cli", "record", *option]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert found.returncode == 2
+    assert words in found.stderr
+    assert len(found.stderr.splitlines()) == 1

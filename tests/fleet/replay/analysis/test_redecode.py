@@ -1,0 +1,199 @@
+"""Recorded frames against today's decoder: recorded vectors have no difference, and what was changed is found."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from mcap.writer import Writer
+
+from fleet.cli import cli
+from fleet.replay.analysis import test_vector
+from fleet.replay.analysis.recorded_frames import Confirmed, Item, Rx, Treated, Tx
+from fleet.replay.analysis.redecode import ReadingDifference, Redecoding
+from gateway.protocol.enums import Mode
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.fleet.replay.make_session import Made, make
+
+VECTORS = sorted((Path(__file__).parents[3] / "vectors" / "recorded").glob("*.jsonl"))
+FOLLOWING = b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM00"
+TRACKING = b"$4WD,CSB0,PV8,GS0,LF0110,HW00,GM00#"
+LINE = {"sensor/line": {"left_outer": False, "left_inner": True, "right_inner": True, "right_outer": False}}
+S = 1_000_000_000
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli, [str(each) for each in arguments])
+
+
+def redecoded(items: list[Item], platform: str | None = None) -> tuple[list[ReadingDifference], Redecoding]:
+    one = Redecoding("red", platform)
+    found = [difference for item in items for difference in one.take(item)]
+    return [*found, *one.end()], one
+
+
+@pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
+def test_a_recorded_vector_has_no_difference(path: Path) -> None:
+    _, items = test_vector.read(path)
+    found, one = redecoded(items)
+    assert found == []
+    assert one.counts.frames >= 3
+    assert one.counts.undecided == 0 == one.counts.absent
+
+
+def test_there_are_vectors() -> None:
+    assert {"manual", "manual_no_echo", "tracking", "following", "raspberry_pi"} <= {path.stem for path in VECTORS}
+
+
+@pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
+def test_every_field_of_a_vector_counts(path: Path) -> None:
+    """Whatever is changed in a recorded frame's readings is found, and named."""
+    _, items = test_vector.read(path)
+    frames = [number for number, item in enumerate(items) if isinstance(item, Rx) and item.readings]
+    changed = 0
+    for number in {frames[0], frames[-1]}:
+        frame = items[number]
+        assert isinstance(frame, Rx)
+        for topic, fields in frame.readings.items():
+            for name, value in fields.items():
+                other: Any = not value if isinstance(value, bool) else (0.0,) if isinstance(value, tuple) else value + 1
+                readings = {**frame.readings, topic: {**fields, name: other}}
+                found, _ = redecoded([*items[:number], replace(frame, readings=readings), *items[number + 1 :]])
+                assert [(each.what, each.then, each.now) for each in found] == [(f"{topic} {name}", other, value)]
+                changed += 1
+    assert changed
+
+
+def test_a_verdict_and_a_reading_that_is_not_published_any_more() -> None:
+    known: list[Item] = [Treated(0, "arduino"), Confirmed(0, Mode.TRACKING)]
+    frame = Rx(S, TRACKING, "sensors", ("sensor/line",), LINE)
+    assert redecoded([*known, frame])[0] == []
+    found, _ = redecoded([*known, replace(frame, verdict="bad_number", published=("sensor/light",), readings={})])
+    assert [(each.what, each.then, each.now) for each in found] == [
+        ("verdict", "bad_number", "sensors"),
+        ("published", ("sensor/light",), ("sensor/line",)),
+    ]
+
+
+def test_an_echo_is_known_by_what_was_sent_and_for_two_seconds() -> None:
+    sent = b"$1,0,0,0,0,0,0,0,0#"
+    known: list[Item] = [Treated(0, "arduino"), Confirmed(0, None), Tx(3 * S, sent)]
+    echo = Rx(4 * S, sent, "echo")
+    assert redecoded([*known, echo])[0] == []
+    late, _ = redecoded([*known, replace(echo, at_ns=6 * S)])
+    assert [(each.what, each.now) for each in late] == [("verdict", "unknown_word")]
+    # Of a frame that was sent before the recording began, nothing is known.
+    assert redecoded([*known[:2], replace(echo, at_ns=S)])[0] == []
+    assert len(redecoded([*known[:2], replace(echo, at_ns=3 * S)])[0]) == 1
+
+
+def test_what_the_recording_does_not_tell_is_no_difference_and_is_counted() -> None:
+    """Following without its # and with nothing in sight has the text of light seeking that waits for its #."""
+    seen = {"sensor/obstacle": {"left": True, "right": True}}
+    frame = Rx(S, FOLLOWING, "sensors", ("sensor/obstacle",), seen)
+    for then in (frame, replace(frame, published=(), readings={})):
+        found, one = redecoded([Treated(0, "arduino"), Confirmed(0, None), then])
+        assert (found, one.counts.undecided) == ([], 1)
+    # A mode that was confirmed at that very moment.
+    changing: list[Item] = [Treated(0, "arduino"), Confirmed(0, None), frame, Confirmed(S + 1, Mode.FOLLOWING)]
+    assert redecoded(changing)[0] == []
+    # What cannot be is a difference all the same.
+    wrong = replace(frame, readings={"sensor/obstacle": {"left": False, "right": True}})
+    assert [each.what for each in redecoded([Treated(0, "arduino"), wrong])[0]] == ["sensor/obstacle left"]
+
+
+def test_a_session_says_what_is_otherwise_and_a_vector_of_it_says_the_same(tmp_path: Path) -> None:
+    """The made session's line readings are not those of its frames, but for one frame here and there."""
+    session = tmp_path / "made.mcap"
+    make(session, seconds=12)
+    result = run("redecode", session)
+    assert result.exit_code == 1
+    assert "+4.000s $4WD,CSB0,PV8,GS0,LF0110,HW00,GM00#: sensor/line " not in result.output.splitlines()[0]
+    lines = [json.loads(line) for line in run("redecode", session, "--json", "--car", "red").output.splitlines()]
+    summary = lines.pop()
+    assert summary["frames"] == 40
+    assert summary["readings"] == 40
+    assert summary["differences"] == len(lines) > 5
+    assert {each["what"] for each in lines} == {"sensor/line left_inner", "sensor/line right_inner"}
+    assert {(each["car"], each["then"], each["now"]) for each in lines} == {("red", False, True)}
+
+    out = tmp_path / "v.jsonl"
+    assert run("sessions", "vector", session, "--car", "red", "--from", "5s", "--to", "7s", "--out", out).exit_code == 0
+    of_it = [json.loads(line) for line in run("redecode", out, "--json").output.splitlines()]
+    assert of_it[-1]["frames"] == 20
+    within = [each for each in lines if 5 <= each["at_s"] < 7]
+    assert [(each["what"], round(each["at_s"], 3)) for each in of_it[:-1]] == [
+        (each["what"], round(each["at_s"] - 5, 3)) for each in within
+    ]
+
+
+def test_a_session_that_was_cut_off_is_decoded_as_far_as_it_goes(tmp_path: Path) -> None:
+    session = tmp_path / "made.mcap"
+    make(session)
+    session.write_bytes(session.read_bytes()[:-9000])
+    result = run("redecode", session, "--json")
+    summary = json.loads(result.output.splitlines()[-1])
+    assert result.exit_code == 1  # its readings differ
+    assert "made.mcap" in summary["damage"]
+    assert summary["frames"] > 0
+
+
+def bare(path: Path) -> Made:
+    return Made(path, Writer)
+
+
+def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
+    no_frames = tmp_path / "plan.mcap"
+    made = bare(no_frames)
+    made.put("fleet/@coordinator/plan", pb.Plan(text="cars: {red: manual}"), 1.0)
+    made.put("fleet/red/state/mode", pb.Mode(asked="manual"), 1.0)
+    made.close()
+    assert "holds no raw frames" in run("redecode", no_frames).output
+    assert "there are red" in run("redecode", no_frames, "--car", "blue").output
+    assert (
+        "holds no raw frames of red there"
+        in run("sessions", "vector", no_frames, "--car", "red", "--out", tmp_path / "x.jsonl").output
+    )
+
+    unknown = tmp_path / "unknown.mcap"
+    made = bare(unknown)
+    made.put("fleet/red/frame/rx", pb.RxFrame(data=TRACKING, verdict="sensors", published=["sensor/line"]), 1.0)
+    made.close()
+    assert (
+        "does not say what red was treated as (no state/health of it): give --platform"
+        in run("redecode", unknown).output
+    )
+    result = run("redecode", unknown, "--platform", "arduino")
+    assert result.exit_code == 0
+    assert "1 readings were published and are not in the recording" in result.output
+
+    foreign = tmp_path / "foreign.mcap"
+    with foreign.open("wb") as file:
+        writer: Any = Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/odom", "json", 0), 5, b"{}", 5)
+        writer.finish()
+    assert "holds no raw frames" in run("redecode", foreign).output
+    assert run("redecode", tmp_path / "none").exit_code == 1
+    assert run("redecode", unknown, "--platform", "tank").exit_code == 2
+
+    for text, words in (
+        ("", "is no vector"),
+        ("{}\n", "is no vector"),
+        ("{\n", "line 1: is no JSON"),
+        ('{"format": 9, "car": "red"}\n', "reads up to 1: update it"),
+        ('{"format": 1, "car": "red"}\n{"at_us": 1, "mode": "asleep"}\n', "line 2: ValueError"),
+        ('{"format": 1, "car": "red"}\n{"at_us": 1, "rx": "$"}\n', "line 2: KeyError"),
+        ('{"format": 1, "car": "red"}\n7\n', "line 2: TypeError"),
+    ):
+        path = tmp_path / "bad.jsonl"
+        path.write_text(text)
+        result = run("redecode", path)
+        assert result.exit_code == 1
+        assert words in result.output
+    path = tmp_path / "there.jsonl"
+    path.touch()
+    assert "is there already" in run("sessions", "vector", unknown, "--car", "red", "--out", path).output
+    assert "ends in .jsonl" in run("sessions", "vector", unknown, "--car", "red", "--out", tmp_path / "x.tsv").output

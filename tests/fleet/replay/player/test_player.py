@@ -1,0 +1,259 @@
+"""A session on the bus again: under another name, byte for byte, on time, and nothing takes a command."""
+
+import json
+import signal
+from collections.abc import Iterator
+from itertools import pairwise
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from mcap.writer import Writer
+
+from fleet.recording.reading.session import Recorded, Session
+from fleet.replay.player.player import Player
+from fleet.replay.player.schedule import Schedule
+from schemas import bus
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.fleet.replay.make_session import START_NS, Made, make
+from tests.support.ports import free_endpoint
+from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, wait_for
+
+S = 1_000_000_000
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
+    started = FleetProcesses(free_endpoint(), tmp_path)
+    yield started
+    started.close()
+
+
+class InOrder(Writer):
+    """Writes by time, as a recorder does."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._given: list[tuple[Any, ...]] = []
+
+    def add_message(self, *message: Any) -> None:
+        self._given.append(message)
+
+    def finish(self) -> None:
+        for message in sorted(self._given, key=itemgetter(1)):
+            super().add_message(*message)
+        super().finish()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    path = tmp_path / "made.mcap"
+    make(path, seconds=6, writer=InOrder)
+    return path
+
+
+def play(fleet: FleetProcesses, session: Path, *more: str) -> GatewayProcess:
+    return fleet.start("-m", "fleet.cli", "replay", str(session), "--to-bus", *more)
+
+
+def test_a_schedule_has_one_origin() -> None:
+    every = Schedule(rate=3.0)
+    assert [every.due_s(START_NS + number * S // 10) for number in range(4)] == pytest.approx([0, 1 / 30, 2 / 30, 0.1])
+    # A tenth of a second a thousand million times is not a thousandth off.
+    long = Schedule()
+    long.played_ns = 10**17
+    assert long.due_s(0) == 1e8
+    assert long.due_s(S // 10) == 1e8 + 0.1
+    # Pauses are made shorter, a clock that went back stands, a loop goes on from where it ended.
+    gaps = Schedule(rate=2.0, longest_gap_ns=5 * S)
+    assert [gaps.due_s(at * S) for at in (0, 4, 104, 103, 104)] == [0.0, 2.0, 4.5, 4.5, 5.0]
+    assert gaps.shortened == 1
+    gaps.again(S)
+    assert [gaps.due_s(at * S) for at in (0, 1)] == [5.5, 6.0]
+
+
+def test_all_of_it_comes_again_as_it_was(fleet: FleetProcesses, session: Path) -> None:
+    got: list[bus.Sample] = []
+    for expression in ("again/**", "again/@coordinator/**", "again/@recorder/**", "again/@sim/**"):
+        fleet.bus.subscribe(expression, got.append)
+    player = play(fleet, session, "--as", "again", "--rate", "3")
+    assert player.wait() == 0
+    lines = player.lines()
+    then: dict[str, list[Recorded]] = {}
+    for one in Session.open(session).messages():
+        if "/@supervisor/" not in one.key:
+            then.setdefault(one.key.replace("fleet/", "again/", 1), []).append(one)
+    wait_for(lambda: len(got) == sum(map(len, then.values())), "all has come")
+    now: dict[str, list[bus.Sample]] = {}
+    for sample in got:
+        now.setdefault(sample.key, []).append(sample)
+    assert now.keys() == then.keys()
+    for key, ones in then.items():
+        assert [sample.payload for sample in now[key]] == [one.payload for one in ones], key
+        assert [sample.sequence for sample in now[key]] == [one.sequence for one in ones], key
+        assert {sample.encoding for sample in now[key]} == {f"application/protobuf;{ones[0].message}"}
+    # Six seconds at three times their speed. When it was put, not when it came: each is as long before the last as it
+    # was then, less what this machine made it wait; that is next to nothing for one of them at least.
+    put = [
+        (one.recorded_ns / 3, sample.time_ns)
+        for key, ones in then.items()
+        for one, sample in zip(ones, now[key], strict=True)
+    ]
+    (due_last, put_last), early = max(put), [each for each in put if each[0] < max(put)[0] - S / 2]
+    assert max((put_last - at) - (due_last - due) for due, at in early) > -0.05 * S
+    assert lines[0].startswith("made as fleet again at tcp/127.0.0.1:")
+    assert lines[0].endswith("3 times as fast: blue, green, red; Ctrl-C ends")
+
+
+def test_it_looks_like_a_fleet_and_takes_no_command(fleet: FleetProcesses, session: Path) -> None:
+    player = play(fleet, session, "--loop", "--rate", "20")
+    wait_for(lambda: len(fleet.bus.tokens("fleet-replay/*")) == 3, "the cars are there")
+    wait_for(lambda: fleet.get("fleet-replay/*/state/mode"), "something was said")
+    assert fleet.bus.tokens("fleet-replay/@replay/*") == ["fleet-replay/@replay/made"]
+    listed = fleet.start("-m", "fleet.cli", "list", "--fleet", "fleet-replay", "--json")
+    assert listed.wait() == 0
+    assert {json.loads(row)["replay"] for row in listed.lines()} == {"made"}
+    assert "fleet-replay is a replay of made" in listed.stderr
+
+    key, words = "fleet-replay/*/@cmd/stop", "fleet fleet-replay is a replay of made: nothing in it takes commands"
+    found = fleet.bus.query(key, timeout_s=PATIENCE_S)
+    answers = [json.loads(each.payload) for each in found if isinstance(each, bus.Sample)]
+    assert {(each["car"], each["status"], each["words"]) for each in answers} == {
+        (car, "rejected", words) for car in ("red", "green", "blue")
+    }
+    asked = fleet.start("-m", "fleet.cli", "drive", "red", "forward", "--fleet", "fleet-replay")
+    assert asked.wait() == 1
+    assert words in asked.stderr
+
+    second = play(fleet, session)
+    assert second.wait() == 2
+    assert "fleet fleet-replay is a replay of made already: give this one another name with --as" in second.stderr
+    assert player.end(signal.SIGINT) == 0
+    wait_for(lambda: not fleet.bus.tokens("fleet-replay/*"), "it is gone")
+
+
+def test_a_part_of_it_over_and_over(fleet: FleetProcesses, session: Path) -> None:
+    got: list[bus.Sample] = []
+    fleet.bus.subscribe("fleet-replay/**", got.append)
+    part = ("--car", "red", "--from", "2s", "--to", "4s", "--offset", "1s", "--cars-only", "--loop", "--rate", "10")
+    player = play(fleet, session, *part)
+
+    def ranges() -> list[int]:
+        return [sample.sequence for sample in got if sample.key.endswith("sensor/line")]
+
+    wait_for(lambda: sum(before > after for before, after in pairwise(ranges())) >= 2, "two rounds are over")
+    assert player.end(signal.SIGINT) == 0
+    assert {sample.key.split("/")[1] for sample in got} == {"red"}
+    first, second, *_ = (number for before, number in pairwise([1 << 31, *ranges()]) if number < before)
+    assert first > second  # the first round begins later
+
+
+def test_what_was_said_before_the_beginning_can_be_asked_for(fleet: FleetProcesses, session: Path) -> None:
+    player = play(fleet, session, "--offset", "4500ms", "--rate", "0.1")
+    # A battery is measured in mode manual only: until second 2.
+    battery = wait_for(lambda: fleet.get("fleet-replay/red/sensor/battery"), "the battery")
+    assert [one.stamp.ToNanoseconds() for one in battery] == [START_NS + S + 60_000_000]
+    assert player.end(signal.SIGINT) == 0
+
+
+def test_a_clock_that_went_back_is_not_waited_for(fleet: FleetProcesses, tmp_path: Path) -> None:
+    recording = Made(tmp_path / "back.mcap", Writer)
+    for at_s in (3600.0, 3600.1, 0.0, 0.1):
+        recording.put("fleet/red/sensor/range", pb.Range(range_m=0.4), at_s)
+    recording.close()
+    player = play(fleet, tmp_path / "back.mcap")
+    assert player.wait() == 0
+    assert player.lines()[-1].startswith("4 messages in ")
+
+
+def test_who_ends_it_before_the_first_message_is_told_no_fault(fleet: FleetProcesses, session: Path) -> None:
+    player = play(fleet, session, "--from", "2s", "--rate", "0.01")
+    wait_for(lambda: fleet.bus.tokens("fleet-replay/red"), "it has begun")
+    assert player.end(signal.SIGINT) == 0
+    assert not player.stderr
+
+
+def live(fleet: FleetProcesses, token: str) -> None:
+    """Be there for all to see."""
+    fleet.bus.token(token)
+    with bus.Bus.open(fleet.endpoint) as other:
+        wait_for(lambda: other.tokens(token), "the hub knows of it")
+
+
+def test_a_name_that_is_a_living_fleets_is_refused(fleet: FleetProcesses, session: Path) -> None:
+    live(fleet, "again/red")
+    player = play(fleet, session, "--as", "again")
+    assert player.wait() == 2
+    assert "fleet again is alive (red): give this one another name with --as" in player.stderr
+    # Also one whose cars have not come yet; a policy that waits for the recorded cars is what --cars-only is for.
+    live(fleet, "third/@supervisor")
+    assert play(fleet, session, "--as", "third", "--cars-only").wait() == 2
+    live(fleet, "tried/@coordinator")
+    both = play(fleet, session, "--as", "tried")
+    assert both.wait() == 2
+    assert (
+        "(@coordinator): give this one another name with --as, or only what cars said with --cars-only" in both.stderr
+    )
+    assert play(fleet, session, "--as", "tried", "--cars-only", "--rate", "100").wait() == 0
+
+
+def test_the_recorded_fleet_is_not_spoken_for(fleet: FleetProcesses, session: Path) -> None:
+    player = play(fleet, session, "--as", "fleet")
+    assert player.wait() == 2
+    assert "--as fleet: so the recorded fleet is called" in player.stderr
+
+
+def test_commands_of_a_recording_are_not_given_again(fleet: FleetProcesses, tmp_path: Path) -> None:
+    recording = Made(tmp_path / "driven.mcap", Writer)
+    recording.put("fleet/red/@cmd/drive", Log(message="drive"), 0.0)
+    recording.put("fleet/red/sensor/range", pb.Range(range_m=0.4), 0.1)
+    recording.close()
+    got: list[str] = []
+    for expression in ("fleet-replay/**", "fleet-replay/*/@cmd/*"):
+        fleet.bus.subscribe(expression, lambda sample: got.append(sample.key))
+    assert play(fleet, tmp_path / "driven.mcap").wait() == 0
+    wait_for(lambda: got, "the reading has come, before which the command would have")
+    assert got == ["fleet-replay/red/sensor/range"]
+    # Neither is it taken out of the recording, nor would it be published if it were.
+    player = Player(fleet.bus, "direct", "")
+    player.play(Session.open(tmp_path / "driven.mcap").messages(), Schedule(), 0.0, lambda: False, lambda _: None)
+    assert player.published == 1
+
+
+def test_a_hub_that_is_killed_is_replaced(fleet: FleetProcesses, session: Path) -> None:
+    player = play(fleet, session, "--loop")
+    wait_for(lambda: fleet.get("fleet-replay/red/state/mode"), "something was said")
+    fleet.hub.kill()
+    got: list[bus.Sample] = []
+    fleet.bus.subscribe("fleet-replay/red/sensor/*", got.append)
+    wait_for(lambda: got, "something is said again")
+    assert player.end(signal.SIGINT) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--as", "Not a name"), "fleet name (--as) 'Not a name' is not allowed"),
+        (("--offset", "9h"), "is not within what is played"),
+        (("--skip-gaps", "soon"), "--skip-gaps: 'soon' is not a time"),
+        (("--skip-gaps", "0s"), "a pause is longer than 0"),
+        (("--save", "x.rrd"), "--save and --to-bus: give one of them"),
+        (("--rate", "0"), "--rate"),
+        (("--car", "nobody"), "nobody is not in"),
+    ],
+)
+def test_wrong_use_is_told_in_a_line(
+    fleet: FleetProcesses, session: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    player = play(fleet, session, *arguments)
+    assert player.wait() == 2
+    assert words in player.stderr
+    assert len(player.stderr.splitlines()) == 1
+
+
+def test_its_options_are_for_it_only(fleet: FleetProcesses, session: Path) -> None:
+    process = fleet.start("-m", "fleet.cli", "replay", str(session), "--loop", "--as", "again")
+    assert process.wait() == 2
+    assert "--as, --loop: only with --to-bus" in process.stderr or "--loop, --as: only" in process.stderr

@@ -1,0 +1,281 @@
+"""A session becomes an .rrd with its layout; what is in it is counted by Rerun's own reader."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import rerun.chunk as rrc
+from click.testing import CliRunner
+
+from fleet.commands.replay import replay
+from fleet.recording.reading.session import NoSession, Session
+from fleet.replay import panels
+from fleet.replay.rerun import export, lenses
+from schemas.topics import TOPICS
+from tests.fleet.replay.make_session import CARS, START_NS, make
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Counter[str]]:
+    path = tmp_path_factory.mktemp("session") / "0001.mcap"
+    return path, make(path)
+
+
+def test_the_made_session_has_every_message_type(made: tuple[Path, Counter[str]]) -> None:
+    topics = {key.split("/", 2)[2] if "@" not in key else key.split("/", 1)[1] for key in made[1]}
+    assert topics == set(TOPICS)
+
+
+def test_the_rrd_holds_every_message_and_its_layout(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    path, counts = made
+    out = tmp_path / "out.rrd"
+    assert export.export(Session.open(path), out) == counts
+    assert export.rows(out) == counts
+    reader = rrc.RrdReader(out)
+    (recording,), (layout,) = reader.recordings(), reader.blueprints()
+    assert recording.application_id == layout.application_id == export.APPLICATION
+    assert recording.recording_id == Session.open(path).name
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    export.export(Session.open(made[0]), out)
+    texts: list[str] = []
+    lanes: dict[str, list[object]] = {}
+    for chunk in rrc.RrdReader(out).store().stream():
+        batch = chunk.to_record_batch()
+        if panels.key_of(chunk.entity_path) == "fleet/red/event/command" and export.TEXT in batch.schema.names:
+            texts += [row[0] for row in batch.column(export.TEXT).to_pylist()]
+        if panels.key_of(chunk.entity_path) == "fleet/red/state/mode":
+            for name in ("mode asked", "mode inferred"):
+                if name in batch.schema.names:
+                    lanes.setdefault(name, []).extend(row[0] for row in batch.column(name).to_pylist())
+    assert "red  drive  asked  forward for 3 s  by ann" in texts
+    assert "red  drive  sent  by ann" in texts
+    messages = [m for m in Session.open(made[0]).messages() if m.key == "fleet/red/state/mode"]
+    assert len(lanes["mode asked"]) == len(lanes["mode inferred"]) == len(messages)
+    assert set(lanes["mode inferred"]) == {"manual", "tracking", "unknown"}
+
+
+def test_lanes_say_what_was_so_and_for_how_long(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    export.export(Session.open(made[0]), out)
+    lanes: dict[tuple[str, str], list[tuple[float, object]]] = {}
+    for chunk in rrc.RrdReader(out).store().stream():
+        batch = chunk.to_record_batch()
+        for name in ("LED asked", "light left", "mode inferred"):
+            if name in batch.schema.names:
+                times = batch.column("message_publish_time").cast("int64").to_pylist()
+                lane = lanes.setdefault((panels.key_of(chunk.entity_path), name), [])
+                for at, row in zip(times, batch.column(name).to_pylist(), strict=True):
+                    lane.append(((at - START_NS) / 1e9, row[0]))
+    assert lanes["fleet/red/event/command", "LED asked"] == [(4.2, "#ff0010")]
+    *light, (end, nothing) = sorted(lanes["fleet/red/sensor/light", "light left"])
+    assert [state for _, state in light] == [second % 2 == 0 for second in range(7)], "as long as mode manual"
+    assert (end, nothing) == (9.06, None), "stale 3 s after the last"
+    assert None not in [state for _, state in lanes["fleet/red/state/mode", "mode inferred"]]
+
+
+def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
+    from schemas.messages import message_class
+
+    for part in panels.parts():
+        fields = message_class(TOPICS[part.topic].message).DESCRIPTOR.fields_by_name
+        names = part.field.rstrip("!").partition("[")[0].split(".")
+        assert names[0] in fields, part
+        assert len(names) == 1 or names[1] in fields[names[0]].message_type.fields_by_name, part
+        # What may be missing must not be drawn as the zero that stands for it.
+        assert not isinstance(part, panels.Curve) or fields[names[0]].has_presence == part.field.endswith("!"), part
+    for words in panels.WORDS:
+        fields = message_class(TOPICS[words.topic].message).DESCRIPTOR.fields_by_name
+        assert {*words.fields, *words.before} <= set(fields)
+
+
+def test_every_topic_of_the_table_is_drawn() -> None:
+    drawn = {part.topic for part in panels.parts()} | {words.topic for words in panels.WORDS}
+    drawn |= {topic for panel in panels.CAR_PANELS for topic in panel.topics}
+    drawn |= {topic for _, ours, theirs in panels.FLEET_TEXTS for topic in (*ours, *theirs)}
+    assert set(TOPICS) - drawn == {panels.PLAN, panels.WORLD}
+
+
+@pytest.mark.parametrize("key", ["fleet/red/sensor/range", "fleet/@recorder/status", "my-fleet/car_1/state/mode"])
+def test_entities_are_named_as_reruns_reader_names_them(key: str) -> None:
+    assert panels.key_of(panels.entity(key)) == key
+
+
+def test_rerun_names_entities_as_we_do(made: tuple[Path, Counter[str]]) -> None:
+    found = {chunk.entity_path for chunk in rrc.McapReader(made[0]).stream() if not chunk.is_static}
+    assert found == {panels.entity(key) for key in made[1]}
+
+
+def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    class Flushing(Writer):
+        """A chunk for every hundred messages."""
+
+        def add_message(self, *arguments: object, **named: object) -> None:
+            super().add_message(*arguments, **named)  # type: ignore[arg-type]
+            self.count = getattr(self, "count", 0) + 1
+            if self.count % 100 == 0:
+                self.flush()  # type: ignore[no-untyped-call]
+
+    path = tmp_path / "0001.mcap"
+    make(path, writer=Flushing)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    session = Session.open(tmp_path)
+    whole = Counter(message.key for message in session.messages())
+    assert sum(whole.values()) > 100
+    out = tmp_path / "out.rrd"
+    result = CliRunner().invoke(replay, [str(tmp_path), "--save", str(out)])
+    assert result.exit_code == 0
+    assert "is cut" in result.stderr
+    assert export.rows(out) == whole
+
+
+def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    foreign = tmp_path / "foreign.mcap"
+    foreign.write_bytes(b"something else")
+    out = str(tmp_path / "out.rrd")
+    for arguments, words in (
+        ([str(tmp_path / "none"), "--save", out], "there is no session at"),
+        ([str(tmp_path), "--save", out], "no 0001.mcap in it"),
+        ([str(foreign), "--save", out], "is not an MCAP file"),
+    ):
+        result = CliRunner().invoke(replay, arguments)
+        assert (result.exit_code, len(result.stderr.splitlines())) == (1, 1), result.stderr
+        assert words in result.stderr
+    if sys.platform == "linux":
+        missing = CliRunner().invoke(replay, [str(tmp_path / "none")])
+        assert "there is no session at" in missing.stderr, "what is missing comes before a missing display"
+
+
+def test_without_a_display_a_file_is_proposed(made: tuple[Path, Counter[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    result = CliRunner().invoke(replay, [str(made[0])])
+    assert result.exit_code == 1
+    assert "--save out.rrd" in result.stderr
+
+
+@pytest.mark.parametrize("size", [8, 9, 20, 30, 200, 1000])
+def test_a_recording_that_was_cut_at_once_is_said(made: tuple[Path, Counter[str]], tmp_path: Path, size: int) -> None:
+    cut = tmp_path / "0001.mcap"
+    cut.write_bytes(made[0].read_bytes()[:size])
+    result = CliRunner().invoke(replay, [str(cut), "--save", str(tmp_path / "out.rrd")])
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
+    assert len(result.stderr.splitlines()) == 1
+    assert f"holds no message that is whole: {cut} is cut" in result.stderr
+    assert "byte " in result.stderr
+
+
+def test_what_is_damaged_is_said_and_only_what_is_whole_is_shown(
+    made: tuple[Path, Counter[str]], tmp_path: Path
+) -> None:
+    whole = made[0].read_bytes()
+    for share in (0.3, 0.6, 0.9):
+        damaged = bytearray(whole)
+        at = int(len(whole) * share)
+        damaged[at : at + 50] = bytes(byte ^ 0x5A for byte in damaged[at : at + 50])
+        path, out = tmp_path / f"{share}.mcap", tmp_path / f"{share}.rrd"
+        path.write_bytes(damaged)
+        result = CliRunner().invoke(replay, [str(path), "--save", str(out)])
+        assert result.exit_code == 0, result.stderr
+        assert "damaged" in result.stderr
+        shown = export.rows(out)
+        assert f"{shown.total()} messages" in result.stdout
+        assert all(count <= made[1][key] for key, count in shown.items())
+
+
+def test_a_recording_or_a_device_is_not_overwritten(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    before = made[0].read_bytes()
+    link = tmp_path / "link.rrd"
+    link.symlink_to(made[0])
+    fifo = tmp_path / "fifo.rrd"
+    os.mkfifo(fifo)
+    for target in (made[0], link, fifo, Path(os.devnull)):
+        result = CliRunner().invoke(replay, [str(made[0]), "--save", str(target)])
+        assert result.exit_code == 2, target
+    assert made[0].read_bytes() == before
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_full_disk_is_said_in_our_words_only(
+    made: tuple[Path, Counter[str]], tmp_path: Path, *, damaged: bool
+) -> None:
+    source, out = tmp_path / "x.mcap", tmp_path / "out.rrd"
+    data = made[0].read_bytes()
+    source.write_bytes(data[:-20] if damaged else data)
+    code = (
+        "import resource; from fleet.cli import main;"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({2 * len(data)}, {2 * len(data)})); main()"
+    )
+    command = [sys.executable, "-c", code, "replay", str(source), "--save", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    assert done.returncode == 1
+    said = done.stderr.splitlines()
+    assert len(said) == 1 + damaged, done.stderr
+    assert ("is cut" in said[0]) == damaged
+    assert f"{out} could not be written whole" in said[-1]
+    assert "bytes are free" in said[-1]
+    assert list(tmp_path.iterdir()) == [source], "nothing is left behind"
+
+
+@pytest.mark.parametrize("where", ["between chunks", "in a lens"])
+def test_ctrl_c_does_not_blame_the_recording(
+    made: tuple[Path, Counter[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    def interrupt(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    if where == "in a lens":
+        monkeypatch.setattr(lenses, "_words", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        export.export(
+            Session.open(made[0]), tmp_path / "out.rrd", seen=interrupt if where == "between chunks" else lambda _: None
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "0001.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(NoSession, match="holds no message"):
+        export.export(Session.open(tmp_path), tmp_path / "out.rrd")
+
+
+def test_nothing_is_written_outside(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    home, work = tmp_path / "home", tmp_path / "work"
+    home.mkdir()
+    work.mkdir()
+    names = ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME", "TMPDIR")
+    environment = {**os.environ, **dict.fromkeys(names, str(home))}
+    environment.pop("CI", None)
+    code = "from fleet.commands.replay import replay; replay()"
+    command = [sys.executable, "-c", code, str(made[0]), "--save", str(work / "out.rrd")]
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    assert list(home.rglob("*")) == []
+    assert list(work.iterdir()) == [work / "out.rrd"]
+
+
+def test_cars_come_from_the_keys_and_foreign_keys_do_no_harm() -> None:
+    keys = frozenset(
+        {"fleet/red/sensor/range", "fleet/@recorder/status", "fleet/red/@cmd/drive", "x", "fleet/blue/other"}
+    )
+    found = panels.contents(keys)
+    assert dict(found.cars) == {"red": frozenset({"sensor/range"})}
+    assert found.services == {"@recorder/status"}
+    assert tuple(sorted(CARS)) == CARS

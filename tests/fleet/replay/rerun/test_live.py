@@ -1,0 +1,227 @@
+"""`fleet view`: what it shows is what is on the bus; it listens on loopback only, and leaves nothing behind."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import rerun as rr
+import rerun.chunk as rrc
+from click.testing import CliRunner
+
+from fleet.commands.view import view
+from fleet.replay.rerun import export, live
+from fleet.replay.rerun.live import Live
+from fleet.replay.rerun.viewer import Viewer, free_port
+from schemas.bus import Bus
+from schemas.gen import fleet_v1_pb2 as pb
+from schemas.topics import TOPICS
+from tests.support.ports import free_endpoint
+from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, wait_for
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
+    directory = tmp_path / "processes"
+    directory.mkdir()
+    made = FleetProcesses(free_endpoint(), directory)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def publish(bus: Bus, car: str, distances: range) -> None:
+    publisher = bus.publisher(f"fleet/{car}/sensor/range", TOPICS["sensor/range"], car)
+    for distance in distances:
+        publisher.put(pb.Range(range_m=distance), time.time_ns())
+
+
+def start_view(fleet: FleetProcesses, *arguments: str) -> GatewayProcess:
+    return fleet.start("-m", "fleet.cli", "view", *arguments)
+
+
+@contextmanager
+def following_of(bus: Bus, sink: Callable[[rr.RecordingStream], None]) -> Iterator[Live]:
+    """Follow the fleet. A failed assertion leaves no thread and no directory to the next test."""
+    following = Live(bus, "fleet", sink)
+    finished = False
+    try:
+        following.start()
+        yield following
+        finished = True
+    finally:
+        following.close(send=finished)
+
+
+def ended(program: psutil.Process) -> bool:
+    """Whether it is gone, or only waits for its parent to look."""
+    try:
+        return not program.is_running() or program.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def viewers(process: GatewayProcess) -> list[psutil.Process]:
+    """Rerun's programs below a process."""
+    below = psutil.Process(process.pid).children(recursive=True)
+    return [each for each in below if each.name().startswith("rerun")]
+
+
+def test_what_is_on_the_bus_is_in_the_file(fleet: FleetProcesses, tmp_path: Path) -> None:
+    out = tmp_path / "now.rrd"
+    with Bus.open(fleet.endpoint) as bus, following_of(bus, lambda recording: recording.save(out)) as following:
+        publish(fleet.bus, "red", range(50))
+        sent = 0
+        deadline = time.monotonic() + PATIENCE_S
+        while sent < 50 and time.monotonic() < deadline:
+            sent += following.step()
+        publish(fleet.bus, "blue", range(20))
+        wait_for(lambda: following.step() or following.held == 70, "all is sent")
+        while following.held < 70:
+            following.step()
+    assert following.cars == ("blue", "red")
+    assert following.dropped == 0
+    assert export.rows(out) == {"fleet/red/sensor/range": 50, "fleet/blue/sensor/range": 20}
+    reader = rrc.RrdReader(out)
+    (layout,) = {each.application_id for each in reader.blueprints()}
+    assert layout == export.APPLICATION
+
+
+def test_a_plan_from_before_is_asked_for(fleet: FleetProcesses, tmp_path: Path) -> None:
+    from schemas.bus import reply_value
+
+    topic = TOPICS["@coordinator/plan"]
+    plan = pb.Plan(text="red: tracking\n", version="1").SerializeToString()
+
+    def answer(query: object) -> None:
+        with query:  # type: ignore[attr-defined]
+            reply_value(query, "fleet/@coordinator/plan", plan, topic)  # type: ignore[arg-type]
+
+    fleet.bus.queryable("fleet/@coordinator/plan", answer)
+    out = tmp_path / "now.rrd"
+    with Bus.open(fleet.endpoint) as bus:
+        wait_for(lambda: list(bus.query("fleet/@coordinator/plan")), "the hub knows who has the plan")
+        with following_of(bus, lambda recording: recording.save(out)):
+            pass
+    assert export.rows(out) == {"fleet/@coordinator/plan": 1}
+
+
+def test_what_finds_no_room_is_counted(fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "LIMIT", 10)
+    out = tmp_path / "now.rrd"
+    with Bus.open(fleet.endpoint) as bus, following_of(bus, lambda recording: recording.save(out)) as following:
+        publish(fleet.bus, "red", range(100))
+        wait_for(lambda: following.dropped == 90, "90 find no room")
+    assert following.held == 10
+
+
+def test_a_page_on_loopback_that_goes_with_the_command(fleet: FleetProcesses) -> None:
+    process = start_view(fleet, "--web")
+    publish(fleet.bus, "red", range(5))
+    page = process._lines.get(timeout=PATIENCE_S).strip()
+    assert page.startswith("http://127.0.0.1:")
+    (viewer,) = viewers(process)
+
+    def listens() -> list[Any]:
+        return [each for each in viewer.net_connections() if each.status == psutil.CONN_LISTEN]
+
+    listening = wait_for(lambda: len(found := listens()) == 2 and found, "it takes data, too")
+    assert {each.laddr.ip for each in listening} == {"127.0.0.1"}
+    assert "--memory-limit" in viewer.cmdline()
+    assert "--server-memory-limit" in viewer.cmdline()
+    assert process.end(signal.SIGINT) == 0
+    wait_for(lambda: ended(viewer), "the viewer has ended")
+
+
+@pytest.mark.parametrize("who", ["the command", "the guard", "the viewer"])
+def test_killed_it_leaves_no_viewer(fleet: FleetProcesses, who: str) -> None:
+    process = start_view(fleet, "--web")
+    process._lines.get(timeout=PATIENCE_S)
+    (viewer,) = viewers(process)
+    victim = {"the command": process.pid, "the guard": viewer.ppid(), "the viewer": viewer.pid}[who]
+    os.kill(victim, signal.SIGKILL)
+    process.wait()
+    wait_for(lambda: ended(viewer), "the viewer has ended")
+
+
+def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
+    fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "LIMIT", 500)
+    port, page = free_port(), free_port()
+    with Viewer("--serve-web", "--port", str(port), "--web-viewer-port", str(page)) as viewer:
+        viewer.wait_until_it_listens(port)
+        with (
+            Bus.open(fleet.endpoint) as bus,
+            following_of(bus, lambda to: to.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")) as following,
+        ):
+            publish(fleet.bus, "red", range(10))
+            wait_for(lambda: following.step() >= 0 and following.held == 10, "the viewer takes what there is")
+            os.kill(viewer.pid, signal.SIGSTOP)
+            try:
+
+                def full() -> bool:
+                    publish(fleet.bus, "red", range(1000))
+                    following.step()
+                    return following.dropped > 2000
+
+                # A viewer that runs may take longer than this to acknowledge what it has, so only a stopped one has
+                # this little time.
+                with monkeypatch.context() as hurried:
+                    hurried.setattr(live, "FLUSH_S", 0.2)
+                    wait_for(full, "what comes is left out")
+            finally:
+                os.kill(viewer.pid, signal.SIGCONT)
+            wait_for(following.step, "it goes on when the viewer does")
+
+
+def test_bad_input_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    endpoint = free_endpoint()
+    for arguments, code, words in (
+        ([], 1, "--web serves it as a page, --save out.rrd writes a file"),
+        (["--web", "--save", "x.rrd"], 2, "do not go together"),
+        (["--save", "x.txt"], 2, "name it x.rrd"),
+        (["--web", "--memory", "much"], 2, "--memory much is not allowed"),
+        (["--web", "--connect", endpoint], 1, f"no fleet is running at {endpoint}"),
+        (["--save", str(tmp_path / "none" / "x.rrd"), "--connect", endpoint], 2, "there is no directory"),
+        (["--web", "--fleet", "No"], 2, "fleet name 'No' is not allowed"),
+        (["--web", "--for", "0"], 2, "--for"),
+    ):
+        result = CliRunner().invoke(view, arguments)
+        assert result.exit_code == code, (arguments, result.stderr)
+        assert words in result.stderr.replace("\n", " "), arguments
+
+
+def test_a_viewer_that_cannot_start_is_said() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        with Viewer("--serve-web", "--port", str(free_port()), "--web-viewer-port", port) as viewer:
+            assert viewer.wait(PATIENCE_S)
+            assert viewer.last_words != "it said nothing"
+
+
+def test_the_guard_ends_its_program_with_its_input() -> None:
+    guard = subprocess.Popen(
+        [sys.executable, "-m", "schemas.process.parent_guard", "sleep", "600"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert guard.stdin is not None
+    assert guard.stdout is not None
+    program = psutil.Process(int(guard.stdout.readline()))
+    guard.stdin.close()
+    guard.wait(PATIENCE_S)
+    guard.stdout.close()
+    assert not program.is_running()

@@ -1,0 +1,215 @@
+"""When a process is started, killed and started again: by tables, and for any order of what may happen."""
+
+from dataclasses import dataclass
+from math import inf
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.supervisor.restart_policy import (
+    FIRST_S,
+    GATEWAY_GRACE_S,
+    JITTER,
+    LONGEST_S,
+    STEADY_S,
+    WRONG_USE_RETRY_S,
+    Patience,
+    ProcessState,
+    RestartAction,
+    RunState,
+    delay_s,
+)
+from gateway.control.executor import SHUTDOWN_S
+
+LEAVES_BUS_S = 2.0
+"""A gateway on a busy machine needs so long to end after its wait."""
+PATIENCE = Patience(start_s=20.0, silence_s=4.0)
+
+
+def running(at: float = 100.0) -> ProcessState:
+    ward = ProcessState(PATIENCE, at)
+    assert ward.turn(at, None) is RestartAction.START
+    ward.started(at)
+    assert ward.heard(at)
+    return ward
+
+
+@pytest.mark.parametrize(
+    ("falls", "delay"), [(1, 0.25), (2, 0.5), (3, 1.0), (4, 2.0), (5, 4.0), (6, 8.0), (7, 10.0), (1000, 10.0)]
+)
+def test_the_delay_doubles_to_its_longest_and_is_spread_either_way(falls: int, delay: float) -> None:
+    assert delay_s(falls, 0.5) == delay
+    assert delay_s(falls, 0.0) == pytest.approx(delay * (1 - JITTER))
+    assert delay_s(falls, 1.0) == pytest.approx(delay * (1 + JITTER))
+
+
+def test_a_gateway_is_killed_no_sooner_than_its_own_wait_for_evidence_is_over() -> None:
+    ward = running()
+    assert ward.end(200.0, GATEWAY_GRACE_S)
+    assert ward.turn(200.0 + SHUTDOWN_S + LEAVES_BUS_S, None) is RestartAction.NOTHING
+    assert ward.turn(200.0 + GATEWAY_GRACE_S, None) is RestartAction.KILL
+
+
+def test_what_dies_is_started_again_after_the_delay() -> None:
+    ward = running()
+    ward.ended(-9, "", 101.0, 0.5)
+    assert ward.state is RunState.WAITING
+    assert ward.words == "was ended by signal 9"
+    assert ward.turn(101.0 + FIRST_S - 0.01, 0.0) is RestartAction.NOTHING
+    assert ward.turn(101.0 + FIRST_S, 0.0) is RestartAction.START
+    ward.started(102.0)
+    assert (ward.state, ward.restarts) == (RunState.STARTING, 1)
+
+
+def test_who_falls_at_once_again_and_again_waits_ever_longer_and_who_ran_steadily_does_not() -> None:
+    ward, at, delays = ProcessState(PATIENCE, 0.0), 0.0, []
+    for _ in range(8):
+        ward.started(at)
+        ward.ended(1, "no", at + 0.1, 0.5)
+        delays.append(ward.due - at - 0.1)
+        at = ward.due
+    assert delays == sorted(delays)
+    assert delays[-1] == pytest.approx(LONGEST_S)
+    ward.started(at)
+    ward.heard(at)
+    ward.ended(1, "no", at + STEADY_S, 0.5)
+    assert ward.due - at - STEADY_S == pytest.approx(FIRST_S)
+    assert ward.words == "ended with exit code 1: no"
+
+
+def test_a_process_that_refuses_its_arguments_is_retried_each_minute_and_at_once_after_a_reload() -> None:
+    ward = running()
+    ward.ended(2, "no such platform", 101.0, 0.5)
+    assert ward.state is RunState.REFUSED
+    assert ward.words == "ended with exit code 2: no such platform"
+    assert ward.turn(101.0 + WRONG_USE_RETRY_S - 0.1, 0.0) is RestartAction.NOTHING
+    assert ward.turn(101.0 + WRONG_USE_RETRY_S, 0.0) is RestartAction.START
+    ward.end(120.0, 5.0, again=True)
+    assert ward.turn(120.0, 0.0) is RestartAction.START
+
+
+@pytest.mark.parametrize(
+    ("leave_s", "act"),
+    [(0.0, RestartAction.KILL), (4.9, RestartAction.KILL), (5.1, RestartAction.NOTHING), (inf, RestartAction.NOTHING)],
+)
+def test_a_silent_process_may_be_left_longer_than_its_patience(leave_s: float, act: RestartAction) -> None:
+    assert running(100.0).turn(105.0, 0.0, leave_s) is act
+
+
+def test_a_process_that_is_to_end_has_its_time_however_long_it_may_be_silent() -> None:
+    ward = running()
+    ward.end(110.0, 7.0)
+    assert ward.turn(117.0, 0.0, inf) is RestartAction.KILL
+
+
+@pytest.mark.parametrize(
+    ("now", "listening_since", "act"),
+    [
+        (103.9, 0.0, RestartAction.NOTHING),
+        (104.1, 0.0, RestartAction.KILL),
+        (200.0, None, RestartAction.NOTHING),  # nobody could have been heard
+        (200.0, 197.0, RestartAction.NOTHING),  # the hub is back, or we are awake, for 3 s only
+        (200.0, 195.9, RestartAction.KILL),
+    ],
+)
+def test_who_is_silent_hangs_if_it_could_have_been_heard(
+    now: float, listening_since: float | None, act: RestartAction
+) -> None:
+    ward = running(100.0)
+    assert ward.turn(now, listening_since) is act
+    if act is RestartAction.KILL:
+        assert ward.words.startswith("hung: not heard for ")
+        assert ward.killed
+        assert ward.turn(now + 10, listening_since) is RestartAction.NOTHING, "once is enough"
+        ward.ended(-9, "", now + 0.1, 0.5)
+        assert ward.words.startswith("hung"), "the reason stays the first"
+
+
+def test_who_starts_has_longer() -> None:
+    ward = ProcessState(PATIENCE, 0.0)
+    ward.started(100.0)
+    assert ward.turn(119.9, 0.0) is RestartAction.NOTHING
+    assert ward.turn(120.1, 0.0) is RestartAction.KILL
+
+
+def test_told_to_end_it_has_its_time_and_then_is_killed_and_not_started_again() -> None:
+    ward = running()
+    assert ward.end(110.0, 7.0)
+    assert not ward.end(111.0, 7.0), "told twice is told once"
+    assert ward.turn(116.9, 0.0) is RestartAction.NOTHING
+    assert ward.turn(117.0, 0.0) is RestartAction.KILL
+    ward.ended(-9, "", 117.1, 0.5)
+    assert ward.state is RunState.ENDED
+    assert ward.turn(1e6, 0.0) is RestartAction.NOTHING
+
+
+def test_begun_anew_is_no_fall() -> None:
+    ward = running()
+    ward.end(110.0, 7.0, again=True)
+    ward.ended(0, "", 111.0, 0.5)
+    assert ward.turn(111.0, 0.0) is RestartAction.START
+
+
+def test_what_somebody_else_does_is_not_started_until_nobody_does() -> None:
+    ward = ProcessState(PATIENCE, 0.0)
+    ward.elsewhere(1.0, "somebody else's")
+    assert ward.turn(100.0, 0.0) is RestartAction.NOTHING
+    ward.wanted(101.0)
+    assert ward.turn(101.0, 0.0) is RestartAction.START
+
+
+@dataclass
+class FakeProcess:
+    """What a ward is told of: at most one lives."""
+
+    alive: bool = False
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["turn", "heard", "die", "wrong", "end", "again", "deaf"]),
+            st.floats(0.0, 30.0),
+            st.floats(0.0, 1.0),
+        )
+    )
+)
+def test_for_any_order_there_is_at_most_one_and_what_may_run_is_due(steps: list[tuple[str, float, float]]) -> None:
+    ward, process, now = ProcessState(PATIENCE, 0.0), FakeProcess(), 0.0
+    for step, seconds, chance in steps:
+        now += seconds
+        if step in ("turn", "deaf"):
+            act = ward.turn(now, None if step == "deaf" else 0.0)
+            if act is RestartAction.START:
+                assert not process.alive
+                process.alive = True
+                ward.started(now)
+            elif act is RestartAction.KILL:
+                assert process.alive
+                process.alive = False
+                ward.ended(-9, "", now, chance)
+        elif step == "heard" and process.alive:
+            ward.heard(now)
+        elif step in ("die", "wrong") and process.alive:
+            process.alive = False
+            ward.ended(2 if step == "wrong" else 1, "", now, chance)
+        elif step in ("end", "again"):
+            assert ward.end(now, 5.0, again=step == "again") <= process.alive
+        assert ward.alive == process.alive
+        if ward.state is RunState.WAITING:
+            assert ward.due <= now + LONGEST_S * (1 + JITTER)
+
+
+def test_who_is_heard_to_the_end_is_killed_when_it_hangs_while_it_ends_and_nobody_else() -> None:
+    for to_the_end in (True, False):
+        ward = ProcessState(Patience(start_s=20.0, silence_s=4.0, to_the_end=to_the_end), 100.0)
+        ward.started(100.0)
+        ward.heard(101.0)
+        ward.end(110.0, 15.0)
+        assert ward.turn(114.0, None) is RestartAction.NOTHING, "nobody could be heard"
+        assert ward.turn(114.0, 112.0) is RestartAction.NOTHING
+        ward.heard(112.5)
+        assert ward.turn(116.4, 112.0) is RestartAction.NOTHING
+        assert ward.turn(116.6, 112.0) is (RestartAction.KILL if to_the_end else RestartAction.NOTHING)
+        assert ward.turn(125.0, 112.0) is (RestartAction.NOTHING if to_the_end else RestartAction.KILL)

@@ -1,0 +1,94 @@
+"""What a gateway learns of the e-stops that the other gateways of its fleet know, on a real bus."""
+
+import asyncio
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import zenoh
+
+from gateway.bus.estop_sync import EstopSync
+from gateway.control.safety import Estop
+from schemas.bus import Bus, Handover, reply
+from schemas.gen import fleet_v1_pb2 as pb
+from schemas.messages import encoding_of
+from tests.support.ports import free_endpoint
+from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
+
+KEY = "fleet/blue/state/safety"
+SAFETY = encoding_of("fleet.v1.Safety")
+
+
+async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) -> None:
+    """It may still be starting, or held up, and know of an e-stop of the whole fleet."""
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    asked: list[zenoh.Query] = []
+    awake = asyncio.Event()
+    learned: list[tuple[str, str]] = []
+
+    def answer(query: zenoh.Query) -> None:
+        asked.append(query)
+        if awake.is_set():
+            with query:
+                safety = pb.Safety(car="blue", estops=[pb.Estop(id="e1", by="mia", scope="fleet")])
+                reply(query, KEY, safety.SerializeToString(), encoding_of("fleet.v1.Safety"))
+
+    def unite(estops: Sequence[Estop], _: Sequence[str], told_by: str) -> None:
+        learned.extend((estop.id, told_by) for estop in estops)
+
+    try:
+        with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as blue, fleet.bus as opened:
+            blue.queryable(KEY, Handover(asyncio.get_running_loop(), answer))
+            while not asked:  # until the hub knows of it
+                await asyncio.to_thread(lambda: list(opened.query(KEY, timeout_s=0.1)))
+            neighbours, before = EstopSync(opened, "fleet", "red"), len(asked)
+            keeping = asyncio.ensure_future(neighbours.keep_united(unite))
+            neighbours.changed({"blue": True})
+            await asyncio.to_thread(wait_for, lambda: len(asked) > before, "it is asked")
+            awake.set()
+            await asyncio.to_thread(wait_for, lambda: learned, "it is asked again")
+            assert learned[0] == ("e1", "blue")
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
+            asked.clear()
+    finally:
+        fleet.close()
+
+
+async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -> None:
+    """Else a hundred gateways that start one after the other have 300,000 answers to give."""
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    asked: dict[str, int] = {"blue": 0, "green": 0}
+    learned: list[str] = []
+
+    def answer(query: zenoh.Query, car: str) -> None:
+        asked[car] += 1
+        with query:
+            reply(query, f"fleet/{car}/state/safety", pb.Safety(car=car).SerializeToString(), SAFETY)
+
+    def learn(_: Sequence[Estop], __: Sequence[str], told_by: str) -> None:
+        learned.append(told_by)
+
+    try:
+        with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as cars, fleet.bus as opened:
+            loop = asyncio.get_running_loop()
+            for car in asked:
+                cars.queryable(f"fleet/{car}/state/safety", Handover(loop, partial(answer, car=car)))
+            while not all(asked.values()):  # until the hub knows of both
+                await asyncio.to_thread(lambda: list(opened.query("fleet/*/state/safety", timeout_s=0.1)))
+            neighbours = EstopSync(opened, "fleet", "red")
+            keeping = asyncio.ensure_future(neighbours.keep_united(learn))
+            for car in asked:
+                neighbours.changed({car: True})
+                await asyncio.to_thread(wait_for, lambda car=car: car in learned, f"{car} is asked")
+            assert learned == ["blue", "green"]
+            neighbours.ask_soon()
+            await asyncio.to_thread(wait_for, lambda: learned == ["blue", "green"] * 2, "all are asked")
+            neighbours.changed({"blue": False})
+            neighbours.ask_soon()
+            await asyncio.to_thread(wait_for, lambda: len(learned) == 5, "who is there is asked")
+            assert learned[4] == "green"
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
+    finally:
+        fleet.close()

@@ -1,0 +1,124 @@
+"""What a gateway takes from the bus, and what it refuses, on a real bus: what is too large, too much, too often."""
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from gateway.bus.service import COMMANDS_WAITING, HISTORIES_WAITING, CarService
+from schemas import bus, keys
+from tests.support.ports import free_endpoint
+from tests.support.processes import FleetProcesses, wait_for
+
+LARGE = b"x" * 5_000_000
+
+
+class Hall:
+    """Who stands behind the doors: keeps what comes."""
+
+    def __init__(self, doors: CarService) -> None:
+        self.doors = doors
+        self.commands: list[tuple[zenoh.Query, str]] = []
+        self.drives: list[bus.Sample] = []
+        self.batches: list[Mapping[str, bool]] = []
+        self.values, self.histories = asyncio.Event(), asyncio.Event()
+
+    def attach(self) -> None:
+        self.doors.attach(
+            asyncio.get_running_loop(),
+            values=self.values,
+            histories=self.histories,
+            command=self.commands.append,
+            streamed=self.drives.append,
+            senders=self.batches.append,
+            cars=lambda _: None,
+        )
+
+    async def until(self, so: Any, what: str) -> None:
+        await asyncio.to_thread(wait_for, so, what)
+
+
+@pytest.fixture
+async def hall(tmp_path: Path) -> AsyncIterator[tuple[Hall, bus.Bus]]:
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    with bus.Bus.open(fleet.endpoint) as opened:
+        there = Hall(CarService(opened, "fleet", "red"))
+        await there.until(lambda: fleet.bus.tokens("fleet/red"), "its doors are open")
+        yield there, fleet.bus
+        there.commands.clear()
+    fleet.close()
+
+
+def ask(asker: bus.Bus, selector: str, payload: bytes | None = None, timeout_s: float = 0.3) -> list[str]:
+    """The words of every error that answers."""
+    answers = list(asker.query(f"fleet/red/{selector}", payload=payload, timeout_s=timeout_s))
+    return [answer.words for answer in answers if isinstance(answer, bus.Failure)]
+
+
+async def test_what_is_too_large_is_handed_over_with_the_reason_and_not_read(hall: tuple[Hall, bus.Bus]) -> None:
+    """A megabyte of JSON stalled the gateway for 0.2 s, 64 of them until it was killed."""
+    there, asker = hall
+    there.attach()
+    for verb in ("drive", "stop"):
+        await asyncio.to_thread(ask, asker, f"@cmd/{verb}", LARGE)
+    await there.until(lambda: len(there.commands) == 2, "both commands")
+    assert {words for _, words in there.commands} == {
+        "a payload of 5000000 bytes is too large: at most 65536 are read, so nothing of it was"
+    }
+    assert await asyncio.to_thread(ask, asker, "sensor/range", LARGE) == [there.commands[0][1]]
+    (long,) = await asyncio.to_thread(ask, asker, f"state/link?a={'x' * 5000}")
+    assert long.endswith("characters: at most 4096 are read")
+    asker.put_command(keys.command_key("fleet", "red", "drive"), LARGE, "application/json")
+    await there.until(lambda: there.drives, "a streamed drive")
+    assert (there.drives[0].payload, there.drives[0].unread) == (b"", there.commands[0][1])
+
+
+async def test_questions_of_the_past_wait_by_themselves_and_not_too_many(hall: tuple[Hall, bus.Bus]) -> None:
+    there, asker = hall
+    there.attach()
+
+    def flood() -> list[str]:
+        words = [ask(asker, "sensor/*?last=1500", timeout_s=0.02) for _ in range(HISTORIES_WAITING + 3)]
+        return [each for found in words for each in found if each != "Timeout"]
+
+    assert await asyncio.to_thread(flood) == [bus.BUSY] * 3
+    assert there.doors.dropped == 3
+    await asyncio.to_thread(ask, asker, "state/link", timeout_s=0.02)
+    family, query = await asyncio.wait_for(there.doors.values.next(), 20.0)  # none of them is before it
+    assert (family, str(query.key_expr)) == ("state", "fleet/red/state/link")
+    assert await there.doors.histories.next()
+
+
+async def test_a_stop_finds_room_where_other_commands_find_none(hall: tuple[Hall, bus.Bus]) -> None:
+    there, asker = hall  # nobody takes anything yet
+
+    def fill() -> list[str]:
+        words = [ask(asker, "@cmd/whistle", b"{}", timeout_s=0.005) for _ in range(COMMANDS_WAITING + 2)]
+        return [each for found in words for each in found if each != "Timeout"]
+
+    assert await asyncio.to_thread(fill) == [bus.BUSY] * 2
+    assert set(await asyncio.to_thread(ask, asker, "@cmd/stop")) == {"Timeout"}
+    there.attach()
+    await there.until(lambda: len(there.commands) == COMMANDS_WAITING + 1, "all that waited")
+    assert str(there.commands[-1][0].key_expr).endswith("/stop"), "and none after a stop that came before it"
+
+
+async def test_changes_of_a_token_are_merged(hall: tuple[Hall, bus.Bus]) -> None:
+    """1,200 tokens a second woke the writer 2,400 times."""
+    there, asker = hall
+    there.attach()
+
+    def blink() -> None:
+        for number in range(300):
+            token = asker.token(f"fleet/{keys.OPERATOR}/ann{number % 3}")
+            token.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+        asker.token(f"fleet/{keys.OPERATOR}/bob")
+
+    await asyncio.to_thread(blink)
+    await there.until(lambda: any("bob" in batch for batch in there.batches), "the last token")
+    told = {name: alive for batch in there.batches for name, alive in batch.items()}
+    assert told == {"ann0": False, "ann1": False, "ann2": False, "bob": True}
+    assert sum(len(batch) for batch in there.batches) < 200

@@ -1,0 +1,338 @@
+"""Who may move the car, through control: e-stops, leases, and streams that must pause after a stop."""
+
+import pytest
+
+from gateway.control.commands import (
+    Action,
+    ChangeSpeed,
+    Drive,
+    EmergencyStop,
+    OneShot,
+    Phase,
+    Reason,
+    Resume,
+    Sender,
+    SenderKind,
+    SetMode,
+    Stop,
+    TakeLease,
+)
+from gateway.control.safety import Estop, PersistedSafety
+from gateway.protocol.enums import Mode, Motion, SpeedStep
+from gateway.protocol.frames import ColorLed
+from tests.gateway.control.workbench import (
+    COORDINATOR,
+    MODE00,
+    PERSON,
+    RUN,
+    SCRIPT,
+    SHOWN_STOP,
+    STOP,
+    TRACKING,
+    Workbench,
+)
+
+SENT, QUEUED, REJECTED, SUPERSEDED = Phase.SENT, Phase.QUEUED, Phase.REJECTED, Phase.SUPERSEDED
+FORWARD = Drive(Motion.FORWARD, 5.0)
+BOB = Sender("bob", SenderKind.PERSON)
+
+
+@pytest.fixture
+def desk() -> Workbench:
+    return Workbench().ready()
+
+
+# ---------------------------------------------------------------------- e-stop
+
+
+def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
+    desk.ask(FORWARD, SCRIPT)
+    answer = desk.ask(EmergencyStop("smoke"), PERSON, identity="e1")
+    assert answer.status is QUEUED
+    assert "latched as e1" in answer.words
+    assert answer.worst_case_s > 0
+    desk.run(600.0)
+    assert desk.frames == [RUN, *SHOWN_STOP]
+    assert desk.life("e1") == [Phase.ASKED, QUEUED, SENT, Phase.COMPLETE]
+    for what in (FORWARD, SetMode(Mode.MANUAL), OneShot(ColorLed(1, 2, 3)), TakeLease(), Drive(Motion.STOP)):
+        refused = desk.ask(what, PERSON)
+        assert (refused.status, refused.reason) == (REJECTED, Reason.ESTOPPED)
+        assert "red is e-stopped by mia: smoke; a person or script ends it: resume e1" in refused.words
+    assert desk.ask(Stop(), SCRIPT).status is QUEUED
+    assert desk.ask(Resume(("e2",)), PERSON).reason is Reason.BAD_VALUE
+    assert "still in force: e-stop e1" in desk.ask(Resume(), PERSON).words, "without ids it ends the hold"
+    assert desk.control.hold is None
+    assert desk.ask(Resume(("e1",)), SCRIPT).status is SENT
+    assert desk.logs[-1].code == "estop_ended"
+    desk.run(5.0)
+    assert desk.ask(FORWARD, SCRIPT).status is QUEUED
+
+
+def test_the_hold_outlives_the_e_stop(desk: Workbench) -> None:
+    desk.ask(EmergencyStop("smoke"), COORDINATOR, identity="e1")
+    desk.run(5.0)
+    assert "on hold (by plan)" in desk.ask(Resume(("e1",)), PERSON).words
+    assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
+    assert desk.ask(FORWARD, PERSON).status is QUEUED
+
+
+def test_an_e_stop_of_a_car_out_of_reach_is_latched_all_the_same(desk: Workbench) -> None:
+    desk.control.link_down("unplugged", desk.now)
+    answer = desk.ask(EmergencyStop(), PERSON, identity="e1")
+    assert (answer.status, answer.reason) == (REJECTED, Reason.LINK_DOWN)
+    assert "it is stopped first when its link is back (latched as e1" in answer.words
+    desk.control.link_up(desk.now)
+    desk.run(10.0)
+    assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
+
+
+def test_an_e_stop_survives_a_restart() -> None:
+    estop = Estop("e1", "mia", "smoke", 7, fleet_wide=False)
+    desk = Workbench(kept=PersistedSafety(None, (estop,), ())).ready()
+    assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
+    desk.ask(Resume(("e1",)), PERSON)
+    assert desk.control.safety.kept == PersistedSafety(None, (), ("e1",))
+
+
+def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Workbench) -> None:
+    desk.ask(FORWARD, SCRIPT, identity="d")
+    estop = Estop("e1", "mia", "smoke", 7, fleet_wide=True)
+    desk.control.unite([estop], [], "blue", desk.now)
+    desk.run(3.0)
+    assert desk.frames == [RUN, *SHOWN_STOP]
+    assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
+    assert desk.logs[0].code == "estop_joined"
+    assert "as blue shows: smoke" in desk.logs[0].words
+    desk.sent.clear()
+    desk.control.unite([estop], [], "green", desk.now)
+    desk.run(3.0)
+    assert desk.frames == [], "it is known already"
+    desk.control.unite([], ["e1"], "blue", desk.now)
+    assert desk.ask(FORWARD, PERSON).status is QUEUED
+
+
+def test_an_e_stop_at_rest_is_carried_out_too(desk: Workbench) -> None:
+    desk.control.unite([Estop("e1", "mia", "", 7, fleet_wide=True)], [], "blue", desk.now)
+    desk.run(3.0)
+    assert desk.frames == [MODE00, STOP]
+
+
+# ---------------------------------------------------------------------- lease
+
+
+def test_who_drives_has_the_car_and_two_seconds_more(desk: Workbench) -> None:
+    desk.ask(Drive(Motion.FORWARD, 3.0), SCRIPT)
+    other = Sender("other")
+    refused = desk.ask(Drive(Motion.LEFT), other)
+    assert (refused.status, refused.reason) == (REJECTED, Reason.LEASED)
+    assert "red is driven by script (script), for 5.0 s more: wait, or ask as a person" in refused.words
+    desk.run(4.9)
+    assert desk.ask(Drive(Motion.STOP), other).reason is Reason.LEASED, "whose idle stick would stop another's car"
+    assert desk.ask(OneShot(ColorLed(1, 2, 3)), other).status is QUEUED
+    desk.run(0.2)
+    assert desk.ask(Drive(Motion.LEFT), other).status is QUEUED
+
+
+def test_a_command_line_that_is_done_keeps_the_car_from_those_of_lower_rank_only(desk: Workbench) -> None:
+    """A person who stops a car, and drives it a little, is not to see it driven off by the coordinator at once."""
+    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
+    desk.run(1.1)
+    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    for other in (SCRIPT, COORDINATOR):
+        assert desk.ask(FORWARD, other).reason is Reason.LEASED
+    desk.run(1.8)
+    assert desk.ask(SetMode(Mode.TRACKING), COORDINATOR).reason is Reason.LEASED
+    assert desk.ask(Drive(Motion.LEFT, 1.0), BOB).status is QUEUED
+    desk.run(3.1)
+    assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
+
+
+def test_a_holder_that_is_back_has_its_lease_again(desk: Workbench) -> None:
+    """A hub that was restarted takes all tokens down for a moment."""
+    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
+    desk.run(1.1)
+    for alive in (False, True):
+        desk.control.sender_alive("mia", alive=alive, now=desk.now)
+    assert desk.ask(FORWARD, BOB).reason is Reason.LEASED
+
+
+def test_a_held_car_is_no_coordinators(desk: Workbench) -> None:
+    desk.ask(FORWARD, COORDINATOR)
+    desk.ask(Stop(), PERSON)
+    assert desk.control.safety.leased(desk.now) is None
+
+
+def test_a_release_shortens_the_lease(desk: Workbench) -> None:
+    desk.ask(Drive(Motion.FORWARD, 9.0), SCRIPT)
+    desk.ask(Drive(Motion.STOP), SCRIPT)
+    desk.run(2.1)
+    assert desk.ask(FORWARD, Sender("other")).status is QUEUED
+
+
+def test_a_person_outranks_a_script_and_the_loser_is_told_by_whom(desk: Workbench) -> None:
+    desk.ask(FORWARD, SCRIPT, identity="d")
+    assert desk.ask(Drive(Motion.LEFT, 1.0), PERSON).status is QUEUED
+    assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
+    assert next(record.words for record in desk.records if record.phase is SUPERSEDED) == "left by mia"
+    assert desk.logs[-1].code == "lease_taken"
+    assert "taken over by mia (person) from script (script)" in desk.logs[-1].words
+    assert "driven by mia (person)" in desk.ask(FORWARD, SCRIPT).words
+
+
+def test_between_persons_the_holder_keeps_it_unless_it_is_taken(desk: Workbench) -> None:
+    desk.ask(FORWARD, PERSON, identity="d")
+    assert desk.ask(FORWARD, BOB).words.endswith("wait, or take it")
+    assert desk.ask(Drive(Motion.BACK, 1.0), BOB, take=True).status is QUEUED
+    assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
+    assert desk.ask(FORWARD, PERSON).reason is Reason.LEASED
+    assert desk.ask(FORWARD, SCRIPT, take=True).reason is Reason.LEASED, "only a person may take"
+
+
+@pytest.mark.parametrize("what", [TakeLease(), ChangeSpeed(SpeedStep.UP)])
+def test_what_is_asked_on_the_way_does_not_shorten_the_lease(desk: Workbench, what: Action) -> None:
+    desk.ask(FORWARD, PERSON)
+    desk.run(0.5)
+    assert desk.ask(what, PERSON).status in (SENT, QUEUED)
+    desk.run(3.5)
+    assert desk.ask(FORWARD, BOB).reason is Reason.LEASED, "mia drives still"
+
+
+def test_taking_the_lease_alone_stops_what_the_other_drove(desk: Workbench) -> None:
+    desk.ask(FORWARD, SCRIPT, identity="d")
+    assert desk.ask(TakeLease(), PERSON).status is SENT
+    assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
+    desk.run(3.0)
+    assert desk.frames == [RUN, STOP, STOP]
+
+
+def test_a_lease_can_be_given_back(desk: Workbench) -> None:
+    desk.ask(FORWARD, PERSON, identity="d")
+    assert "bob had no lease" in desk.ask(TakeLease(release=True), BOB).words
+    assert desk.ask(TakeLease(release=True), PERSON).words == "red is free"
+    assert desk.end("d") == (Phase.COMPLETE, None)
+    assert desk.ask(FORWARD, BOB).status is QUEUED
+
+
+def test_a_stop_needs_no_lease_and_ends_it(desk: Workbench) -> None:
+    desk.ask(Drive(Motion.FORWARD, 9.0), PERSON)
+    assert desk.ask(Stop(), SCRIPT).status is QUEUED
+    desk.run(2.1)
+    assert desk.ask(FORWARD, BOB).status is QUEUED
+
+
+# ---------------------------------------------------------------------- streams after a stop
+
+
+def test_a_stick_that_is_leaned_on_after_anothers_stop_does_not_drive_on(desk: Workbench) -> None:
+    stick = Drive(Motion.FORWARD, 0.5)
+    for _ in range(10):
+        desk.ask(stick, SCRIPT, streamed=True)
+        desk.run(0.1)
+    desk.ask(Stop(), PERSON, identity="s")
+    for _ in range(50):
+        refused = desk.ask(stick, SCRIPT, streamed=True)
+        assert (refused.reason, "let go" in refused.words) == (Reason.HELD, True)
+        desk.run(0.1)
+    assert desk.frames == [RUN, *SHOWN_STOP]
+    assert desk.control.hold is not None, "what was refused ends no hold"
+    rejected = [record for record in desk.records if record.phase is REJECTED]
+    assert len(rejected) == 1, "one record for the whole stream"
+    desk.run(0.5)
+    assert desk.ask(stick, SCRIPT, streamed=True).status is QUEUED, "let go, and taken again"
+
+
+def test_a_stick_that_a_lease_kept_out_does_not_drive_when_it_lapses_after_a_stop(desk: Workbench) -> None:
+    stick = Drive(Motion.FORWARD, 0.5)
+    for _ in range(10):
+        desk.ask(stick, PERSON, streamed=True)
+        assert desk.ask(stick, SCRIPT, streamed=True).reason is Reason.LEASED
+        desk.run(0.1)
+    desk.ask(Stop(), BOB)
+    for _ in range(50):
+        assert desk.ask(stick, SCRIPT, streamed=True).status is REJECTED
+        desk.run(0.1)
+    assert desk.frames == [RUN, *SHOWN_STOP]
+
+
+def test_a_stream_that_says_stop_is_heard_again_at_once(desk: Workbench) -> None:
+    stick = Drive(Motion.FORWARD, 0.5)
+    desk.ask(stick, SCRIPT, streamed=True)
+    desk.ask(Stop(), SCRIPT)
+    desk.run(0.1)
+    assert desk.ask(stick, SCRIPT, streamed=True).reason is Reason.HELD
+    desk.ask(Drive(Motion.STOP), SCRIPT, streamed=True)
+    desk.run(0.1)
+    assert desk.ask(Drive(Motion.FORWARD, 9.0), SCRIPT, streamed=True).status is QUEUED
+
+
+def test_a_single_drive_is_no_stream(desk: Workbench) -> None:
+    desk.ask(FORWARD, SCRIPT)
+    desk.ask(Stop(), PERSON)
+    desk.run(2.0)
+    assert desk.ask(FORWARD, SCRIPT).status is QUEUED
+
+
+def test_who_asks_for_one_drive_after_another_lets_go_first_too(desk: Workbench) -> None:
+    for _ in range(5):
+        desk.ask(Drive(Motion.FORWARD, 0.5), SCRIPT)
+        desk.run(0.1)
+    desk.ask(Stop(), PERSON)
+    for _ in range(20):
+        assert desk.ask(FORWARD, SCRIPT).reason is Reason.HELD
+        desk.run(0.1)
+    desk.run(0.5)
+    assert desk.ask(FORWARD, SCRIPT).status is QUEUED
+
+
+def test_a_script_that_drives_stops_and_drives_leans_on_nothing(desk: Workbench) -> None:
+    desk.ask(FORWARD, SCRIPT)
+    desk.run(0.1)
+    desk.ask(Stop(), SCRIPT)
+    desk.run(0.1)
+    assert desk.ask(FORWARD, SCRIPT).status is QUEUED
+
+
+# ---------------------------------------------------------------------- what ends no hold
+
+
+def test_a_drive_that_is_refused_and_a_stick_that_is_let_go_end_no_hold(desk: Workbench) -> None:
+    desk.ask(FORWARD, SCRIPT)
+    desk.ask(Stop(), PERSON)
+    desk.run(0.55)
+    assert desk.ask(Drive(Motion.FORWARD, 0.1), SCRIPT).reason is Reason.EXPIRED, "the stop takes longer"
+    assert desk.control.hold is not None
+    assert desk.control.safety.lease is None or desk.control.safety.lease.holder == SCRIPT
+    desk.run(3.0)
+    desk.ask(Drive(Motion.STOP), SCRIPT, streamed=True)
+    desk.ask(Drive(Motion.STOP), PERSON)
+    assert desk.control.hold is not None
+    assert desk.ask(SetMode(Mode.TRACKING), COORDINATOR).reason is Reason.HELD
+
+
+def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Workbench) -> None:
+    for _ in range(3):
+        desk.run(0.3, reports=False)
+        desk.hear(TRACKING)
+    assert (desk.control.motors, desk.control.motion) == ("unknown", None)
+    assert desk.ask(OneShot(ColorLed(1, 2, 3)), PERSON).reason is Reason.WRONG_MODE, "it would be lost"
+
+
+def test_who_sets_a_mode_has_the_car_until_it_is_in_force(desk: Workbench) -> None:
+    """Or the coordinator closes it again while it opens: that takes 3.5 s, longer than a lease outlives its drive."""
+    desk.ask(SetMode(Mode.TRACKING), PERSON)
+    desk.run(4.0, reports=False)
+    assert desk.ask(SetMode(Mode.MANUAL), COORDINATOR).reason is Reason.LEASED
+    desk.run(2.0, reports=False)
+    assert desk.ask(SetMode(Mode.MANUAL), COORDINATOR).status is QUEUED
+
+
+def test_a_token_that_is_known_only_from_its_end_ends_the_drive() -> None:
+    """Changes of tokens are merged: one that came and went within 50 ms is told as gone."""
+    desk = Workbench().ready()
+    desk.ask(Drive(Motion.FORWARD, 60.0), SCRIPT, identity="drive")
+    desk.control.sender_alive(SCRIPT.name, alive=False, now=desk.now)
+    desk.run(1.5)
+    assert desk.life("drive")[-1] is Phase.EXPIRED
+    assert STOP in desk.frames

@@ -1,0 +1,70 @@
+"""What a battery's level does to a car: warn, refuse what would drain it, stop it."""
+
+import pytest
+
+from gateway.control.commands import Drive, OneShot, Phase, Reason, SetMode, Stop
+from gateway.control.controller import Controller
+from gateway.control.estimate.battery import BatteryPolicy, BatteryReaction
+from gateway.protocol.enums import Light, Mode, Motion
+from gateway.protocol.frames import General
+from gateway.protocol.platforms import parse_platform
+from tests.gateway.control.workbench import MODE00, RUN, STOP, Workbench
+
+FORWARD = Drive(Motion.FORWARD, 9.0)
+
+
+def reading(voltage: float) -> bytes:
+    return f"$4WD,CSB57.24,PV{voltage:.2f},GS5,LF0000,HW00,GM00#".encode()
+
+
+def drained(desk: Workbench, voltage: float) -> None:
+    for _ in range(12):
+        desk.run(1.0, reports=False)
+        desk.hear(reading(voltage))
+
+
+def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
+    desk = Workbench().ready()
+    drained(desk, 6.9)
+    assert [log.code for log in desk.logs] == ["battery_low"]
+    assert "6.90 V" in desk.logs[0].words
+    assert desk.ask(Drive(Motion.FORWARD, 0.3)).status is Phase.QUEUED
+    drained(desk, 6.1)
+    assert [log.code for log in desk.logs] == ["battery_low", "battery_critical"]
+    for what in (FORWARD, SetMode(Mode.TRACKING)):
+        refused = desk.ask(what)
+        assert (refused.status, refused.reason) == (Phase.REJECTED, Reason.BATTERY_LOW)
+        assert "charge it" in refused.words
+    for still in (Drive(Motion.STOP), SetMode(Mode.MANUAL), Stop(), OneShot(General(Motion.STOP, light=Light.RED))):
+        assert desk.ask(still).status is not Phase.REJECTED
+        desk.run(3.0)
+    drained(desk, 8.0)
+    assert desk.logs[-1].code == "battery_ok"
+    assert desk.ask(FORWARD).status is Phase.QUEUED
+
+
+def test_a_car_can_be_stopped_by_its_battery() -> None:
+    desk = Workbench()
+    desk.control = Controller(
+        "red", parse_platform("arduino"), battery_policy=BatteryPolicy(critical=BatteryReaction.STOP)
+    )
+    desk.ready()
+    desk.ask(FORWARD, identity="d")
+    desk.car.reading = reading(5.9)
+    desk.run(11.0)
+    assert desk.frames[0] == RUN
+    assert MODE00 in desk.frames
+    assert desk.control.motors == "off"
+    assert desk.end("d") == (Phase.SUPERSEDED, Reason.SUPERSEDED)
+    assert STOP in desk.frames
+
+
+@pytest.mark.parametrize("platform", ["raspberry_pi", "raspberry_pi+arm"])
+def test_a_constant_is_no_battery(platform: str) -> None:
+    desk = Workbench(platform)
+    desk.control.link_up(desk.now)
+    for _ in range(20):
+        desk.run(1.0, reports=False)
+        desk.hear(b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#")
+    assert desk.control.battery.level is None
+    assert not [log for log in desk.logs if log.code.startswith("battery")]

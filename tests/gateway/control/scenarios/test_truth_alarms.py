@@ -1,0 +1,38 @@
+"""A car that nothing is wrong with raises no alarm: some minutes of each mode here, ten hours of each in tests/soak."""
+
+import pytest
+
+from gateway.protocol.enums import Mode
+from gateway.sim.model.raspberry_pi import Transport
+from tests.support.normal import NormalRun, normal
+from tests.support.truth import WORLDS
+
+SECONDS = 120.0
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("mode", Mode)
+def test_no_alarm_in_normal_running(mode: Mode, world: str) -> None:
+    run = NormalRun(world, seed=7)
+    normal(run, mode, SECONDS)
+    assert run.commands > 3
+    assert not run.alarms
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize(
+    ("platform", "told", "transport"),
+    [
+        ("raspberry_pi", "raspberry_pi", Transport.SERIAL),
+        ("raspberry_pi", "raspberry_pi", Transport.TCP),
+        ("raspberry_pi", "unknown", Transport.TCP),
+        ("arduino", "unknown", Transport.SERIAL),
+        ("stm32", "stm32", Transport.SERIAL),
+    ],
+)
+def test_nor_on_another_platform_nor_on_one_that_is_not_known(
+    platform: str, told: str, transport: Transport, world: str
+) -> None:
+    run = NormalRun(world, seed=8, platform=platform, told=told, transport=transport)
+    normal(run, Mode.MANUAL, SECONDS)
+    assert not run.alarms
