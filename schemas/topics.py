@@ -40,6 +40,10 @@ class Topic:
     """Age at which a value no longer says how things are; None: it never expires."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Unit by field, where a field has one."""
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Lowest and highest published value by field (docs/reference/protocol.md#readings)."""
+    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """All published values by field, where a field has one of a few words."""
     recorded: bool = True
     entity: str = ""
     """Rerun entity below the car; empty: shown through frames and logs only."""
@@ -70,6 +74,11 @@ class Topic:
 _READING: Final = 3.0
 _STATE: Final = 3.0
 _TRACKING_HZ: Final = 27.0  # docs/reference/protocol.md#rates: the most frames the UART carries, in tracking
+_MODES: Final = (
+    *("manual", "remote_control", "tracking", "obstacle_avoidance", "color_led", "light_seeking", "following"),
+    "unknown",
+)
+_MOTIONS: Final = ("stop", "forward", "back", "left", "right", "spin_left", "spin_right", "unknown")
 
 CAR_TOPICS: Final = (
     Topic(
@@ -80,6 +89,7 @@ CAR_TOPICS: Final = (
         1.0,
         _READING,
         {"range_m": "m"},
+        {"range_m": (0.0, 12.0)},
         entity="range",
     ),
     Topic(
@@ -90,6 +100,8 @@ CAR_TOPICS: Final = (
         1.0,
         _READING,
         {"voltage_v": "V", "charge": "1", "charge_error": "1"},
+        {"voltage_v": (0.0, 12.0), "charge": (0.0, 1.0), "charge_error": (0.0, 1.0)},
+        {"level": ("ok", "low", "critical")},
         entity="battery",
     ),
     Topic(
@@ -100,6 +112,7 @@ CAR_TOPICS: Final = (
         1.0,
         _READING,
         {"raw": "count"},
+        {"raw": (0.0, 1023.0)},
         entity="grayscale",
     ),
     Topic("sensor/line", "fleet.v1.Line", "line sensors", Qos.READING, _TRACKING_HZ, _READING, entity="line"),
@@ -141,6 +154,8 @@ CAR_TOPICS: Final = (
         1.0,
         _STATE,
         {"tx_airtime": "1", "since_s": "s", "last_rx_s": "s", "rx_bytes": "B", "tx_bytes": "B"},
+        {"tx_airtime": (0.0, 1.0)},
+        {"state": ("online", "quiet", "stale", "lost")},
         entity="link",
     ),
     Topic(
@@ -151,6 +166,7 @@ CAR_TOPICS: Final = (
         1.0,
         _STATE,
         {"evidence_age_s": "s"},
+        words={"asked": _MODES, "inferred": _MODES, "verdict": ("assumed", "confirmed", "contradicted")},
         entity="mode",
     ),
     Topic(
@@ -161,6 +177,8 @@ CAR_TOPICS: Final = (
         1.0,
         _STATE,
         {"speed": "1", "expires_in_s": "s", "servo_deg": "deg"},
+        {"speed": (0.0, 1.0), "servo_deg": (0.0, 180.0)},
+        {"motion": _MOTIONS, "source": ("commanded", "assumed", "unknown")},
         entity="motion",
     ),
     Topic(
@@ -171,6 +189,7 @@ CAR_TOPICS: Final = (
         1.0,
         _STATE,
         {"worst_stop_s": "s"},
+        words={"motors": ("off", "on", "stopping", "unknown"), "motors_basis": ("shown", "sent")},
         entity="safety",
     ),
     Topic(

@@ -9,9 +9,9 @@ from typing import Final, Self
 
 from fleet.client.reading import Reading
 from fleet.conditions import BadExpression, Expression, fields_of, parse, value_in
-from fleet.conditions.domains import outside
-from fleet.conditions.expression import written
+from fleet.conditions.expression import format_literal
 from fleet.conditions.fields import LAST
+from fleet.conditions.satisfiability import explain_impossible
 from schemas import keys, messages, topics
 from schemas.bus import intersects
 
@@ -49,7 +49,7 @@ class KeyCondition:
         for message, fields in names.items():
             try:
                 found[message] = parse(text, fields)
-                never += filter(None, [outside(found[message], fields, short[message])])
+                never += filter(None, [explain_impossible(found[message], short[message])])
             except BadExpression:
                 if len(names) == 1:
                     raise
@@ -75,4 +75,6 @@ class KeyCondition:
         if expression is None:
             return []
         values = {name: value_in(reading.value)(name) for name in expression.names}
-        return [f"{name}={'not measured' if value is None else written(value)}" for name, value in values.items()]
+        return [
+            f"{name}={'not measured' if value is None else format_literal(value)}" for name, value in values.items()
+        ]

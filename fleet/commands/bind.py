@@ -26,9 +26,9 @@ from fleet.commands.fleet_file import (
     write,
 )
 from fleet.commands.options import explained
-from fleet.fleetfile.editor import CannotEdit, with_link
+from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import FleetFile
-from fleet.fleetfile.models import checked_link
+from fleet.fleetfile.models import validate_link
 from fleet.fleetfile.scan import FoundLink
 from fleet.links import LinkKind, parse_link
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
@@ -58,7 +58,7 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
     """Find out which car is at which link: each blinks and beeps, you say which it was, and the file has it."""
     with explained():
         for link in links:
-            checked_link(link)
+            validate_link(link)
     fleet = read(file, unbound=True)
     found = [each for each in look_for(links, seconds) if each.verdict != "busy" and _unknown(each, fleet)]
     if not found:
@@ -150,7 +150,7 @@ def _which(client: Fleet, name: str, file: Path) -> str:
 def _write(file: Path, car: str, link: str) -> None:
     """Write the link into the file as it is now."""
     try:
-        write(file, with_link(read_text(file), file, car, link))
+        write(file, set_link(read_text(file), file, car, link))
     except BadFile as error:
         tell(error)
         raise SystemExit(1) from None

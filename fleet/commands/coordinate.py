@@ -13,7 +13,7 @@ from fleet.coordinator.coordinator import SENDER, AnotherCoordinator, Coordinato
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.policy.decision import Decision
-from fleet.policy.plan.lint import faults
+from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from schemas.process import signals
 from schemas.yaml_document.document import read_text
@@ -51,7 +51,7 @@ def coordinate(
     parent = os.getppid() if with_parent else None
     plan = parse(read_text(path), str(path))
     listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file, unbound=True))
-    found = faults(plan, listed or None)
+    found = find_faults(plan, listed or None)
     if found.errors:
         raise WrongFile(found.refusal(str(path)))
     for each in found.warnings:

@@ -13,9 +13,9 @@ import click
 
 from fleet.commands.options import explained, json_option
 from fleet.fleetfile.fleet_file import PALETTE, FleetFile, parse_fleet, read_fleet
-from fleet.fleetfile.link_check import look
-from fleet.fleetfile.models import checked_colour, checked_link, checked_name, checked_platform, schema
-from fleet.fleetfile.scan import LIKELY, FoundLink, NewCar, ScanFailed, new_file, scan
+from fleet.fleetfile.link_check import check_link
+from fleet.fleetfile.models import schema, validate_color, validate_link, validate_name, validate_platform
+from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, scan
 from schemas import bus
 from schemas.yaml_document.document import BadFile
 
@@ -51,7 +51,7 @@ def check(file: Path, *, as_json: bool) -> None:
     fleet = read(file, as_json=as_json)
     served = _served(fleet)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        found = list(pool.map(lambda car: look(car, served), fleet.cars.values()))
+        found = list(pool.map(lambda car: check_link(car, served), fleet.cars.values()))
     widest = max(len(each.car) for each in found)
     for each in found:
         if as_json:
@@ -119,7 +119,7 @@ def init(*, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: 
     """Write a fleet file: look for cars, ask for their names."""
     with explained():
         for link in links:
-            checked_link(link)
+            validate_link(link)
     if out.exists() and not force:
         if yes:
             raise click.UsageError(f"{out} is there already: give --force to write over it, or --out for another")
@@ -134,7 +134,7 @@ def init(*, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: 
             "silent is asked for without --yes; a TCP car is named with --link tcp://HOST:8888; without cars there is "
             "`fleet up --sim 3`"
         )
-    text = new_file(cars, "fleet")
+    text = format_new_file(cars, "fleet")
     try:
         parse_fleet(text, out)
     except BadFile as error:
@@ -150,7 +150,7 @@ def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:
         found = scan(links, seconds)
     except ScanFailed as error:
         raise click.ClickException(str(error)) from None
-    return sorted(found, key=lambda each: each.verdict not in LIKELY)
+    return sorted(found, key=lambda each: each.verdict not in LIKELY_VERDICTS)
 
 
 def write(path: Path, text: str) -> None:
@@ -171,7 +171,7 @@ def write(path: Path, text: str) -> None:
 
 
 def _taken(found: list[FoundLink]) -> list[NewCar]:
-    likely = [each for each in found if each.verdict in LIKELY]
+    likely = [each for each in found if each.verdict in LIKELY_VERDICTS]
     cars = []
     for index, each in enumerate(likely):
         name = NAMES[index] if index < len(NAMES) else f"car{index + 1}"
@@ -184,13 +184,13 @@ def _asked(found: list[FoundLink]) -> list[NewCar]:
     for each in found:
         click.echo(f"\n{each.url}\n  {each.words}")
         free = [name for name in NAMES if name not in {car.name for car in cars}] or [f"car{len(cars) + 1}"]
-        offered = free[0] if each.verdict in LIKELY else _SKIP
+        offered = free[0] if each.verdict in LIKELY_VERDICTS else _SKIP
         name = prompt_name(f"  its name ({_SKIP} to leave it out)", offered, {car.name for car in cars})
         if name == _SKIP:
             continue
-        platform = click.prompt("  its platform", default=each.platform, value_proc=_checked(checked_platform))
+        platform = click.prompt("  its platform", default=each.platform, value_proc=_checked(validate_platform))
         colour = PALETTE[NAMES.index(name) if name in NAMES else len(cars) % len(PALETTE)]
-        colour = click.prompt("  its colour", default=colour, value_proc=_checked(checked_colour))
+        colour = click.prompt("  its colour", default=colour, value_proc=_checked(validate_color))
         cars.append(NewCar(name, each.url, platform, colour, each.words))
     return cars
 
@@ -202,7 +202,7 @@ def prompt_name(words: str, offered: str | None, taken: set[str]) -> str:
         name = name.strip()
         if name in taken:
             raise click.UsageError(f"{name} is another car's name already")
-        return name if name == _SKIP else _checked(checked_name)(name)
+        return name if name == _SKIP else _checked(validate_name)(name)
 
     name: str = click.prompt(words, default=offered, value_proc=proper)
     return name

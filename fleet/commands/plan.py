@@ -89,12 +89,12 @@ def check(file: Path, fleet_file: Path | None, *, as_json: bool) -> None:
         read = parse(read_text(file), str(file))
         cars = None if fleet_file is None else listed_cars(read_fleet(fleet_file))
     findings = check_plan(read, cars)
-    errors = [each for each in findings if each.gravity is Severity.ERROR]
+    errors = [each for each in findings if each.severity is Severity.ERROR]
     for each in findings:
         if as_json:
-            click.echo(json.dumps({"gravity": each.gravity, "part": each.part, "words": each.words}))
+            click.echo(json.dumps({"gravity": each.severity, "part": each.part, "words": each.words}))
         else:
-            click.echo(f"{file}: {each.gravity}: {each}")
+            click.echo(f"{file}: {each.severity}: {each}")
     if errors:
         raise SystemExit(1)
     if not as_json:

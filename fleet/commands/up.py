@@ -17,7 +17,7 @@ import click
 from fleet.commands.options import explained
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
-from fleet.policy.plan.lint import faults
+from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.supervisor.service import AnotherSupervisor
 from fleet.supervisor.spec import MOST_SIMULATED, Asked, FleetSpec, listing, wanted
@@ -123,7 +123,7 @@ def _with_plan(wish: FleetSpec, text: str) -> FleetSpec:
     """With this plan, if it can work; raises ValueError with all that cannot."""
     plan = parse_plan(text, str(wish.plan))
     cars = listed_cars(parse_fleet(listing(wish), Path("fleet.yaml"), unbound=True))  # as the coordinator will
-    found = faults(plan, cars)
+    found = find_faults(plan, cars)
     if found.errors:
         raise ValueError(f"the plan can never work:\n{found.refusal(str(wish.plan))}")
     return replace(wish, plan_text=text, doubts=tuple(f"{wish.plan}: {each}" for each in found.warnings))

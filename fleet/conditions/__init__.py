@@ -1,12 +1,13 @@
-"""Conditions as people write them: `range_m < 0.3 and not light.left`; for the command line, the SDK and plans.
+"""Conditions as people write them: `range_m < 0.3 and not light.left`. The command line, the SDK and plans use them.
 
-What the names are and where values come from the caller says; nothing is ever executed. What was not measured makes a
-comparison neither true nor false, and so what depends on it: Kleene's logic.
+The caller defines the names and looks up their values; no text is executed. A comparison with a value that was not
+measured is unknown (Kleene's logic). Read `expression` (the tree) first, then `parser`, `fields` (names from messages)
+and `satisfiability` (conditions that can never be true).
 """
 
 from fleet.conditions.expression import Expression, Lookup
 from fleet.conditions.fields import fields_of, value_in
 from fleet.conditions.parser import BadExpression, parse
-from fleet.conditions.satisfiability import contradictory
+from fleet.conditions.satisfiability import is_contradictory
 
-__all__ = ["BadExpression", "Expression", "Lookup", "contradictory", "fields_of", "parse", "value_in"]
+__all__ = ["BadExpression", "Expression", "Lookup", "fields_of", "is_contradictory", "parse", "value_in"]

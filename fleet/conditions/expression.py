@@ -1,20 +1,19 @@
-"""A condition that was understood, as a tree: its value over readings, and its text again. Pure."""
+"""A parsed condition as a tree: evaluates it over readings and writes it as text. Pure."""
 
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from types import MappingProxyType
 from typing import Any, Final, TypeAlias
 
 Value: TypeAlias = bool | int | float | str
 Lookup: TypeAlias = Callable[[str], object | None]
-"""The value under a name; None: not measured."""
+"""Returns the value of a name; None: not measured."""
 
 
 class ValueKind(StrEnum):
-    """What a value is."""
+    """The kind of a value."""
 
     NUMBER = "a number"
     WORD = "a word"
@@ -30,7 +29,7 @@ KINDS: Final[Mapping[type, ValueKind]] = {
 
 
 class Op(StrEnum):
-    """A comparison."""
+    """A comparison operator."""
 
     LT = "<"
     LE = "<="
@@ -40,16 +39,7 @@ class Op(StrEnum):
     NE = "!="
 
 
-_TESTS: Final[Mapping[Op, Callable[[Any, Any], bool]]] = MappingProxyType(
-    {
-        Op.LT: operator.lt,
-        Op.LE: operator.le,
-        Op.GT: operator.gt,
-        Op.GE: operator.ge,
-        Op.EQ: operator.eq,
-        Op.NE: operator.ne,
-    }
-)
+_TESTS: Final[Mapping[Op, Callable[[Any, Any], bool]]] = {op: getattr(operator, op.name.lower()) for op in Op}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,34 +55,34 @@ class Name:
 
 @dataclass(frozen=True, slots=True)
 class Literal:
-    """A value as written."""
+    """A value that stands in the text."""
 
     value: Value
 
     @property
     def kind(self) -> ValueKind:
-        """What it is."""
+        """The kind of the value."""
         return KINDS[type(self.value)]
 
     def __str__(self) -> str:
-        return written(self.value)
+        return format_literal(self.value)
 
 
 @dataclass(frozen=True, slots=True)
 class Compare:
-    """Two values and how they must stand to each other."""
+    """A comparison of two values."""
 
     left: "Node"
     op: Op
     right: "Node"
 
     def __str__(self) -> str:
-        return " ".join((_within(self.left), self.op, _within(self.right)))
+        return " ".join((_in_parentheses(self.left), self.op, _in_parentheses(self.right)))
 
 
 @dataclass(frozen=True, slots=True)
 class Not:
-    """The opposite."""
+    """`not`."""
 
     inner: "Node"
 
@@ -123,8 +113,8 @@ class Or:
 Node: TypeAlias = Name | Literal | Compare | Not | And | Or
 
 
-def written(value: object) -> str:
-    """A value as it stands in a condition."""
+def format_literal(value: object) -> str:
+    """Format a value as conditions write it."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -132,13 +122,13 @@ def written(value: object) -> str:
     return repr(value)
 
 
-def _within(side: Node) -> str:
+def _in_parentheses(side: Node) -> str:
     return str(side) if isinstance(side, Name | Literal) else f"({side})"
 
 
 @dataclass(frozen=True, slots=True)
 class Expression:
-    """A condition that was understood; as text it is normalised, and the same when it is read again."""
+    """A parsed condition. Its text is normalized; parsing that text gives the same condition."""
 
     root: Node
 
@@ -146,86 +136,87 @@ class Expression:
         return str(self.root)
 
     def __and__(self, other: "Expression") -> "Expression":
-        """Both."""
-        return Expression(joined(And, (self.root, other.root)))
+        """Join both conditions by `and`."""
+        return Expression(join_nodes(And, (self.root, other.root)))
 
     def __invert__(self) -> "Expression":
-        """Not."""
+        """Negate the condition."""
         return Expression(self.root.inner if isinstance(self.root, Not) else Not(self.root))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names it uses, each once, as they come."""
-        return tuple(dict.fromkeys(_names(self.root)))
+        """The names that it uses, each once, in their order."""
+        return tuple(dict.fromkeys(each.name for each in names_in(self.root)))
 
     def value(self, lookup: Lookup) -> bool | None:
-        """Whether it holds; None: it cannot be said, because something was not measured (None, or not a number).
+        """Return whether it is true; None: not known, as a value was not measured (None or NaN).
 
         Raises TypeError for a value that is not of its name's type: the caller's mistake.
         """
-        return _truth(self.root, lookup)
+        return _evaluate(self.root, lookup)
 
 
 _VALUES: Final = (bool, int, float, str)
 
 
-def _names(node: Node) -> Iterator[str]:
+def names_in(node: Node) -> Iterator[Name]:
+    """Yield the names in a tree, in the order of its text."""
     match node:
-        case Name(name):
-            yield name
+        case Name():
+            yield node
         case Literal():
             pass
         case Compare(left, _, right):
-            yield from _names(left)
-            yield from _names(right)
+            yield from names_in(left)
+            yield from names_in(right)
         case Not(inner):
-            yield from _names(inner)
+            yield from names_in(inner)
         case And(parts) | Or(parts):
             for part in parts:
-                yield from _names(part)
+                yield from names_in(part)
 
 
-def _truth(node: Node, lookup: Lookup) -> bool | None:
-    # A coordinator asks a thousand times in a decision: no `match`, which takes three times as long here.
+def _evaluate(node: Node, lookup: Lookup) -> bool | None:
+    # A coordinator evaluates a thousand conditions in a step. `match` would take three times as long here.
     if isinstance(node, Compare):
-        one, other = _value(node.left, lookup), _value(node.right, lookup)
+        one, other = _value_of(node.left, lookup), _value_of(node.right, lookup)
         return None if one is None or other is None else _TESTS[node.op](one, other)
     if isinstance(node, And):
-        return _first(node.parts, lookup, decisive=False)
+        return _evaluate_parts(node.parts, lookup, decisive=False)
     if isinstance(node, Or):
-        return _first(node.parts, lookup, decisive=True)
+        return _evaluate_parts(node.parts, lookup, decisive=True)
     if isinstance(node, Not):
-        held = _truth(node.inner, lookup)
-        return None if held is None else not held
-    found = _value(node, lookup)
-    return None if found is None else bool(found)
+        truth = _evaluate(node.inner, lookup)
+        return None if truth is None else not truth
+    value = _value_of(node, lookup)
+    return None if value is None else bool(value)
 
 
-def _first(parts: tuple[Node, ...], lookup: Lookup, *, decisive: bool) -> bool | None:
+def _evaluate_parts(parts: tuple[Node, ...], lookup: Lookup, *, decisive: bool) -> bool | None:
     unknown = False
     for part in parts:
-        held = _truth(part, lookup)
-        if held is decisive:
+        truth = _evaluate(part, lookup)
+        if truth is decisive:
             return decisive
-        unknown = unknown or held is None
+        unknown = unknown or truth is None
     return None if unknown else not decisive
 
 
-def _value(node: Node, lookup: Lookup) -> Value | None:
+def _value_of(node: Node, lookup: Lookup) -> Value | None:
     if isinstance(node, Literal):
         return node.value
     if not isinstance(node, Name):
-        return _truth(node, lookup)
-    found = lookup(node.name)
-    if found is None:
+        return _evaluate(node, lookup)
+    value = lookup(node.name)
+    if value is None:
         return None
-    if not isinstance(found, _VALUES) or KINDS.get(type(found)) is not node.kind:
-        raise TypeError(f"{node.name} should be {node.kind}, and is {found!r}")
-    return None if isinstance(found, float) and math.isnan(found) else found
+    if not isinstance(value, _VALUES) or KINDS.get(type(value)) is not node.kind:
+        raise TypeError(f"{node.name} should be {node.kind}, and is {value!r}")
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def joined(join: type[And] | type[Or], parts: Sequence[Node]) -> Node:
-    """One node of these; `a and (b and c)` is `a and b and c`."""
+def join_nodes(join: type[And] | type[Or], parts: Sequence[Node]) -> Node:
+    """Join nodes into one; `a and (b and c)` becomes `a and b and c`."""
     flat: list[Node] = []
     for part in parts:
         flat.extend(part.parts if isinstance(part, join) else (part,))
@@ -233,5 +224,5 @@ def joined(join: type[And] | type[Or], parts: Sequence[Node]) -> Node:
 
 
 def kind_of(node: Node) -> ValueKind:
-    """What its value is."""
+    """Return the kind of a node's value."""
     return node.kind if isinstance(node, Name | Literal) else ValueKind.TRUTH

@@ -1,4 +1,4 @@
-"""The fields of a message as names of a condition: which there are, of which type, and their values."""
+"""The fields of a message as names of a condition, with their types and values."""
 
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
@@ -8,32 +8,27 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
 _TYPES: Final[Mapping[int, type]] = {
-    FieldDescriptor.CPPTYPE_INT32: float,
-    FieldDescriptor.CPPTYPE_INT64: float,
-    FieldDescriptor.CPPTYPE_UINT32: float,
-    FieldDescriptor.CPPTYPE_UINT64: float,
-    FieldDescriptor.CPPTYPE_DOUBLE: float,
-    FieldDescriptor.CPPTYPE_FLOAT: float,
     FieldDescriptor.CPPTYPE_BOOL: bool,
     FieldDescriptor.CPPTYPE_STRING: str,
     FieldDescriptor.CPPTYPE_ENUM: str,
 }
+"""By protobuf's type in C++; all others but messages are numbers."""
 LAST: Final = ("car", "seq", "boot_id")
-"""Every message has them; few ask for them."""
+"""Fields of every message; lists of names end with them."""
 
 
 def fields_of(message_class: type[Message]) -> Mapping[str, type]:
-    """The fields that a condition may name, with their types: float, bool or str.
+    """Return the fields that a condition may name, with their types: float, bool or str.
 
-    A message within is there as its own fields (`hold.by`) and as a truth, whether it is there (`hold`); of what is
-    repeated only whether there is any (`estops`). An enum is a word. Times and bytes cannot be compared.
+    A nested message has its own fields (`hold.by`) and a boolean for its presence (`hold`). A repeated field is a
+    boolean, true if it has elements (`estops`). An enum is a word. Times and bytes cannot be compared.
     """
-    found = dict(_fields(message_class.DESCRIPTOR))
-    return MappingProxyType({name: found[name] for name in sorted(found, key=LAST.__contains__)})
+    result = dict(_fields(message_class.DESCRIPTOR))
+    return MappingProxyType({name: result[name] for name in sorted(result, key=LAST.__contains__)})
 
 
 def value_in(message: Message) -> Callable[[str], object | None]:
-    """Looks names of `fields_of` up in a message; None: not measured, or its message is not there."""
+    """Return a lookup of names in a message. It returns None if the field was not measured or its message is absent."""
     return lambda name: _value(message, name)
 
 
@@ -44,8 +39,8 @@ def _fields(descriptor: Any, prefix: str = "") -> Iterator[tuple[str, type]]:
         if each.is_repeated:
             yield name, bool
         elif inner is None:
-            if each.cpp_type in _TYPES and each.type != FieldDescriptor.TYPE_BYTES:
-                yield name, _TYPES[each.cpp_type]
+            if each.type != FieldDescriptor.TYPE_BYTES:
+                yield name, _TYPES.get(each.cpp_type, float)
         elif inner.file.package != "google.protobuf":
             yield name, bool
             yield from _fields(inner, f"{name}.")
@@ -59,8 +54,8 @@ def _value(message: Any, name: str) -> object | None:
     if rest:
         return _value(getattr(message, first), rest) if message.HasField(first) else None
     if field.message_type is not None:
-        found: bool = message.HasField(first)
-        return found
+        result: bool = message.HasField(first)
+        return result
     if field.has_presence and not message.HasField(first):
         return None
     value: object = getattr(message, first)

@@ -1,91 +1,124 @@
-"""Whether a condition can be true at all. Sound, not complete: what it calls contradictory never holds. Pure.
+"""Finds conditions that can never be true. Sound, not complete: some of them are not found. Pure.
 
-Each way in which a condition can be true is a set of comparisons; a way is open unless what they ask of one field, or
-of two fields against each other, cannot be.
+A condition is split into alternatives, each a set of comparisons that make it true together. An alternative is
+possible unless its comparisons of one field, or of two fields with each other, exclude each other.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
-from fleet.conditions.expression import And, Compare, Expression, Literal, Name, Node, Not, Op, Or, ValueKind
+from fleet.conditions.expression import And, Compare, Expression, Literal, Name, Node, Not, Op, Or, ValueKind, names_in
+from schemas import topics
 
-_WAYS: Final = 512
-"""With more ways than this, nothing is said."""
+_MAX_ALTERNATIVES: Final = 512
+"""Maximum alternatives of a condition. With more it counts as possible."""
 
-_Way: TypeAlias = tuple[Compare, ...]
-_STANDS: Final = {Op.LT: "<", Op.LE: "<=", Op.GT: ">", Op.GE: ">=", Op.EQ: "=", Op.NE: "<>"}
-"""How two values may stand to each other, one character for each."""
+_DOMAINS: Final = {
+    f"{topic.name.rpartition('/')[2]}.{name}": (topic.words.get(name, ()), topic.ranges.get(name))
+    for topic in topics.TOPICS.values()
+    for name in {*topic.words, *topic.ranges}
+}
+"""Words and range by name; a field is named after the last word of its topic."""
+_Alternative: TypeAlias = tuple[Compare, ...]
+_RELATIONS: Final = {Op.LT: "<", Op.LE: "<=", Op.GT: ">", Op.GE: ">=", Op.EQ: "=", Op.NE: "<>"}
+"""The relations of two values that fulfil each operator, one character for each."""
 _OPPOSITE: Final = {Op.LT: Op.GE, Op.GE: Op.LT, Op.GT: Op.LE, Op.LE: Op.GT, Op.EQ: Op.NE, Op.NE: Op.EQ}
-_TURNED: Final = {Op.LT: Op.GT, Op.GT: Op.LT, Op.LE: Op.GE, Op.GE: Op.LE, Op.EQ: Op.EQ, Op.NE: Op.NE}
+_MIRRORED: Final = {Op.LT: Op.GT, Op.GT: Op.LT, Op.LE: Op.GE, Op.GE: Op.LE, Op.EQ: Op.EQ, Op.NE: Op.NE}
 
 
-def contradictory(expression: Expression) -> bool:
-    """Whether it can never be true, as `range_m < 0.1 and range_m > 0.2`; some that cannot be are not found."""
+def is_contradictory(expression: Expression) -> bool:
+    """Return True if it can never be true, as `range_m < 0.1 and range_m > 0.2`."""
     try:
-        return not any(_open(way) for way in _ways(expression.root, wanted=True))
-    except _TooManyError:
+        return not any(_is_possible(alternative) for alternative in _alternatives_of(expression.root, wanted=True))
+    except _TooManyAlternativesError:
         return False
 
 
-class _TooManyError(Exception):
-    """More ways than are looked at."""
+def explain_impossible(expression: Expression, of: str = "") -> str:
+    """Return why it can never be true by the words and ranges of schemas/topics.py; empty if it can.
+
+    `of`: the last word of the topic, if the names are the fields of one message.
+    """
+    if is_contradictory(expression):
+        return f"{expression} is never so"
+    for name in dict.fromkeys(names_in(expression.root)):
+        words, limits = _DOMAINS.get(f"{of}.{name}" if of else str(name), ((), None))
+        if words:
+            allowed: Node = Or(tuple(Compare(name, Op.EQ, Literal(word)) for word in words))
+            domain = f"one of {', '.join(words)}"
+        elif limits is not None:
+            least, most = limits
+            allowed = And((Compare(name, Op.GE, Literal(least)), Compare(name, Op.LE, Literal(most))))
+            domain = f"{least:g} .. {most:g}"
+        else:
+            continue
+        if is_contradictory(expression & Expression(allowed)):
+            return f"{expression} is never so: {name} is {domain}"
+    return ""
 
 
-def _ways(node: Node, *, wanted: bool) -> list[_Way]:
-    """The ways in which a condition is true, or (not `wanted`) false."""
+class _TooManyAlternativesError(Exception):
+    """The condition has too many alternatives."""
+
+
+def _alternatives_of(node: Node, *, wanted: bool) -> list[_Alternative]:
+    """Return the alternatives that make a condition true, or (not `wanted`) false."""
     match node:
         case Literal(value):
             return [()] if value is wanted else []
         case Name():
             return [(Compare(node, Op.EQ, Literal(wanted)),)]
         case Not(inner):
-            return _ways(inner, wanted=not wanted)
+            return _alternatives_of(inner, wanted=not wanted)
         case And(parts):
-            each = [_ways(part, wanted=wanted) for part in parts]
+            each = [_alternatives_of(part, wanted=wanted) for part in parts]
             return _all_of(each) if wanted else _one_of(each)
         case Or(parts):
-            each = [_ways(part, wanted=wanted) for part in parts]
+            each = [_alternatives_of(part, wanted=wanted) for part in parts]
             return _one_of(each) if wanted else _all_of(each)
         case Compare(left, op, right):
-            if _simple(left) and _simple(right):
+            if _is_simple(left) and _is_simple(right):
                 return [(node if wanted else Compare(left, _OPPOSITE[op], right),)]
             same = (op is Op.EQ) is wanted
             return _one_of(
-                [_all_of([_ways(left, wanted=one), _ways(right, wanted=one is same)]) for one in (True, False)]
+                [
+                    _all_of([_alternatives_of(left, wanted=one), _alternatives_of(right, wanted=one is same)])
+                    for one in (True, False)
+                ]
             )
 
 
-def _simple(side: Node) -> bool:
+def _is_simple(side: Node) -> bool:
     return isinstance(side, Name | Literal)
 
 
-def _all_of(several: Iterable[list[_Way]]) -> list[_Way]:
-    found: list[_Way] = [()]
-    for ways in several:
-        if len(found) * len(ways) > _WAYS:
-            raise _TooManyError
-        found = [one + other for one in found for other in ways]
+def _all_of(several: Iterable[list[_Alternative]]) -> list[_Alternative]:
+    found: list[_Alternative] = [()]
+    for alternatives in several:
+        if len(found) * len(alternatives) > _MAX_ALTERNATIVES:
+            raise _TooManyAlternativesError
+        found = [one + other for one in found for other in alternatives]
     return found
 
 
-def _one_of(several: Iterable[list[_Way]]) -> list[_Way]:
-    found = [way for ways in several for way in ways]
-    if len(found) > _WAYS:
-        raise _TooManyError
+def _one_of(several: Iterable[list[_Alternative]]) -> list[_Alternative]:
+    found = [alternative for alternatives in several for alternative in alternatives]
+    if len(found) > _MAX_ALTERNATIVES:
+        raise _TooManyAlternativesError
     return found
 
 
 @dataclass(slots=True)
 class _Constraint:
-    """What is asked of one field."""
+    """The values of one field that a set of comparisons allows."""
 
     least: float = float("-inf")
     most: float = float("inf")
     is_: set[object] = field(default_factory=set)
     is_not: set[object] = field(default_factory=set)
 
-    def take(self, op: Op, value: object) -> None:
+    def add(self, op: Op, value: object) -> None:
         if isinstance(value, bool) and op is Op.NE:
             op, value = Op.EQ, not value
         if op is Op.EQ:
@@ -101,7 +134,7 @@ class _Constraint:
             if op in (Op.GT, Op.LT):
                 self.is_not.add(value)
 
-    def possible(self) -> bool:
+    def is_possible(self) -> bool:
         if self.least == self.most:
             self.is_.add(self.least)
         if self.least > self.most or len(self.is_) > 1:
@@ -112,29 +145,31 @@ class _Constraint:
         )
 
 
-def _open(way: _Way) -> bool:
-    """Whether all of it can be so at once, as far as is seen."""
-    asked: dict[str, _Constraint] = {}
+def _is_possible(alternative: _Alternative) -> bool:
+    """Return False if the comparisons of an alternative exclude each other."""
+    constraints: dict[str, _Constraint] = {}
     between: dict[tuple[str, str], set[str]] = {}
-    for atom in way:
+    for atom in alternative:
         match atom:
             case Compare(Literal(value=one), op, Literal(value=other)):
-                stands = "=" if one == other else "<" if _number(one) < _number(other) else ">"
-                if stands not in _STANDS[op]:
+                relation = "=" if one == other else "<" if _sort_key(one) < _sort_key(other) else ">"
+                if relation not in _RELATIONS[op]:
                     return False
             case Compare(Name(name), op, Literal(value)):
-                asked.setdefault(name, _Constraint()).take(op, value)
+                constraints.setdefault(name, _Constraint()).add(op, value)
             case Compare(Literal(value), op, Name(name)):
-                asked.setdefault(name, _Constraint()).take(_TURNED[op], value)
+                constraints.setdefault(name, _Constraint()).add(_MIRRORED[op], value)
             case Compare(Name(name=one), op, Name(name=other, kind=kind)):
-                op = op if one <= other else _TURNED[op]
-                able = "=" if one == other else "<=>" if kind is ValueKind.NUMBER else "<="
-                between.setdefault((min(one, other), max(one, other)), set(able)).intersection_update(_STANDS[op])
+                op = op if one <= other else _MIRRORED[op]
+                possible_relations = "=" if one == other else "<=>" if kind is ValueKind.NUMBER else "<="
+                between.setdefault((min(one, other), max(one, other)), set(possible_relations)).intersection_update(
+                    _RELATIONS[op]
+                )
             case _:
                 pass
-    return all(between.values()) and all(each.possible() for each in asked.values())
+    return all(between.values()) and all(each.is_possible() for each in constraints.values())
 
 
-def _number(value: object) -> float:
-    """For order; words and truths that differ have one, too, and only whether they are the same is asked of them."""
+def _sort_key(value: object) -> float:
+    """Return a sort key. Words and booleans are only tested for equality, so any order will do for them."""
     return value if isinstance(value, int | float) else 0.0

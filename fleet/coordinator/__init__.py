@@ -1,1 +1,1 @@
-"""The coordinator process: it observes the fleet, asks the policy what to do, and commands the cars."""
+"""The coordinator process: `observer` takes samples in, `coordinator` runs the policy and commands the cars."""

@@ -1,6 +1,6 @@
-"""The coordinator: one more client of the bus, with a policy. Samples come in, commands and publications go out.
+"""The coordinator: a client of the bus with a policy. Samples come in, commands and publications go out.
 
-What it wants is decided in policy/, also that a car on hold is left alone; the gateway sees to that once more.
+policy/ takes all decisions, also to leave a car on hold alone; the gateway enforces that once more.
 """
 
 import contextlib
@@ -24,37 +24,39 @@ from fleet.coordinator.observer import FleetObserver
 from fleet.coordinator.state_file import CoordinatorStateFile
 from fleet.policy.decide import Ask, DecisionStep, step
 from fleet.policy.decision import LEFT_ALONE, Decision
-from fleet.policy.plan.lint import faults
+from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
 from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
-from fleet.policy.state import PolicyState, carried, hub_back, restarted, restored, to_keep
+from fleet.policy.state import PolicyState, carry_over, on_hub_back, restart_plan, restore, to_persisted
 from schemas import keys, messages, topics
 from schemas.bus import BusError, Latest, Publisher, Sample, ensure_hub, reply, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos
 
 SENDER: Final = "coordinator-"
-"""How the sender of every coordinator begins, so that a second one can name the first."""
-TURN_S: Final = 0.1
-HUB_GONE_S: Final = 0.5
-LOOK_AGAIN_S: Final = 1.0
-AGAIN_S: Final = 10.0
-"""Plan, assignment and decisions are published again so often, for a recording that began after them."""
-_ANSWERS_S: Final = 1.0
-_TRIES: Final = 3
-"""How often who has just begun asks: what a car did before counts, and its gateway may be held up for a moment."""
-_QUEUE: Final = 4096
-_QUESTIONS: Final = 64
-"""Queries that may wait in it."""
-_ASKERS: Final = 4
-_APIECE: Final = 8
-"""Maximum cars that are asked one by one. If more came together, one question asks all cars."""
+"""Prefix of every coordinator's sender name, so that a second coordinator can name the first."""
+STEP_INTERVAL_S: Final = 0.1
+HUB_OUTAGE_S: Final = 0.5
+"""Time without a link to a hub after which the coordinator starts one."""
+SINGLETON_RECHECK_S: Final = 1.0
+"""Delay of the second search for other coordinators: two may have started at the same moment."""
+REPUBLISH_INTERVAL_S: Final = 10.0
+"""Interval of repeated plans, assignments and decisions, for recordings that began after the first."""
+_STATE_QUERY_TIMEOUT_S: Final = 1.0
+_MAX_STATE_QUERIES: Final = 3
+"""Maximum queries for the cars' states at the start: a stalled gateway may miss the first."""
+_INBOX_SIZE: Final = 4096
+_MAX_WAITING_QUERIES: Final = 64
+"""Maximum queries in the inbox."""
+_MAX_STATE_QUERIES_AT_ONCE: Final = 4
+_MAX_CARS_QUERIED_SINGLY: Final = 8
+"""Maximum cars with a query of their own. If more arrive together, one query asks all cars."""
 INTERNAL_ERROR: Final = "internal_error"
-"""Code of the event about an exception that nobody foresaw. The coordinator goes on."""
-_LONGEST_ERROR: Final = 500
-"""Maximum characters of such an exception's own words: they may quote what came over the bus."""
-_ERROR: Final = 4  # foxglove.Log.Level
+"""Code of the event about an unexpected exception. The coordinator goes on."""
+_MAX_ERROR_LENGTH: Final = 500
+"""Maximum characters of such an exception's text, which may quote payloads from the bus."""
+_LEVEL_ERROR: Final = 4  # foxglove.Log.Level
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
 RESTART_VERB: Final = "restart"
@@ -62,209 +64,213 @@ RESTART_VERB: Final = "restart"
 
 
 @dataclass(frozen=True, slots=True)
-class _Answer:
-    """A sample that was asked for, so it may be old."""
+class _QueriedSample:
+    """A sample from a query, so it may be old."""
 
     sample: Sample
 
 
-_Item = Sample | _Answer | zenoh.Query
+_Item = Sample | _QueriedSample | zenoh.Query
 
 
 class AnotherCoordinator(Exception):
-    """The fleet has a coordinator; the text names it."""
+    """The fleet has a coordinator already; the text names it."""
 
 
 @dataclass(slots=True)
 class Coordinator:
-    """Keeps a plan true. `client` is of kind coordinator, its sender begins with SENDER.
+    """Commands cars by a plan. `client` is of kind coordinator, its sender begins with SENDER.
 
-    `decided` hears of every decision that changed, `failed` of a command that was not carried out and of what is
-    doubtful in a plan that was taken over the bus. `listed`: what the fleet file says of its cars; empty: there is
-    none. Whoever gives `plan` has asked policy.check.faults() of it.
+    The coordinator calls `on_decision` for each changed decision, and `on_failure` for each failed command and each
+    warning about a plan from the bus. `listed`: the cars of the fleet file; empty: there is none. The caller has
+    checked `plan` by lint.find_faults().
     """
 
     client: Fleet
     plan: Plan
-    decided: Callable[[Decision], None]
-    failed: Callable[[str], None]
+    on_decision: Callable[[Decision], None]
+    on_failure: Callable[[str], None]
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
     run_name: str = ""
-    """Of the `fleet up` that it belongs to: with a new one the plan begins anew."""
+    """Name of its `fleet up` run: in a new run the plan begins anew."""
     dropped: int = 0
-    """Samples that found the queue full."""
+    """Number of samples and queries dropped because the inbox was full."""
     _memory: PolicyState = field(default_factory=PolicyState)
-    _running: "dict[str, tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=dict)
-    _colouring: "list[tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=list)
-    _told: dict[str, str] = field(default_factory=dict)
+    _mode_commands: "dict[str, tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=dict)
+    _led_commands: "list[tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=list)
+    _last_failures: dict[str, str] = field(default_factory=dict)
     _published: dict[tuple[str, str], tuple[Publisher, Any]] = field(default_factory=dict)
-    """The last of each topic, and of each subject in it: what a query is answered with."""
+    """The last message by topic and subject: the replies to queries."""
     _publishers: dict[str, Publisher] = field(default_factory=dict)
-    _unforeseen_at: dict[str, float] = field(default_factory=dict)
-    """When each unforeseen exception was logged last, by its words."""
+    _internal_errors: dict[str, float] = field(default_factory=dict)
+    """Time at which each unexpected exception was logged last, by its words."""
     _subscribed: set[str] = field(default_factory=set)
-    _inbox: "queue.Queue[_Item]" = field(default_factory=lambda: queue.Queue(_QUEUE))
-    _questions: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(_QUESTIONS))
-    """How many queries find room."""
+    _inbox: "queue.Queue[_Item]" = field(default_factory=lambda: queue.Queue(_INBOX_SIZE))
+    _query_slots: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(_MAX_WAITING_QUERIES))
+    """Free places for queries in the inbox."""
     _tokens: Latest[bool] = field(default_factory=Latest)
     """Changes of tokens by car: True if the gateway is on the bus."""
-    _came: set[str] = field(default_factory=set)
-    """Cars whose gateways came and were not asked yet."""
-    _asked: "list[Future[None]]" = field(default_factory=list)
+    _arrived: set[str] = field(default_factory=set)
+    """Cars whose gateways arrived and whose states were not queried yet."""
+    _state_queries: "list[Future[None]]" = field(default_factory=list)
 
-    def run(self, ended: Callable[[], bool]) -> None:
-        """Coordinate until `ended` says so; raises AnotherCoordinator. The cars keep their modes afterwards."""
+    def run(self, has_ended: Callable[[], bool]) -> None:
+        """Coordinate until `has_ended()`; raises AnotherCoordinator. The cars keep their modes afterwards."""
         bus, fleet = self.client.bus, self.client.name
         token = f"{fleet}/{keys.COORDINATOR}"
         if bus.tokens(token):
-            raise AnotherCoordinator(self._named(self._others()))
+            raise AnotherCoordinator(self._describe(self._others()))
         bus.token(token)
-        hearing = FleetObserver(self.listed)
-        keeper = CoordinatorStateFile(fleet, bus.endpoint, self.run_name)
+        observer = FleetObserver(self.listed)
+        state_file = CoordinatorStateFile(fleet, bus.endpoint, self.run_name)
         self._subscribe(f"{fleet}/*/state/*")
         bus.watch_tokens(keys.car_token(fleet, "*"), lambda key, alive: self._tokens(key.rpartition("/")[2], alive))
-        self._follow(self.plan)
-        bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._ask)
+        self._put_in_force(self.plan)
+        bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._on_query)
         for verb in (PLAN_VERB, RESTART_VERB):
-            bus.queryable(keys.command_key(fleet, keys.COORDINATOR, verb), self._ask)
-        again_at = time.monotonic() + AGAIN_S
-        look_again_at: float | None = time.monotonic() + LOOK_AGAIN_S
+            bus.queryable(keys.command_key(fleet, keys.COORDINATOR, verb), self._on_query)
+        republish_at = time.monotonic() + REPUBLISH_INTERVAL_S
+        recheck_at: float | None = time.monotonic() + SINGLETON_RECHECK_S
         hubs, linked_at = bus.hubs, time.monotonic()
         with ThreadPoolExecutor(max_workers=32) as pool:
             try:
-                self._listen(hearing, pool, wait_s=0.0)
-                for _ in range(_TRIES):
-                    self._ask_all()
-                    self._listen(hearing, pool, wait_s=0.0)
-                    if not hearing.unheard:
+                self._drain_inbox(observer, pool, wait_s=0.0)
+                for _ in range(_MAX_STATE_QUERIES):
+                    self._query_states()
+                    self._drain_inbox(observer, pool, wait_s=0.0)
+                    if not observer.unconfirmed:
                         break
                 now = time.monotonic()
-                self._memory = restored(self.plan, hearing.picture(()), keeper.load(), now, time.time())
-                while not ended():
-                    there = bus.hubs  # before it listens: who went with the last hub has been told then
-                    self._listen(hearing, pool)
+                self._memory = restore(self.plan, observer.snapshot(()), state_file.load(), now, time.time())
+                while not has_ended():
+                    # Read the hubs before the inbox, which then has the lost tokens of a hub that is gone.
+                    linked_hubs = bus.hubs
+                    self._drain_inbox(observer, pool)
                     now = time.monotonic()
-                    if not there:
-                        linked_at = self._see_to_hub(linked_at, now)
+                    if not linked_hubs:
+                        linked_at = self._ensure_hub(linked_at, now)
                         continue
-                    if there != hubs:
-                        hubs, self._memory = there, hub_back(self._memory, now)
+                    if linked_hubs != hubs:
+                        hubs, self._memory = linked_hubs, on_hub_back(self._memory, now)
                     linked_at = now
                     try:
-                        self._turn(hearing, pool, now)
-                    except OSError:  # its own output is gone: whoever started it has ended
+                        self._step(observer, pool, state_file, now)
+                    except OSError:  # its own output is closed: its parent has ended
                         raise
-                    except Exception as error:  # noqa: BLE001 - what it decides on came over the bus
-                        self._unforeseen("deciding", error)
-                    keeper.save(to_keep(self.plan, self._memory, now, time.time()))
-                    if look_again_at is not None and now >= look_again_at:
-                        look_again_at = None
-                        self._yield_to_the_first()
-                    if now >= again_at:
-                        again_at = now + AGAIN_S
+                    except Exception as error:  # noqa: BLE001 - the input came over the bus
+                        self._log_internal_error("deciding", error)
+                    if recheck_at is not None and now >= recheck_at:
+                        recheck_at = None
+                        self._yield_to_another()
+                    if now >= republish_at:
+                        republish_at = now + REPUBLISH_INTERVAL_S
                         for publisher, message in self._published.values():
                             publisher.put(message, time.time_ns())
             finally:
-                self.client.close()  # ends what is still waited for
+                self.client.close()  # ends pending commands
 
-    # ------------------------------------------------------------------ one turn
+    # ------------------------------------------------------------------ one step
 
-    def _turn(self, hearing: FleetObserver, pool: ThreadPoolExecutor, now: float) -> None:
-        for car, (ask, future) in list(self._running.items()):
+    def _step(
+        self, observer: FleetObserver, pool: ThreadPoolExecutor, state_file: CoordinatorStateFile, now: float
+    ) -> None:
+        for car, (ask, future) in list(self._mode_commands.items()):
             if future.done():
-                del self._running[car]
-                self._outcome(hearing, car, ask, future.result()[0], now)
-        for ask, future in [each for each in self._colouring if each[1].done()]:
-            self._colouring.remove((ask, future))
+                del self._mode_commands[car]
+                self._on_outcome(observer, car, ask, future.result()[0], now)
+        for ask, future in [each for each in self._led_commands if each[1].done()]:
+            self._led_commands.remove((ask, future))
             outcome = future.result()[0]
             if not outcome.ok:
-                self.failed(f"{ask.car}: the colour of a rule: {outcome.reason or outcome.phase}: {outcome.words}")
-        hearing.forget(now, {*self.plan.named, *self._memory.held, *self._running})
-        result = step(self.plan, hearing.picture(self._running), self._memory, now)
+                self.on_failure(f"{ask.car}: the color of a rule: {outcome.reason or outcome.phase}: {outcome.words}")
+        observer.forget(now, {*self.plan.named, *self._memory.held_roles, *self._mode_commands})
+        result = step(self.plan, observer.snapshot(self._mode_commands), self._memory, now)
         before, self._memory = self._memory, result.memory
-        self._forget(before.said.keys() - result.memory.said.keys())
+        # Persist before anything is published or commanded: a coordinator killed now is followed by one that knows.
+        state_file.save(to_persisted(self.plan, self._memory, now, time.time()))
+        self._forget(before.decisions.keys() - result.memory.decisions.keys())
         since_s = time.time() - now
         for decision in (*result.changed, *result.reworded):
             self._publish("decision", _message(decision, since_s + decision.since))
         for decision in result.changed:
-            self.decided(decision)
+            self.on_decision(decision)
         if result.changed or before.phase.name != result.memory.phase.name:
             self._publish("assignment", _assignment(self.plan, result))
         for ask in result.asks:
             request = mode_request(ask.mode) if ask.mode is not None else led_request(*(ask.led or (0, 0, 0)))
             future = pool.submit(self.client.ask, request, [ask.car])
             if ask.mode is not None:
-                self._running[ask.car] = (ask, future)
+                self._mode_commands[ask.car] = (ask, future)
             else:
-                self._colouring.append((ask, future))
+                self._led_commands.append((ask, future))
 
     def _forget(self, subjects: Collection[str]) -> None:
-        """Nothing is decided of them any more."""
+        """Forget subjects that have no decision any more."""
         for subject in subjects:
             self._published.pop(("decision", subject), None)
-            self._told.pop(subject, None)
+            self._last_failures.pop(subject, None)
 
-    def _outcome(self, hearing: FleetObserver, car: str, ask: Ask, outcome: Outcome, now: float) -> None:
+    def _on_outcome(self, observer: FleetObserver, car: str, ask: Ask, outcome: Outcome, now: float) -> None:
         assert ask.mode is not None
         refusal = None if outcome.ok else Refusal(ask.mode, outcome.reason, outcome.words, now)
-        hearing.refused(car, refusal)
+        observer.on_outcome(car, refusal)
         words = "" if outcome.ok else f"{car}: {outcome.reason or outcome.phase}: {outcome.words}"
-        if words and words != self._told.get(car):
-            self.failed(words)
-        self._told[car] = words
+        if words and words != self._last_failures.get(car):
+            self.on_failure(words)
+        self._last_failures[car] = words
 
     # ------------------------------------------------------------------ the plan
 
-    def _follow(self, plan: Plan) -> None:
-        """Hear what this plan looks at, and say that it is in force."""
+    def _put_in_force(self, plan: Plan) -> None:
+        """Put a plan in force: subscribe to the readings that it uses, and publish it."""
         self.plan = plan
         for topic in sorted({topic_of(name) for name in plan.names}):
             if not topic.startswith("state/"):
                 self._subscribe(f"{self.client.name}/*/{topic}")
         self._publish("plan", pb.Plan(text=plan.text, version=plan.version))
 
-    def _replace(self, query: zenoh.Query, hearing: FleetObserver) -> None:
-        """Take another plan, wholly; or refuse it with all that is wrong with it."""
+    def _on_plan(self, query: zenoh.Query, observer: FleetObserver) -> None:
+        """Put the plan of a query in force, or refuse it with all its faults."""
         result = pb.Result(status="sent")
         try:
             plan = parse(_text(query))
         except (ValueError, messages.BadPayload) as error:  # BadPlan and UnicodeDecodeError are ValueErrors
             result = pb.Result(status="rejected", reason="bad_value", words=str(error))
         else:
-            found = faults(plan, self.listed or None, hearing.present)
-            if found.errors:
-                result = pb.Result(status="rejected", reason="bad_value", words=found.refusal())
+            plan_faults = find_faults(plan, self.listed or None, observer.present)
+            if plan_faults.errors:
+                result = pb.Result(status="rejected", reason="bad_value", words=plan_faults.refusal())
             else:
-                warnings = [f"warning: {each}" for each in found.warnings]
+                warnings = [f"warning: {each}" for each in plan_faults.warnings]
                 result.words = "\n".join((f"plan {plan.version} is in force", *warnings))
-                self._take(plan)
-                for each in found.warnings:
-                    self.failed(f"the new plan: {each}")
-        self._result(query, result)
+                self._take_over(plan)
+                for each in plan_faults.warnings:
+                    self.on_failure(f"the new plan: {each}")
+        self._reply_result(query, result)
 
-    def _result(self, query: zenoh.Query, result: pb.Result) -> None:
+    def _reply_result(self, query: zenoh.Query, result: pb.Result) -> None:
         if query.parameters.get("format") == "json":
             reply(query, str(query.key_expr), messages.to_json(result).encode(), messages.JSON)
         else:
             reply(query, str(query.key_expr), result.SerializeToString(), messages.encoding_of(topics.RESULT))
 
-    def _take(self, plan: Plan) -> None:
-        self._memory = carried(self._memory, self.plan, plan)
+    def _take_over(self, plan: Plan) -> None:
+        self._memory = carry_over(self._memory, self.plan, plan)
         for name, subject in [*self._published]:
             if name == "decision":
                 del self._published[name, subject]
-        self._follow(plan)
-        self._ask_all()
+        self._put_in_force(plan)
+        self._query_states()
 
-    # ------------------------------------------------------------------ what is heard
+    # ------------------------------------------------------------------ samples and queries
 
     def _subscribe(self, expression: str) -> None:
         if expression not in self._subscribed:
             self._subscribed.add(expression)
-            self.client.bus.subscribe(expression, self._put)
+            self.client.bus.subscribe(expression, self._enqueue)
 
-    def _put(self, item: _Item) -> bool:
-        """On a Zenoh thread; False if there is no room."""
+    def _enqueue(self, item: _Item) -> bool:
+        """Put an item into the inbox; False if it is full. Runs on a Zenoh thread."""
         try:
             self._inbox.put_nowait(item)
         except queue.Full:
@@ -272,138 +278,143 @@ class Coordinator:
             return False
         return True
 
-    def _ask(self, query: zenoh.Query) -> bool:
-        """On a Zenoh thread; False if too many wait."""
-        if not self._questions.acquire(blocking=False):
+    def _on_query(self, query: zenoh.Query) -> bool:
+        """Put a query into the inbox; False if too many wait. Runs on a Zenoh thread."""
+        if not self._query_slots.acquire(blocking=False):
             return False
-        if self._put(query):
+        if self._enqueue(query):
             return True
-        self._questions.release()
+        self._query_slots.release()
         return False
 
-    def _ask_all(self, car: str = "*") -> None:
-        """What the cars (or one of them) have said last: whoever begins needs not wait until they say it again."""
-        wanted = {"state/*", *(topic_of(name) for name in self.plan.names)}
-        for topic in sorted(wanted):
+    def _query_states(self, car: str = "*") -> None:
+        """Query the last states and readings of all cars, or of one."""
+        topics_wanted = {"state/*", *(topic_of(name) for name in self.plan.names)}
+        for topic in sorted(topics_wanted):
             selector = f"{self.client.name}/{car}/{topic}"
-            for answer in self.client.bus.query(selector, timeout_s=_ANSWERS_S, qos=Qos.STATE):
+            for answer in self.client.bus.query(selector, timeout_s=_STATE_QUERY_TIMEOUT_S, qos=Qos.STATE):
                 if isinstance(answer, Sample):
-                    self._put(_Answer(answer))
+                    self._enqueue(_QueriedSample(answer))
 
-    def _listen(self, hearing: FleetObserver, pool: ThreadPoolExecutor, wait_s: float = TURN_S) -> None:
-        """Take what came, waiting a turn's length for the first."""
-        for _ in range(_QUEUE):  # what comes meanwhile is for the next turn
+    def _drain_inbox(self, observer: FleetObserver, pool: ThreadPoolExecutor, wait_s: float = STEP_INTERVAL_S) -> None:
+        """Handle all items in the inbox. Wait at most `wait_s` for the first."""
+        for _ in range(_INBOX_SIZE):  # later items are for the next step
             try:
                 item = self._inbox.get(timeout=wait_s) if wait_s else self._inbox.get_nowait()
             except queue.Empty:
-                self._look_at_tokens(hearing, pool)
+                self._handle_tokens(observer, pool)
                 return
-            self._look_at_tokens(hearing, pool)  # first: a gateway says how its car is when its token is there
+            self._handle_tokens(observer, pool)  # first: a gateway declares its token before it publishes states
             wait_s = 0.0
             try:
-                self._take_item(item, hearing)
-            except OSError:  # its own output is gone: whoever started it has ended
+                self._handle(item, observer)
+            except OSError:  # its own output is closed: its parent has ended
                 raise
-            except Exception as error:  # noqa: BLE001 - nothing that comes over the bus may end a coordinator
-                self._unforeseen("handling what came over the bus", error)
+            except Exception as error:  # noqa: BLE001 - no input from the bus may end a coordinator
+                self._log_internal_error("handling what came over the bus", error)
 
-    def _take_item(self, item: _Item, hearing: FleetObserver) -> None:
+    def _handle(self, item: _Item, observer: FleetObserver) -> None:
         now = time.monotonic()
         if isinstance(item, zenoh.Query):
-            self._questions.release()
-            self._answer(item, hearing)
-        elif isinstance(item, _Answer):
-            hearing.take(item.sample, now, time.time())
+            self._query_slots.release()
+            self._answer(item, observer)
+        elif isinstance(item, _QueriedSample):
+            observer.on_sample(item.sample, now, time.time())
         else:
-            hearing.take(item, now, None)
+            observer.on_sample(item, now, None)
 
-    def _look_at_tokens(self, hearing: FleetObserver, pool: ThreadPoolExecutor) -> None:
-        """Note who came and went, and ask who came how it is."""
+    def _handle_tokens(self, observer: FleetObserver, pool: ThreadPoolExecutor) -> None:
+        """Note arrived and lost gateways, and query the states of those that arrived."""
         now = time.monotonic()
         for car, alive in self._tokens.taken().items():
-            hearing.token(car, now, alive=alive)
-            if alive and self._memory.began is not None:
-                self._came.add(car)
+            observer.on_token(car, now, alive=alive)
+            if alive and self._memory.started_at is not None:
+                self._arrived.add(car)
             elif not alive:
-                self._came.discard(car)
-        self._asked = [each for each in self._asked if not each.done()]
-        if self._came and len(self._asked) < _ASKERS:
-            cars, self._came = sorted(self._came), set()
-            self._asked += [pool.submit(self._ask_all, car) for car in (cars if len(cars) <= _APIECE else ["*"])]
+                self._arrived.discard(car)
+        self._state_queries = [each for each in self._state_queries if not each.done()]
+        if self._arrived and len(self._state_queries) < _MAX_STATE_QUERIES_AT_ONCE:
+            cars, self._arrived = sorted(self._arrived), set()
+            self._state_queries += [
+                pool.submit(self._query_states, car)
+                for car in (cars if len(cars) <= _MAX_CARS_QUERIED_SINGLY else ["*"])
+            ]
 
-    def _answer(self, query: zenoh.Query, hearing: FleetObserver) -> None:
+    def _answer(self, query: zenoh.Query, observer: FleetObserver) -> None:
         with query:
             try:
-                self._reply(query, hearing)
+                self._reply(query, observer)
             except OSError:
                 raise
-            except Exception as error:  # noqa: BLE001 - whoever asks gets an answer, and the coordinator goes on
-                words = self._unforeseen(f"answering {query.key_expr}", error)
+            except Exception as error:  # noqa: BLE001 - each query gets a reply, and the coordinator goes on
+                words = self._log_internal_error(f"answering {query.key_expr}", error)
                 query.reply_err(words, encoding="text/plain")
 
-    def _reply(self, query: zenoh.Query, hearing: FleetObserver) -> None:
+    def _reply(self, query: zenoh.Query, observer: FleetObserver) -> None:
         if str(query.key_expr).endswith(f"/@cmd/{PLAN_VERB}"):
-            self._replace(query, hearing)
+            self._on_plan(query, observer)
             return
         if str(query.key_expr).endswith(f"/@cmd/{RESTART_VERB}"):
-            self._memory = restarted(self._memory)
-            self._result(query, pb.Result(status="sent", words=f"plan {self.plan.version} begins anew"))
+            self._memory = restart_plan(self._memory)
+            self._reply_result(query, pb.Result(status="sent", words=f"plan {self.plan.version} begins anew"))
             return
         for publisher, message in self._published.values():
             if query.key_expr.intersects(publisher.key):
                 reply_value(query, publisher.key, message.SerializeToString(), publisher.topic)
 
-    def _unforeseen(self, during: str, error: Exception) -> str:
-        """Log an exception that nobody foresaw, as an event and on stderr; return the words.
+    def _log_internal_error(self, during: str, error: Exception) -> str:
+        """Log an unexpected exception as an event and on stderr; return the words.
 
-        The same words are logged once in AGAIN_S: a fault in each turn would fill the disk.
+        The same words are logged once per REPUBLISH_INTERVAL_S: a fault in each step would fill the disk.
         """
         frames = traceback.extract_tb(error.__traceback__)
         where = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
-        words = f"{INTERNAL_ERROR} while {during}: {type(error).__name__}{where}: {str(error)[:_LONGEST_ERROR]}"
+        words = f"{INTERNAL_ERROR} while {during}: {type(error).__name__}{where}: {str(error)[:_MAX_ERROR_LENGTH]}"
         now = time.monotonic()
-        self._unforeseen_at = {each: at for each, at in self._unforeseen_at.items() if now - at < AGAIN_S}
-        if words not in self._unforeseen_at:
-            self._unforeseen_at[words] = now
+        self._internal_errors = {
+            each: at for each, at in self._internal_errors.items() if now - at < REPUBLISH_INTERVAL_S
+        }
+        if words not in self._internal_errors:
+            self._internal_errors[words] = now
             self._log(words)
         return words
 
     def _log(self, words: str) -> None:
-        """Publish an error as foxglove.Log, and tell whoever started the coordinator."""
+        """Publish an error as foxglove.Log, and call `on_failure`."""
         now_ns = time.time_ns()
         message: Any = messages.message_class("foxglove.Log")(
-            level=_ERROR, name=f"{keys.COORDINATOR} {INTERNAL_ERROR}", message=words
+            level=_LEVEL_ERROR, name=f"{keys.COORDINATOR} {INTERNAL_ERROR}", message=words
         )
         message.timestamp.seconds, message.timestamp.nanos = divmod(now_ns, 1_000_000_000)
         self._publisher("log").put(message, now_ns)
-        with contextlib.suppress(Exception):  # what `failed` does is what may have failed
-            self.failed(words)
+        with contextlib.suppress(Exception):  # the error may come from `on_failure` itself
+            self.on_failure(words)
 
-    # ------------------------------------------------------------------ there is only one; and the hub
+    # ------------------------------------------------------------------ other coordinators, the hub, publishers
 
     def _others(self) -> list[str]:
         operators = self.client.bus.tokens(f"{self.client.name}/{keys.OPERATOR}/*")
         names = [token.rpartition("/")[2] for token in operators]
         return sorted(name for name in names if name.startswith(SENDER) and name != self.client.sender)
 
-    def _yield_to_the_first(self) -> None:
-        """Of two that started at the same moment, the one with the higher name yields."""
+    def _yield_to_another(self) -> None:
+        """Raise AnotherCoordinator if one with a lower name started at the same moment."""
         others = [name for name in self._others() if name < self.client.sender]
         if others:
-            raise AnotherCoordinator(self._named(others))
+            raise AnotherCoordinator(self._describe(others))
 
-    def _named(self, others: list[str]) -> str:
+    def _describe(self, others: list[str]) -> str:
         who = ", ".join(others) or "one that does not say who it is"
         return f"fleet {self.client.name} has a coordinator already ({who}): stop that one first"
 
-    def _see_to_hub(self, linked_at: float, now: float) -> float:
-        """Without a link for a while: see that there is a hub."""
-        if now - linked_at < HUB_GONE_S:
+    def _ensure_hub(self, linked_at: float, now: float) -> float:
+        """Start a hub if there was no link to one for HUB_OUTAGE_S; return the new start of the outage."""
+        if now - linked_at < HUB_OUTAGE_S:
             return linked_at
         try:
             ensure_hub(self.client.bus.endpoint)
         except BusError as error:
-            self.failed(str(error))
+            self.on_failure(str(error))
         return now
 
     def _publish(self, name: str, message: Any) -> None:
@@ -420,13 +431,13 @@ class Coordinator:
 
 
 def _text(query: zenoh.Query) -> str:
-    """The text of the plan that a query gives, in protobuf, in JSON, or as it is."""
+    """Return the text of the plan in a query: protobuf, JSON or plain text."""
     payload = query.payload.to_bytes() if query.payload is not None else b""
     encoding = str(query.encoding) if query.encoding is not None else ""
     if not encoding.startswith((topics.PROTOBUF, messages.JSON)):
         return payload.decode()
-    given: Any = messages.parse(topics.TOPICS[f"{keys.COORDINATOR}/plan"].message, payload, encoding)
-    return str(given.text)
+    message: Any = messages.parse(topics.TOPICS[f"{keys.COORDINATOR}/plan"].message, payload, encoding)
+    return str(message.text)
 
 
 def _message(decision: Decision, since_s: float) -> pb.Decision:

@@ -1,4 +1,4 @@
-"""What the coordinator hears becomes a picture: tokens and messages in, values of policy/picture.py out. No Zenoh."""
+"""Observes the fleet for the coordinator: tokens and messages in, snapshots (policy/snapshot.py) out. No Zenoh."""
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -11,28 +11,28 @@ from schemas import keys, messages, topics
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 
-NEEDED: Final = ("state/link", "state/mode", "state/motion", "state/safety")
-"""Only when all that could forbid a command is known, a car counts as heard."""
+REQUIRED_TOPICS: Final = ("state/link", "state/mode", "state/motion", "state/safety")
+"""The states that could forbid a command. A car is confirmed when all of them are known."""
 _HEALTH: Final = "state/health"
-FORGOTTEN_S: Final = 60.0
-"""A car is forgotten whose gateway has been away for so long, unless the fleet file or the plan names it."""
-MOST_GONE: Final = 256
-"""Maximum cars that are remembered while their gateways are away. The oldest are forgotten first."""
-MOST_UNHEARD: Final = 256
-"""Maximum names on the bus that count as cars before they publish a state, if no fleet file lists them."""
+FORGET_AFTER_S: Final = 60.0
+"""Time after which a car without a gateway is forgotten, unless the fleet file or the plan names it."""
+MAX_ABSENT_CARS: Final = 256
+"""Maximum remembered cars without a gateway. The oldest are forgotten first."""
+MAX_UNCONFIRMED_CARS: Final = 256
+"""Maximum unlisted names on the bus that count as cars before they publish their states."""
 
 
 @dataclass(slots=True)
 class FleetObserver:
-    """The cars as they were last heard. `listed`: what the fleet file says of them, if there is one."""
+    """The cars as last observed. `listed`: the cars of the fleet file; empty: there is none."""
 
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
     cars: dict[str, CarSnapshot] = field(default_factory=dict)
     readings: dict[str, dict[str, Observation]] = field(default_factory=dict)
-    _gone_since: dict[str, float] = field(default_factory=dict)
-    """Cars without a gateway on the bus that no fleet file lists; who went first stands first."""
-    _met: set[str] = field(default_factory=set)
-    """Cars that have said all that could forbid a command, whatever has become of them."""
+    _absent_since: dict[str, float] = field(default_factory=dict)
+    """Unlisted cars without a gateway on the bus; the first to leave stands first."""
+    _confirmed: set[str] = field(default_factory=set)
+    """Cars that have published all REQUIRED_TOPICS once, present or not."""
 
     def __post_init__(self) -> None:
         self.cars.update(self.listed)
@@ -43,56 +43,56 @@ class FleetObserver:
         return frozenset(car for car, known in self.cars.items() if known.present)
 
     @property
-    def unheard(self) -> frozenset[str]:
-        """Those of them of which not all that could forbid a command is known."""
+    def unconfirmed(self) -> frozenset[str]:
+        """The present cars with an unknown state among REQUIRED_TOPICS."""
         return frozenset(car for car in self.present if not _all_known(self.readings.get(car, {})))
 
-    def picture(self, busy: Iterable[str]) -> FleetSnapshot:
-        """What is known now; `busy`: the cars that something was asked of, with no outcome yet."""
-        # A name that no file lists is a car once it has said how it is: until then few count, and only while there.
-        cars = {car: known for car, known in self.cars.items() if known.listed or car in self._met}
-        unheard = (each for each in self.cars.items() if each[1].present and each[0] not in cars)
-        cars.update(list(islice(unheard, MOST_UNHEARD)))
+    def snapshot(self, busy: Iterable[str]) -> FleetSnapshot:
+        """Return a snapshot; `busy`: the cars with a pending command."""
+        # An unlisted name counts as a car once it has published its states. Before, only few count while present.
+        cars = {car: known for car, known in self.cars.items() if known.listed or car in self._confirmed}
+        unconfirmed = (each for each in self.cars.items() if each[1].present and each[0] not in cars)
+        cars.update(list(islice(unconfirmed, MAX_UNCONFIRMED_CARS)))
         cars.update({car: replace(cars[car], busy=True) for car in busy if car in cars})
-        return FleetSnapshot(cars, {car: dict(seen) for car, seen in self.readings.items() if car in cars})
+        return FleetSnapshot(cars, {car: dict(readings) for car, readings in self.readings.items() if car in cars})
 
-    def token(self, car: str, now: float, *, alive: bool) -> None:
-        """A gateway came or went: what was known of its car may no longer be so, a hold above all."""
+    def on_token(self, car: str, now: float, *, alive: bool) -> None:
+        """Note that a gateway came or went, and drop its car's states: a hold may have changed meanwhile."""
         try:
             keys.check_name(car)
         except keys.BadKey:
-            return  # no gateway of ours: nothing could be asked of it
+            return  # no gateway has such a name, so no command could reach it
         if alive:
-            self._gone_since.pop(car, None)
+            self._absent_since.pop(car, None)
         elif car not in self.listed:
-            if car not in self._met:
+            if car not in self._confirmed:
                 self._forget(car)
                 return
-            self._gone_since.setdefault(car, now)
+            self._absent_since.setdefault(car, now)
         self.cars[car] = replace(self.listed.get(car, CarSnapshot()), present=alive)
-        for topic in (*NEEDED, _HEALTH):
+        for topic in (*REQUIRED_TOPICS, _HEALTH):
             self.readings.get(car, {}).pop(topic, None)
 
     def forget(self, now: float, needed: Container[str]) -> None:
-        """Forget the cars that have been away for long, but for the `needed`."""
-        for car, since in list(self._gone_since.items()):
-            if now - since < FORGOTTEN_S and len(self._gone_since) <= MOST_GONE:
+        """Forget cars that have been absent for FORGET_AFTER_S, except the `needed`."""
+        for car, since in list(self._absent_since.items()):
+            if now - since < FORGET_AFTER_S and len(self._absent_since) <= MAX_ABSENT_CARS:
                 return
             if car not in needed:
                 self._forget(car)
 
     def _forget(self, car: str) -> None:
-        self._met.discard(car)
-        for each in (self.cars, self.readings, self._gone_since):
+        self._confirmed.discard(car)
+        for each in (self.cars, self.readings, self._absent_since):
             each.pop(car, None)
 
-    def refused(self, car: str, refusal: Refusal | None) -> None:
-        """A command was not carried out, or (None) one was."""
+    def on_outcome(self, car: str, refusal: Refusal | None) -> None:
+        """Note the refusal of a command, or (None) that one succeeded."""
         if car in self.cars:
             self.cars[car] = replace(self.cars[car], refused=refusal)
 
-    def take(self, sample: Sample, now: float, wall_s: float | None) -> None:
-        """A message of a car. `wall_s`: the wall clock, for an answer, which may be old; None: it came as published."""
+    def on_sample(self, sample: Sample, now: float, wall_s: float | None) -> None:
+        """Take a message in. `wall_s`: the wall clock if a query returned it (it may be old); None: just published."""
         key = keys.parse(sample.key)
         topic = None if key is None else topics.TOPICS.get(key.topic)
         if key is None or topic is None:
@@ -100,28 +100,28 @@ class FleetObserver:
         try:
             value: Any = messages.parse(topic.message, sample.payload, sample.encoding)
         except messages.BadPayload:
-            return  # not of this fleet's gateways: nothing to decide on
+            return  # not from a gateway of this version
         if key.car not in self.listed and not self.cars.get(key.car, CarSnapshot()).present:
-            self._gone_since.setdefault(key.car, now)
+            self._absent_since.setdefault(key.car, now)
         at = now
         if wall_s is not None:
             at -= max(0.0, wall_s - value.stamp.seconds - value.stamp.nanos / 1e9)
-        seen = self.readings.setdefault(key.car, {})
-        if key.topic in seen and seen[key.topic].at > at:
-            return  # an answer that was overtaken
+        readings = self.readings.setdefault(key.car, {})
+        if key.topic in readings and readings[key.topic].at > at:
+            return  # a published message overtook this reply
         measured = {descriptor.name for descriptor, _ in value.ListFields()}
         fields = {
             each.name: getattr(value, each.name)
             for each in value.DESCRIPTOR.fields
             if not each.has_presence or each.name in measured
         }
-        seen[key.topic] = Observation(fields, at)
-        if key.topic in NEEDED or key.topic == _HEALTH:
-            self._states(key.car, seen)
+        readings[key.topic] = Observation(fields, at)
+        if key.topic in REQUIRED_TOPICS or key.topic == _HEALTH:
+            self._update_states(key.car, readings)
 
-    def _states(self, car: str, seen: Mapping[str, Observation]) -> None:
+    def _update_states(self, car: str, readings: Mapping[str, Observation]) -> None:
         before = self.cars.get(car, CarSnapshot())
-        health = seen.get(_HEALTH)
+        health = readings.get(_HEALTH)
         if health is not None:
             capabilities: Any = health.fields["capabilities"]
             before = replace(
@@ -130,10 +130,10 @@ class FleetObserver:
                 capabilities=before.capabilities if before.listed else frozenset(capabilities),
             )
             self.cars[car] = before
-        if not before.present or not _all_known(seen):
+        if not before.present or not _all_known(readings):
             return
-        self._met.add(car)
-        link, mode, motion, safety = (seen[topic].fields for topic in NEEDED)
+        self._confirmed.add(car)
+        link, mode, motion, safety = (readings[topic].fields for topic in REQUIRED_TOPICS)
         hold, lease = safety.get("hold"), safety.get("lease")
         estops: Any = safety.get("estops") or ()
         driver = motion["owner"]
@@ -152,12 +152,12 @@ class FleetObserver:
         )
 
 
-def _all_known(seen: Mapping[str, Observation]) -> bool:
-    return all(topic in seen for topic in NEEDED)
+def _all_known(readings: Mapping[str, Observation]) -> bool:
+    return all(topic in readings for topic in REQUIRED_TOPICS)
 
 
 def listed_cars(file: FleetFile) -> Mapping[str, CarSnapshot]:
-    """What a fleet file says of its cars."""
+    """Return the cars of a fleet file as the policy knows them before their gateways are up."""
     return {
         name: CarSnapshot(
             platform="" if car.platform.startswith("auto") else car.platform,

@@ -1,11 +1,12 @@
-"""What a coordinator leaves to the next one, in one small JSON file a fleet: roles, phase, rules in force.
+"""Persists roles, phase and rules in force for the next coordinator, in one small JSON file per fleet.
 
-It is a convenience, not the truth: what the cars are in counts for more (policy/memory.py). So a file that cannot be
-read or written stops nobody.
+The file is a convenience: the cars' modes count for more (policy/state.py). So errors of reading and writing are
+ignored.
 """
 
 import contextlib
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from schemas.state_dir import directory_of
 
 
 class CoordinatorStateFile:
-    """The file of one fleet at one endpoint. `run`: the `fleet up` that it belongs to; empty: none."""
+    """The file of one fleet at one endpoint. `run`: name of its `fleet up` run; empty: none."""
 
     def __init__(self, fleet: str, endpoint: str, run: str) -> None:
         self._endpoint = endpoint
@@ -25,9 +26,9 @@ class CoordinatorStateFile:
             self.path = directory_of(endpoint) / f"{fleet}.@coordinator.json"
 
     def load(self) -> PersistedPolicy:
-        """What the last one left; nothing, if it cannot be read or was of another bus.
+        """Return the persisted state; an empty one if the file cannot be read or belongs to another bus.
 
-        Phase and rules count within one `fleet up`: with a new one the plan begins anew, and only the roles are kept.
+        Phase and rules count within one `fleet up` run: in a new run the plan begins anew with the same roles.
         """
         if self.path is None:
             return PersistedPolicy()
@@ -48,27 +49,19 @@ class CoordinatorStateFile:
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return PersistedPolicy()
 
-    def save(self, kept: PersistedPolicy) -> None:
-        """Write it, whole or not at all, if it has changed."""
-        if self.path is None or _same(kept, self._last):
+    def save(self, state: PersistedPolicy) -> None:
+        """Write the state, whole or not at all, if it has changed."""
+        if self.path is None or _same(state, self._last):
             return
-        self._last = kept
-        content = {
-            "endpoint": self._endpoint,
-            "run": self._run,
-            "version": kept.version,
-            "roles": dict(kept.roles),
-            "phase": kept.phase,
-            "phase_since_s": kept.phase_since_s,
-            "rules": {str(index): that for index, that in kept.rules.items()},
-        }
-        scratch = self.path.with_suffix(".new")
+        self._last = state
+        content = {"endpoint": self._endpoint, "run": self._run, **asdict(state)}
+        temporary = self.path.with_suffix(".new")
         with contextlib.suppress(OSError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            scratch.write_text(json.dumps(content), encoding="utf-8")
-            scratch.replace(self.path)
+            temporary.write_text(json.dumps(content), encoding="utf-8")
+            temporary.replace(self.path)
 
 
 def _same(one: PersistedPolicy, other: PersistedPolicy) -> bool:
-    """Whether nothing but the clock's last digit has changed."""
+    """Return True if nothing but the start of the phase differs (its last digit follows the clock)."""
     return (one.version, one.roles, one.phase, one.rules) == (other.version, other.roles, other.phase, other.rules)

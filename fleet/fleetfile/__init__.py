@@ -1,1 +1,1 @@
-"""The fleet file: its models, reading and editing it, writing a first one from a scan, and checking its links."""
+"""The fleet file: `models`, reading (`fleet_file`), edits (`editor`), a first file from a `scan`, and `link_check`."""

@@ -1,7 +1,7 @@
-"""A link written into the text of a fleet file, with all else of it, comments too, left as it is. Pure.
+"""Writes a link into the text of a fleet file; everything else, comments too, stays as it is. Pure.
 
-The text is cut at the marks of what stands in it, never dumped anew. What comes out is read again: a text that says
-anything but the one link otherwise is not given back.
+The editor inserts into the text at YAML marks and never dumps it anew. It parses the result and refuses it if anything
+but the link has changed.
 """
 
 from dataclasses import replace
@@ -10,41 +10,41 @@ from pathlib import Path
 import yaml
 
 from fleet.fleetfile.fleet_file import FleetFile, parse_fleet
-from fleet.fleetfile.scan import key, quoted
+from fleet.fleetfile.scan import format_key, quote
 from schemas.yaml_document.document import BadFile, Document
 
 
 class CannotEdit(ValueError):
-    """A file that must be changed by hand; the text says what to write."""
+    """A file that must be edited by hand; the text says what to write."""
 
 
-def with_link(text: str, path: Path, car: str, link: str) -> str:
-    """The text with this link for a car of the file or a new one; raises BadFile for a bad file, and CannotEdit."""
+def set_link(text: str, path: Path, car: str, link: str) -> str:
+    """Return the text with this link for a listed or a new car; raises BadFile for a bad file, and CannotEdit."""
     before = parse_fleet(text, path, unbound=True)
     document = Document(text, str(path))
     cars = document.node(("cars",))
-    entry, there = document.node(("cars", car)), document.node(("cars", car, "link"))
+    entry, link_node = document.node(("cars", car)), document.node(("cars", car, "link"))
     assert isinstance(cars, yaml.MappingNode)  # else the file is a bad one
-    if there is not None:
-        start, end = there.start_mark.index, there.end_mark.index
-        after = f"{text[:start]}{quoted(link)}{text[end:]}"
+    if link_node is not None:
+        start, end = link_node.start_mark.index, link_node.end_mark.index
+        after = f"{text[:start]}{quote(link)}{text[end:]}"
     elif entry is not None:
         assert isinstance(entry, yaml.MappingNode)
-        after = _first(text, entry, f"link: {quoted(link)}")
+        after = _insert_first(text, entry, f"link: {quote(link)}")
     else:
-        after = _last(text, cars, f"{key(car)}: {{link: {quoted(link)}}}")
-    by_hand = CannotEdit(f"{path} cannot be changed here without changing more: write cars.{car}.link: {quoted(link)}")
+        after = _insert_last(text, cars, f"{format_key(car)}: {{link: {quote(link)}}}")
+    by_hand = CannotEdit(f"{path} cannot be changed here without changing more: write cars.{car}.link: {quote(link)}")
     try:
         now = parse_fleet(after, path, unbound=True)
     except BadFile as error:
-        raise (by_hand if not _clashes(error) else error) from None
-    if not _same_but(before, now, car, link):
+        raise (by_hand if not _is_about_links(error) else error) from None
+    if not _differs_only_in(before, now, car, link):
         raise by_hand
     return after
 
 
-def _first(text: str, mapping: yaml.MappingNode, entry: str) -> str:
-    """The text with an entry before the first of a mapping."""
+def _insert_first(text: str, mapping: yaml.MappingNode, entry: str) -> str:
+    """Insert an entry before the first of a mapping."""
     if mapping.flow_style:
         inside: int = mapping.start_mark.index + 1
         return text[:inside] + entry + (", " if mapping.value else "") + text[inside:]
@@ -53,22 +53,22 @@ def _first(text: str, mapping: yaml.MappingNode, entry: str) -> str:
     return text[:at] + entry + _new_line(text, mark.column) + text[at:]
 
 
-def _last(text: str, mapping: yaml.MappingNode, entry: str) -> str:
-    """The text with an entry after the last of a mapping, and after what is said beside that."""
+def _insert_last(text: str, mapping: yaml.MappingNode, entry: str) -> str:
+    """Insert an entry after the last of a mapping and after the comment beside that."""
     if mapping.flow_style:
         at: int = mapping.end_mark.index - 1
         return text[:at] + (", " if mapping.value else "") + entry + text[at:]
-    end = text.find("\n", _end(mapping))
+    end = text.find("\n", _end_of(mapping))
     end = len(text) if end < 0 else end - (text[end - 1] == "\r")
     return text[:end] + _new_line(text, mapping.value[0][0].start_mark.column) + entry + text[end:]
 
 
-def _end(node: yaml.Node) -> int:
-    """Where the last value of a node ends: the mark of a block's end is that of what follows it."""
+def _end_of(node: yaml.Node) -> int:
+    """Return the end of a node's last value. PyYAML's end mark of a block is the start of the next node."""
     if isinstance(node, yaml.MappingNode) and not node.flow_style:
-        return max(_end(part) for pair in node.value for part in pair)
+        return max(_end_of(part) for pair in node.value for part in pair)
     if isinstance(node, yaml.SequenceNode) and not node.flow_style:
-        return max(map(_end, node.value))
+        return max(map(_end_of, node.value))
     at: int = node.end_mark.index
     return at
 
@@ -77,12 +77,12 @@ def _new_line(text: str, column: int) -> str:
     return ("\r\n" if "\r\n" in text else "\n") + " " * column
 
 
-def _clashes(error: BadFile) -> bool:
-    """Whether the link itself is refused, not what the cutting made of the text."""
+def _is_about_links(error: BadFile) -> bool:
+    """Return True if all faults are about links; else the insertion has broken the text."""
     return all(problem.field.endswith(".link") for problem in error.problems)
 
 
-def _same_but(before: FleetFile, now: FleetFile, car: str, link: str) -> bool:
+def _differs_only_in(before: FleetFile, now: FleetFile, car: str, link: str) -> bool:
     others, others_now = ({name: spec for name, spec in each.cars.items() if name != car} for each in (before, now))
     same = others == others_now and set(before.unbound) - {car} == set(now.unbound)
     rest = [replace(each, cars={}, text="", unlinked={}) for each in (before, now)]

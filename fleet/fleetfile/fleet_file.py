@@ -1,7 +1,7 @@
-"""The fleet file: which cars there are, and what each is, may do and must not. Read whole, checked whole, resolved.
+"""Reads a fleet file: the cars, their platforms, capabilities and limits. All faults are reported at once.
 
-A car overrides its type, a type the defaults; lists replace, `limits` merge. What is there and answers, `fleet check`
-finds out; nothing is opened here but the file.
+A car overrides its type, a type overrides the defaults; lists replace, `limits` merge. link_check.py checks whether the
+cars are there; only the file itself is opened here.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,7 +13,7 @@ from typing import Any, Final
 from fleet.fleetfile.models import (
     CAPABILITIES,
     CRITICAL_V,
-    LONGEST_DRIVE_S,
+    DEFAULT_MAX_DRIVE_S,
     LOW_V,
     BatteryAction,
     FileEntry,
@@ -22,22 +22,22 @@ from fleet.fleetfile.models import (
 from fleet.links import BadLink, LinkKind, LinkUrl, parse_link, shared_ports
 from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_told
 from schemas.yaml_document.document import Document, read_text
-from schemas.yaml_document.messages import Where, meant, shown
+from schemas.yaml_document.messages import Where, quote_value, suggest
 
 PALETTE: Final = ("#e01b24", "#33d17a", "#3584e4", "#f6d32d", "#9141ac", "#ff7800", "#2ec7c0", "#986a44")
-"""Colours of cars that are given none, in the order of the file."""
+"""Colors of cars without one, in the order of the file."""
 PATHS: Final = ("plan", "recordings", "world")
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a car is kept within.
+    """The limits of a car.
 
-    longest_drive_s: the longest `duration_s` of a drive, up to 3600. speed_max: 0 to 1 of its fastest. battery_*_v:
-    below this the level is low, critical; at rest.
+    longest_drive_s: maximum `duration_s` of a drive, up to 3600. speed_max: 0 to 1 of its top speed. battery_*_v:
+    voltage at rest below which the level is low, critical.
     """
 
-    longest_drive_s: float = LONGEST_DRIVE_S
+    longest_drive_s: float = DEFAULT_MAX_DRIVE_S
     speed_max: float = 1.0
     battery_low_v: float = LOW_V
     battery_critical_v: float = CRITICAL_V
@@ -47,11 +47,11 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class FleetCar:
-    """One car, resolved: nothing is left to look up in its type or the defaults.
+    """One car with its type and the defaults resolved.
 
-    link: as `gateway run --link` takes it. platform: as `--platform` does. colour: #rrggbb. capabilities: modes and
-    parts by their words; with platform `auto` and none given, all that any platform has, until its gateway knows.
-    roles: those it may take; None: any.
+    link, platform: values for `gateway run --link` and `--platform`. colour: #rrggbb. capabilities: words for modes and
+    parts; for platform `auto` by default those of all platforms, until its gateway detects the platform. roles: the
+    roles that it may take; None: any.
     """
 
     name: str
@@ -65,9 +65,9 @@ class FleetCar:
 
 @dataclass(frozen=True, slots=True)
 class FleetFile:
-    """A fleet file, every car resolved, every path absolute.
+    """A fleet file with resolved cars and absolute paths.
 
-    endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. unlinked: cars without a link, where those are let through.
+    endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. unlinked: cars without a link, if those are allowed.
     """
 
     name: str
@@ -83,31 +83,31 @@ class FleetFile:
 
     @property
     def unbound(self) -> tuple[str, ...]:
-        """The cars without a link (`fleet bind`)."""
+        """The names of the cars without a link (`fleet bind`)."""
         return tuple(self.unlinked)
 
 
 def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) -> FleetFile:
-    """The fleet in a file, every car resolved; raises BadFile. `unbound`: cars without a link are let through.
+    """Read a fleet file; raises BadFile. `unbound`: allow cars without a link.
 
-    `moved`: it is a copy (a session's), so the plan and the world that it names need not be beside it.
+    `moved`: the file is a session's copy, so its plan and its world need not be beside it.
     """
     path = Path(path)
     return parse_fleet(read_text(path), path, unbound=unbound, moved=moved)
 
 
 def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = False) -> FleetFile:
-    """The fleet in a text, as if it stood in this file; raises BadFile."""
+    """Parse the text of a fleet file at this path; raises BadFile."""
     document = Document(text, str(path))
-    file = document.take(FileEntry)
-    tree = _mapping(document.tree)
-    for where, words in _contradictions(tree, path, unbound=unbound, moved=moved):
-        document.complain(where, words)
-    document.end()
+    file = document.validate(FileEntry)
+    tree = _as_mapping(document.tree)
+    for where, words in _find_contradictions(tree, path, unbound=unbound, moved=moved):
+        document.report(where, words)
+    document.raise_faults()
     assert file is not None  # else the document had ended
-    merged = {name: _merged(tree, car) for name, car in tree["cars"].items()}
-    places = {name: _beside(path, tree.get(name)) for name in PATHS}
-    cars = {name: _spec(name, car, index) for index, (name, car) in enumerate(merged.items())}
+    merged = {name: _merge_layers(tree, car) for name, car in tree["cars"].items()}
+    places = {name: _resolve_path(path, tree.get(name)) for name in PATHS}
+    cars = {name: _resolve_car(name, car, index) for index, (name, car) in enumerate(merged.items())}
     return FleetFile(
         name=file.name,
         endpoint=file.endpoint or None,
@@ -121,7 +121,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
 
 
 def profile_capabilities(platform: str) -> frozenset[str]:
-    """What a platform's cars have: parts and modes by their words; of `auto` what any has."""
+    """Return the parts and modes of a platform's cars; for `auto` those of all platforms."""
     _, auto = parse_told(platform)
     kinds = [kind for kind in Platform if kind is not Platform.UNKNOWN] if auto else [platform.partition("+")[0]]
     options = platform.partition("+")[1] + platform.partition("+")[2]
@@ -129,7 +129,7 @@ def profile_capabilities(platform: str) -> frozenset[str]:
     return frozenset(str(word) for profile in profiles for word in (*profile.capabilities, *profile.modes))
 
 
-def _spec(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
+def _resolve_car(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
     platform = car.get("platform", AUTO)
     limits = LimitsEntry.model_validate(car.get("limits", {}))
     return FleetCar(
@@ -143,59 +143,62 @@ def _spec(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
     )
 
 
-def _merged(tree: Mapping[str, Any], car: Mapping[str, Any]) -> dict[str, Any]:
-    """A car's fields: the defaults, over them its type's, over them its own."""
+def _merge_layers(tree: Mapping[str, Any], car: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge a car's fields: the defaults, then those of its type, then its own."""
     merged: dict[str, Any] = {}
     limits: dict[str, Any] = {}
     kind = car.get("type")
-    named = _mapping(tree.get("types")).get(kind) if isinstance(kind, str) else None
+    named = _as_mapping(tree.get("types")).get(kind) if isinstance(kind, str) else None
     for layer in (tree.get("defaults"), named, car):
-        merged |= _mapping(layer)
-        limits |= _mapping(_mapping(layer).get("limits"))
+        merged |= _as_mapping(layer)
+        limits |= _as_mapping(_as_mapping(layer).get("limits"))
     return {**merged, "limits": limits}
 
 
-def _beside(path: Path, given: str | None) -> Path | None:
+def _resolve_path(path: Path, given: str | None) -> Path | None:
     return None if given is None else (path.absolute().parent / Path(given).expanduser()).resolve()
 
 
-# What no field shows by itself. These look at the text as it is, so that they tell of it along with the fields' faults.
+# Contradictions between fields. They are searched in the raw data, so that they are reported along with the faults of
+# single fields.
 
 
-def _contradictions(tree: Mapping[str, Any], path: Path, *, unbound: bool, moved: bool) -> Iterator[tuple[Where, str]]:
-    cars = {name: _mapping(car) for name, car in _mapping(tree.get("cars")).items()}
-    types = _mapping(tree.get("types"))
+def _find_contradictions(
+    tree: Mapping[str, Any], path: Path, *, unbound: bool, moved: bool
+) -> Iterator[tuple[Where, str]]:
+    cars = {name: _as_mapping(car) for name, car in _as_mapping(tree.get("cars")).items()}
+    types = _as_mapping(tree.get("types"))
     for name, car in cars.items():
         kind = car.get("type")
         if isinstance(kind, str) and kind not in types:
             known = f"one of {', '.join(types)}" if types else "this file has no types"
-            yield ("cars", name, "type"), f"{shown(kind)} is not allowed: {known}{meant(kind, types)}"
+            yield ("cars", name, "type"), f"{quote_value(kind)} is not allowed: {known}{suggest(kind, types)}"
         if "link" not in car and not unbound:
             words = "is missing: how the car is reached; `gateway scan` shows links, `fleet bind` finds out which it is"
             yield ("cars", name, "link"), words
-        yield from _car_contradictions(tree, name, car)
-    yield from _one_port(cars)
+        yield from _find_car_contradictions(tree, name, car)
+    yield from _find_shared_ports(cars)
     for entry in () if moved else ("plan", "world"):
         given = tree.get(entry)
         if isinstance(given, str) and given and given.isprintable():
-            there = _beside(path, given)
+            there = _resolve_path(path, given)
             if there is not None and not there.is_file():
-                yield (entry,), f"{shown(given)}: there is no such file beside this one"
+                yield (entry,), f"{quote_value(given)}: there is no such file beside this one"
 
 
-def _car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:
-    merged = _merged(tree, car)
+def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:
+    merged = _merge_layers(tree, car)
     layers: list[tuple[Where, Any]] = [(("cars", name), car), (("defaults",), tree.get("defaults"))]
     if isinstance(car.get("type"), str):
-        layers.insert(1, (("types", car["type"]), _mapping(tree.get("types")).get(car["type"])))
+        layers.insert(1, (("types", car["type"]), _as_mapping(tree.get("types")).get(car["type"])))
     limits = merged["limits"]
     low, critical = limits.get("battery_low_v", LOW_V), limits.get("battery_critical_v", CRITICAL_V)
     if isinstance(low, int | float) and isinstance(critical, int | float) and critical > low:
-        said = (
-            {"battery_low_v", "battery_critical_v"} & _mapping(_mapping(layer).get("limits")).keys()
+        given_limits = (
+            {"battery_low_v", "battery_critical_v"} & _as_mapping(_as_mapping(layer).get("limits")).keys()
             for _, layer in layers
         )
-        at = next(where for (where, _), there in zip(layers, said, strict=True) if there)
+        at = next(where for (where, _), there in zip(layers, given_limits, strict=True) if there)
         yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}: it is at most that"
     platform, given = merged.get("platform", AUTO), merged.get("capabilities")
     if car.get("link") == LinkKind.SIMULATED and str(platform).partition("+")[0] in (AUTO, Platform.UNKNOWN):
@@ -206,14 +209,14 @@ def _car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, An
     try:
         had = profile_capabilities(platform)
     except ValueError:
-        return  # the platform's own fault
+        return  # reported as a fault of the platform
     if missing := [word for word in given if isinstance(word, str) and word in CAPABILITIES and word not in had]:
-        at = next(where for where, layer in layers if {"platform", "capabilities"} & _mapping(layer).keys())
+        at = next(where for where, layer in layers if {"platform", "capabilities"} & _as_mapping(layer).keys())
         words = f"{', '.join(missing)}: no {platform} car has it; allowed are {', '.join(sorted(had))}"
-        yield (*at, "capabilities") if "capabilities" in _mapping(dict(layers)[at]) else at, words
+        yield (*at, "capabilities") if "capabilities" in _as_mapping(dict(layers)[at]) else at, words
 
 
-def _one_port(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Where, str]]:
+def _find_shared_ports(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Where, str]]:
     links: dict[str, LinkUrl] = {}
     for name, car in cars.items():
         given = car.get("link")
@@ -221,11 +224,11 @@ def _one_port(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Where, st
             try:
                 links[name] = parse_link(given)
             except BadLink:
-                continue  # the link's own fault
+                continue  # reported as a fault of the link
     for first, second in shared_ports(links):
-        words = f"{shown(cars[second]['link'])} may be the port of {first}: every car has a port of its own"
+        words = f"{quote_value(cars[second]['link'])} may be the port of {first}: every car has a port of its own"
         yield ("cars", second, "link"), words
 
 
-def _mapping(value: Any) -> Mapping[str, Any]:
+def _as_mapping(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}

@@ -1,8 +1,8 @@
-"""Whether the links of a fleet file are there: looked at, never opened where that could move, reset or end anything.
+"""Checks the links of a fleet file without opening any that could move, reset or end a car.
 
-A serial port is not opened: that resets an Arduino. A Raspberry Pi car's TCP port is not connected to: its program ends
-when the connection does, and the motors stay as they were; its host is asked instead. A car that a gateway serves is
-left to it. See docs/reference/protocol.md#hazards-of-raspberry-pi-programs.
+Opening a serial port resets an Arduino. Closing a connection to a Raspberry Pi car ends its program while the motors go
+on (docs/reference/protocol.md#hazards-of-raspberry-pi-programs), so only its host is checked. A car with a gateway is
+checked by the gateway's state.
 """
 
 import errno
@@ -20,18 +20,19 @@ from fleet.fleetfile.fleet_file import FleetCar
 from fleet.links import LinkKind, LinkUrl, parse_link
 from gateway.protocol.platforms import Platform
 
-PATIENCE_S: Final = 3.0
-DISCARD: Final = 9
-"""A port that nothing listens on: a host that is there refuses it at once."""
+HOST_TIMEOUT_S: Final = 3.0
+"""Timeout for the reply of a host."""
+CLOSED_PORT: Final = 9
+"""A TCP port without a listener (discard): a reachable host refuses a connection at once."""
 _LOCK: Final = re.compile(r"FLOCK .* (?P<pid>-?\d+) (?P<major>[0-9a-f]+):(?P<minor>[0-9a-f]+):(?P<inode>\d+) ")
 _LOCKS: Final = Path("/proc/locks")
-_BRIDGED: Final = (Platform.ARDUINO, Platform.STM32)
-"""Platforms without a network of their own: their TCP port is a bridge's, which outlives its clients."""
+_BRIDGED_PLATFORMS: Final = (Platform.ARDUINO, Platform.STM32)
+"""Platforms without a network: their TCP port belongs to a bridge, which outlives its clients."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkCheck:
-    """What was found of one car's link."""
+    """The result of the check of one car's link."""
 
     car: str
     link: str
@@ -39,55 +40,55 @@ class LinkCheck:
     words: str
 
 
-def look(car: FleetCar, served: Mapping[str, tuple[str, str]]) -> LinkCheck:
-    """Look at a car's link, for about `PATIENCE_S`. `served`: state and reason of the links of cars with a gateway."""
+def check_link(car: FleetCar, served: Mapping[str, tuple[str, str]]) -> LinkCheck:
+    """Check a car's link within HOST_TIMEOUT_S. `served`: state and reason of the links of cars with a gateway."""
     if car.name in served:
         state, reason = served[car.name]
         ok = state in ("online", "quiet")
         words = f"its gateway runs, the link is {state}" + (f": {reason}" if reason and not ok else "")
         return LinkCheck(car.name, car.link, ok, words)
-    ok, words = _look(parse_link(car.link), car.platform)
+    ok, words = _check(parse_link(car.link), car.platform)
     return LinkCheck(car.name, car.link, ok, words)
 
 
-def _look(link: LinkUrl, platform: str) -> tuple[bool, str]:
+def _check(link: LinkUrl, platform: str) -> tuple[bool, str]:
     match link.kind:
         case LinkKind.SIMULATED:
             return True, "`fleet up` simulates it"
         case LinkKind.DEVICE:
-            return device(link.where)
+            return check_device(link.where)
         case LinkKind.USB:
-            return _usb(link)
+            return _check_usb(link)
         case LinkKind.TCP:
-            return _tcp(link, platform)
+            return _check_tcp(link, platform)
         case LinkKind.BLE:
-            return _ble()
+            return _check_ble()
 
 
-def device(path: str) -> tuple[bool, str]:
-    """Whether a serial port is there, may be used and is free; nothing is opened."""
+def check_device(path: str) -> tuple[bool, str]:
+    """Return whether a serial port exists, is permitted and is free, with the words. Nothing is opened."""
     if os.name != "posix":
-        there = path.upper() in map(str.upper, _ports())
-        return there, "the port is there; not opened" if there else "there is no such port: plug the car in"
+        is_listed = path.upper() in map(str.upper, _list_ports())
+        return is_listed, "the port is there; not opened" if is_listed else "there is no such port: plug the car in"
     try:
-        found = Path(path).stat()
+        file_stat = Path(path).stat()
     except OSError as error:
         if error.errno == errno.ENOENT:
             return False, "there is no such device: plug the car in, switch it on, or bind it again (fleet bind)"
         return False, f"cannot be looked at: {error.strerror}"
-    if not stat.S_ISCHR(found.st_mode):
+    if not stat.S_ISCHR(file_stat.st_mode):
         return False, "is no serial port but a file or directory"
     if not os.access(path, os.R_OK | os.W_OK):
-        group = _group(found.st_gid)
+        group = _group_name(file_stat.st_gid)
         return False, f"no permission: join the group {group} (sudo usermod -aG {group} $USER), then log in again"
-    holder = _holder(found)
+    holder = _lock_holder(file_stat)
     if holder is not None:
         return False, f"in use by another program{holder}: end that first"
     free = "free" if _LOCKS.exists() else "whether it is free is not known here"
     return True, f"there, permitted, {free}; not opened, which can reset a car"
 
 
-def _group(number: int) -> str:
+def _group_name(number: int) -> str:
     try:
         import grp
     except ImportError:  # not POSIX
@@ -98,13 +99,13 @@ def _group(number: int) -> str:
         return str(number)
 
 
-def _holder(found: os.stat_result) -> str | None:
-    """Who has locked a device, as gateways do; None if nobody has, or the system does not tell (Linux does)."""
+def _lock_holder(file_stat: os.stat_result) -> str | None:
+    """Return which process has locked a device, as gateways do; None if none has, or it is unknown (not Linux)."""
     try:
         locks = _LOCKS.read_text(encoding="ascii", errors="replace")
     except OSError:
         return None
-    place = (os.major(found.st_dev), os.minor(found.st_dev), found.st_ino)
+    place = (os.major(file_stat.st_dev), os.minor(file_stat.st_dev), file_stat.st_ino)
     for line in locks.splitlines():
         lock = _LOCK.search(line)
         if lock and (int(lock["major"], 16), int(lock["minor"], 16), int(lock["inode"])) == place:
@@ -112,42 +113,42 @@ def _holder(found: os.stat_result) -> str | None:
     return None
 
 
-def _ports() -> list[str]:
+def _list_ports() -> list[str]:
     from serial.tools import list_ports
 
     return [str(port.device) for port in list_ports.comports()]
 
 
-def _usb(link: LinkUrl) -> tuple[bool, str]:
+def _check_usb(link: LinkUrl) -> tuple[bool, str]:
     from serial.tools import list_ports
 
-    asked = dict(link.ids)
-    fit = []
+    ids_wanted = dict(link.ids)
+    matching = []
     for port in list_ports.comports():
         ids = {"serial": port.serial_number or ""}
         if port.vid is not None and port.pid is not None:
             ids |= {"vid": f"{port.vid:04x}", "pid": f"{port.pid:04x}"}
-        if asked.items() <= ids.items():
-            fit.append(str(port.device))
-    if not fit:
+        if ids_wanted.items() <= ids.items():
+            matching.append(str(port.device))
+    if not matching:
         return False, "no such USB device is plugged in: plug the car in, or bind it again (fleet bind)"
-    if len(fit) > 1:
-        return False, f"{len(fit)} devices fit ({', '.join(sorted(fit))}): add a serial= that only one has"
-    ok, words = device(fit[0])
-    return ok, f"{fit[0]}: {words}"
+    if len(matching) > 1:
+        return False, f"{len(matching)} devices fit ({', '.join(sorted(matching))}): add a serial= that only one has"
+    ok, words = check_device(matching[0])
+    return ok, f"{matching[0]}: {words}"
 
 
-def _tcp(link: LinkUrl, platform: str) -> tuple[bool, str]:
-    bridge = platform.partition("+")[0] in _BRIDGED
+def _check_tcp(link: LinkUrl, platform: str) -> tuple[bool, str]:
+    bridge = platform.partition("+")[0] in _BRIDGED_PLATFORMS
     port = int(dict(link.ids)["port"])
     try:
-        with socket.create_connection((link.where, port if bridge else DISCARD), timeout=PATIENCE_S):
+        with socket.create_connection((link.where, port if bridge else CLOSED_PORT), timeout=HOST_TIMEOUT_S):
             pass
     except ConnectionRefusedError:
         if bridge:
             return False, f"{link.where} is there, and nothing listens on port {port}: start the car's bridge"
     except TimeoutError:
-        return False, f"no answer from {link.where} within {PATIENCE_S:g} s: switch the car on, join its network"
+        return False, f"no answer from {link.where} within {HOST_TIMEOUT_S:g} s: switch the car on, join its network"
     except (OSError, UnicodeError) as error:  # UnicodeError: a name that DNS cannot express
         words = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         return False, f"{link.where}: {words}: switch the car on, join its network"
@@ -156,7 +157,7 @@ def _tcp(link: LinkUrl, platform: str) -> tuple[bool, str]:
     return True, f"{link.where} is there; not connected to port {port}, which would end the car's program"
 
 
-def _ble() -> tuple[bool, str]:
+def _check_ble() -> tuple[bool, str]:
     if find_spec("bleak") is None:
         return False, "needs Bluetooth, which is not installed: pip install 'zenoh-car-fleet[ble]'"
     return True, "Bluetooth is installed; whether the car is near, `gateway scan` shows"

@@ -1,6 +1,6 @@
-"""What may stand in a fleet file: its models, field by field, and the JSON Schema that editors take. Pure.
+"""The models of a fleet file, field by field, and its JSON Schema for editors. Pure.
 
-What the fields mean together is `config`'s part.
+fleet_file.py checks contradictions between fields.
 """
 
 from enum import StrEnum
@@ -13,43 +13,43 @@ from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import AUTO, OPTIONS, Platform, parse_platform, parse_told
 from schemas import bus, keys
 from schemas.yaml_document.document import Entry
-from schemas.yaml_document.messages import shown
+from schemas.yaml_document.messages import quote_value
 
-LONGEST_DRIVE_S: Final = 10.0
+DEFAULT_MAX_DRIVE_S: Final = 10.0
 LOW_V, CRITICAL_V = 7.0, 6.6
 EMPTY_V, FULL_V = 6.4, 8.4  # docs/reference/protocol.md#readings: two Li-ion cells
 
 
 class BatteryAction(StrEnum):
-    """What a battery's level leads to, as `gateway run --battery-low` takes it."""
+    """The reaction to a battery's level, a value of `gateway run --battery-low`."""
 
     WARN = "warn"
     REFUSE = "refuse"
     STOP = "stop"
 
 
-def checked_name(name: str) -> str:
-    """A car's, type's, role's or fleet's name; else ValueError."""
+def validate_name(name: str) -> str:
+    """Return the name of a car, type, role or fleet if it is valid; raises ValueError."""
     return keys.check_name(name, "name")
 
 
-def checked_link(text: str) -> str:
-    """A link's text, which parse_link takes; else ValueError."""
+def validate_link(text: str) -> str:
+    """Return a link if parse_link accepts it; raises ValueError."""
     try:
         parse_link(text)
     except BadLink as error:
-        raise ValueError(f"{shown(text)} is not allowed, {error}: {ALLOWED}") from None
+        raise ValueError(f"{quote_value(text)} is not allowed, {error}: {ALLOWED}") from None
     return text
 
 
-def checked_platform(text: str) -> str:
-    """A platform's words, auto among them; else ValueError."""
+def validate_platform(text: str) -> str:
+    """Return a platform (or auto) if it is valid; raises ValueError."""
     parse_told(text)
     return text
 
 
-def checked_endpoint(text: str) -> str:
-    """The bus's endpoint; else ValueError."""
+def validate_endpoint(text: str) -> str:
+    """Return the bus endpoint if it is valid; raises ValueError."""
     return bus.resolve_endpoint(text) if text else _bad_endpoint()
 
 
@@ -57,19 +57,19 @@ def _bad_endpoint() -> str:
     raise ValueError("'' is not allowed: write tcp/HOST:PORT, or leave it out")
 
 
-def checked_colour(text: str) -> str:
-    """A colour as #rrggbb, in small letters; else ValueError."""
+def validate_color(text: str) -> str:
+    """Return a color as #rrggbb in lower case; raises ValueError."""
     if len(text) != 7 or text[0] != "#" or set(text[1:].lower()) - set("0123456789abcdef"):
         raise ValueError(
-            f'{shown(text)} is not allowed: a colour in quotes as "#e01b24", red, green and blue from 00 to ff'
+            f'{quote_value(text)} is not allowed: a colour in quotes as "#e01b24", red, green and blue from 00 to ff'
         )
     return text.lower()
 
 
-def checked_path(text: str) -> str:
-    """A path's text; else ValueError."""
+def validate_path(text: str) -> str:
+    """Return a path if it is printable; raises ValueError."""
     if not text or not text.isprintable():
-        raise ValueError(f"{shown(text)} is not allowed: a path, from the place of this file")
+        raise ValueError(f"{quote_value(text)} is not allowed: a path, from the place of this file")
     return text
 
 
@@ -78,37 +78,41 @@ CAPABILITIES: Final = tuple(sorted(PARTS | set(Mode)))
 Capability = StrEnum("Capability", {word: word for word in CAPABILITIES})  # type: ignore[misc]  # the words are the platforms' own
 _PLATFORMS: Final = f"^({'|'.join((AUTO, *Platform))})([+]({'|'.join(sorted(OPTIONS))}))*$"
 
-_Name = Annotated[str, AfterValidator(checked_name), Field(json_schema_extra={"pattern": "^[a-z0-9][a-z0-9_-]{0,31}$"})]
-_Link = Annotated[str, AfterValidator(checked_link), Field(examples=["/dev/ttyUSB0", "tcp://192.168.1.7:8888"])]
-_Platform = Annotated[str, AfterValidator(checked_platform), Field(json_schema_extra={"pattern": _PLATFORMS})]
-_Colour = Annotated[str, AfterValidator(checked_colour), Field(json_schema_extra={"pattern": "^#[0-9a-fA-F]{6}$"})]
-_Path = Annotated[str, AfterValidator(checked_path)]
+_Name = Annotated[
+    str, AfterValidator(validate_name), Field(json_schema_extra={"pattern": "^[a-z0-9][a-z0-9_-]{0,31}$"})
+]
+_Link = Annotated[str, AfterValidator(validate_link), Field(examples=["/dev/ttyUSB0", "tcp://192.168.1.7:8888"])]
+_Platform = Annotated[str, AfterValidator(validate_platform), Field(json_schema_extra={"pattern": _PLATFORMS})]
+_Colour = Annotated[str, AfterValidator(validate_color), Field(json_schema_extra={"pattern": "^#[0-9a-fA-F]{6}$"})]
+_Path = Annotated[str, AfterValidator(validate_path)]
 _Volts = Annotated[float, Field(ge=EMPTY_V, le=FULL_V)]
 
 
 class LimitsEntry(Entry):
-    """What a car is kept within."""
+    """The limits of a car."""
 
     longest_drive_s: float = Field(
-        default=LONGEST_DRIVE_S, gt=0, le=3600, description="longest duration of a drive, seconds"
+        default=DEFAULT_MAX_DRIVE_S, gt=0, le=3600, description="longest duration of a drive, seconds"
     )
     speed_max: float = Field(default=1.0, gt=0, le=1, description="1 is the car's fastest, 0.5 half of it")
     battery_low_v: _Volts = Field(default=LOW_V, description="below this the battery is low, volts at rest")
     battery_critical_v: _Volts = Field(default=CRITICAL_V, description="below this it is critical, volts at rest")
-    on_battery_low: BatteryAction = Field(default=BatteryAction.WARN, description="what a low battery leads to")
-    on_battery_critical: BatteryAction = Field(default=BatteryAction.REFUSE, description="what a critical one leads to")
+    on_battery_low: BatteryAction = Field(default=BatteryAction.WARN, description="reaction to a low battery")
+    on_battery_critical: BatteryAction = Field(
+        default=BatteryAction.REFUSE, description="reaction to a critical battery"
+    )
 
 
 class CommonEntry(Entry):
-    """What defaults, types and cars may all say."""
+    """Fields of defaults, types and cars."""
 
-    # A default here is for editors, or empty: which layer said what is known from the text.
+    # Defaults are for editors only, or empty. fleet_file.py merges the layers from the text.
     platform: _Platform = Field(default=AUTO, description="its program, with +arm, +imu; auto: its gateway finds out")
     colour: _Colour = Field(default_factory=str, description='in tables and pictures, in quotes: "#e01b24"')
     capabilities: list[Capability] = Field(
         default_factory=list, description="modes and parts to use, fewer than it has"
     )
-    limits: LimitsEntry = Field(default_factory=LimitsEntry, description="what it is kept within")
+    limits: LimitsEntry = Field(default_factory=LimitsEntry, description="its limits")
     roles: list[_Name] = Field(default_factory=list, description="roles of the plan that it may take; left out: any")
 
 
@@ -116,14 +120,14 @@ class CarEntry(CommonEntry):
     """One car."""
 
     type: str = Field(default_factory=str, description="one of the types above")
-    link: _Link = Field(default_factory=str, description="how it is reached; `gateway scan` shows links")
+    link: _Link = Field(default_factory=str, description="address of the car; `gateway scan` shows links")
 
 
 class FileEntry(Entry):
     """A fleet of cars, for `fleet up`."""
 
     name: _Name = Field(default=keys.DEFAULT_FLEET, description="the first part of every key")
-    endpoint: Annotated[str, AfterValidator(checked_endpoint)] = Field(
+    endpoint: Annotated[str, AfterValidator(validate_endpoint)] = Field(
         default_factory=str, description="the bus, tcp/HOST:PORT; left out: FLEET_ENDPOINT, or loopback"
     )
     plan: _Path = Field(default_factory=str, description="what the fleet should do, a file")
@@ -138,13 +142,13 @@ class FileEntry(Entry):
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema of fleet files, for editors."""
+    """Return the JSON Schema of fleet files, for editors."""
     made = _untitled(FileEntry.model_json_schema())
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "fleet file", **made}
 
 
 def _untitled(part: Any) -> Any:
-    """Without the titles that pydantic makes of names: an editor shows them instead of what is said of a field."""
+    """Remove the titles that pydantic makes of names: editors show them instead of the descriptions."""
     if isinstance(part, list):
         return [_untitled(each) for each in part]
     if not isinstance(part, dict):

@@ -1,4 +1,4 @@
-"""What `gateway scan` finds, run as a process, and a fleet file written of it."""
+"""Runs `gateway scan` as a process, and writes a fleet file from its results."""
 
 import json
 import subprocess
@@ -10,21 +10,21 @@ from typing import Any, Final
 from fleet.links import LinkKind, parse_link
 from gateway.protocol.platforms import AUTO, Platform
 
-LIKELY: Final = ("car", "ble", "given")
-POSSIBLE: Final = (*LIKELY, "silent", "busy")
-"""Verdicts of what may be a car: one that is off, in a silent mode, or served already, says nothing to a scan.
+LIKELY_VERDICTS: Final = ("car", "ble", "given")
+POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, "silent", "busy")
+"""Verdicts on links that may be a car's: a scan receives nothing from a car that is off, silent or served already.
 
-`ble`: has the service of a car's module. `given`: was not listened to."""
+`ble`: a Bluetooth device with the service of a car's module. `given`: typed by the user and not scanned."""
 SCHEMA_URL: Final = "fleet.schema.json"
 
 
 class ScanFailed(Exception):
-    """`gateway scan` could not look; the text is what it said."""
+    """`gateway scan` failed; the text says why."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundLink:
-    """A link that may be a car's. verdict: of `POSSIBLE`. platform: as it was told from readings, else `auto`."""
+    """A link that may be a car's. verdict: one of POSSIBLE_VERDICTS. platform: detected from readings, or `auto`."""
 
     url: str
     verdict: str
@@ -34,7 +34,7 @@ class FoundLink:
 
 @dataclass(frozen=True, slots=True)
 class NewCar:
-    """A car as a new file has it."""
+    """A car in a new fleet file."""
 
     name: str
     link: str
@@ -44,9 +44,9 @@ class NewCar:
 
 
 def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
-    """What may be a car: of these links, or of all ports and Bluetooth devices; raises ScanFailed.
+    """Scan these links, or all ports and Bluetooth devices, for cars; raises ScanFailed.
 
-    TCP and Bluetooth links are taken as they are given: where a TCP connection ends, a car's program may end, too.
+    Typed TCP and Bluetooth links are not scanned: closing a TCP connection may end the car's program.
     """
     given = [link for link in links if parse_link(link).kind not in (LinkKind.DEVICE, LinkKind.USB)]
     taken = [FoundLink(link, "given", "not listened to") for link in dict.fromkeys(given)]
@@ -62,7 +62,7 @@ def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
     if done.returncode and not (links and done.returncode == 1):  # 1: one of the links could not be listened to
         raise ScanFailed("`gateway scan` could not look, see above")
     found = [_found(json.loads(line)) for line in done.stdout.splitlines()]
-    return [*(each for each in found if each.verdict in POSSIBLE), *taken]
+    return [*(each for each in found if each.verdict in POSSIBLE_VERDICTS), *taken]
 
 
 def _found(fields: Mapping[str, Any]) -> FoundLink:
@@ -74,27 +74,27 @@ def _found(fields: Mapping[str, Any]) -> FoundLink:
 
 
 def _printable(text: str | None) -> str:
-    """Text that a device has chosen, for one line of a terminal or a file."""
+    """Return a device's text without control characters, for one line of a terminal or a file."""
     return "".join(each for each in text or "" if each.isprintable())
 
 
-def quoted(text: str) -> str:
-    """A scalar that YAML takes back as this text, whatever is in it."""
+def quote(text: str) -> str:
+    """Format any text as a YAML scalar."""
     return json.dumps(text, ensure_ascii=False)
 
 
-def key(name: str) -> str:
-    """A car's name as a key that YAML takes for a word: `10` would be a number, `null` nothing."""
-    return name if name[0].isalpha() and name not in ("null", "true", "false") else quoted(name)
+def format_key(name: str) -> str:
+    """Format a car's name as a YAML key, in quotes where YAML would read a number (`10`) or nothing (`null`)."""
+    return name if name[0].isalpha() and name not in ("null", "true", "false") else quote(name)
 
 
-def new_file(cars: Sequence[NewCar], name: str) -> str:
-    """The text of a fleet file with these cars."""
+def format_new_file(cars: Sequence[NewCar], name: str) -> str:
+    """Return the text of a fleet file with these cars."""
     lines = [
         f"# yaml-language-server: $schema={SCHEMA_URL}",
         "# A fleet of cars. `fleet check` looks whether it is right and the cars are there, `fleet up` starts it,",
         "# `fleet schema > fleet.schema.json` lets an editor help.",
-        f"name: {quoted(name)}",
+        f"name: {quote(name)}",
         "# plan: plan.yaml           # what the cars shall do; `fleet plan check plan.yaml`",
         "# recordings: sessions      # where `fleet up` records; record: false to leave it",
         "",
@@ -107,9 +107,9 @@ def new_file(cars: Sequence[NewCar], name: str) -> str:
     ]
     for car in cars:
         about = car.words.partition(":")[0]
-        lines.append(f"  {key(car.name)}:" + (f"  # {about}" if about else ""))
-        lines.append(f"    link: {quoted(car.link)}")
+        lines.append(f"  {format_key(car.name)}:" + (f"  # {about}" if about else ""))
+        lines.append(f"    link: {quote(car.link)}")
         lines.append(f"    platform: {car.platform}" + ("  # its gateway finds out" if car.platform == AUTO else ""))
-        lines.append(f"    colour: {quoted(car.colour)}")
+        lines.append(f"    colour: {quote(car.colour)}")
         lines.append("    # roles: [patrol]       # of the plan; left out: any")
     return "\n".join(lines) + "\n"

@@ -1,5 +1,6 @@
-"""What a plan decides for the cars. Pure: readings in, decisions out.
+"""Decides by a plan what the cars should do. Pure: readings in, decisions out.
 
-Read `plan.plan` (the values) first, then `rules` (which apply now), `allocation` (who takes which role), `decide` (one
-step) and `explain` (the step in words). `snapshot` is what is known of the cars, `state` what lasts between steps.
+Read `plan.plan` (the values) first, then `rules` (which are in force), `allocation` (which car takes which role),
+`decide` (one step) and `explain` (the step in words). `snapshot` is the knowledge of the cars, `state` lasts between
+steps.
 """

@@ -1,7 +1,7 @@
-"""Which roles are open, who may take which, and who does. Pure; times in s.
+"""Gives open roles to cars. Pure; times in s.
 
-To keep a place filled counts for most (of one priority the places that are counted, before those for all that are
-left), then that nobody who has a role loses it, then that few cars change their mode, then the order in the plan.
+Filled places count most; of one priority, counted places come before those of a role for all cars. Next count
+current holders, then few mode changes, then the order in the plan.
 """
 
 from collections.abc import Mapping
@@ -12,57 +12,58 @@ from fleet.conditions import Expression
 from fleet.policy.assignment import assign
 from fleet.policy.debounce import Settled, settle
 from fleet.policy.plan.plan import Plan, Role
-from fleet.policy.snapshot import CONTRADICTED, NOBODY, CarSnapshot, FleetSnapshot
+from fleet.policy.snapshot import CONTRADICTED, UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 
-REFUSED_S: Final = 10.0
-"""So long a car that refused a mode is not asked for it again."""
+REFUSED_MODE_RETRY_S: Final = 10.0
+"""Interval before a car is asked again for a mode that it refused."""
 _REFUSALS: Final = frozenset({"battery_low", "unsupported", "link_down", "write_failed"})
-"""Reasons that lie with the car; a hold or a lease its states tell."""
-_SLOT: Final = "/"
-"""At the end of a role's name: a place in it in place of another role's."""
-_KEEP: Final = 1_000_000_000
-_SWITCH: Final = 1_000_000
-_DOUBT: Final = 10_000
-"""Each worth more than all of the next together."""
+"""Reasons that lie with the car. Holds and leases are known from its states."""
+_STAND_IN: Final = "/"
+"""Suffix of a role's name for a place in it that stands in for another role."""
+_ROLE_LOSS_COST: Final = 1_000_000_000
+_MODE_CHANGE_COST: Final = 1_000_000
+_LINK_DOUBT_COST: Final = 10_000
+"""Each of these costs is worth more than all lower ones together."""
 
 
 @dataclass(frozen=True, slots=True)
 class Barrier:
-    """Why not, and what would change it."""
+    """Why a car may not do something, and what would change that."""
 
     why: str
     change: str
     looks_at: Expression | None = None
-    """What it was seen by."""
+    """The expression that it follows from."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """The cars to be given roles, and what is known of each."""
+    """The cars to be given roles, with all that decides who may have which."""
 
     plan: Plan
-    picture: FleetSnapshot
+    snapshot: FleetSnapshot
     free: tuple[str, ...]
     reserved: Mapping[str, str]
-    """Cars that cannot be asked just now, and the role that is kept for each."""
-    has: Mapping[str, str]
-    """The role that each car has had."""
-    in_vain: frozenset[str]
-    """Cars that were asked for their mode more than once, and are not in it."""
+    """Cars that cannot be commanded for a moment, each with the role that it keeps."""
+    roles_before: Mapping[str, str]
+    """The role of each car before this step."""
+    unresponsive: frozenset[str]
+    """Cars that were commanded into their mode more than once and are not in it."""
     pinned: Mapping[str, tuple[str, str]]
-    """The only role that a rule leaves a car, and the rule's name."""
+    """By car: the only role that a rule lets it have, and the rule's name."""
     in_force: frozenset[str]
+    """The roles that count in this phase."""
     needs: Mapping[tuple[str, str], Settled]
     now: float
 
     def seen(self, car: str, barrier: Barrier | None) -> tuple[str, ...]:
-        """The readings that a barrier was seen by."""
+        """Return the readings that a barrier follows from."""
         if barrier is None or barrier.looks_at is None:
             return ()
-        return self.picture.used(barrier.looks_at, car, self.now)
+        return self.snapshot.used(barrier.looks_at, car, self.now)
 
     def barrier(self, car: str, role: Role) -> Barrier | None:
-        """Why this car may not have this role."""
+        """Return why this car may not have this role, None if it may."""
         name = role.name
         pinned = self.pinned.get(car)
         if pinned is not None and pinned[0] != name:
@@ -71,8 +72,8 @@ class Candidates:
             return Barrier("the plan does not give it to this car", "another plan")
         if role.on_call and pinned is None and not any(name == other.fallback for other in self.plan.roles.values()):
             return Barrier("only a rule gives it", "such a rule coming true")
-        known = self.picture.cars.get(car, NOBODY)
-        return unfit(known, role, self.now) or self._needy(car, role, known)
+        known = self.snapshot.cars.get(car, UNKNOWN_CAR)
+        return find_barrier(known, role, self.now) or self._needy(car, role, known)
 
     def _needy(self, car: str, role: Role, known: CarSnapshot) -> Barrier | None:
         if role.needs is None:
@@ -82,15 +83,15 @@ class Candidates:
             return None
         if settled is not None:
             return Barrier(f"it needs {role.needs_text}", role.needs_text, role.needs)
-        # In most modes little is measured: what is in the role's mode already is not taken out of it to find out.
-        if self.has.get(car) == role.name or (car not in self.has and known.mode == role.mode):
+        # Most modes measure little. A car that is in the role's mode already is not taken out of it to find out.
+        if self.roles_before.get(car) == role.name or (car not in self.roles_before and known.mode == role.mode):
             return None
         why, change = f"it needs {role.needs_text}, and that is not known", f"{role.needs_text} being measured"
         return Barrier(why, change, role.needs)
 
 
-def unfit(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
-    """What a car is, or has said, that keeps it from a role whatever its readings."""
+def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
+    """Return what keeps a car from a role whatever its readings, None if nothing does."""
     if known.roles is not None and role.name not in known.roles:
         return Barrier("the fleet file does not let it take this role", "the fleet file")
     profile = known.profile
@@ -111,7 +112,7 @@ def unfit(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
         refused is not None
         and refused.mode == role.mode
         and refused.reason in _REFUSALS
-        and now - refused.at < REFUSED_S
+        and now - refused.at < REFUSED_MODE_RETRY_S
     ):
         return Barrier(f"it refused mode {refused.mode}: {refused.reason}: {refused.words}", "asking again after 10 s")
     return None
@@ -119,23 +120,23 @@ def unfit(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
 
 @dataclass(frozen=True, slots=True)
 class RoleAllocation:
-    """Who has which role, and the places that there are."""
+    """Which car has which role, and how many places each role has."""
 
     roles: Mapping[str, str]
     places: Mapping[str, int]
     stands_in: Mapping[str, str]
-    """Roles that have more places than they want themselves, and for which role."""
+    """Roles with extra places, each with the role that it stands in for."""
 
     def holders(self, role: str) -> list[str]:
-        """The cars that have it."""
+        """Return the cars that have this role."""
         return [car for car, name in self.roles.items() if name == role]
 
 
 def follow_needs(
-    plan: Plan, picture: FleetSnapshot, cars: tuple[str, ...], before: Mapping[tuple[str, str], Settled], now: float
+    plan: Plan, snapshot: FleetSnapshot, cars: tuple[str, ...], before: Mapping[tuple[str, str], Settled], now: float
 ) -> dict[tuple[str, str], Settled]:
-    """Whether each car has what each role needs; a value that nothing measures now counts as it was."""
-    found = {}
+    """Evaluate the needs of each role for each car. A value that is not measured now counts as it was."""
+    result = {}
     values: dict[tuple[str, str], bool | None] = {}
     for role in plan.roles.values():
         if role.needs is None:
@@ -144,28 +145,32 @@ def follow_needs(
             if plan.may(car, role):
                 same = role.needs_text, car
                 if same not in values:
-                    values[same] = picture.holds(role.needs, car, now, old=True)
+                    values[same] = snapshot.holds(role.needs, car, now, old=True)
                 so = values[same]
                 settled = settle(before.get((car, role.name)), so, now)
                 if settled is not None:
-                    found[car, role.name] = settled
-    return found
+                    result[car, role.name] = settled
+    return result
 
 
-def fill(staff: Candidates) -> RoleAllocation:
-    """Give the roles in force to cars; a role with a fallback that cannot be filled opens as many places there."""
-    plan, cars = staff.plan, (*staff.free, *staff.reserved)
-    wanted = {name: _wanted(staff, plan.roles[name], len(cars)) for name in plan.roles if name in staff.in_force}
-    costs = _costs(staff)
-    places, stands_in = dict(wanted), dict[str, str]()
+def allocate(candidates: Candidates) -> RoleAllocation:
+    """Give the roles in force to cars. A role that lacks cars opens as many places in its fallback."""
+    plan, cars = candidates.plan, (*candidates.free, *candidates.reserved)
+    counts = {
+        name: _count_places(candidates, plan.roles[name], len(cars))
+        for name in plan.roles
+        if name in candidates.in_force
+    }
+    costs = _costs(candidates)
+    places, stands_in = dict(counts), dict[str, str]()
     while True:
-        open_ = {name: min(places[name], wanted.get(name, 0)) for name in plan.roles if name in places}
-        open_ |= {f"{name}{_SLOT}": places[name] - count for name, count in open_.items() if places[name] > count}
-        roles = {car: place.removesuffix(_SLOT) for car, place in assign(costs, open_).items()}
-        more = dict(wanted)
+        open_ = {name: min(places[name], counts.get(name, 0)) for name in plan.roles if name in places}
+        open_ |= {f"{name}{_STAND_IN}": places[name] - count for name, count in open_.items() if places[name] > count}
+        roles = {car: place.removesuffix(_STAND_IN) for car, place in assign(costs, open_).items()}
+        more = dict(counts)
         for name in _fallback_order(plan):
             role = plan.roles[name]
-            # A role of any number of cars lacks one only when it has none.
+            # A role for any number of cars lacks one only when it has none.
             lacks = max(0, (1 if role.count is None else more.get(name, 0)) - list(roles.values()).count(name))
             if role.fallback is not None and name in more and lacks:
                 more[role.fallback] = more.get(role.fallback, 0) + lacks
@@ -173,20 +178,20 @@ def fill(staff: Candidates) -> RoleAllocation:
         more = {name: max(count, places.get(name, 0)) for name, count in more.items()}
         if more == places:
             return RoleAllocation(
-                roles, places, {name: of for name, of in stands_in.items() if places[name] > wanted.get(name, 0)}
+                roles, places, {name: of for name, of in stands_in.items() if places[name] > counts.get(name, 0)}
             )
         places = more
 
 
-def _wanted(staff: Candidates, role: Role, cars: int) -> int:
+def _count_places(candidates: Candidates, role: Role, cars: int) -> int:
     count = cars if role.count is None else role.count
     if not role.on_call:
         return count
-    return min(count, sum(name == role.name for name, _ in staff.pinned.values()))
+    return min(count, sum(name == role.name for name, _ in candidates.pinned.values()))
 
 
 def _fallback_order(plan: Plan) -> list[str]:
-    """A role before the one that stands in for it."""
+    """Sort the roles so that each comes before its fallback."""
     depth = dict.fromkeys(plan.roles, 0)
     for name in plan.roles:
         at, steps = name, 0
@@ -201,52 +206,52 @@ def _rank(role: Role) -> tuple[int, bool, int]:
 
 
 def _stand_in_ranks(plan: Plan) -> dict[str, tuple[int, bool, int]]:
-    """A place in place of another is worth less than that one, and more than what is worth less than that one."""
-    found: dict[str, tuple[int, bool, int]] = {}
+    """Rank the places of each fallback just below the role that it stands in for."""
+    result: dict[str, tuple[int, bool, int]] = {}
     for name in _fallback_order(plan):
         after = plan.roles[name].fallback
         if after is not None:
-            priority, _, depth = max(_rank(plan.roles[name]), found.get(name, _rank(plan.roles[name])))
-            found[after] = max(found.get(after, (-1000, True, 0)), (priority, True, depth - 1))
-    return found
+            priority, _, depth = max(_rank(plan.roles[name]), result.get(name, _rank(plan.roles[name])))
+            result[after] = max(result.get(after, (-1000, True, 0)), (priority, True, depth - 1))
+    return result
 
 
-def _costs(staff: Candidates) -> dict[str, dict[str, int]]:
-    """What each car costs in each role that it may have."""
-    plan = staff.plan
-    cars = sorted({*staff.free, *staff.reserved})
+def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
+    """Return the cost of each car in each role that it may have."""
+    plan = candidates.plan
+    cars = sorted({*candidates.free, *candidates.reserved})
     slots = _stand_in_ranks(plan)
     every = sorted({*(_rank(role) for role in plan.roles.values()), *slots.values()})
     ranks = {rank: order for order, rank in enumerate(every)}
-    # One place of a higher rank is worth more than all of the lower ones, and any place more than all else.
-    worth = {rank: (len(cars) + 1) ** (order + 1) * _KEEP * 10 for rank, order in ranks.items()}
-    found: dict[str, dict[str, int]] = {}
+    # One place of a higher rank is worth more than all places of lower ranks, and any place more than all else.
+    worth = {rank: (len(cars) + 1) ** (order + 1) * _ROLE_LOSS_COST * 10 for rank, order in ranks.items()}
+    result: dict[str, dict[str, int]] = {}
     for car in cars:
         row: dict[str, int] = {}
-        known = staff.picture.cars.get(car, NOBODY)
+        known = candidates.snapshot.cars.get(car, UNKNOWN_CAR)
         for order, role in enumerate(plan.roles.values()):
-            # Also a role that is open only if another lacks a car: assign() takes what has places.
-            kept = staff.reserved.get(car)
-            if kept is not None:
-                pinned = staff.pinned.get(car)
-                if kept != role.name or (pinned is not None and pinned[0] != kept):
+            # Include roles that are closed now: they open if another role lacks a car. assign() looks at the places.
+            reserved_role = candidates.reserved.get(car)
+            if reserved_role is not None:
+                pinned = candidates.pinned.get(car)
+                if reserved_role != role.name or (pinned is not None and pinned[0] != reserved_role):
                     continue
-            elif staff.barrier(car, role) is not None:
+            elif candidates.barrier(car, role) is not None:
                 continue
             cost = order - worth[_rank(role)]
-            if car in staff.in_vain and known.verdict == CONTRADICTED and role.count is not None:
-                cost += _KEEP
-            elif staff.has.get(car) == role.name:
-                # Less for a place that any car has: it holds nobody back from taking over a counted one.
-                cost -= _KEEP if role.count is not None else _KEEP // 2
+            if car in candidates.unresponsive and known.verdict == CONTRADICTED and role.count is not None:
+                cost += _ROLE_LOSS_COST
+            elif candidates.roles_before.get(car) == role.name:
+                # A role for all counts half, so that its holder may take over a counted place.
+                cost -= _ROLE_LOSS_COST if role.count is not None else _ROLE_LOSS_COST // 2
             if known.mode != role.mode or known.verdict == CONTRADICTED:
-                cost += _SWITCH
+                cost += _MODE_CHANGE_COST
             if known.link != "online" and known.link != "quiet":
-                cost += _DOUBT
+                cost += _LINK_DOUBT_COST
             if role.cars is not None and car in role.cars:
                 cost += role.cars.index(car) * 10
             row[role.name] = cost
             if role.name in slots:
-                row[f"{role.name}{_SLOT}"] = cost + worth[_rank(role)] - worth[slots[role.name]]
-        found[car] = row
-    return found
+                row[f"{role.name}{_STAND_IN}"] = cost + worth[_rank(role)] - worth[slots[role.name]]
+        result[car] = row
+    return result

@@ -1,6 +1,6 @@
-"""Which car gets which role at the least cost: the Hungarian method, a role's places counted instead of listed. Pure.
+"""Assigns cars to roles at the lowest total cost: the Hungarian method with several places per role. Pure.
 
-What a role on a car costs is staffing.py's; here only the sum is made the least.
+allocation.py sets the costs.
 """
 
 from collections import deque
@@ -8,11 +8,10 @@ from collections.abc import Mapping
 
 
 def assign(costs: Mapping[str, Mapping[str, int]], places: Mapping[str, int]) -> dict[str, str]:
-    """Each car's role: at most one a car, at most `places[role]` cars a role, the sum of costs the least.
+    """Return each car's role: at most one per car, at most `places[role]` cars per role, at the lowest total cost.
 
-    `costs[car][role]` is what it costs if the car has the role; below 0 it is worth it; 0 is having none. A role that
-    the car may not have is left out. Of equal sums the order of cars and roles decides, so the same input gives the
-    same answer.
+    `costs[car][role]` is the cost of the car in the role; no role costs 0. Roles that the car may not have are left
+    out. Equal sums are decided by the order of cars and roles, so the result is deterministic.
     """
     matching = _Matching(costs, places)
     for car in costs:
@@ -21,7 +20,7 @@ def assign(costs: Mapping[str, Mapping[str, int]], places: Mapping[str, int]) ->
 
 
 class _Matching:
-    """The best assignment of the cars so far; each insert finds the cheapest chain of moves that makes room."""
+    """The best assignment of the cars inserted so far."""
 
     def __init__(self, costs: Mapping[str, Mapping[str, int]], places: Mapping[str, int]) -> None:
         self._places = places
@@ -31,7 +30,8 @@ class _Matching:
         self.members: dict[str, list[str]] = {role: [] for role in places}
 
     def insert(self, car: str) -> None:
-        """Find the cheapest way to let this car in: Bellman-Ford over the roles, for some moves are worth something."""
+        """Insert a car by the cheapest chain of moves that makes room for it."""
+        # Bellman-Ford over the roles, as some moves have a negative cost.
         costs = self._costs[car]
         reached: dict[str | None, int] = {None: 0}
         reached.update(costs)

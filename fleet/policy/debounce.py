@@ -1,53 +1,53 @@
-"""What is so for long enough, and no longer so for long enough: nothing follows a flicker. Pure; times in s."""
+"""Debounces conditions: short changes of their values have no effect. Pure; times in s."""
 
 from dataclasses import dataclass, replace
 from typing import Final
 
 HYSTERESIS_S: Final = 1.5
-"""So long what was so must be otherwise before it counts (issue 5, coordinator)."""
-BLIND_S: Final = 5.0
-"""So long it may be unknown: a car that changes its mode says nothing while it does, 1 + 3.5 s
+"""Minimum time for which a value must have changed before the change counts."""
+UNKNOWN_TIMEOUT_S: Final = 5.0
+"""Maximum time for which a true condition may be unknown. A mode change silences a car for 4.5 s
 (docs/reference/protocol.md#blocking-times)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Debounced:
-    """Something that is so, or (not `on`) is about to be."""
+    """A condition that is true, or (not `on`) has not been true for long enough yet."""
 
     on: bool
     since: float
-    """Since when it was so without a break."""
+    """Since when the condition has been true without a break."""
     otherwise_since: float | None = None
 
 
-def follow(before: Debounced | None, so: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001 - the fact itself
-    """It counts once it was so for `for_s`, until it was not for HYSTERESIS_S or unknown for BLIND_S: then None."""
+def debounce(before: Debounced | None, value: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001
+    """Follow a condition: on after `for_s`, None after HYSTERESIS_S of false or UNKNOWN_TIMEOUT_S of unknown."""
     if before is None or not before.on:
-        if not so:
+        if not value:
             return None
         since = now if before is None else before.since
         return Debounced(now - since >= for_s, since)
-    if so:
+    if value:
         return before if before.otherwise_since is None else replace(before, otherwise_since=None)
     since = now if before.otherwise_since is None else before.otherwise_since
-    if now - since >= (BLIND_S if so is None else HYSTERESIS_S):
+    if now - since >= (UNKNOWN_TIMEOUT_S if value is None else HYSTERESIS_S):
         return None
     return replace(before, otherwise_since=since)
 
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """A yes or no that changes only after HYSTERESIS_S of the other."""
+    """A boolean that changes only after HYSTERESIS_S of the other value."""
 
     value: bool
     other_since: float | None = None
 
 
-def settle(before: Settled | None, so: bool | None, now: float) -> Settled | None:  # noqa: FBT001 - the fact itself
-    """The first answer counts at once; unknown leaves what was."""
-    if so is None or before is None:
-        return before if so is None else Settled(so)
-    if so is before.value:
-        return before if before.other_since is None else Settled(so)
+def settle(before: Settled | None, value: bool | None, now: float) -> Settled | None:  # noqa: FBT001
+    """Follow a boolean. The first value counts at once; unknown leaves the value as it was."""
+    if value is None or before is None:
+        return before if value is None else Settled(value)
+    if value is before.value:
+        return before if before.other_since is None else Settled(value)
     since = now if before.other_since is None else before.other_since
-    return Settled(so) if now - since >= HYSTERESIS_S else Settled(before.value, since)
+    return Settled(value) if now - since >= HYSTERESIS_S else Settled(before.value, since)

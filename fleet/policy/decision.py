@@ -1,4 +1,4 @@
-"""A decision as a value: of whom, what, why, and what would change it. Its words are explain.py's. Pure."""
+"""A decision as a value: subject, result, reason, and what would change it. explain.py writes the words. Pure."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -20,32 +20,32 @@ class DecisionKind(StrEnum):
     FILLED = "filled"
     PHASE = "phase"
     OUT = "out"
-    """A role that nobody is to have now."""
+    """A role that no car should have now."""
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What was decided of one subject: a car, `role NAME`, or `phase`."""
+    """The decision about one subject: a car, `role NAME`, or `phase`."""
 
     subject: str
     kind: DecisionKind
     decided: str
-    """In a word or two: the mode, `left alone`, `1 of 2`, the phase."""
+    """The result in a word or two: the mode, `left alone`, `1 of 2`, the phase."""
     cause: str
-    """The same as long as the same thing decides."""
+    """Identifies the reason: it stays the same as long as the same thing decides."""
     why: str
     readings: tuple[str, ...] = ()
-    """Those that were used, with values and ages."""
+    """The readings that it is based on, with values and ages."""
     would_change: str = ""
     car: str | None = None
     role: str | None = None
     mode: Mode | None = None
-    """The mode the car should be in; None: it is left alone."""
+    """The mode that the car should be in; None: the car is left alone."""
     since: float = 0.0
-    """When it was decided, s on the step's clock: the same as long as the cause is."""
+    """Time at which the cause became the current one, s on the step's clock."""
 
     def after(self, before: "Decision | None", now: float) -> "Decision":
-        """This, or `before` if it said the same: its readings are those that were used then."""
+        """Return `before` if both say the same, so that its first readings stay; else this decision."""
         if before is None or before.cause != self.cause:
             return replace(self, since=now)
         if (before.decided, before.why, before.would_change) == (self.decided, self.why, self.would_change):

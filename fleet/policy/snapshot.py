@@ -1,6 +1,6 @@
-"""What the coordinator knows of the cars, as values, and what a plan's expressions may name of it. Pure.
+"""A snapshot of the fleet as the coordinator knows it, and the names that a plan's expressions may use. Pure.
 
-How it is heard is coordinator.py's, what follows from it decide.py's.
+observer.py fills the snapshot, decide.py decides by it.
 """
 
 import math
@@ -22,7 +22,7 @@ _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
 
 def _fields() -> dict[str, tuple[str, str, type]]:
-    found: dict[str, tuple[str, str, type]] = {}
+    result: dict[str, tuple[str, str, type]] = {}
     kinds = {FieldDescriptor.CPPTYPE_BOOL: bool, FieldDescriptor.CPPTYPE_STRING: str}
     for name, topic in topics.TOPICS.items():
         if topic.family not in ("sensor", "state"):
@@ -32,15 +32,13 @@ def _fields() -> dict[str, tuple[str, str, type]]:
         for each in descriptors:
             if each.name not in _HEADER and not each.is_repeated and each.message_type is None:
                 kind = kinds.get(each.cpp_type, float)
-                found[f"{name.partition('/')[2]}.{each.name}"] = (name, each.name, kind)
-    return found
+                result[f"{name.partition('/')[2]}.{each.name}"] = (name, each.name, kind)
+    return result
 
 
 _FIELDS: Final = _fields()
 NAMES: Final[Mapping[str, type]] = MappingProxyType({name: kind for name, (_, _, kind) in _FIELDS.items()})
-"""What an expression of a plan may name: `battery.voltage_v`, `light.left`, `mode.asked`, and its type."""
-
-
+"""The names that a plan's expressions may use (`battery.voltage_v`, `light.left`, `mode.asked`), with their types."""
 _STALE_S: Final = {
     topic: math.inf if (after_s := topics.TOPICS[topic].stale_after_s) is None else after_s
     for topic, _, _ in _FIELDS.values()
@@ -48,13 +46,13 @@ _STALE_S: Final = {
 
 
 def topic_of(name: str) -> str:
-    """The topic in which a name of NAMES is published."""
+    """Return the topic in which a name of NAMES is published."""
     return _FIELDS[name][0]
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The fields of one reading that were measured, and when it came."""
+    """The measured fields of one reading, and when it came."""
 
     fields: Mapping[str, object]
     at: float
@@ -62,7 +60,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """What a car's gateway said no to."""
+    """A mode that a car's gateway refused, and why."""
 
     mode: str
     reason: str
@@ -72,39 +70,39 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class CarSnapshot:
-    """What is known of one car."""
+    """The coordinator's knowledge of one car."""
 
     present: bool = False
-    """Its gateway is on the bus."""
+    """True if its gateway is on the bus."""
     mode: str = ""
-    """The mode it was last asked for, as its gateway says; empty: not heard yet."""
+    """The last mode that it was commanded into, by its gateway's state; empty: no state yet."""
     verdict: str = ""
     evidence: str = ""
     motors: str = ""
     link: str = ""
-    """As its gateway says; empty: not heard yet."""
+    """The state of its link, by its gateway; empty: no state yet."""
     platform: str = ""
-    """As its gateway or the fleet file says; empty: not known."""
+    """From its gateway or the fleet file; empty: not known."""
     capabilities: frozenset[str] = frozenset()
     estopped_by: str | None = None
     held_by: str | None = None
     driven_by: str | None = None
-    """Who holds a motion or a lease; a coordinator never does."""
+    """The holder of a motion or a lease; never a coordinator."""
     roles: frozenset[str] | None = None
     """The roles that the fleet file lets it take; None: any."""
     listed: bool = False
-    """It stands in the fleet file."""
+    """True if the fleet file lists it."""
     refused: Refusal | None = None
     busy: bool = False
-    """Something was asked of it, and there is no outcome yet."""
+    """True if a command to it has no outcome yet."""
 
     @property
     def profile(self) -> Profile | None:
-        """What its platform can do; None if that is not known."""
+        """The profile of its platform; None if that is not known."""
         return _profile(self.platform)
 
     def lacks(self, mode: str) -> bool:
-        """Whether it is known not to do this mode, by its platform or by the fleet file."""
+        """Return True if its platform does not know this mode, or the fleet file forbids it."""
         profile = self.profile
         return (profile is not None and mode not in profile.modes) or (self.listed and mode not in self.capabilities)
 
@@ -113,25 +111,26 @@ class CarSnapshot:
 def _profile(platform: str) -> Profile | None:
     try:
         return parse_platform(platform) if platform else None
-    except ValueError:  # of a gateway that is newer than this
+    except ValueError:  # from a gateway that is newer than this coordinator
         return None
 
 
-NOBODY: Final = CarSnapshot()
+UNKNOWN_CAR: Final = CarSnapshot()
 
 
 @dataclass(frozen=True, slots=True)
 class FleetSnapshot:
-    """What the coordinator knows."""
+    """The coordinator's knowledge of all cars."""
 
     cars: Mapping[str, CarSnapshot] = field(default_factory=dict)
     readings: Mapping[str, Mapping[str, Observation]] = field(default_factory=dict)
     """By car and topic."""
 
     def holds(self, expression: Expression, car: str, now: float, *, old: bool = False) -> bool | None:
-        """Whether it is so of this car; None: not known. A value too old to say how things are is none, unless `old`.
+        """Return whether the expression is true of this car; None: not known.
 
-        `old` is for what changes slowly: a mode that does not measure it leaves the last value standing.
+        Stale values count as not measured, unless `old`. `old` is for values that change slowly: in a mode that does
+        not measure them, their last value counts.
         """
         seen = self.readings.get(car)
         if seen is None:
@@ -139,30 +138,32 @@ class FleetSnapshot:
 
         def lookup(name: str) -> object | None:
             topic, member, _ = _FIELDS[name]
-            one = seen.get(topic)
-            if one is None:
+            observation = seen.get(topic)
+            if observation is None:
                 return None
-            if not old and now - one.at > _STALE_S[topic]:
+            if not old and now - observation.at > _STALE_S[topic]:
                 return None
-            return one.fields.get(member)
+            return observation.fields.get(member)
 
         return expression.value(lookup)
 
     def used(self, expression: Expression, car: str, now: float) -> tuple[str, ...]:
-        """The readings that it looks at, each with its value and age: for a person."""
-        told = []
+        """Return the readings that an expression uses, each with its value and age, for a person."""
+        lines = []
         for name in dict.fromkeys(expression.names):
             topic, member, _ = _FIELDS[name]
-            one = self.readings.get(car, {}).get(topic)
-            if one is None or member not in one.fields:
-                told.append(f"{car}/{topic} {member} not measured")
+            observation = self.readings.get(car, {}).get(topic)
+            if observation is None or member not in observation.fields:
+                lines.append(f"{car}/{topic} {member} not measured")
             else:
-                told.append(f"{car}/{topic} {member}={shown(one.fields[member])} ({max(0.0, now - one.at):.1f} s old)")
-        return tuple(told)
+                age_s = max(0.0, now - observation.at)
+                value = format_reading(observation.fields[member])
+                lines.append(f"{car}/{topic} {member}={value} ({age_s:.1f} s old)")
+        return tuple(lines)
 
 
-def shown(value: object) -> str:
-    """A value as an expression has it."""
+def format_reading(value: object) -> str:
+    """Format a value as expressions write it, floats with 4 digits."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

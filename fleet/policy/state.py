@@ -1,4 +1,4 @@
-"""What the coordinator remembers from one decision to the next, and what of it outlives a change of plan. Pure."""
+"""The state of the coordinator between decisions, and which part of it outlives a change of plan or a restart. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -8,30 +8,29 @@ from fleet.policy.debounce import HYSTERESIS_S, Debounced, Settled
 from fleet.policy.decision import Decision
 from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
-from fleet.policy.snapshot import NOBODY, FleetSnapshot
+from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
 from gateway.protocol.enums import Mode
 
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
-"""Why a car has a role that it had before."""
-HUB_BACK_S: Final = 5.0
-"""So long after a hub was away roles are kept for cars whose gateways are not back at it: they try again every half
-second, and may be held up."""
+"""Reason for a role that a car had before a restart of the coordinator."""
+HUB_RETURN_GRACE_S: Final = 5.0
+"""Maximum wait for gateways after the hub returns; their cars keep their roles. Gateways reconnect every 0.5 s."""
 IN_PHASE: Final = "it was so before the coordinator was started again"
 
 
 @dataclass(frozen=True, slots=True)
 class ModeAttempts:
-    """How often a car was asked for one mode, and when it may be asked again."""
+    """The number of commands for one mode of a car, and the time of the next retry."""
 
     mode: str = ""
-    attempts: int = 0
+    count: int = 0
     again_at: float = 0.0
     fine_since: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class HeldRole:
-    """A role that a car has, and how it came by it."""
+    """A role that a car has, and how it got that role."""
 
     role: str
     why: str = ""
@@ -40,60 +39,60 @@ class HeldRole:
 
 @dataclass(frozen=True, slots=True)
 class PersistedPolicy:
-    """What outlives a coordinator: the roles, the phase, the rules in force and the car that made each so."""
+    """The persisted part of the state: roles, phase, and rules in force with the car that triggered each."""
 
     version: str = ""
-    """Of the plan."""
+    """The plan's version."""
     roles: Mapping[str, str] = field(default_factory=dict)
     phase: str = ""
     phase_since_s: float = 0.0
-    """On the wall clock."""
+    """Start of the phase on the wall clock."""
     rules: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
-class LinkColor:
-    """A car that was asked for the colour of a rule since that came into force."""
+class LedRequest:
+    """A car that was commanded to show the color of a rule since the rule came into force."""
 
     rule: int
     effect: int
-    """Both by position."""
+    """Position of the rule in the plan, and of the effect in the rule."""
     that: str | None
     car: str | None
-    """None: every car, by the coordinator before this one."""
+    """None: every car, by the coordinator before a restart."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyState:
-    """Everything that the next decision needs besides the picture. Times are seconds on one monotonic clock."""
+    """Everything that the next decision needs besides the snapshot. Times are seconds on one monotonic clock."""
 
-    began: float | None = None
-    """The first decision."""
+    started_at: float | None = None
+    """Time of the first step."""
     phase: PhaseState = field(default_factory=PhaseState)
     rules: Mapping[int, RuleState] = field(default_factory=dict)
     """By position in the plan."""
-    held: Mapping[str, HeldRole] = field(default_factory=dict)
-    """The role that each car has; it is kept for a moment for one that cannot be asked."""
+    held_roles: Mapping[str, HeldRole] = field(default_factory=dict)
+    """The role of each car. A car that cannot be commanded keeps its role for a moment."""
     gone_since: Mapping[str, float] = field(default_factory=dict)
     needs: Mapping[tuple[str, str], Settled] = field(default_factory=dict)
-    tried: Mapping[str, ModeAttempts] = field(default_factory=dict)
-    coloured: frozenset["LinkColor"] = frozenset()
-    said: Mapping[str, Decision] = field(default_factory=dict)
+    mode_attempts: Mapping[str, ModeAttempts] = field(default_factory=dict)
+    led_requests: frozenset[LedRequest] = frozenset()
+    decisions: Mapping[str, Decision] = field(default_factory=dict)
     """The last decision of each subject."""
 
     @property
     def roles(self) -> dict[str, str]:
-        """The role of each car."""
-        return {car: held.role for car, held in self.held.items()}
+        """The role of each car, by name."""
+        return {car: held_roles.role for car, held_roles in self.held_roles.items()}
 
 
-def hub_back(memory: PolicyState, now: float) -> PolicyState:
-    """What counts when there is a hub again: without one nobody could be heard, and nobody was lost for that."""
-    return replace(memory, gone_since=dict.fromkeys(memory.held, now + HUB_BACK_S - HYSTERESIS_S))
+def on_hub_back(memory: PolicyState, now: float) -> PolicyState:
+    """Return the state for the time after a hub's return: an outage of the hub costs no car its role."""
+    return replace(memory, gone_since=dict.fromkeys(memory.held_roles, now + HUB_RETURN_GRACE_S - HYSTERESIS_S))
 
 
-def carried(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:
-    """What still counts under another plan: roles, rules and the phase that it has, too."""
+def carry_over(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:
+    """Return the state under another plan: roles, rules and the phase remain if both plans have them."""
     places = {rule: index for index, rule in enumerate(after.rules)}
     rules = {
         places[before.rules[index]]: state for index, state in memory.rules.items() if before.rules[index] in places
@@ -103,54 +102,54 @@ def carried(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:
         memory,
         phase=memory.phase if memory.phase.name in after.phases else PhaseState(),
         rules=rules,
-        coloured=frozenset(
+        led_requests=frozenset(
             replace(each, rule=places[before.rules[each.rule]])
-            for each in memory.coloured
+            for each in memory.led_requests
             if before.rules[each.rule] in places
         ),
-        held={car: held for car, held in memory.held.items() if held.role in after.roles},
+        held_roles={car: held_roles for car, held_roles in memory.held_roles.items() if held_roles.role in after.roles},
         needs={key: settled for key, settled in memory.needs.items() if key[1] in same},
-        said={},
+        decisions={},
     )
 
 
-def restarted(memory: PolicyState) -> PolicyState:
-    """Return what still counts when the plan begins anew: who has which role, but no phase and no rule in force."""
-    return replace(memory, phase=PhaseState(), rules={}, coloured=frozenset())
+def restart_plan(memory: PolicyState) -> PolicyState:
+    """Return the state for a restart of the plan: the roles remain, phase and rules begin anew."""
+    return replace(memory, phase=PhaseState(), rules={}, led_requests=frozenset())
 
 
-def restored(plan: Plan, picture: FleetSnapshot, kept: PersistedPolicy, now: float, wall_s: float) -> PolicyState:
-    """What a coordinator that begins takes over from the one before, as far as the cars are still as it left them.
+def restore(plan: Plan, snapshot: FleetSnapshot, persisted: PersistedPolicy, now: float, wall_s: float) -> PolicyState:
+    """Return the state of a coordinator that starts, from the persisted state of the one before.
 
-    What was kept under another plan counts only for the roles that both have; a car that is in the mode of another
-    role has been changed by somebody since.
+    Under another plan only the roles count that both plans have. A car in the mode of another role loses its role:
+    somebody has changed it since.
     """
     modes = {role.mode for role in plan.roles.values()} - {Mode.MANUAL}
-    held = {}
-    for car, name in kept.roles.items():
+    held_roles = {}
+    for car, name in persisted.roles.items():
         role = plan.roles.get(name)
-        mode = picture.cars.get(car, NOBODY).mode
+        mode = snapshot.cars.get(car, UNKNOWN_CAR).mode
         if role is not None and plan.may(car, role) and (mode == role.mode or mode not in modes):
-            held[car] = HeldRole(name, TAKEN_OVER)
-    if kept.version != plan.version or (kept.phase and kept.phase not in plan.phases):
-        return PolicyState(held=held)
+            held_roles[car] = HeldRole(name, TAKEN_OVER)
+    if persisted.version != plan.version or (persisted.phase and persisted.phase not in plan.phases):
+        return PolicyState(held_roles=held_roles)
     rules = {
         index: RuleState(on=True, when={that: Debounced(on=True, since=now)}, that=that or None, since=now)
-        for index, that in kept.rules.items()
+        for index, that in persisted.rules.items()
         if index < len(plan.rules)
     }
-    age_s = max(0.0, wall_s - kept.phase_since_s)
-    phase = PhaseState(kept.phase, now - age_s, why=IN_PHASE) if kept.phase else PhaseState()
-    coloured = frozenset(
-        LinkColor(index, position, state.that, None)
+    age_s = max(0.0, wall_s - persisted.phase_since_s)
+    phase = PhaseState(persisted.phase, now - age_s, why=IN_PHASE) if persisted.phase else PhaseState()
+    led_requests = frozenset(
+        LedRequest(index, position, state.that, None)
         for index, state in rules.items()
         for position in range(len(plan.rules[index].effects))
     )
-    return PolicyState(held=held, rules=rules, phase=phase, coloured=coloured)
+    return PolicyState(held_roles=held_roles, rules=rules, phase=phase, led_requests=led_requests)
 
 
-def to_keep(plan: Plan, memory: PolicyState, now: float, wall_s: float) -> PersistedPolicy:
-    """What the next coordinator should know."""
+def to_persisted(plan: Plan, memory: PolicyState, now: float, wall_s: float) -> PersistedPolicy:
+    """Return the part of the state to persist for the next coordinator."""
     return PersistedPolicy(
         plan.version,
         memory.roles,

@@ -1,1 +1,5 @@
-"""YAML files whose faults are named with file, line and column, all at once. Not imported by `gateway run`."""
+"""YAML files that people write, checked with line and column.
+
+`document` reads the text and collects faults, `messages` puts pydantic's errors into words, `partial` lets the sound
+rest of a faulty file be checked too.
+"""

@@ -1,16 +1,22 @@
-"""What pydantic finds wrong, in words for a person. Pure.
+"""Puts pydantic's errors into words for a person. Pure.
 
-What is allowed is taken from the model's JSON schema, which knows all members of a union. Where: `marked`.
+The allowed values come from the model's JSON schema, which knows all members of a union. document.py adds the place.
 """
 
 import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
+_BOUNDS: Final = {
+    "exclusiveMinimum": "more than",
+    "minimum": "at least",
+    "exclusiveMaximum": "less than",
+    "maximum": "at most",
+}
 Where = tuple[str | int, ...]
-"""The way to a value: names of fields, positions in lists."""
+"""The path to a value: names of fields, positions in lists."""
 
-_LONGEST: Final = 60
+_MAX_VALUE_LENGTH: Final = 60
 _TYPES: Final = {
     "string": "text",
     "integer": "a whole number",
@@ -22,53 +28,55 @@ _TYPES: Final = {
 }
 
 
-def spelled(where: Where) -> str:
-    """A place in words: `cars.red.limits`, `rules[2].when`."""
+def format_place(where: Where) -> str:
+    """Format a place: `cars.red.limits`, `rules[2].when`."""
     text = ""
     for part in where:
         if isinstance(part, int):
             text += f"[{part}]"
         else:
-            word = part if part.isprintable() and part and not set(part) & set(" .[]:") else shown(part)
+            word = part if part.isprintable() and part and not set(part) & set(" .[]:") else quote_value(part)
             text += f".{word}" if text else word
     return text
 
 
-def meant(word: str, allowed: Iterable[str]) -> str:
-    """`; did you mean 'red'?`, or nothing if none of the allowed is near."""
+def suggest(word: str, allowed: Iterable[str]) -> str:
+    """Return `; did you mean 'red'?`, or nothing if no allowed word is close."""
     near = difflib.get_close_matches(word, list(allowed), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
-def shown(value: object) -> str:
-    """A value as a person reads it, cut if it is long."""
+def quote_value(value: object) -> str:
+    """Format a value for a person, truncated if it is long."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict | list | tuple):
         return "a list" if isinstance(value, list | tuple) else "a mapping"
     text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+    return text if len(text) <= _MAX_VALUE_LENGTH else f"{text[:_MAX_VALUE_LENGTH]}…"
 
 
-def fault(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str, Any]) -> tuple[str, str]:
-    """What is wrong, and what is allowed (may be empty); `error` is one of pydantic's of this kind."""
+def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str, Any]) -> tuple[str, str]:
+    """Return what is wrong, and what is allowed (may be empty), for an error of pydantic of this kind."""
     definitions = schema.get("$defs", {})
     if kind == "extra_forbidden":
-        allowed = sorted({name for each in _at(schema, where[:-1], definitions) for name in each.get("properties", ())})
-        return "there is no such field here", f"allowed are {', '.join(allowed)}{meant(str(where[-1]), allowed)}"
-    here = _at(schema, where, definitions)
+        allowed = sorted(
+            {name for each in _schemas_at(schema, where[:-1], definitions) for name in each.get("properties", ())}
+        )
+        return "there is no such field here", f"allowed are {', '.join(allowed)}{suggest(str(where[-1]), allowed)}"
+    here = _schemas_at(schema, where, definitions)
     if kind == "missing":
         return "is missing", next((each["description"] for each in here if "description" in each), "")
     value = error["input"]
     if kind in ("value_error", "assertion_error"):
         return str(error["ctx"]["error"]), ""
-    head = "has no value" if value is None else f"{shown(value)} is not allowed"
+    head = "has no value" if value is None else f"{quote_value(value)} is not allowed"
     chosen = ["enum" in each or "const" in each for each in here]
     if kind in ("enum", "literal_error") and (all(chosen) or not any(chosen)):
         words = [str(word) for each in here for word in each.get("enum", [each["const"]] if "const" in each else [])]
         listed = f"one of {', '.join(words)}" if words else str(error["ctx"]["expected"])
-        return head, listed + meant(str(value), words)
-    allowed_here = [words for words in map(_allowed, here) if words and words != "nothing"]
+        return head, listed + suggest(str(value), words)
+    allowed_here = [words for words in map(_describe_allowed, here) if words and words != "nothing"]
     kinds = ("_type", "_than", "_equal", "_parsing", "int_from_float", "enum", "literal_error")
     if allowed_here and kind.endswith(kinds):
         quotes = " (write it in quotes)" if kind == "string_type" and isinstance(value, bool | int | float) else ""
@@ -77,49 +85,45 @@ def fault(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str
     return head, message[:1].lower() + message[1:]
 
 
-def _allowed(schema: Mapping[str, Any]) -> str:
-    """What one member of the schema allows, with its range."""
+def _describe_allowed(schema: Mapping[str, Any]) -> str:
+    """Describe the values that one member of the schema allows, with their range."""
     if "const" in schema:
         return f"the word {schema['const']}"
     if "enum" in schema:
         return f"one of {', '.join(map(str, schema['enum']))}"
     words = _TYPES.get(schema.get("type", ""), "")
-    bounds = []
-    for key, text in (("exclusiveMinimum", "more than"), ("minimum", "at least")):
-        if key in schema:
-            bounds.append(f"{text} {schema[key]:g}")
-    for key, text in (("exclusiveMaximum", "less than"), ("maximum", "at most")):
-        if key in schema:
-            bounds.append(f"{text} {schema[key]:g}")
+    bounds = [f"{text} {schema[key]:g}" for key, text in _BOUNDS.items() if key in schema]
     return f"{words}, {' and '.join(bounds)}" if bounds else words
 
 
-def _at(schema: Mapping[str, Any], where: Where, definitions: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The members of the schema that speak of a place, references and unions resolved."""
-    here = _members(schema, definitions)
+def _schemas_at(schema: Mapping[str, Any], where: Where, definitions: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the members of the schema for a place, with references and unions resolved."""
+    here = _resolve_members(schema, definitions)
     for part in where:
         below: list[Mapping[str, Any]] = []
         for each in here:
             if isinstance(part, int):
-                found = [*each.get("prefixItems", [])[part : part + 1], each.get("items")]
+                members = [*each.get("prefixItems", [])[part : part + 1], each.get("items")]
             else:
                 named = each.get("properties", {})
                 others = [each.get("additionalProperties"), *each.get("patternProperties", {}).values()]
-                found = [named[part]] if part in named else others
-            below += [member for one in found if isinstance(one, dict) for member in _members(one, definitions)]
+                members = [named[part]] if part in named else others
+            below += [
+                member for one in members if isinstance(one, dict) for member in _resolve_members(one, definitions)
+            ]
         here = below
     return here
 
 
-def _members(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    found: list[Mapping[str, Any]] = []
+def _resolve_members(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    members: list[Mapping[str, Any]] = []
     if "$ref" in schema:
-        found += _members(definitions[schema["$ref"].rpartition("/")[2]], definitions)
+        members += _resolve_members(definitions[schema["$ref"].rpartition("/")[2]], definitions)
     for key in ("anyOf", "oneOf", "allOf"):
-        found += [member for each in schema.get(key, ()) for member in _members(each, definitions)]
+        members += [member for each in schema.get(key, ()) for member in _resolve_members(each, definitions)]
     # A description beside a reference or a union is the field's own.
-    return [schema] if not found else [{**each, **_own(schema)} for each in found]
+    return [schema] if not members else [{**each, **_own_description(schema)} for each in members]
 
 
-def _own(schema: Mapping[str, Any]) -> dict[str, Any]:
+def _own_description(schema: Mapping[str, Any]) -> dict[str, Any]:
     return {"description": schema["description"]} if "description" in schema else {}

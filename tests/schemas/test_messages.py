@@ -4,7 +4,12 @@ import json
 
 import pytest
 from google.protobuf import descriptor_pb2
+from google.protobuf.descriptor import FieldDescriptor
 
+from gateway.control.estimate.battery import BatteryLevel
+from gateway.control.estimate.link_health import LinkState
+from gateway.control.estimate.mode import Verdict
+from gateway.protocol.enums import Mode, Motion
 from schemas import messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -64,3 +69,20 @@ def test_bad_payloads_say_why_in_one_line(payload: bytes, encoding: str, words: 
     with pytest.raises(messages.BadPayload, match=words) as caught:
         messages.parse("fleet.v1.DriveCommand", payload, encoding)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("topic", topics.TOPICS.values(), ids=str)
+def test_words_and_ranges_name_fields_of_the_message(topic: topics.Topic) -> None:
+    fields = messages.message_class(topic.message).DESCRIPTOR.fields_by_name
+    assert all(fields[name].cpp_type == FieldDescriptor.CPPTYPE_STRING for name in topic.words)
+    numbers = (FieldDescriptor.CPPTYPE_DOUBLE, FieldDescriptor.CPPTYPE_UINT32, FieldDescriptor.CPPTYPE_INT32)
+    assert all(fields[name].cpp_type in numbers for name in topic.ranges)
+
+
+def test_words_of_the_table_are_those_that_gateways_publish() -> None:
+    words = {name: set(each) for topic in topics.CAR_TOPICS for name, each in topic.words.items()}
+    assert words["asked"] == words["inferred"] == {*Mode, "unknown"}
+    assert words["motion"] == {*Motion, "unknown"}
+    assert words["verdict"] == {*Verdict}
+    assert words["state"] == {*LinkState}
+    assert words["level"] == {*BatteryLevel}

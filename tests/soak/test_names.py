@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet.coordinator.coordinator import AGAIN_S
-from fleet.coordinator.observer import FORGOTTEN_S, MOST_GONE
+from fleet.coordinator.coordinator import REPUBLISH_INTERVAL_S
+from fleet.coordinator.observer import FORGET_AFTER_S, MAX_ABSENT_CARS
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 
@@ -37,17 +37,17 @@ def test_ten_thousand_names_in_ten_seconds(kind: str, tmp_path: Path) -> None:
         flood = fleet.start(str(FLOODER), kind, str(PER_S), str(SECONDS))
         assert flood.wait() == 0, flood.stderr
         ended = time.monotonic()
-        wait_for(lambda: len(subjects()) <= MOST_GONE + 1, "it is done with them")
+        wait_for(lambda: len(subjects()) <= MAX_ABSENT_CARS + 1, "it is done with them")
         names = flood.line()
         print(f"\n{kind}: {names} names, {before_mb:.0f} MB before", end="")
-        wait_for(lambda: subjects() == {"role scout"}, "all are forgotten", FORGOTTEN_S + PATIENCE_S)
+        wait_for(lambda: subjects() == {"role scout"}, "all are forgotten", FORGET_AFTER_S + PATIENCE_S)
         after_mb = coordinator.rss_mb()
         print(f", {len(decided)} decisions, {after_mb:.0f} MB after, forgotten after {time.monotonic() - ended:.0f} s")
         assert after_mb < before_mb + 30.0
         assert len(decided) < names, "only what was met alive is decided on"
 
         def lately() -> set[str]:
-            return {subject for at, subject in decided if at > time.monotonic() - AGAIN_S - 1.0}
+            return {subject for at, subject in decided if at > time.monotonic() - REPUBLISH_INTERVAL_S - 1.0}
 
         wait_for(lambda: lately() == {"role scout"}, "nothing is decided of names that are gone")
         assert coordinator.end() == 0

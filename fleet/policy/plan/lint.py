@@ -1,37 +1,37 @@
-"""What can never work in a plan, before anything moves: roles that no car can fill, rules that never fire. Pure.
+"""Finds what can never work in a plan before anything moves: roles that no car can fill, rules that never fire. Pure.
 
-What is wrong in the text itself reader.py says. Here is what the plan means for the cars there are: those of a fleet
-file, or (without one) cars of any platform.
+parser.py reports faults of the text itself. The lint checks the plan against the cars of a fleet file or, without one,
+against cars of any platform.
 """
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from fleet.conditions.domains import outside
+from fleet.conditions.satisfiability import explain_impossible
 from fleet.policy.debounce import HYSTERESIS_S
-from fleet.policy.plan.lint_conflicts import alternations, fights, implies
+from fleet.policy.plan.lint_conflicts import find_conflicts, implies
 from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanPhase, Role, Rule
-from fleet.policy.plan.reachability import ModeReachability, Outlook, seen, unmeasured
-from fleet.policy.snapshot import NAMES, CarSnapshot
+from fleet.policy.plan.reachability import ModeReachability, Outlook, can_be_true, list_unmeasured
+from fleet.policy.snapshot import CarSnapshot
 from gateway.protocol.enums import Mode
-from schemas.yaml_document.messages import meant
+from schemas.yaml_document.messages import suggest
 
 
 class Severity(StrEnum):
-    """How bad it is."""
+    """The severity of a fault."""
 
     ERROR = "error"
     """It can never work."""
     WARNING = "warning"
-    """It works, but hardly as it is meant."""
+    """It works, but probably not as intended."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanFault:
-    """One thing that is wrong with a plan: of which part, what, and what to do."""
+    """One fault of a plan: the part, what is wrong with it, and what to do."""
 
-    gravity: Severity
+    severity: Severity
     part: str
     words: str
 
@@ -41,31 +41,33 @@ class PlanFault:
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What is wrong with a plan; with an error it is not put in force."""
+    """The faults of a plan. The coordinator refuses a plan with errors."""
 
     errors: tuple[PlanFault, ...] = ()
     warnings: tuple[PlanFault, ...] = ()
 
     def refusal(self, source: str = "plan") -> str:
-        """Every error, one a line, each with the plan's name; empty: the plan may be put in force."""
+        """Return all errors, one per line, each with the plan's name; empty: the plan may be put in force."""
         return "\n".join(f"{source}: {each}" for each in self.errors)
 
 
-def faults(plan: Plan, cars: Mapping[str, CarSnapshot] | None = None, there: Collection[str] | None = None) -> Faults:
-    """What is wrong with a plan that is to be put in force.
+def find_faults(
+    plan: Plan, cars: Mapping[str, CarSnapshot] | None = None, present: Collection[str] | None = None
+) -> Faults:
+    """Return the faults of a plan that should be put in force.
 
-    `cars`: those of the fleet file (hearing.listed_cars), None: there is none. Then a car that the plan names and that
-    is not among those `there` (on the bus; None: not known) is a warning: it may still come.
+    `cars`: those of the fleet file (observer.listed_cars), None: there is none. Then each car of the plan that is not
+    among `present` (on the bus; None: not known) is a warning, as it may still come.
     """
-    found = check(plan, cars)
-    warnings = [each for each in found if each.gravity is Severity.WARNING]
-    if cars is None and there is not None:
-        told = ", ".join(sorted(there)) or "no cars"
+    findings = check(plan, cars)
+    warnings = [each for each in findings if each.severity is Severity.WARNING]
+    if cars is None and present is not None:
+        listed = ", ".join(sorted(present)) or "no cars"
         warnings += [
-            PlanFault(Severity.WARNING, f"car {car}", f"it is not on the bus now, which has {told}")
-            for car in sorted(_named(plan) - set(there))
+            PlanFault(Severity.WARNING, f"car {car}", f"it is not on the bus now, which has {listed}")
+            for car in sorted(_named(plan) - set(present))
         ]
-    return Faults(tuple(each for each in found if each.gravity is Severity.ERROR), tuple(warnings))
+    return Faults(tuple(each for each in findings if each.severity is Severity.ERROR), tuple(warnings))
 
 
 def _named(plan: Plan) -> set[str]:
@@ -73,7 +75,7 @@ def _named(plan: Plan) -> set[str]:
 
 
 def check(plan: Plan, fleet: Mapping[str, CarSnapshot] | None = None) -> tuple[PlanFault, ...]:
-    """What is wrong; `fleet`: what the fleet file says of its cars, None: there is none."""
+    """Return the faults of a plan; `fleet`: the cars of the fleet file, None: there is none."""
     return tuple(_Check(plan, fleet).findings())
 
 
@@ -94,14 +96,14 @@ class _Check:
     def _unknown_cars(self) -> Iterator[PlanFault]:
         for car in sorted(self._named):
             if self._known is not None and car not in self._known:
-                there = ", ".join(sorted(self._known)) or "none"
-                yield PlanFault(Severity.ERROR, f"car {car}", f"the fleet file has no such car; it has {there}")
+                present = ", ".join(sorted(self._known)) or "none"
+                yield PlanFault(Severity.ERROR, f"car {car}", f"the fleet file has no such car; it has {present}")
 
     def _unknown_roles(self) -> Iterator[PlanFault]:
         for car, known in sorted((self._known or {}).items()):
             for role in sorted((known.roles or set()) - set(self._plan.roles)):
-                there = f"there are {', '.join(self._plan.roles)}{meant(role, self._plan.roles)}"
-                words = f"the fleet file lets it take role {role}, which this plan does not have: {there}"
+                present = f"there are {', '.join(self._plan.roles)}{suggest(role, self._plan.roles)}"
+                words = f"the fleet file lets it take role {role}, which this plan does not have: {present}"
                 yield PlanFault(Severity.WARNING, f"car {car}", words)
 
     # ------------------------------------------------------------------ roles
@@ -109,19 +111,21 @@ class _Check:
     def _roles(self) -> Iterator[PlanFault]:
         for role in self._plan.roles.values():
             part = f"role {role.name}"
-            if role.needs is not None and (why := outside(role.needs, NAMES)):
+            if role.needs is not None and (why := explain_impossible(role.needs)):
                 yield PlanFault(Severity.ERROR, part, f"no car can fill it: {why}")
                 continue
-            able = [car for car in self._reach.cars if self._reach.able(car, role)]
-            if not able:
+            can_have = [car for car in self._reach.cars if self._reach.can_have(car, role)]
+            if not can_have:
                 whys = "; ".join(f"{car}: {self._reach.why_not(car, role)}" for car in list(self._reach.cars)[:4])
                 yield PlanFault(Severity.ERROR, part, f"no car can fill it{f': {whys}' if whys else ''}")
             elif (
-                role.count is not None and len(able) < role.count and (self._known is not None or role.cars is not None)
+                role.count is not None
+                and len(can_have) < role.count
+                and (self._known is not None or role.cars is not None)
             ):
-                words = f"it wants {role.count} cars, and only {', '.join(sorted(able))} can have it"
+                words = f"it wants {role.count} cars, and only {', '.join(sorted(can_have))} can have it"
                 yield PlanFault(Severity.WARNING, part, words)
-            if role.on_call and not self._called(role):
+            if role.on_call and not self._is_called(role):
                 yield PlanFault(
                     Severity.ERROR,
                     part,
@@ -130,9 +134,9 @@ class _Check:
             if not role.on_call and not self._in_some_phase(role):
                 yield PlanFault(Severity.WARNING, part, "no phase has it")
 
-    def _called(self, role: Role) -> bool:
-        given = any(effect.role == role.name for rule in self._plan.rules for effect in rule.effects)
-        return given or any(other.fallback == role.name for other in self._plan.roles.values())
+    def _is_called(self, role: Role) -> bool:
+        is_given = any(effect.role == role.name for rule in self._plan.rules for effect in rule.effects)
+        return is_given or any(other.fallback == role.name for other in self._plan.roles.values())
 
     def _in_some_phase(self, role: Role, during: frozenset[str] | None = None) -> bool:
         phases = [phase for phase in self._plan.phases.values() if during is None or phase.name in during]
@@ -142,24 +146,24 @@ class _Check:
 
     def _rules(self) -> Iterator[PlanFault]:
         for rule in self._plan.rules:
-            apart = [*self._out_of_phase(rule)]
-            yield from apart
+            out_of_phase = [*self._out_of_phase(rule)]
+            yield from out_of_phase
             for condition, word in ((rule.when, "fire"), (rule.until, "end by `until`")):
-                outlook = Outlook() if condition is None or apart else self._reach.outlook(condition, rule.during)
-                if outlook.never:
-                    yield PlanFault(Severity.ERROR, rule.name, f"it can never {word}: {outlook.never}")
-                elif outlook.only:
-                    yield PlanFault(Severity.WARNING, rule.name, f"it can {word} only by {outlook.only}")
+                assess = Outlook() if condition is None or out_of_phase else self._reach.assess(condition, rule.during)
+                if assess.never:
+                    yield PlanFault(Severity.ERROR, rule.name, f"it can never {word}: {assess.never}")
+                elif assess.only:
+                    yield PlanFault(Severity.WARNING, rule.name, f"it can {word} only by {assess.only}")
             if rule.until is not None and implies(rule.when, rule.until):
                 words = f"it can never fire: {rule.until.text} ends it, and is so whenever it begins"
                 yield PlanFault(Severity.ERROR, rule.name, words)
             for effect in rule.effects:
                 yield from self._useless(rule, effect)
-        yield from self._fights()
-        yield from self._circular()
+        yield from self._conflicts()
+        yield from self._self_ending()
 
     def _out_of_phase(self, rule: Rule) -> Iterator[PlanFault]:
-        """A rule about a role, or that gives one, which counts in none of the rule's phases."""
+        """Report a rule about a role, or for one, that counts in none of the rule's phases."""
         for role in (rule.when.role, *(effect.role for effect in rule.effects)):
             if role is not None and not self._in_some_phase(self._plan.roles[role], rule.during):
                 where = f"phase {' or '.join(sorted(rule.during))}" if rule.during is not None else "any phase"
@@ -169,7 +173,7 @@ class _Check:
                 )
 
     def _useless(self, rule: Rule, effect: Effect) -> Iterator[PlanFault]:
-        """What no car that it is for can do."""
+        """Report an effect that none of its cars can follow."""
         who = effect.who if effect.who != THAT or rule.when.car is None else rule.when.car
         if who == OTHERS and self._known is not None and len(self._known) < 2:
             yield PlanFault(
@@ -190,19 +194,19 @@ class _Check:
         yield PlanFault(Severity.ERROR, rule.name, words)
 
     def _cannot(self, car: str, mode: Mode) -> str:
-        """Why it is never in this mode; empty if it can be."""
+        """Return why a car is never in this mode; empty if it can be."""
         profiles = self._reach.profiles(car)
         if not any(mode in profile.modes for profile in profiles):
             return f"a {profiles[0].name} car, which does not know mode {mode}"
         known = self._reach.cars[car]
         return f"not let do mode {mode} by the fleet file" if known.lacks(mode) else ""
 
-    def _fights(self) -> Iterator[PlanFault]:
-        for rule, words, always in fights(self._plan):
+    def _conflicts(self) -> Iterator[PlanFault]:
+        for rule, words, always in find_conflicts(self._plan):
             yield PlanFault(Severity.ERROR if always else Severity.WARNING, rule.name, words)
 
-    def _circular(self) -> Iterator[PlanFault]:
-        """A rule that ends itself: in the mode that it gives, what makes it true is not measured."""
+    def _self_ending(self) -> Iterator[PlanFault]:
+        """Report a rule that ends itself, as its mode does not measure the readings of its condition."""
         for rule in self._plan.rules:
             if rule.until is not None:
                 continue
@@ -217,8 +221,8 @@ class _Check:
                     continue
                 cars = [car for car in self._reach.cars if rule.when.car in (None, car)]
                 kinds = [profile for car in cars for profile in self._reach.profiles(car)]
-                if kinds and not any(seen(rule.when.expression, profile, mode) for profile in kinds):
-                    missing = ", ".join(unmeasured(rule.when.expression, kinds[0], mode))
+                if kinds and not any(can_be_true(rule.when.expression, profile, mode) for profile in kinds):
+                    missing = ", ".join(list_unmeasured(rule.when.expression, kinds[0], mode))
                     words = f"it ends itself: in mode {mode}, {missing} is not measured; give it until"
                     yield PlanFault(Severity.WARNING, rule.name, words)
 
@@ -244,15 +248,13 @@ class _Check:
                 words = f"it lasts {HYSTERESIS_S:g} s at least, whatever timeout_s says"
                 yield PlanFault(Severity.WARNING, part, words)
             yield from self._endless(phase)
-        for name, words in alternations(plan):
-            yield PlanFault(Severity.ERROR, f"phase {name}", words)
 
     def _endless(self, phase: PlanPhase) -> Iterator[PlanFault]:
-        """A phase that its condition does not end."""
+        """Report a phase that its condition does not end."""
         if phase.until is None:
             return
-        outlook, jumps = self._reach.outlook(phase.until, {phase.name}), self._jumps_out(phase)
-        why = self._no_role(phase) or outlook.never
+        assess, jumps = self._reach.assess(phase.until, {phase.name}), self._jumps_out(phase)
+        why = self._no_role(phase) or assess.never
         if phase.timeout_s is not None and phase.until.for_s >= phase.timeout_s:
             why = why or f"until wants {phase.until.for_s:g} s, and timeout_s is {phase.timeout_s:g}"
         part = f"phase {phase.name}"
@@ -261,17 +263,17 @@ class _Check:
         elif why:
             other = " or ".join([*(["its time-out"] if phase.timeout_s is not None else []), *jumps])
             yield PlanFault(Severity.WARNING, part, f"only {other} ends it: {why}")
-        elif outlook.only:
-            yield PlanFault(Severity.WARNING, part, f"it can end only by {outlook.only}")
+        elif assess.only:
+            yield PlanFault(Severity.WARNING, part, f"it can end only by {assess.only}")
 
     def _jumps_out(self, phase: PlanPhase) -> list[str]:
-        """The rules that can end it."""
+        """List the rules that can end a phase."""
         return [
             rule.name
             for rule in self._plan.rules
             if any(effect.phase not in (None, phase.name) for effect in rule.effects)
             and (rule.during is None or phase.name in rule.during)
-            and not self._reach.outlook(rule.when, {phase.name}).never
+            and not self._reach.assess(rule.when, {phase.name}).never
         ]
 
     def _no_role(self, phase: PlanPhase) -> str:

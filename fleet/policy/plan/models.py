@@ -1,4 +1,4 @@
-"""What may stand in a plan's file: names, types and ranges of its fields. What they mean is plan.py's. Pure."""
+"""The models of a plan's file: names, types and ranges of its fields. plan.py says what they mean. Pure."""
 
 from typing import Annotated, Literal
 
@@ -9,24 +9,24 @@ from schemas import keys
 from schemas.yaml_document.document import Entry
 
 _Name = Annotated[str, Field(description=keys.NAME_RULE)]
-"""Checked by reader.py, which goes on with a name that is not allowed: a refused key would hide what it has."""
+"""Only parser.py checks names. If pydantic refused a key, faults in its value would stay hidden."""
 _Seconds = Annotated[float, Field(ge=0, le=86_400)]
 _Byte = Annotated[int, Field(ge=0, le=255)]
 
 
 class ConditionEntry(Entry):
-    """What must be so, of which car: exactly one of any, all, car."""
+    """A condition, and the cars of which it must be true: exactly one of any, all, car."""
 
-    any: str | None = Field(None, description="an expression that must be so of one car at least: light.left")
-    all: str | None = Field(None, description="an expression that must be so of every car")
-    car: _Name | None = Field(None, description="the car of which `is` must be so")
+    any: str | None = Field(None, description="an expression that must be true of at least one car: light.left")
+    all: str | None = Field(None, description="an expression that must be true of every car")
+    car: _Name | None = Field(None, description="the car of which `is` must be true")
     is_: str | None = Field(None, alias="is", description="an expression over the readings of `car`")
     role: _Name | None = Field(None, description="any, all: only of the cars that have this role")
-    for_s: _Seconds = Field(0.0, description="s for which it must have been so without a break")
+    for_s: _Seconds = Field(0.0, description="minimum time without a break, s")
 
 
 class EffectEntry(Entry):
-    """What a rule does: to whom, and what."""
+    """An effect of a rule on some cars."""
 
     who: _Name | None = Field(None, description="that (the car that made the rule true), others, all, a car or a role")
     role: _Name | None = Field(None, description="the role that they take")
@@ -36,9 +36,9 @@ class EffectEntry(Entry):
 
 
 class RuleEntry(Entry):
-    """While `when` is so (or from then on until `until` is), `then`."""
+    """Effects (`then`) that count while `when` is true; with `until`, from then on until that is true."""
 
-    name: str = Field("", max_length=60, description="as it is called in explanations")
+    name: str = Field("", max_length=60, description="its name in explanations")
     when: ConditionEntry = Field(description="the condition, as `{any: light.left, for_s: 1}`")
     until: ConditionEntry | None = None
     then: EffectEntry | list[EffectEntry] = Field(description="what follows, as `{who: that, role: rest}`, or a list")
@@ -46,23 +46,21 @@ class RuleEntry(Entry):
 
 
 class RoleEntry(Entry):
-    """What some cars should do."""
+    """A mode for some cars."""
 
     mode: Mode = Field(description=f"the mode of a car that has it, one of {', '.join(Mode)}")
-    needs: str | None = Field(None, description="an expression that must be so of a car that has it")
+    needs: str | None = Field(None, description="an expression that must be true of a car that has it")
     count: Annotated[int, Field(ge=1, le=1000)] | Literal["all"] = Field(1, description="how many cars, or all")
     priority: int = Field(0, ge=-100, le=100, description="the higher is filled first")
     cars: list[_Name] | None = Field(None, min_length=1, description="the only cars that may have it, best first")
-    capabilities: list[str] = Field(
-        default=[], description="what a car must be able to, as its gateway or fleet file says"
-    )
+    capabilities: list[str] = Field(default=[], description="capabilities that a car must have")
     platforms: list[str] | None = Field(None, min_length=1, description="the platforms that may have it")
     fallback: _Name | None = Field(None, description="the role that gets a place for each that no car can take here")
     on_call: bool = Field(default=False, description="only a rule gives it to a car")
 
 
 class PhaseEntry(Entry):
-    """A part of the job: it lasts until a condition is so or its time is over."""
+    """A part of the job: it lasts until a condition is true or its time is over."""
 
     roles: list[_Name] | None = Field(None, description="the roles that count; all, if left out")
     until: ConditionEntry | None = None
@@ -75,9 +73,9 @@ class PlanEntry(Entry):
     """A plan: cars with a fixed role or mode, roles, rules, phases (the first one begins)."""
 
     cars: dict[_Name, _Name] = Field(default={}, description="a role, or a mode, for a certain car: red: tracking")
-    roles: dict[_Name, RoleEntry] = Field(default={}, description="what cars may be given to do, by name")
+    roles: dict[_Name, RoleEntry] = Field(default={}, description="the roles for cars, by name")
     rules: list[RuleEntry] = Field(default=[], max_length=200)
     phases: dict[_Name, PhaseEntry] = Field(default={}, description="parts of the job, the first one begins")
     idle: Literal["manual", "leave"] = Field(
-        "manual", description="what a car without a role gets: mode manual, or nothing"
+        "manual", description="the mode of a car without a role: manual, or the mode it has (leave)"
     )

@@ -1,6 +1,6 @@
 """A plan as values: roles for cars, rules that change them, phases that follow each other. Pure.
 
-It is read from a text in reader.py; what can never work in it, check.py finds; what follows from it is decide.py's.
+parser.py reads a plan from its text, lint.py finds what can never work in it, decide.py follows it.
 """
 
 import hashlib
@@ -16,11 +16,11 @@ THAT: Final = "that"
 OTHERS: Final = "others"
 ALL: Final = "all"
 RESERVED: Final = frozenset({THAT, OTHERS, ALL, "any"})
-"""Words of rules, so no names of cars, roles or phases."""
+"""Words of rules, not allowed as names of cars, roles or phases."""
 
 
 class Quantifier(StrEnum):
-    """Of which cars a condition must be so."""
+    """The cars of which a condition must be true."""
 
     ANY = "any"
     ALL = "all"
@@ -29,20 +29,20 @@ class Quantifier(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlanCondition:
-    """An expression, of which cars it must be so, and for how long without a break, s."""
+    """An expression, the cars of which it must be true, and the minimum time without a break, s."""
 
     of: Quantifier
     expression: Expression
     car: str | None = None
-    """With Of.CAR."""
+    """The car, with Quantifier.CAR."""
     role: str | None = None
     """Only of the cars that have this role."""
     for_s: float = 0.0
     text: str = field(init=False, compare=False)
-    """As it is told."""
+    """The condition in words."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "text", self._text())  # asked for ten times a second, for each car
+        object.__setattr__(self, "text", self._text())  # computed once: it is used ten times a second for each car
 
     def _text(self) -> str:
         who = self.car if self.of is Quantifier.CAR else f"{self.of} {f'with role {self.role}' if self.role else 'car'}"
@@ -52,16 +52,16 @@ class PlanCondition:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """What some cars should do, and which may."""
+    """A mode for some cars, and which cars may have it."""
 
     name: str
     mode: Mode
     needs: Expression | None = None
     count: int | None = 1
-    """How many cars; None: any number."""
+    """Number of cars; None: any number."""
     priority: int = 0
     cars: tuple[str, ...] | None = None
-    """The only ones that may have it, best first; None: any."""
+    """The only cars that may have it, best first; None: any."""
     capabilities: frozenset[str] = frozenset()
     platforms: tuple[str, ...] | None = None
     fallback: str | None = None
@@ -74,7 +74,7 @@ class Role:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """What a rule does to whom (that, others, all, a car, a role); or the phase that it begins."""
+    """A role, mode or color that a rule gives (to that, others, all, a car, a role); or the phase that it begins."""
 
     who: str = ""
     role: str | None = None
@@ -85,7 +85,7 @@ class Effect:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """While `when` is so, or once it was and `until` is not, its effects count."""
+    """Effects that count while `when` is true; with `until`, from then on until that is true."""
 
     name: str
     when: PlanCondition
@@ -100,7 +100,7 @@ class PlanPhase:
 
     name: str
     roles: frozenset[str] | None = None
-    """Those that count; None: all."""
+    """The roles that count; None: all."""
     until: PlanCondition | None = None
     timeout_s: float | None = None
     next: str | None = None
@@ -109,37 +109,37 @@ class PlanPhase:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What the coordinator keeps true. Of several rules for one car the first that is true counts."""
+    """A plan for the coordinator. If several rules are about one car, the first that is true counts."""
 
     roles: Mapping[str, Role]
     fixed: Mapping[str, str]
-    """Cars that may have one role only."""
+    """By car: the only role that it may have."""
     rules: tuple[Rule, ...]
     phases: Mapping[str, PlanPhase]
     idle: Mode | None
-    """The mode of a car without a role; None: it is left alone."""
+    """The mode of a car without a role; None: the car is left alone."""
     text: str
 
     @property
     def version(self) -> str:
-        """The same for the same text."""
+        """The start of the text's hash."""
         return hashlib.sha256(self.text.encode()).hexdigest()[:12]
 
     @property
     def first(self) -> str:
-        """The phase that begins; empty if there are none."""
+        """The first phase; empty if there are none."""
         return next(iter(self.phases), "")
 
     @property
     def open(self) -> bool:
-        """Whether cars that it does not name may be given something."""
+        """True if the plan may affect cars that it does not name."""
         if any(role.cars is None for role in self.roles.values()):
             return True
         return any(effect.who in (THAT, OTHERS, ALL) for rule in self.rules for effect in rule.effects)
 
     @property
     def named(self) -> tuple[str, ...]:
-        """The cars that it names to do something."""
+        """The cars that it names in roles and effects."""
         targets = (effect.who for rule in self.rules for effect in rule.effects)
         cars = [*self.fixed, *(car for role in self.roles.values() for car in role.cars or ())]
         return tuple(dict.fromkeys([*cars, *(who for who in targets if who and self.is_car(who))]))
@@ -157,17 +157,17 @@ class Plan:
 
     @property
     def names(self) -> frozenset[str]:
-        """What its expressions look at: names of picture.NAMES."""
+        """The names (snapshot.NAMES) that its expressions use."""
         needs = [role.needs for role in self.roles.values() if role.needs is not None]
         used = [*needs, *(condition.expression for condition in self.conditions)]
         return frozenset(name for expression in used for name in expression.names)
 
     def is_car(self, who: str) -> bool:
-        """Whether a name in an effect is a car's."""
+        """Return True if this name in an effect is a car's."""
         return who not in RESERVED and who not in self.roles
 
     def may(self, car: str, role: Role) -> bool:
-        """Whether the plan lets this car have this role."""
+        """Return True if the plan lets this car have this role."""
         if car in self.fixed:
             return self.fixed[car] == role.name
         return role.cars is None or car in role.cars

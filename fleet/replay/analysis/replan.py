@@ -15,8 +15,8 @@ from fleet.coordinator.observer import FleetObserver
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
-from fleet.policy.snapshot import NOBODY, CarSnapshot, Refusal, topic_of
-from fleet.policy.state import TAKEN_OVER, HeldRole, PersistedPolicy, PolicyState, carried, restored, to_keep
+from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, Refusal, topic_of
+from fleet.policy.state import TAKEN_OVER, HeldRole, PersistedPolicy, PolicyState, carry_over, restore, to_persisted
 from fleet.recording.reading.session import Recorded
 from fleet.replay.analysis.recorded_decisions import (
     CoordinatorRun,
@@ -66,7 +66,7 @@ class Replanning:
     kept: PersistedPolicy = field(default_factory=PersistedPolicy)
     """What the coordinator before it left."""
     said: Timeline = field(default_factory=dict)
-    _hearing: FleetObserver = field(init=False)
+    _observer: FleetObserver = field(init=False)
     _plan: Plan = field(init=False)
     _memory: PolicyState | None = None
     _busy: dict[str, str] = field(default_factory=dict)
@@ -74,7 +74,7 @@ class Replanning:
     _looked_ns: int = 0
 
     def __post_init__(self) -> None:
-        self._hearing = FleetObserver(self.listed)
+        self._observer = FleetObserver(self.listed)
         self._plan = self.plans[0][1]
 
     def go(self, recorded: Iterable[Recorded], tokens: Iterable[PresenceToken]) -> PersistedPolicy:
@@ -93,24 +93,24 @@ class Replanning:
             new_ns = at_ns if new_ns is None else new_ns
             match item:
                 case PresenceToken():
-                    self._hearing.token(item.car, item.at_ns / 1e9, alive=item.alive)
+                    self._observer.on_token(item.car, item.at_ns / 1e9, alive=item.alive)
                 case _NewPlan():
                     if self._memory is not None:
-                        self._memory = carried(self._memory, self._plan, item.plan)
+                        self._memory = carry_over(self._memory, self._plan, item.plan)
                     self._plan = item.plan
                 case _:
                     self._take(item)
         self._pass(self.run.end_ns)
         self._look(self.run.end_ns)
         assert self._memory is not None
-        return to_keep(self._plan, self._memory, self.run.end_ns / 1e9, self.run.end_ns / 1e9)
+        return to_persisted(self._plan, self._memory, self.run.end_ns / 1e9, self.run.end_ns / 1e9)
 
     def _take(self, item: Recorded) -> None:
         if item.key.endswith("/event/command"):
             self._outcome(item)
         else:
             encoding = f"{PROTOBUF};{item.message}"
-            self._hearing.take(
+            self._observer.on_sample(
                 Sample(item.key, item.payload, encoding, item.published_ns, item.sequence), item.recorded_ns / 1e9, None
             )
 
@@ -127,7 +127,7 @@ class Replanning:
             self._busy[key.car] = request.mode
         elif event.phase in _ENDED and (mode := self._busy.pop(key.car, None)) is not None:
             refusal = Refusal(mode, event.reason, event.words, item.recorded_ns / 1e9)
-            self._hearing.refused(key.car, None if event.phase in _DONE else refusal)
+            self._observer.on_outcome(key.car, None if event.phase in _DONE else refusal)
 
     def _pass(self, to_ns: int) -> None:
         """Time in which nothing came."""
@@ -142,27 +142,27 @@ class Replanning:
     def _begin(self) -> PolicyState:
         now = self.run.start_ns / 1e9
         known = {car: role for car, role in self.run.roles.items() if role in self._plan.roles}
-        picture = self._hearing.picture(())
-        if not self.run.whole or any(not picture.cars.get(car, NOBODY).mode for car in known):
+        picture = self._observer.snapshot(())
+        if not self.run.whole or any(not picture.cars.get(car, UNKNOWN_CAR).mode for car in known):
             # It began, or knew its cars, before the recording: that is where its first roles are from.
-            return restored(
+            return restore(
                 self._plan, picture, PersistedPolicy(self._plan.version, known, self.run.phase, now), now, now
             )
-        memory = restored(self._plan, picture, self.kept, now, now)
+        memory = restore(self._plan, picture, self.kept, now, now)
         # Roles from before the session: its first words tell of them.
         told = {
             car: HeldRole(known[car], TAKEN_OVER)
             for car, said in self.run.said.items()
             if car in known and said[0].role == known[car] and TAKEN_OVER in said[0].why
         }
-        return memory if memory.held or not told else PolicyState(held=told)
+        return memory if memory.held_roles or not told else PolicyState(held_roles=told)
 
     def _look(self, at_ns: int) -> None:
         if self._memory is None or at_ns < self._looked_ns:
             return
         self._looked_ns = at_ns
-        self._hearing.forget(at_ns / 1e9, {*self._plan.named, *self._memory.held})
-        result = step(self._plan, self._hearing.picture(self._busy), self._memory, at_ns / 1e9)
+        self._observer.forget(at_ns / 1e9, {*self._plan.named, *self._memory.held_roles})
+        result = step(self._plan, self._observer.snapshot(self._busy), self._memory, at_ns / 1e9)
         self._memory = result.memory
         for each in result.changed:
             said = RecordedDecision(

@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from fleet.fleetfile.editor import CannotEdit, with_link
+from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
-from fleet.fleetfile.scan import NewCar, new_file
+from fleet.fleetfile.scan import NewCar, format_new_file
 from schemas.yaml_document.document import BadFile
 from tests.support import in_process
 from tests.support.ports import free_endpoint
@@ -239,7 +239,7 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
 def test_any_name_and_any_word_of_a_device_make_a_right_file() -> None:
     cars = [NewCar(name, "COM1" if name == "red" else f"tcp://pi:{number}", "auto", "#000000", "a # 'car': \"x\"")
             for number, name in enumerate(("red", "10", "null", "true", "0x1", "on", "a-b"), 1)]  # fmt: skip
-    fleet = parse_fleet(new_file(cars, "null"), Path("f.yaml"))
+    fleet = parse_fleet(format_new_file(cars, "null"), Path("f.yaml"))
     assert [*fleet.cars] == [car.name for car in cars]
     assert fleet.name == "null"
 
@@ -365,17 +365,17 @@ def test_no_unknown_link(command: Command, port: Port, tmp_path: Path) -> None:
 def test_the_text_is_cut_not_made_anew(text: str, car: str, after: str | None) -> None:
     if after is None:
         with pytest.raises((CannotEdit, BadFile), match=re.escape(car)):
-            with_link(text, Path("f.yaml"), car, "COM9")
+            set_link(text, Path("f.yaml"), car, "COM9")
     else:
-        assert with_link(text, Path("f.yaml"), car, "COM9") == after
+        assert set_link(text, Path("f.yaml"), car, "COM9") == after
 
 
 def test_a_link_that_is_another_cars_is_not_written() -> None:
     with pytest.raises(BadFile, match="may be the port of red"):
-        with_link("cars: {red: {link: COM9}, blue: {link: COM2}}", Path("f.yaml"), "blue", "com9")
+        set_link("cars: {red: {link: COM9}, blue: {link: COM2}}", Path("f.yaml"), "blue", "com9")
 
 
 def test_a_text_that_would_say_something_else_too_is_not_given_back() -> None:
     text = "cars:\n  red: &both\n    platform: stm32\n  blue: *both\n"
     with pytest.raises(CannotEdit, match=r'write cars\.red\.link: "sim"'):
-        with_link(text, Path("f.yaml"), "red", "sim")
+        set_link(text, Path("f.yaml"), "red", "sim")

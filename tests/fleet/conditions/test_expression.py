@@ -9,9 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.conditions import BadExpression, contradictory, fields_of, parse, value_in
-from fleet.conditions.expression import And, Compare, Expression, Literal, Name, Node, Not, Op, Or, ValueKind, joined
-from fleet.conditions.parser import DEPTH, LENGTH
+from fleet.conditions import BadExpression, fields_of, is_contradictory, parse, value_in
+from fleet.conditions.expression import (
+    And,
+    Compare,
+    Expression,
+    Literal,
+    Name,
+    Node,
+    Not,
+    Op,
+    Or,
+    ValueKind,
+    join_nodes,
+)
+from fleet.conditions.parser import MAX_CONDITION_LENGTH, MAX_PARENTHESES
 from schemas import messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -89,8 +101,16 @@ def test_what_a_condition_means(text: str, held: bool | None) -> None:
         ("(no_echo", 9, "the ( of column 1 is not closed"),
         ("no_echo)", 8, "this ) has no ( before it"),
         ("no_echo light.left", 9, "light.left is not expected here: join conditions with and, or"),
-        ("(" * (DEPTH + 1) + "no_echo" + ")" * (DEPTH + 1), DEPTH + 1, "parentheses are too deep: allowed are 32"),
-        ("no_echo" + " " * LENGTH, LENGTH + 1, "it is too long: 1007 characters, allowed are 1000"),
+        (
+            "(" * (MAX_PARENTHESES + 1) + "no_echo" + ")" * (MAX_PARENTHESES + 1),
+            MAX_PARENTHESES + 1,
+            "parentheses are too deep: allowed are 32",
+        ),
+        (
+            "no_echo" + " " * MAX_CONDITION_LENGTH,
+            MAX_CONDITION_LENGTH + 1,
+            "it is too long: 1007 characters, allowed are 1000",
+        ),
     ],
 )
 def test_what_means_nothing_is_told_with_its_place(text: str, column: int, words: str) -> None:
@@ -168,13 +188,13 @@ def test_a_number_that_is_none_was_not_measured_and_a_wrong_type_is_the_callers_
     ],
 )
 def test_what_can_never_be_true(text: str, never: bool) -> None:
-    assert contradictory(parse(text, NAMES)) is never
+    assert is_contradictory(parse(text, NAMES)) is never
 
 
 def test_two_conditions_make_one() -> None:
     both = parse("no_echo or light.left", NAMES) & parse("range_m < 1", NAMES)
     assert str(both) == "(no_echo or light.left) and range_m < 1"
-    assert contradictory(parse("range_m < 1", NAMES) & parse("range_m > 1", NAMES))
+    assert is_contradictory(parse("range_m < 1", NAMES) & parse("range_m > 1", NAMES))
 
 
 # ---------------------------------------------------------------------- against a second opinion
@@ -204,14 +224,18 @@ _atoms = st.one_of(
 def _larger(inner: st.SearchStrategy[Node]) -> st.SearchStrategy[Node]:
     parts = st.lists(inner, min_size=2, max_size=3)
     return st.one_of(
-        parts.map(lambda several: joined(And, several)),
-        parts.map(lambda several: joined(Or, several)),
+        parts.map(lambda several: join_nodes(And, several)),
+        parts.map(lambda several: join_nodes(Or, several)),
         inner.map(lambda one: one.inner if isinstance(one, Not) else Not(one)),
         st.builds(Compare, inner, st.sampled_from([Op.EQ, Op.NE]), inner),
     )
 
 
-_trees = st.recursive(_atoms, _larger, max_leaves=8).map(Expression).filter(lambda made: len(str(made)) <= LENGTH)
+_trees = (
+    st.recursive(_atoms, _larger, max_leaves=8)
+    .map(Expression)
+    .filter(lambda made: len(str(made)) <= MAX_CONDITION_LENGTH)
+)
 _values = st.fixed_dictionaries(
     {},
     optional={
@@ -266,7 +290,7 @@ def test_its_value_is_that_of_a_reference(tree: Expression, values: dict[str, An
 @given(_trees, _values)
 def test_what_is_true_once_is_not_contradictory(tree: Expression, values: dict[str, Any]) -> None:
     if tree.value(values.get):
-        assert not contradictory(tree)
+        assert not is_contradictory(tree)
 
 
 @given(st.text(max_size=40) | st.text("range_m<>=!()'\" andortu0.3-", max_size=40))

@@ -1,5 +1,6 @@
 """Nothing that comes over the bus ends a coordinator: it answers with an error, logs an event, and goes on."""
 
+import json
 import queue
 import threading
 from collections.abc import Iterator
@@ -35,6 +36,14 @@ class Started:
     decided: "queue.Queue[Decision]" = field(default_factory=queue.Queue)
     said: list[str] = field(default_factory=list)
     broken: bool = False
+    persisted: list[tuple[str, str]] = field(default_factory=list)
+    """Each decided phase, and the phase in the state file at that moment."""
+
+    def on_decision(self, decision: Decision) -> None:
+        if decision.subject == "phase":
+            (path,) = self.processes.directory.rglob("*.@coordinator.json")
+            self.persisted.append((decision.decided, json.loads(path.read_text())["phase"]))
+        self.decided.put(decision)
 
     def failed(self, words: str) -> None:
         self.said.append(words)
@@ -59,7 +68,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started
     processes, ended = Processes(free_endpoint(), tmp_path), threading.Event()
     one = Started(processes)
     with Fleet(processes.endpoint, sender=f"{SENDER}x", kind="coordinator") as client:
-        coordinator = Coordinator(client, parse(PLAN), one.decided.put, one.failed)
+        coordinator = Coordinator(client, parse(PLAN), one.on_decision, one.failed)
         thread = threading.Thread(target=coordinator.run, args=(ended.is_set,))
         thread.start()
         try:
@@ -126,3 +135,10 @@ def test_a_finished_plan_begins_anew_when_it_is_restarted(started: Started) -> N
     assert (done.exit_code, done.output.strip()) == (0, f"plan {parse(PHASES).version} begins anew")
     until("work")
     until("done")
+
+
+def test_a_decision_is_persisted_before_it_is_published(started: Started) -> None:
+    """Else a coordinator killed at that moment leaves commands that the next one does not know of."""
+    assert started.ask(PHASES.encode()).status == "sent"
+    wait_for(lambda: len(started.persisted) == 2, "both phases are decided")
+    assert started.persisted == [("work", "work"), ("done", "done")]

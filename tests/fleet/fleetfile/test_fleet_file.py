@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
-from fleet.fleetfile.models import CRITICAL_V, EMPTY_V, FULL_V, LONGEST_DRIVE_S, LOW_V, BatteryAction, schema
+from fleet.fleetfile.models import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V, BatteryAction, schema
 from fleet.links import BadLink, LinkKind, LinkUrl, parse_link, shared_ports
 from gateway.bus import requests
 from gateway.control.estimate import battery
@@ -75,7 +75,7 @@ def test_what_is_not_said_is_as_gateways_have_it() -> None:
     assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.low, policy.critical)
     assert [*BatteryAction] == [*battery.BatteryReaction]
     assert (EMPTY_V, FULL_V, LOW_V, CRITICAL_V) == (battery.EMPTY_V, battery.FULL_V, battery.LOW_V, battery.CRITICAL_V)
-    assert requests.LONGEST_DRIVE_S == LONGEST_DRIVE_S
+    assert requests.LONGEST_DRIVE_S == DEFAULT_MAX_DRIVE_S
 
 
 def test_all_faults_of_a_fleet_are_told_at_once() -> None:

@@ -2,14 +2,14 @@
 
 import pytest
 
-from fleet.policy.debounce import Debounced, Settled, follow, settle
+from fleet.policy.debounce import Debounced, Settled, debounce, settle
 
 
 def _followed(for_s: float, course: list[tuple[float, bool | None]]) -> list[bool]:
     steady: Debounced | None = None
     found = []
     for now, so in course:
-        steady = follow(steady, so, for_s, now)
+        steady = debounce(steady, so, for_s, now)
         found.append(steady is not None and steady.on)
     return found
 

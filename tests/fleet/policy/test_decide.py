@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
-from fleet.policy.state import HUB_BACK_S, PolicyState, carried, hub_back, restored, to_keep
+from fleet.policy.state import HUB_RETURN_GRACE_S, PolicyState, carry_over, on_hub_back, restore, to_persisted
 from tests.fleet.policy.cars import GONE, HERE, PolicyRun
 
 FIXED = parse("cars: {red: tracking}")
@@ -52,7 +52,7 @@ rules:
     ],
 )
 def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarSnapshot, mode: str | None, asks: bool) -> None:
-    result = step(FIXED, FleetSnapshot({"red": car}), PolicyState(began=-9.0), 0.0)
+    result = step(FIXED, FleetSnapshot({"red": car}), PolicyState(started_at=-9.0), 0.0)
     (decision, *_) = result.decisions
     assert decision.mode == mode
     assert bool(result.asks) is asks
@@ -184,7 +184,9 @@ rules:
     assert run.of("blue").readings == ("red/sensor/range range_m=0.2 (1.0 s old)",)
 
 
-@pytest.mark.parametrize(("back_s", "kept"), [(0.3, True), (HUB_BACK_S - 0.2, True), (HUB_BACK_S + 0.2, False)])
+@pytest.mark.parametrize(
+    ("back_s", "kept"), [(0.3, True), (HUB_RETURN_GRACE_S - 0.2, True), (HUB_RETURN_GRACE_S + 0.2, False)]
+)
 def test_after_a_hub_was_away_a_role_waits_for_the_car_that_is_back_last(back_s: float, kept: bool) -> None:
     """Without one the coordinator decides nothing; a car that nobody could hear was not lost."""
     run = PolicyRun(ONE, "blue", "green", "red")
@@ -193,7 +195,7 @@ def test_after_a_hub_was_away_a_role_waits_for_the_car_that_is_back_last(back_s:
     here = dict(run.cars)
     run.cars = dict.fromkeys(here, GONE)
     run.at(1.1)
-    run.memory = hub_back(run.memory, 9.0)
+    run.memory = on_hub_back(run.memory, 9.0)
     for car in here.keys() - {scout}:
         run.cars[car] = here[car]
     run.at(9.0)
@@ -274,8 +276,8 @@ rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led:
     run.change("red", busy=False)
     until(9.0)
     assert coloured == [2.1]
-    kept = to_keep(plan, run.memory, run.now, 100.0)
-    run.memory = restored(plan, FleetSnapshot(run.cars), kept, run.now, 100.0)
+    kept = to_persisted(plan, run.memory, run.now, 100.0)
+    run.memory = restore(plan, FleetSnapshot(run.cars), kept, run.now, 100.0)
     until(12.0)
     assert coloured == [2.1], "nor by a coordinator that takes over"
 
@@ -315,8 +317,8 @@ def test_a_restarted_coordinator_switches_no_mode() -> None:
     same = parse("roles: {a: {mode: tracking}, b: {mode: tracking}}")
     run = PolicyRun(same, "green", "red")
     run.at(0.0)
-    kept = replace(to_keep(same, run.memory, 1.0, 100.0), roles={"green": "b", "red": "a"})
-    run.memory = restored(same, FleetSnapshot(run.cars), kept, 2.0, 101.0)
+    kept = replace(to_persisted(same, run.memory, 1.0, 100.0), roles={"green": "b", "red": "a"})
+    run.memory = restore(same, FleetSnapshot(run.cars), kept, 2.0, 101.0)
     run.at(2.0)
     assert run.roles == {"green": "b", "red": "a"}
     assert len(run.asked) == 2
@@ -327,7 +329,7 @@ def test_a_new_plan_keeps_the_roles_that_it_has_too() -> None:
     run.at(0.0)
     before, asked = run.roles, len(run.asked)
     after = parse(TWO.text + "\nrules: [{when: {any: light.left}, then: {who: that, mode: manual}}]")
-    run.memory, run.plan = carried(run.memory, run.plan, after), after
+    run.memory, run.plan = carry_over(run.memory, run.plan, after), after
     run.at(0.1)
     assert (run.roles, len(run.asked)) == (before, asked)
 
@@ -351,7 +353,7 @@ def test_a_role_for_all_that_are_left_starves_none_of_its_priority() -> None:
     assert set(run.roles.values()) == {"rest"}
     for roles in (f"{PATROL}, {REST}", f"{REST}, {PATROL}"):
         after = parse(f"roles: {{{roles}}}")
-        memory, again = carried(run.memory, run.plan, after), PolicyRun(after, *run.cars)
+        memory, again = carry_over(run.memory, run.plan, after), PolicyRun(after, *run.cars)
         again.memory, again.now = memory, run.now
         again.until(4.0)
         assert sorted(again.roles.values()) == ["patrol", "rest", "rest"]
@@ -485,7 +487,7 @@ def test_when_nothing_changes_any_more_nothing_is_decided_any_more(plan: Any, co
 
 
 def test_gone_is_gone() -> None:
-    assert step(FIXED, FleetSnapshot({"red": GONE}), PolicyState(began=-9.0), 0.0).asks == ()
+    assert step(FIXED, FleetSnapshot({"red": GONE}), PolicyState(started_at=-9.0), 0.0).asks == ()
 
 
 DEPLOYED = parse((Path(__file__).parents[3] / "deploy" / "plan.yaml").read_text(encoding="utf-8"))

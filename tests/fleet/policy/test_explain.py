@@ -55,7 +55,7 @@ CHANGES: dict[str, dict[str, Any]] = {
 def _last(case: str) -> PolicyRun:
     """A coordinator that has come to the decision."""
     run = PolicyRun(SCOUT, "red", obey=False)
-    run.memory = replace(run.memory, began=0.0)
+    run.memory = replace(run.memory, started_at=0.0)
     run.readings["red"] = {} if "not known" in case else {"sensor/battery": Observation({"voltage_v": 7.4}, 9.5)}
     if "too low" in case or case == "role lacks a car":
         run.readings["red"] = {"sensor/battery": Observation({"voltage_v": 6.8}, 9.5)}

@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 from pydantic import Field
 
-from schemas.yaml_document.document import LARGEST_BYTES, BadFile, Entry, read_marked, read_text
+from schemas.yaml_document.document import MAX_YAML_BYTES, BadFile, Entry, read_text, read_yaml
 
 
 class Wheel(Entry):
@@ -28,7 +28,7 @@ FIELDS = "allowed are flag, mode, names, spare, wheels"
 
 def _faults(text: str) -> list[str]:
     with pytest.raises(BadFile) as caught:
-        read_marked(text, "f.yaml", Wagon)
+        read_yaml(text, "f.yaml", Wagon)
     return str(caught.value).splitlines()
 
 
@@ -46,7 +46,7 @@ def test_all_faults_are_told_at_once_each_in_its_place() -> None:
 
 
 def test_yaml_is_that_of_1_2() -> None:
-    wagon = read_marked("wheels: {on: {}, no: {}}\nnames: [11:22:33:44:55:10, off, 1_000]", "f", Wagon)
+    wagon = read_yaml("wheels: {on: {}, no: {}}\nnames: [11:22:33:44:55:10, off, 1_000]", "f", Wagon)
     assert list(wagon.wheels) == ["on", "no"]
     assert wagon.names == ["11:22:33:44:55:10", "off", "1_000"]
 
@@ -98,7 +98,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
         ("wheels: &a [*a]", "nested more than"),
         ("wheels: " + "[" * 100_000, "nested more than"),
         ("wheels: " + "{a: " * 20_000, "nested more than"),
-        ("#" * LARGEST_BYTES + "\nwheels: {}", "more than 256 KiB"),
+        ("#" * MAX_YAML_BYTES + "\nwheels: {}", "more than 256 KiB"),
     ],
     ids=["aliases", "a circle", "brackets", "mappings", "size"],
 )
@@ -125,4 +125,4 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
         with pytest.raises(BadFile, match=rf"{odd.name}:1:1: is a {kind}, not a file: save the text as a file"):
             read_text(odd)
     path.write_bytes("\ufeffmode: fast\nwheels: {}".encode())
-    assert read_marked(read_text(path), "f", Wagon).mode == "fast"
+    assert read_yaml(read_text(path), "f", Wagon).mode == "fast"

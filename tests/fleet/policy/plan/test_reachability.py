@@ -25,8 +25,8 @@ phases: {search: {SEARCH, until: {any: light.left or light.right, for_s: 1}, nex
 LIGHT = "rules: [{when: {any: light.left or light.right, for_s: 1}, then: {who: others, mode: following}}]"
 
 
-def found(text: str, fleet: dict[str, CarSnapshot] | None, gravity: Severity) -> list[str]:
-    return [str(each) for each in check(parse(text), fleet) if each.gravity is gravity]
+def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -> list[str]:
+    return [str(each) for each in check(parse(text), fleet) if each.severity is severity]
 
 
 @pytest.mark.parametrize("fleet", [None, THREE], ids=["any cars", "three cars"])

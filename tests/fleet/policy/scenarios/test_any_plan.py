@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.conditions.parser import DEPTH, LENGTH
+from fleet.conditions.parser import MAX_CONDITION_LENGTH, MAX_PARENTHESES
 from fleet.policy.decide import step
-from fleet.policy.plan.lint import faults
+from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
 from fleet.policy.snapshot import NAMES, CarSnapshot, FleetSnapshot
@@ -38,7 +38,7 @@ def put_in_force(text: str) -> Plan | None:
     except BadFile:
         return None
     for cars in (None, FLEET):
-        str(faults(plan, cars, ["red"]).refusal())
+        str(find_faults(plan, cars, ["red"]).refusal())
     picture = FleetSnapshot({"red": HERE, "pi": HERE}, {"red": seen(0.0, battery={"voltage_v": 6.0})})
     memory = PolicyState()
     for now in (0.0, 2.0, 90_000.0):
@@ -47,19 +47,26 @@ def put_in_force(text: str) -> Plan | None:
 
 
 @pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("length", [949, 950, 975, LENGTH - 1, LENGTH])
+@pytest.mark.parametrize("length", [949, 950, 975, MAX_CONDITION_LENGTH - 1, MAX_CONDITION_LENGTH])
 def test_a_condition_as_long_as_is_allowed_is_put_in_force(place: str, length: int) -> None:
     filler = " or mode.asked == 'manual'"
     count = (length - len(LOW)) // len(filler)
     condition = LOW + " " * (length - len(LOW) - count * len(filler)) + filler * count
     assert len(condition) == length
     assert put_in_force(place.format(json.dumps(condition))) is not None
-    assert put_in_force(place.format(json.dumps(f"{condition}   "[: LENGTH + 1]))) is None or length < LENGTH
+    assert (
+        put_in_force(place.format(json.dumps(f"{condition}   "[: MAX_CONDITION_LENGTH + 1]))) is None
+        or length < MAX_CONDITION_LENGTH
+    )
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_a_condition_as_deep_as_is_allowed_is_put_in_force(place: str) -> None:
-    for depth, allowed in ((DEPTH - 1, True), (DEPTH, True), (DEPTH + 1, False)):
+    for depth, allowed in (
+        (MAX_PARENTHESES - 1, True),
+        (MAX_PARENTHESES, True),
+        (MAX_PARENTHESES + 1, False),
+    ):
         for begin, end in (("(", ")"), ("not (", ")"), ("(link.state != 'lost' and ", ")")):
             condition = begin * depth + LOW + end * depth
             assert (put_in_force(place.format(json.dumps(condition))) is not None) is allowed, (depth, begin)
@@ -101,7 +108,7 @@ SENSIBLE = st.recursive(
         ),
         inner.map(lambda text: f"not ({text})"),
         st.tuples(inner, st.sampled_from([" and ", " or "]), st.integers(2, 40)).map(
-            lambda x: x[1].join([x[0]] * x[2])[:LENGTH]
+            lambda x: x[1].join([x[0]] * x[2])[:MAX_CONDITION_LENGTH]
         ),
     ),
     max_leaves=12,

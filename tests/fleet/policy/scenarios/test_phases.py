@@ -6,9 +6,9 @@ import pytest
 
 from fleet.coordinator.state_file import CoordinatorStateFile
 from fleet.policy.plan.parser import parse
-from fleet.policy.rules import SETTLES_WITHIN_S
+from fleet.policy.rules import PHASE_SETTLE_TIMEOUT_S
 from fleet.policy.snapshot import FleetSnapshot
-from fleet.policy.state import PersistedPolicy, restarted, restored, to_keep
+from fleet.policy.state import PersistedPolicy, restart_plan, restore, to_persisted
 from tests.fleet.policy.cars import GONE, HERE, PolicyRun
 
 PLAN = parse(
@@ -30,7 +30,7 @@ def ends_at(run: PolicyRun) -> float:
         (HERE, 0.0, 0.1, 5.1),  # obeys at once
         (HERE, 0.0, 4.0, 9.0),  # the mode takes its time
         (GONE, 7.0, 8.0, 13.0),  # its gateway comes late
-        (HERE, 0.0, 60.0, SETTLES_WITHIN_S + 5.1),  # it never is: no longer than that
+        (HERE, 0.0, 60.0, PHASE_SETTLE_TIMEOUT_S + 5.1),  # it never is: no longer than that
     ],
 )
 def test_a_time_out_counts_from_when_the_cars_are_in_their_modes(
@@ -63,12 +63,12 @@ def test_phase_and_rules_are_kept_within_one_run_and_roles_longer(
     run = PolicyRun(PLAN, "red")
     run.until(12.0)
     assert run.memory.phase.name == "done"
-    CoordinatorStateFile("fleet", "tcp/x", "run-1").save(to_keep(PLAN, run.memory, run.now, 1000.0))
+    CoordinatorStateFile("fleet", "tcp/x", "run-1").save(to_persisted(PLAN, run.memory, run.now, 1000.0))
 
     def begins(name: str) -> str:
         kept = CoordinatorStateFile("fleet", "tcp/x", name).load()
         assert kept.roles == {"red": "rest"}
-        memory = restored(PLAN, FleetSnapshot(run.cars), kept, 0.0, 1001.0)
+        memory = restore(PLAN, FleetSnapshot(run.cars), kept, 0.0, 1001.0)
         run.memory = memory
         return run.at(0.1).memory.phase.name
 
@@ -80,7 +80,7 @@ def test_phase_and_rules_are_kept_within_one_run_and_roles_longer(
 def test_a_restarted_plan_begins_with_its_first_phase() -> None:
     run = PolicyRun(PLAN, "red")
     run.until(12.0)
-    run.memory = restarted(run.memory)
+    run.memory = restart_plan(run.memory)
     step = run.at(12.1)
     assert step.memory.phase.name == "work"
     assert [each.decided for each in step.changed if each.subject == "phase"] == ["work"]
