@@ -1,1 +1,1 @@
-"""The car on the bus: its service, its publications, the requests that come, and e-stops shared with other gateways."""
+"""The bus interface of one car: service, publications, requests, and the sync of e-stops with other gateways."""

@@ -1,7 +1,7 @@
-"""The other gateways of a fleet: what is meant for all is passed on to them, and fleet-wide e-stops are united.
+"""Syncs fleet-wide e-stops between the gateways of a fleet.
 
-Each gateway serves its own car; only an e-stop (and its end) concerns those of others. They are asked, not subscribed
-to: with fifty cars that would be 2,500 states a second.
+Each gateway serves its own car. Only a fleet-wide e-stop, and its end, concerns the others. A gateway queries the
+others and does not subscribe to them: with fifty cars that would be 2,500 states a second.
 """
 
 import asyncio
@@ -15,131 +15,125 @@ from gateway.control.safety import Estop, PersistedSafety
 from schemas import bus, keys, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
-TOGETHER_S: Final = 0.2
-"""Gateways that come within this time are asked together for the e-stops that they know of."""
-AGAIN_S: Final = 0.5
-"""One that did not answer is asked again after this, then twice this...: it may be starting, and know of an e-stop that
-nobody else knows."""
-SELDOM_S: Final = 30.0
-"""... and so seldom in the end."""
-CALM_S: Final = 1.0
-"""While gateways come on and on, they are asked ever more seldom, down to every `LONGEST_TOGETHER_S`; after so long
-without one that came, at once again."""
-LONGEST_TOGETHER_S: Final = 3.0
-MANY: Final = 8
-"""Maximum gateways that are asked one by one. One query that all answer is cheaper for more of them."""
+BATCH_DELAY_S: Final = 0.2
+"""Delay before a query, so that gateways that start together are queried together."""
+MAX_BATCH_DELAY_S: Final = 3.0
+"""Maximum of that delay. It doubles while more gateways start."""
+BATCH_RESET_S: Final = 1.0
+"""Time without a new gateway after which the delay is short again."""
+FIRST_RETRY_S: Final = 0.5
+"""Delay before the first retry of gateways that did not answer. It doubles with each retry."""
+MAX_RETRY_S: Final = 30.0
+"""Maximum retry interval. Retries never end: the gateway may be starting, and know of an e-stop that no other knows."""
+MAX_SINGLE_QUERIES: Final = 8
+"""Maximum gateways that are queried one by one. One query to all of them is cheaper for more."""
+# After a restart of the hub each gateway queries all others: a hundred gateways cause 10,000 answers. If all queries
+# start at once, answers time out and are requested again, which keeps two processors busy for more than a minute. A new
+# e-stop does not wait for this: its gateway forwards it at once.
 ANSWERS_PER_S: Final = 400.0
-"""Maximum answers per second, all gateways together, when they come back at once.
-
-When a hub comes back every gateway asks all others: a hundred are 10,000 answers. If they ask in one instant, answers
-come too late and are asked for again, which keeps two processors busy for more than a minute. An e-stop that is asked
-for meanwhile does not wait for this: its gateway passes it on at once.
-"""
+"""Maximum answers per second of all gateways together after a restart of the hub."""
 
 log = logging.getLogger("gateway")
 
-Unite = Callable[[Sequence[Estop], Sequence[str], str], object]
-"""Hears e-stops in force, ids of those that ended, and the car whose gateway knows them."""
+MergeEstops = Callable[[Sequence[Estop], Sequence[str], str], object]
+"""Takes the e-stops in force, the ids of ended ones, and the car whose gateway has sent them."""
 
 
 class EstopSync:
-    """Asks the other gateways of `fleet`; made and used in the loop, the bus is asked on threads."""
+    """Queries the other gateways of `fleet`. Create and use it in the loop; the queries run on threads."""
 
     def __init__(self, opened: bus.Bus, fleet: str, car: str) -> None:
         self._bus = opened
         self._fleet = fleet
         self._car = car
-        self._passing_on: set[asyncio.Task[None]] = set()
-        self._came = asyncio.Event()
+        self._forwarding: set[asyncio.Task[None]] = set()
+        self._changed = asyncio.Event()
         self._alive: set[str] = set()
         self._due: set[str] = set()
-        """Gateways that came and have not answered since."""
+        """Gateways that have not answered since they started."""
 
-    def changed(self, changes: Mapping[str, bool]) -> None:
-        """Take that gateways of the fleet came or went."""
+    def on_tokens(self, changes: Mapping[str, bool]) -> None:
+        """Record that gateways of the fleet started or ended."""
         for name, alive in changes.items():
             if name == self._car:
                 continue
             if alive:
                 self._alive.add(name)
                 self._due.add(name)
-                self._came.set()
+                self._changed.set()
             else:
                 self._alive.discard(name)
                 self._due.discard(name)
 
-    def ask_soon(self) -> None:
-        """Ask all: there may be fleet-wide e-stops that this gateway does not know."""
+    def sync_soon(self) -> None:
+        """Query all gateways soon: there may be fleet-wide e-stops that this gateway does not know."""
         self._due |= self._alive
-        self._came.set()
+        self._changed.set()
 
-    def pass_on(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
-        """What was asked of this car alone and is meant for the fleet: ask all, under the same id."""
+    def forward(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
+        """Send a fleet-wide e-stop, or its end, to all gateways under the same id, if it came to this car only."""
         fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
         payload: pb.EstopCommand | pb.ResumeCommand
         match command.what:
             case EmergencyStop(why, True):
                 payload = pb.EstopCommand(why=why, scope="fleet")
-            case Resume(ids) if over := sorted(fleet_wide & set(ids) & set(now.ended)):
-                payload = pb.ResumeCommand(ids=over)
+            case Resume(ids) if ended_ids := sorted(fleet_wide & set(ids) & set(now.ended)):
+                payload = pb.ResumeCommand(ids=ended_ids)
             case _:
                 return
         payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
         key = keys.command_key(self._fleet, "*", command.verb)
         encoding = messages.encoding_of(topics.COMMANDS[command.verb])
-        asking = asyncio.to_thread(self._ask_all, key, payload.SerializeToString(), encoding)
-        task = asyncio.ensure_future(asking)
-        self._passing_on.add(task)
-        task.add_done_callback(self._passing_on.discard)
+        task = asyncio.ensure_future(asyncio.to_thread(self._send_to_all, key, payload.SerializeToString(), encoding))
+        self._forwarding.add(task)
+        task.add_done_callback(self._forwarding.discard)
 
-    def _ask_all(self, key: str, payload: bytes, encoding: str) -> None:
-        """On a thread; what each car answers is in its own records."""
+    def _send_to_all(self, key: str, payload: bytes, encoding: str) -> None:
+        """Send a command to all gateways, on a thread. Ignore the answers: each car records its own."""
         for _ in self._bus.query(key, payload=payload, encoding=encoding):
             pass
 
-    async def keep_united(self, unite: Unite) -> None:
-        """Fleet-wide e-stops, in force and ended, are taken over from whoever comes onto the bus; until cancelled."""
-        again_s, again = AGAIN_S, None
-        together_s, first = TOGETHER_S, True
+    async def keep_synced(self, merge: MergeEstops) -> None:
+        """Merge the fleet-wide e-stops of each gateway that starts, until cancelled."""
+        retry_s, retry = FIRST_RETRY_S, None
+        batch_delay_s, first = BATCH_DELAY_S, True
         while True:
             try:
-                async with asyncio.timeout(CALM_S):
-                    await self._came.wait()
+                async with asyncio.timeout(BATCH_RESET_S):
+                    await self._changed.wait()
             except TimeoutError:
-                together_s = TOGETHER_S
-                await self._came.wait()
-            await asyncio.sleep(together_s)
-            together_s = min(2 * together_s, LONGEST_TOGETHER_S)
-            if len(self._due) > MANY and not first:
+                batch_delay_s = BATCH_DELAY_S
+                await self._changed.wait()
+            await asyncio.sleep(batch_delay_s)
+            batch_delay_s = min(2 * batch_delay_s, MAX_BATCH_DELAY_S)
+            if len(self._due) > MAX_SINGLE_QUERIES and not first:
                 await asyncio.sleep(len(self._due) ** 2 / ANSWERS_PER_S * random.random())  # noqa: S311 - jitter, no secret
             first = False
-            self._came.clear()
-            for answer in await asyncio.to_thread(self._ask, sorted(self._due)):
+            self._changed.clear()
+            for answer in await asyncio.to_thread(self._query, sorted(self._due)):
                 try:
-                    shown: Any = answer.message()
+                    state: Any = answer.message()
                 except (messages.BadPayload, KeyError) as error:
                     log.warning("%s: no state of a gateway of this fleet: %s", answer.key, error)
                     continue
-                unite([_estop(each) for each in shown.estops], shown.ended, shown.car)
-                self._due.discard(shown.car)
-            if again is not None:
-                again.cancel()
+                merge([_estop(each) for each in state.estops], state.ended, state.car)
+                self._due.discard(state.car)
+            if retry is not None:
+                retry.cancel()
             if self._due:
-                again = asyncio.get_running_loop().call_later(again_s, self._came.set)
-            again_s = min(2 * again_s, SELDOM_S) if self._due else AGAIN_S
+                retry = asyncio.get_running_loop().call_later(retry_s, self._changed.set)
+            retry_s = min(2 * retry_s, MAX_RETRY_S) if self._due else FIRST_RETRY_S
 
-    def _ask(self, names: Sequence[str]) -> list[bus.Sample]:
-        """Return the states of these gateways; on a thread.
-
-        If each gateway asked all others whenever one came, a hundred that start would have 300,000 answers to give.
-        """
-        asked = names if len(names) <= MANY else ("*",)
-        selectors = [keys.topic_key(self._fleet, name, "state/safety") for name in asked]
+    def _query(self, names: Sequence[str]) -> list[bus.Sample]:
+        """Return the states of these gateways. Runs on a thread."""
+        # If each gateway queried all others at every start, a hundred starting gateways would cause 300,000 answers.
+        targets = names if len(names) <= MAX_SINGLE_QUERIES else ("*",)
+        selectors = [keys.topic_key(self._fleet, name, "state/safety") for name in targets]
         return [
             answer for selector in selectors for answer in self._bus.query(selector) if isinstance(answer, bus.Sample)
         ]
 
 
-def _estop(shown: pb.Estop) -> Estop:
-    at_ns = shown.stamp.seconds * 1_000_000_000 + shown.stamp.nanos
-    return Estop(shown.id, shown.by, shown.why, at_ns, shown.scope == "fleet")
+def _estop(message: pb.Estop) -> Estop:
+    at_ns = message.stamp.seconds * 1_000_000_000 + message.stamp.nanos
+    return Estop(message.id, message.by, message.why, at_ns, message.scope == "fleet")

@@ -1,7 +1,7 @@
-"""The values of one key, the latest and a ring of earlier ones, and the time ranges that a query may ask for. No bus.
+"""Buffers the last values of one key, and selects them by the time range of a query. No bus.
 
-A time range is written as Zenoh writes it: `[now(-30s)..]`, `[now(-1m)..now(-30s)[`. Zenoh's other form,
-`[start;duration]`, never arrives whole: `;` separates the parameters of a query.
+Time ranges have Zenoh's form: `[now(-30s)..]`, `[now(-1m)..now(-30s)[`. Zenoh's other form, `[start;duration]`, never
+arrives whole: `;` separates the parameters of a query.
 """
 
 import math
@@ -32,7 +32,7 @@ _COUNT: Final = re.compile(r"0*([1-9][0-9]*)")
 
 
 class BadRange(ValueError):
-    """A `_time` or `last` that cannot be read; its text says how to write one."""
+    """An invalid `_time` or `last`. Its text shows the correct form."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +50,11 @@ class HistoryBuffer:
         self._values: deque[Value] = deque(maxlen=size)
 
     def add(self, time_ns: int, payload: bytes) -> None:
-        """Keep a value; the oldest goes."""
+        """Append a value. A full buffer drops the oldest one."""
         self._values.append(Value(time_ns, payload))
 
     def select(self, *, time_range: str | None, last: str | None, now_ns: int) -> list[Value]:
-        """The latest value, or those in a time range, or the last so many; raises BadRange."""
+        """Return the latest value, or those in a time range, or the last ones. Raises BadRange."""
         if time_range is None and last is None:
             return [self._values[-1]] if self._values else []
         values = list(self._values)
@@ -62,16 +62,16 @@ class HistoryBuffer:
             begin, end = parse_range(time_range, now_ns)
             values = [value for value in values if begin <= value.time_ns < end]
         if last is not None:
-            found = _COUNT.fullmatch(last)
-            if found is None:
+            match = _COUNT.fullmatch(last)
+            if match is None:
                 raise BadRange(f"last={last}: give a whole number from 1 on, at most {HISTORY} are kept")
-            if len(found[1]) <= len(str(HISTORY)):
-                values = values[-int(found[1]) :]
+            if len(match[1]) <= len(str(HISTORY)):
+                values = values[-int(match[1]) :]
         return values
 
 
 def parse_range(text: str, now_ns: int) -> tuple[int, int]:
-    """The half-open range [begin, end) of a Zenoh time range, ns since the epoch; raises BadRange."""
+    """Return a Zenoh time range as half-open range [begin, end), ns since the epoch. Raises BadRange."""
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         raise _bad(text)
@@ -82,9 +82,9 @@ def parse_range(text: str, now_ns: int) -> tuple[int, int]:
 
 
 def _instant(text: str, now_ns: int, whole: str) -> int:
-    found = _NOW.fullmatch(text)
-    if found is not None:
-        return now_ns + (_duration_ns(found[1], whole) if found[1] else 0)
+    match = _NOW.fullmatch(text)
+    if match is not None:
+        return now_ns + (_duration_ns(match[1], whole) if match[1] else 0)
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
@@ -95,10 +95,10 @@ def _instant(text: str, now_ns: int, whole: str) -> int:
 
 
 def _duration_ns(text: str, whole: str) -> int:
-    found = _DURATION.fullmatch(text)
-    if found is None:
+    match = _DURATION.fullmatch(text)
+    if match is None:
         raise _bad(whole)
-    duration_ns = float(found[1]) * _UNITS_NS[found[2] or "s"]
+    duration_ns = float(match[1]) * _UNITS_NS[match[2] or "s"]
     if not math.isfinite(duration_ns):
         raise _bad(whole)
     return round(duration_ns)

@@ -1,6 +1,6 @@
-"""From a payload on a command key to a command that control understands, or words that say what is wrong with it.
+"""Parses a command query or publication into a `Command`, or raises an error that names the mistake.
 
-Ranges are checked here, at the edge; whether the car may do it now is the arbiter's.
+It checks ranges. The arbiter decides whether the car may carry out the command now.
 """
 
 import hashlib
@@ -33,23 +33,25 @@ from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz,
 from schemas import messages
 from schemas.topics import COMMANDS, PROTOBUF, STOPS
 
-LONGEST_DRIVE_S: Final = 10.0
-"""A drive that holds longer is refused, unless `gateway run --longest-drive` allows it: who drives can say so again."""
-LONGEST_NAME: Final = 128
-"""Of a sender or an id, characters."""
-LONGEST_WHY: Final = 200
-"""Of an e-stop's reason, characters; the rest is cut off: nobody's e-stop fails over its words."""
+DEFAULT_MAX_DRIVE_S: Final = 10.0
+"""Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
+MAX_NAME_LENGTH: Final = 128
+"""Maximum characters of a sender's name or an id."""
+MAX_REASON_LENGTH: Final = 200
+"""Maximum characters of an e-stop's reason. The rest is cut off, so that no e-stop fails for its reason."""
 _DRIVE_TTL_S: Final = 0.5
-_TTL_S: Final = 2.0  # docs/reference/messages.md#commands: maximum age at arrival
+_TTL_S: Final = (
+    2.0  # docs/reference/messages.md#commands: maximum age at arrival, default 0.5 for drive, 2 for the rest
+)
 _SAME_QUERY_NS: Final = 2_000_000_000
-"""One query reaches every gateway within this time."""
-BY_WILDCARD: Final = ("stop", "estop", "resume")
-"""Verbs that may be asked of several cars with one query (docs/reference/keys.md#command-keys)."""
+"""Maximum time in which one query reaches every gateway."""
+WILDCARD_VERBS: Final = ("stop", "estop", "resume")
+"""Verbs that one query may send to several cars (docs/reference/keys.md#command-keys)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParsedRequest:
-    """What came: the verb, the payload, and how old it is."""
+    """A request before parsing: the verb, the payload, and its times."""
 
     verb: str
     payload: bytes | None
@@ -58,20 +60,20 @@ class ParsedRequest:
     """Wall clock, ns since the epoch."""
     sampled_ns: int | None = None
     """Zenoh timestamp of a publication; None for a query."""
-    longest_drive_s: float = LONGEST_DRIVE_S
+    longest_drive_s: float = DEFAULT_MAX_DRIVE_S
     by_wildcard: bool = False
-    """It was asked of several cars with one key expression."""
+    """True if one key expression addressed several cars."""
     unread: str = ""
-    """Why its payload was not read, and is left out here."""
+    """Why the payload was not read; empty if it was."""
 
     @property
     def streamed(self) -> bool:
-        """It came as a publication: nobody waits for an answer."""
+        """Return True for a publication: nobody waits for an answer."""
         return self.sampled_ns is not None
 
 
 class BadRequest(ValueError):
-    """A request that is no command. Carries what is known of it, so that the refusal can be recorded under its id."""
+    """An invalid request. `command` has its readable part, so that the rejection is recorded under its id."""
 
     def __init__(self, reason: Reason, words: str, command: Command) -> None:
         super().__init__(words)
@@ -81,38 +83,38 @@ class BadRequest(ValueError):
 
 
 def parse(request: ParsedRequest) -> Command:
-    """The command in a request; raises BadRequest."""
+    """Parse a request. Raises BadRequest."""
     verb = request.verb
     blank = Command(_id(request), verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
     if verb not in COMMANDS:
         words = f"{verb!r} is no command; there are: {', '.join(COMMANDS)}"
         raise BadRequest(Reason.UNSUPPORTED, words, blank)
-    if request.by_wildcard and verb not in BY_WILDCARD:
-        words = f"{verb} cannot be asked by wildcard: name one car (only {', '.join(BY_WILDCARD)} can)"
+    if request.by_wildcard and verb not in WILDCARD_VERBS:
+        words = f"{verb} cannot be asked by wildcard: name one car (only {', '.join(WILDCARD_VERBS)} can)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     if request.unread:
         if verb not in STOPS:
             raise BadRequest(Reason.BAD_VALUE, f"{verb}: {request.unread}", blank)
-        return _stopped_though(blank, request.unread, request)
+        return _stop_anyway(blank, request.unread, request)
     if request.payload is None and verb not in STOPS:
         words = f"{verb} without a payload: give {COMMANDS[verb]} or its JSON (only stop and estop need none)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     try:
-        return _filled(blank, request)
+        return _parse_payload(blank, request)
     except BadRequest as error:
         if verb not in STOPS:
             raise
-        return _stopped_though(error.command, error.words, request)
+        return _stop_anyway(error.command, error.words, request)
 
 
-def _stopped_though(command: Command, words: str, request: ParsedRequest) -> Command:
-    """Whatever is wrong with its words: somebody wants this car to stop."""
+def _stop_anyway(command: Command, words: str, request: ParsedRequest) -> Command:
+    """Return the stop of an invalid stop or e-stop: the car stops whatever the error is."""
     what = Stop() if request.verb == "stop" else _readable_estop(request)
     return replace(command, what=what, note=f"stopped, though: {words}")
 
 
 def _id(request: ParsedRequest) -> str:
-    """An id for who gave none. An e-stop asked of all with one query is one e-stop: every gateway makes the same."""
+    """Return an id for a request without one. For an e-stop to all cars every gateway makes the same id."""
     if request.verb != "estop" or not request.by_wildcard:
         return uuid.uuid4().hex
     query = (request.payload or b"") + str(request.now_ns // _SAME_QUERY_NS).encode()
@@ -120,22 +122,22 @@ def _id(request: ParsedRequest) -> str:
 
 
 def _readable_estop(request: ParsedRequest) -> EmergencyStop:
-    """What can be read of an e-stop in which something is wrong: its scope and its reason, if nothing else."""
+    """Return the readable part of an invalid e-stop: its scope and its reason."""
     try:
-        given = json.loads(request.payload or b"{}")
+        fields = json.loads(request.payload or b"{}")
     except (ValueError, RecursionError):
-        given = None
-    if not isinstance(given, dict):
+        fields = None
+    if not isinstance(fields, dict):
         try:
             message: Any = messages.parse(COMMANDS["estop"], request.payload or b"", _encoding(request))
         except messages.BadPayload:
             return EmergencyStop()
-        given = {"why": message.why, "scope": message.scope}
-    why = given.get("why")
-    return EmergencyStop(_why(why) if isinstance(why, str) else "", given.get("scope") == "fleet")
+        fields = {"why": message.why, "scope": message.scope}
+    why = fields.get("why")
+    return EmergencyStop(_why(why) if isinstance(why, str) else "", fields.get("scope") == "fleet")
 
 
-def _filled(blank: Command, request: ParsedRequest) -> Command:
+def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
     verb = blank.verb
     try:
         message: Any = messages.parse(COMMANDS[verb], request.payload or b"", _encoding(request))
@@ -166,7 +168,7 @@ def _encoding(request: ParsedRequest) -> str:
 
 
 def _age_s(message: Any, request: ParsedRequest) -> float | None:
-    """Return the seconds since it was asked, None if unknown; a clock that is ahead of ours gives 0, not a bonus."""
+    """Return the age of a request, s; None if unknown, and 0 if the sender's clock is ahead of ours."""
     if message.HasField("asked"):
         asked_ns = message.asked.seconds * 1_000_000_000 + message.asked.nanos
     elif request.sampled_ns is not None:
@@ -178,13 +180,13 @@ def _age_s(message: Any, request: ParsedRequest) -> float | None:
 
 
 def _text(field: str, value: str, forbidden: str = "") -> str:
-    """A name as it goes into states and files; a sender's also stands in the key of its token."""
+    """Check a name for states and files. The sender's name is also part of the key of its token."""
     if set(value) & set(forbidden):
         raise ValueError(f"{field} {value!r} is not allowed: none of {' '.join(forbidden)} may be in it")
     if not value.isprintable():
         raise ValueError(f"{field} {value!r} is not allowed: no control characters")
-    if len(value) > LONGEST_NAME:
-        raise ValueError(f"{field} of {len(value)} characters is too long: at most {LONGEST_NAME}")
+    if len(value) > MAX_NAME_LENGTH:
+        raise ValueError(f"{field} of {len(value)} characters is too long: at most {MAX_NAME_LENGTH}")
     return value
 
 
@@ -192,8 +194,8 @@ def _word(field: str, value: str, kind: Any) -> Any:
     try:
         return kind(value)
     except ValueError:
-        given = f"{field} {value!r}" if value else f"no {field} given"
-        raise ValueError(f"{given}: allowed are {', '.join(kind)}") from None
+        problem = f"{field} {value!r}" if value else f"no {field} given"
+        raise ValueError(f"{problem}: allowed are {', '.join(kind)}") from None
 
 
 def _seconds(field: str, value: float, top: float) -> float:
@@ -264,7 +266,7 @@ def _estop(message: Any) -> Action:
 
 
 def _why(text: str) -> str:
-    return "".join(each if each.isprintable() else " " for each in text)[:LONGEST_WHY]
+    return "".join(each if each.isprintable() else " " for each in text)[:MAX_REASON_LENGTH]
 
 
 def _checked(frame: ColorLed | Ptz | ArmSet) -> OneShot:

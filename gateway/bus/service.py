@@ -1,10 +1,10 @@
-"""A gateway's doors on the bus: its queryables, its drive subscription and its token, and whether another has them.
+"""The bus service of one car: its queryables, its drive subscription, its token, and the check for a second gateway.
 
-They are declared before the gateway has imported the rest of itself, half of what a start takes: a car is on the bus at
-once, and what is asked meanwhile waits for `attach`. So nothing heavy is imported here.
+The gateway declares it before it imports the rest of its modules, which takes half of the start. So the car is on the
+bus at once, and queries wait for `attach`. Do not import heavy modules here.
 
-Commands come before answers: a command waits for a turn of the loop, a question of values for those before it, and a
-question of the past for the task that answers one of them at a time.
+Commands go before queries of values. A command waits for one turn of the loop. Queries of values wait in a queue, and
+queries of the history in another one.
 """
 
 import time
@@ -21,50 +21,52 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 FAMILIES: Final = ("sensor", "state")
-STREAM_WAITING: Final = 32
-"""Drives of streams that may wait: of a flood the newest, and few, so that a stop never waits for long behind them."""
-COMMANDS_WAITING: Final = 128
-STOPS_WAITING: Final = 128
-"""Stops find room when other commands find none: they wait in one order, as a drive must not follow its own stop."""
-LARGE_WAITING: Final = 4
-"""Commands that are too large to be read, and wait to be refused: each keeps its payload in memory."""
-VALUES_WAITING: Final = 256
-HISTORIES_WAITING: Final = 8
-"""Questions of the past that may wait: each takes up to a second of work, and every answer of it memory."""
-ANSWERS_S: Final = 3.0
-"""Who serves the car and is held up answers within it, or is off the bus: Zenoh's lease is 2 s."""
+MAX_QUEUED_DRIVES: Final = 32
+"""Maximum waiting drives of streams; the newest are kept. Few, so that a stop never waits long behind them."""
+MAX_QUEUED_QUERIES: Final = 128
+"""Maximum waiting command queries."""
+MAX_QUEUED_STOPS: Final = 128
+"""Additional room for stops. They share the queue of the commands, because a drive must not overtake its own stop."""
+MAX_QUEUED_OVERSIZED: Final = 4
+"""Maximum waiting commands that are too large and will be rejected. Each holds its payload in memory."""
+MAX_QUEUED_VALUE_QUERIES: Final = 256
+"""Maximum waiting queries of the latest values."""
+MAX_QUEUED_HISTORY_QUERIES: Final = 8
+"""Maximum waiting queries of the history. Each takes up to a second of work, and memory for every answer."""
+RIVAL_TIMEOUT_S: Final = 3.0
+"""Timeout for another gateway's answer. A stalled one answers within it or loses its Zenoh lease (2 s)."""
 
 
 class AlreadyServed(Exception):
-    """Another gateway serves this car; the text names it."""
+    """Another gateway serves this car. The text names it."""
 
 
 class CarService:
-    """What one gateway has declared. Raises AlreadyServed if another gateway answers for the car."""
+    """The declarations of one gateway. Raises AlreadyServed if another gateway answers for the car."""
 
     def __init__(self, opened: bus.Bus, fleet: str, car: str) -> None:
         self._bus = opened
         self._fleet = fleet
         self._car = car
         self.refuse(self.others())
-        self._commands: bus.Handover[tuple[zenoh.Query, str]] = bus.Handover(limit=COMMANDS_WAITING)
-        self._large: bus.Handover[tuple[zenoh.Query, str]] = bus.Handover(limit=LARGE_WAITING)
-        self._stream: bus.Handover[bus.Sample] = bus.Handover(limit=STREAM_WAITING, newest=True)
-        self.values: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(VALUES_WAITING)
-        """Questions of the latest values: the family, and the query."""
-        self.histories: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(HISTORIES_WAITING)
-        """Questions of earlier values."""
+        self._commands: bus.Handover[tuple[zenoh.Query, str]] = bus.Handover(limit=MAX_QUEUED_QUERIES)
+        self._large: bus.Handover[tuple[zenoh.Query, str]] = bus.Handover(limit=MAX_QUEUED_OVERSIZED)
+        self._stream: bus.Handover[bus.Sample] = bus.Handover(limit=MAX_QUEUED_DRIVES, newest=True)
+        self.values: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(MAX_QUEUED_VALUE_QUERIES)
+        """Queries of the latest values, each with its family."""
+        self.histories: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(MAX_QUEUED_HISTORY_QUERIES)
+        """Queries of the history, each with its family."""
         self._senders: bus.Latest[bool] = bus.Latest()
         self._cars: bus.Latest[bool] = bus.Latest()
-        # Queryables first, then the token: whoever sees the token gets an answer.
+        # Queryables first, then the token: clients that see the token must get an answer.
         for family in FAMILIES:
             # A query on `fleet/**` reaches both: each answers for its own family only.
-            opened.queryable(f"{fleet}/{car}/{family}/*", partial(self._asked, family))
-        opened.queryable(keys.command_key(fleet, car, "*"), self._command, too_large=self._too_large)
+            opened.queryable(f"{fleet}/{car}/{family}/*", partial(self._on_query, family))
+        opened.queryable(keys.command_key(fleet, car, "*"), self._on_command, too_large=self._on_oversized)
         opened.subscribe(keys.command_key(fleet, car, "drive"), self._stream, largest=bus.LARGEST_PAYLOAD)
-        opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._sender)
+        opened.watch_tokens(f"{fleet}/{keys.OPERATOR}/*", self._on_sender)
         opened.token(keys.car_token(fleet, car))
-        opened.watch_tokens(keys.car_token(fleet, "*"), self._neighbour)
+        opened.watch_tokens(keys.car_token(fleet, "*"), self._on_car)
 
     def attach(
         self,
@@ -77,9 +79,10 @@ class CarService:
         senders: "Callable[[Mapping[str, bool]], object]",
         cars: "Callable[[Mapping[str, bool]], object]",
     ) -> None:
-        """Say who takes what comes, and came: (command, why it is not read), drives, whether each name is alive.
+        """Connect the handlers, also for items that wait already.
 
-        `values` and `histories` are set when there are questions.
+        `command` takes a query and why its payload is not read. `senders` and `cars` take changes of tokens by name.
+        `values` and `histories` are set when there are queries.
         """
         self.values.attach(loop, values)
         self.histories.attach(loop, histories)
@@ -91,24 +94,26 @@ class CarService:
 
     @property
     def dropped(self) -> int:
-        """How much came that nobody could take in time."""
+        """Return the number of dropped items."""
         handovers = (self._commands, self._large, self._stream, self.values, self.histories, self._senders, self._cars)
         return sum(handover.dropped for handover in handovers)
 
     def others(self) -> list[Any]:
-        """The fleet.v1.Health of every other gateway that answers for this car."""
-        found: list[Any] = []
-        deadline, busy = time.monotonic() + ANSWERS_S, True
+        """Return the fleet.v1.Health of each other gateway that answers for this car."""
+        healths: list[Any] = []
+        deadline, busy = time.monotonic() + RIVAL_TIMEOUT_S, True
         while busy and time.monotonic() < deadline:
             busy = False
-            for answer in self._bus.query(keys.topic_key(self._fleet, self._car, "state/health"), timeout_s=ANSWERS_S):
+            for answer in self._bus.query(
+                keys.topic_key(self._fleet, self._car, "state/health"), timeout_s=RIVAL_TIMEOUT_S
+            ):
                 if isinstance(answer, bus.Failure):
-                    busy = busy or answer.words == bus.BUSY  # there is one, and it will say who it is
+                    busy = busy or answer.words == bus.BUSY  # there is one: repeat the query until it answers
                     continue
                 health: Any = answer.message()
                 if health.boot_id != self._bus.boot_id:
-                    found.append(health)
-        return found
+                    healths.append(health)
+        return healths
 
     def refuse(self, others: list[Any]) -> None:
         """Raise AlreadyServed if there is another."""
@@ -118,27 +123,27 @@ class CarService:
                 f"(link {other.link}): stop that one first, or give this car another name"
             )
 
-    def _asked(self, family: str, query: zenoh.Query) -> bool:
-        """On a Zenoh thread."""
-        of_the_past = any(each in query.parameters for each in ("_time", "last"))
-        return (self.histories if of_the_past else self.values)((family, query))
+    def _on_query(self, family: str, query: zenoh.Query) -> bool:
+        """Queue a query of values. Runs on a Zenoh thread."""
+        is_history = any(each in query.parameters for each in ("_time", "last"))
+        return (self.histories if is_history else self.values)((family, query))
 
-    def _command(self, query: zenoh.Query) -> bool:
-        """On a Zenoh thread."""
-        return self._commands((query, ""), reserve=STOPS_WAITING if _is_stop(query) else 0)
+    def _on_command(self, query: zenoh.Query) -> bool:
+        """Queue a command. Runs on a Zenoh thread."""
+        return self._commands((query, ""), reserve=MAX_QUEUED_STOPS if _is_stop(query) else 0)
 
-    def _too_large(self, query: zenoh.Query, words: str) -> bool:
-        """On a Zenoh thread."""
+    def _on_oversized(self, query: zenoh.Query, words: str) -> bool:
+        """Queue a command that is too large to be read. Runs on a Zenoh thread."""
         if _is_stop(query):
-            return self._commands((query, words), reserve=STOPS_WAITING)
+            return self._commands((query, words), reserve=MAX_QUEUED_STOPS)
         return self._large((query, words))
 
-    def _sender(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
-        """On a Zenoh thread."""
+    def _on_sender(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
+        """Queue a change of a sender's token. Runs on a Zenoh thread."""
         self._senders(key.rpartition("/")[2], alive)
 
-    def _neighbour(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
-        """On a Zenoh thread."""
+    def _on_car(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
+        """Queue a change of a gateway's token. Runs on a Zenoh thread."""
         self._cars(key.rpartition("/")[2], alive)
 
 

@@ -1,61 +1,63 @@
-"""How long to wait before the next try to connect, and what of many tries is news."""
+"""Sets the delay between attempts to open a link, and limits how often they are logged."""
 
 from typing import Final
 
-FIRST_S: Final = 0.25
-LONGEST_S: Final = 1.0
-"""A car may be driving while its link is away: whatever a try costs, it is tried again within a second."""
+FIRST_DELAY_S: Final = 0.25
+MAX_DELAY_S: Final = 1.0
+"""Delay after the first failure, and maximum delay: a car may be driving while its link is down."""
 PROVEN_S: Final = 3.0
-"""An open link that lived so long was no failure to open, though nothing was heard."""
-MOST_CAUSES: Final = 10
+"""Minimum time after which an open link counts as proven without a reading."""
+MAX_LOGGED_CAUSES: Final = 10
+"""Maximum different causes that are logged until a link is proven."""
 _OPENED: Final = ""
 
 
 def delay_s(failures: int, jitter: float) -> float:
-    """Seconds before the next try after `failures` (1..) in a row; `jitter` 0..1 spreads it over the upper half."""
-    longest = min(LONGEST_S, FIRST_S * 2.0 ** min(failures - 1, 10))
+    """Return the delay after `failures` (1..) in a row, s. `jitter` 0..1 spreads it over the upper half."""
+    longest = min(MAX_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures - 1, 10))
     return longest * (0.5 + 0.5 * jitter)
 
 
 class Attempts:
-    """The openings of one link, each of which may reset a car's board.
+    """The attempts to open one link; each may reset a car's board.
 
-    One that carried a reading, or lived PROVEN_S, is proven, and its loss is followed by a try at once. One that opens
-    and dies at once counts as one that did not open. Until one is proven, each cause is news once, and so is opening.
+    A link is proven by a reading, or after `PROVEN_S`. After the loss of a proven link the delay starts from the
+    shortest. A link that is lost earlier counts as a failure. Until a link is proven, each cause is logged once, and so
+    is the opening.
     """
 
     def __init__(self) -> None:
         self._failures = 0
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self._opened_at: float | None = None
-        """Of the link that is open and not proven yet."""
-        self._untold = False
+        """When the link was opened that is not proven yet; None if there is none."""
+        self._log_when_proven = False
 
-    def opened(self, now: float) -> bool:
-        """The link is open; whether that is news."""
+    def on_open(self, now: float) -> bool:
+        """Record that the link is open. Return True if that should be logged."""
         self._opened_at = now
-        self._untold = _OPENED in self._told
-        self._told.add(_OPENED)
-        return not self._untold
+        self._log_when_proven = _OPENED in self._logged
+        self._logged.add(_OPENED)
+        return not self._log_when_proven
 
-    def proven(self, now: float, *, heard: bool) -> bool:
-        """Ask of an open link, at each reading and now and then; whether it is news now that it is open."""
-        if self._opened_at is None or not (heard or now - self._opened_at >= PROVEN_S):
+    def check_proven(self, now: float, *, has_reading: bool) -> bool:
+        """Check whether the open link is proven now. Return True if its opening should be logged now."""
+        if self._opened_at is None or not (has_reading or now - self._opened_at >= PROVEN_S):
             return False
         self._opened_at = None
         self._failures = 0
-        self._told.clear()
-        return self._untold
+        self._logged.clear()
+        return self._log_when_proven
 
-    def failed(self, cause: str) -> bool:
-        """The link did not open, or is lost; whether the cause is news."""
+    def on_failed(self, cause: str) -> bool:
+        """Record that the link did not open, or is lost. Return True if the cause should be logged."""
         self._opened_at = None
         self._failures += 1
-        news = cause not in self._told and len(self._told) < MOST_CAUSES
-        if news:
-            self._told.add(cause)
-        return news
+        should_log = cause not in self._logged and len(self._logged) < MAX_LOGGED_CAUSES
+        if should_log:
+            self._logged.add(cause)
+        return should_log
 
     def delay_s(self, jitter: float) -> float:
-        """Seconds before the next try; `jitter` as for `delay_s`."""
+        """Return the delay before the next attempt, s; `jitter` as for the function `delay_s`."""
         return delay_s(max(1, self._failures), jitter)

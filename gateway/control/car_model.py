@@ -1,6 +1,6 @@
-"""What the gateway believes of one car: platform, mode, battery, outputs, trust, and what shows a stop. No decisions.
+"""The estimates of one car: platform, mode, battery, outputs, trust, and evidence of a stop. It decides nothing.
 
-`Executor` changes it by what it writes, `CarMonitor` by what is heard.
+`Executor` updates it with each written frame, `CarMonitor` with each reading.
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.platforms import Profile, StopStyle
 
 KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
-"""In these states the last recovery is over and no write has failed since, so the car reads frames as meant."""
+"""States in which the last recovery is over and no write has failed since, so the car reads frames as meant."""
 
 
 @dataclass(slots=True)
@@ -29,7 +29,7 @@ class CarModel:
     name: str
     profile: Profile
     auto: bool
-    ledger: CommandLog
+    log: CommandLog
     battery_policy: BatteryPolicy
     platform: PlatformDetector = field(init=False)
     mode: ModeEstimator = field(init=False)
@@ -39,7 +39,10 @@ class CarModel:
     evidence: StopEvidence = field(default_factory=StopEvidence)
     trust: TrustState = field(default_factory=TrustState)
     rest: StopCase = StopCase.SOFT
-    """What the claim of rest rests on, if that is only `sent`."""
+    """What the claim of rest rests on if its basis is `sent`."""
+    left_at: float = float("-inf")
+    left_until: float = float("-inf")
+    """When the last frame that leaves a mode was written, and when the car has left the mode at the latest."""
     link_open: bool = False
     link_reason: str = "not connected yet"
 
@@ -56,42 +59,47 @@ class CarModel:
         self.believed = replace(self.believed, profile=profile)
 
     def learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
-        """Change the trust in the car. This is the only place that does; the record has each change."""
+        """Update the trust state, and log each change. Only this function changes it."""
         if self.trust.take(event, now, evidence):
             trust = self.trust
             basis = f" ({trust.basis})" if trust.basis is not None else ""
             words = f"{self.name} is {trust.state.replace('_', ' ')}{basis}: {trust.evidence}"
-            self.ledger.log(Level.DEBUG, "trust", words, now)
+            self.log.log(Level.DEBUG, "trust", words, now)
 
     @property
     def known(self) -> bool:
-        """Return True if the car reads what is sent as it is meant."""
+        """Return True if the car reads frames as meant."""
         return self.trust.state in KNOWN
 
     @property
     def manual(self) -> bool:
-        """Return True if mode 0 is the last that was asked, and no reading contradicts it."""
+        """Return True if mode 0 was commanded last, and no reading contradicts it."""
         return self.mode.asked is Mode.MANUAL and self.mode.verdict is not Verdict.CONTRADICTED
 
     @property
     def at_rest(self) -> bool:
-        """Return True if the car stands in mode 0 after a stop, as shown or as sent."""
+        """Return True if the car stands in mode 0 after a stop. The basis may be `shown` or `sent`."""
         return self.trust.state is CarTrust.STOPPED and self.manual
 
     @property
     def rest_is_sure(self) -> bool:
-        """Return True if the car has shown that it stands, or could not show it if it did."""
+        """Return True if the car has shown that it stands, or cannot show it."""
         return self.at_rest and (self.trust.shown or self.rest is not StopCase.SOFT or not self.can_show)
 
     @property
     def can_show(self) -> bool:
-        """Return True if the platform is one that shows a stop."""
-        return self.for_stop_style is StopStyle.MODE_FRAME
+        """Return True if a car of this platform shows a stop."""
+        return self.stop_style is StopStyle.MODE_FRAME
 
     @property
-    def for_stop_style(self) -> StopStyle:
-        """Return which kind of stop the car takes now."""
+    def stop_style(self) -> StopStyle:
+        """Return the kind of stop for this car now."""
         return stopping.style_of(self.profile, doubted=self.platform.doubted)
+
+    @property
+    def is_heard(self) -> bool:
+        """Return False if the car is silent for longer than any normal silence."""
+        return self.trust.state is not CarTrust.UNHEARD
 
     @property
     def motors(self) -> str:
@@ -103,29 +111,34 @@ class CarModel:
 
     @property
     def basis(self) -> Basis | None:
-        """Return what `off` rests on; None if the motors are not off."""
+        """Return the basis of the claim that the motors are off; None if they are not."""
         return self.trust.basis if self.motors == "off" else None
 
     @property
     def motion(self) -> Motion | None:
-        """Return the motion that was sent last; None if the state is unknown or the car moves by itself."""
+        """Return the last motion sent; None if the state is unknown or the car drives by itself."""
         return self.believed.motion if self.known and self.manual else None
 
     def for_stop(self, now: float) -> stopping.StopContext:
-        """Return what the choice of a stop looks at."""
+        """Return the context for the choice of a stop."""
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
         clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
         return stopping.StopContext(
             self.profile, self.known, self.mode.asked, contradicted, clear, blocked, self.platform.doubted
         )
 
+    @property
+    def ready_at(self) -> float:
+        """Return the earliest time for a frame that belongs to no stop."""
+        return max(self.pacing.flight_until, self.left_until)
+
     def is_awake(self, now: float) -> bool:
-        """Return True if the car reads a frame at once: no block of ours runs, nor one that we know nothing of."""
+        """Return True if the car reads a frame at once, because no block runs, known or unknown."""
         pacing = self.pacing
-        if now <= pacing.heard_at + AWAKE_S and now >= pacing.block_from - FLIGHT_S / 2:
+        if now <= pacing.reported_at + AWAKE_S and now >= pacing.block_from - FLIGHT_S / 2:
             return True
         if now < pacing.block_until - FLIGHT_S:
             return False
         if self.known and self.manual:
             return True
-        return now >= self.pacing.written_at + sequences.SILENCE_S - 0.1
+        return now >= pacing.written_at + sequences.RECOVERY_SILENCE_S - 0.1

@@ -1,4 +1,4 @@
-"""What became of each command, and notable events, kept until the loop publishes them."""
+"""Records the transitions of commands, and log records, until the loop publishes them."""
 
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
@@ -8,36 +8,37 @@ from gateway.control.commands import Command, Phase, Reason
 from gateway.control.events import CommandRecord, Level, LogRecord, Record
 from gateway.protocol.frames import Frame
 
-_REMEMBERED_IDS: Final = 256
+MAX_COMMAND_IDS: Final = 256
+"""Maximum accepted commands whose ids are remembered, to detect duplicates."""
 
 
 @dataclass(slots=True)
 class Pending:
-    """A command on its way: the frames it still needs, and when it came."""
+    """A command in progress: its arrival time, and the frames that it still needs."""
 
     command: Command
-    asked_at: float
+    received_at: float
     frames: deque[Frame] = field(default_factory=deque)
     sent: bool = False
     count: int = 1
-    """How many commands of a stream it stands for."""
+    """Number of merged commands of a stream."""
 
 
 class CommandLog:
-    """Records transitions; of a stream only its start, its end, and where a refusal begins."""
+    """Records each transition. Of a stream it records the start, the end, and the first rejection of each reason."""
 
     def __init__(self) -> None:
         self._records: list[Record] = []
         self._ids: OrderedDict[str, None] = OrderedDict()
-        self._refused: dict[str, Reason] = {}
+        self._rejected: dict[str, Reason] = {}
 
     @property
-    def waiting(self) -> bool:
-        """Whether there are records to take."""
+    def has_records(self) -> bool:
+        """Return True if there are records to take."""
         return bool(self._records)
 
     def take(self) -> list[Record]:
-        """The records since the last call."""
+        """Return the records since the last call."""
         records, self._records = self._records, []
         return records
 
@@ -53,44 +54,44 @@ class CommandLog:
         evidence: tuple[str, ...] = (),
         basis: str = "",
     ) -> None:
-        """Note one transition."""
+        """Record one transition."""
         pending.sent = pending.sent or phase is Phase.SENT
-        took = now - pending.asked_at
+        took = now - pending.received_at
         self._records.append(
             CommandRecord(
                 pending.command, phase, now, reason, words, worst_case_s, took, evidence, pending.count, basis
             )
         )
 
-    def sent(self, pending: Pending, now: float, words: str = "") -> None:
-        """Note that the first frame went out, once."""
+    def record_sent(self, pending: Pending, now: float, words: str = "") -> None:
+        """Record once that the first frame was written."""
         if not pending.sent:
             self.record(pending, Phase.SENT, now, words=words)
 
-    def refused(self, pending: Pending, reason: Reason, words: str, now: float) -> None:
-        """Note a refusal; of a stream only the first of a kind."""
+    def record_rejection(self, pending: Pending, reason: Reason, words: str, now: float) -> None:
+        """Record a rejection. Of a stream record only the first of each reason."""
         sender = pending.command.sender.name
         if pending.command.streamed:
-            if self._refused.get(sender) is reason:
+            if self._rejected.get(sender) is reason:
                 return
-            if len(self._refused) >= _REMEMBERED_IDS:
-                self._refused.clear()
-            self._refused[sender] = reason
+            if len(self._rejected) >= MAX_COMMAND_IDS:
+                self._rejected.clear()
+            self._rejected[sender] = reason
         self.record(pending, Phase.REJECTED, now, reason=reason, words=words)
 
-    def accepted(self, command: Command) -> None:
-        """Remember a command's id, so that it is not carried out twice."""
-        self._refused.pop(command.sender.name, None)
+    def accept(self, command: Command) -> None:
+        """Remember the command's id, so that the command is not carried out twice."""
+        self._rejected.pop(command.sender.name, None)
         if command.streamed:
             return
         self._ids[command.id] = None
-        if len(self._ids) > _REMEMBERED_IDS:
+        if len(self._ids) > MAX_COMMAND_IDS:
             self._ids.popitem(last=False)
 
-    def known(self, command: Command) -> bool:
-        """Whether a command with this id was accepted before (of the last 256)."""
+    def has_accepted(self, command: Command) -> bool:
+        """Return True if one of the last accepted commands has this id."""
         return command.id in self._ids
 
     def log(self, level: Level, code: str, words: str, now: float) -> None:
-        """Note a notable event."""
+        """Add a log record."""
         self._records.append(LogRecord(level, code, words, now))

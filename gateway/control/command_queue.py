@@ -1,6 +1,6 @@
-"""What the car is still to do: the motion that is held, the mode to be opened, what acts once. Each ends with a record.
+"""Holds the commands in progress of one car: the held motion, the pending mode, and the queue of one-shots.
 
-What is written when is the controller's; here is what waits, for whom, until when, and what became of it.
+Each command ends with a record. `Executor` decides when a frame is written.
 """
 
 from collections import deque
@@ -13,63 +13,63 @@ from gateway.control.safety import Safety
 from gateway.control.senders import Senders
 from gateway.protocol.enums import Motion
 
-PATIENCE_S: Final = 10.0
-"""How long a one-shot or a mode may wait for a busy car before it is too old to matter."""
+MAX_QUEUE_TIME_S: Final = 10.0
+"""Maximum time that a one-shot or a mode waits for a busy car."""
 
 
 @dataclass(slots=True)
 class HeldMotion:
-    """The motion that is held, for whom, and until when."""
+    """A drive in progress."""
 
     motion: Motion
     pending: Pending
     expires_at: float
     began_at: float | None = None
-    """When its frame was written."""
+    """When its frame was written; None if it waits."""
 
     @property
     def sender(self) -> Sender:
-        """Who holds it."""
+        """Return the sender of the drive."""
         return self.pending.command.sender
 
 
 @dataclass(slots=True)
 class CommandQueue:
-    """One motion at most, one mode at most, a queue of what acts once. Times: s, monotonic."""
+    """At most one motion, at most one mode, and a queue of one-shots. Times: s, monotonic."""
 
-    ledger: CommandLog
+    log: CommandLog
     senders: Senders
     safety: Safety
     held: HeldMotion | None = None
-    opening: Pending | None = None
-    acts: deque[Pending] = field(default_factory=deque)
+    mode_change: Pending | None = None
+    one_shots: deque[Pending] = field(default_factory=deque)
 
     @property
     def held_until(self) -> float:
-        """When the held motion is over, or its sender lost; inf if none is held."""
+        """Return when the held motion ends, by its duration or by the loss of its sender; inf if none is held."""
         held = self.held
         return float("inf") if held is None else min(held.expires_at, self.senders.lost_at(held.sender.name))
 
     def deadlines(self) -> list[float]:
-        """When something that waits is over if nothing happens before."""
-        waiting = [*self.acts, *([self.opening] if self.opening is not None else [])]
-        times = [pending.asked_at + PATIENCE_S for pending in waiting]
+        """Return when the queued commands expire."""
+        waiting = [*self.one_shots, *([self.mode_change] if self.mode_change is not None else [])]
+        times = [pending.received_at + MAX_QUEUE_TIME_S for pending in waiting]
         return times if self.held is None else [*times, self.held_until]
 
-    def give_up_old(self, now: float) -> None:
-        """What has waited too long for a busy car is too old to matter."""
-        words = f"waited {PATIENCE_S:g} s for a busy car"
-        while self.acts and now >= self.acts[0].asked_at + PATIENCE_S:
-            self.ledger.record(self.acts.popleft(), Phase.EXPIRED, now, reason=Reason.EXPIRED, words=words)
-        if self.opening is not None and now >= self.opening.asked_at + PATIENCE_S:
-            self.close_opening(Phase.EXPIRED, Reason.EXPIRED, words, now)
+    def expire(self, now: float) -> None:
+        """Expire the commands that have waited too long for a busy car."""
+        words = f"waited {MAX_QUEUE_TIME_S:g} s for a busy car"
+        while self.one_shots and now >= self.one_shots[0].received_at + MAX_QUEUE_TIME_S:
+            self.log.record(self.one_shots.popleft(), Phase.EXPIRED, now, reason=Reason.EXPIRED, words=words)
+        if self.mode_change is not None and now >= self.mode_change.received_at + MAX_QUEUE_TIME_S:
+            self.close_mode_change(Phase.EXPIRED, Reason.EXPIRED, words, now)
 
     def drop(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
-        """All of it is over."""
+        """End all commands."""
         self.close_held(phase, reason, words, now)
-        self.close_opening(phase, reason, words, now)
-        while self.acts:
-            self.ledger.record(self.acts.popleft(), phase, now, reason=reason, words=words)
+        self.close_mode_change(phase, reason, words, now)
+        while self.one_shots:
+            self.log.record(self.one_shots.popleft(), phase, now, reason=reason, words=words)
 
     def close_held(self, phase: Phase, reason: Reason | None, words: str, now: float, basis: str = "") -> None:
         """End the held motion. Release the lease too if its holder has disconnected."""
@@ -79,11 +79,11 @@ class CommandQueue:
         if self.senders.forget(held.sender.name):
             self.safety.release(held.sender)
         if phase is not Phase.SUPERSEDED:
-            self.safety.driven_no_more(now)
-        self.ledger.record(held.pending, phase, now, reason=reason, words=words, basis=basis)
+            self.safety.shorten_lease(now)
+        self.log.record(held.pending, phase, now, reason=reason, words=words, basis=basis)
 
-    def close_opening(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
-        """The mode will not be opened."""
-        pending, self.opening = self.opening, None
+    def close_mode_change(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
+        """End the pending mode without opening it."""
+        pending, self.mode_change = self.mode_change, None
         if pending is not None:
-            self.ledger.record(pending, phase, now, reason=reason, words=words)
+            self.log.record(pending, phase, now, reason=reason, words=words)

@@ -1,4 +1,4 @@
-"""Commands as control sees them: parsed, in range, and of a known age; and their answers. Values only."""
+"""The commands that control takes, after parsing and range checks, and their answers. Values only."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -8,7 +8,7 @@ from gateway.protocol.frames import Frame
 
 
 class SenderKind(StrEnum):
-    """What a sender is; a person outranks a script, a script the coordinator."""
+    """The kind of a sender. A person outranks a script, a script outranks the coordinator."""
 
     PERSON = "person"
     SCRIPT = "script"
@@ -16,7 +16,7 @@ class SenderKind(StrEnum):
 
 
 class Reason(StrEnum):
-    """Why a command was not, or is no longer, carried out. The closed set of the answers."""
+    """Why a command was rejected or ended early. Answers use no other reasons."""
 
     BAD_VALUE = "bad_value"
     UNSUPPORTED = "unsupported"
@@ -33,7 +33,7 @@ class Reason(StrEnum):
     DUPLICATE = "duplicate"
     STALE = "stale"
     NOT_SHOWN = "not_shown"
-    """A stop: the car could have shown it and did not."""
+    """The car could have shown the stop and did not."""
 
 
 class Phase(StrEnum):
@@ -52,7 +52,7 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Sender:
-    """Who asks."""
+    """The sender of a command."""
 
     name: str = "anonymous"
     kind: SenderKind = SenderKind.SCRIPT
@@ -60,7 +60,7 @@ class Sender:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Hold a motion for `duration_s` seconds from its arrival, then stop. `Motion.STOP` releases."""
+    """Hold a motion for `duration_s` seconds from the arrival of the command. `Motion.STOP` releases it."""
 
     motion: Motion
     duration_s: float = 0.5
@@ -68,40 +68,40 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class SetMode:
-    """Bring the car into a mode; `Mode.MANUAL` closes whatever is open."""
+    """Bring the car into a mode. `Mode.MANUAL` closes the open mode."""
 
     mode: Mode
 
 
 @dataclass(frozen=True, slots=True)
 class OneShot:
-    """A frame that acts once: light, servo, whistle, arm. A general frame's motion is filled in when it is sent."""
+    """Send a frame that acts once: light, servo, whistle, arm. A general frame gets the current motion."""
 
     frame: Frame
 
 
 @dataclass(frozen=True, slots=True)
 class ChangeSpeed:
-    """One step of the car's relative speed."""
+    """Change the car's relative speed by one step."""
 
     step: SpeedStep
 
 
 @dataclass(frozen=True, slots=True)
 class Fan:
-    """Toggle the fan, or bring it to a state, which takes a known one."""
+    """Toggle the fan, or bring it to a state. For that its current state must be known."""
 
     on: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Stop, and hold the car against the coordinator unless the coordinator asked."""
+    """Stop the car. Put it on hold, unless the coordinator is the sender."""
 
 
 @dataclass(frozen=True, slots=True)
 class EmergencyStop:
-    """Stop, and refuse everything until it is ended by its id. `fleet_wide`: every gateway of the fleet latches it."""
+    """Stop the car, and refuse commands until a resume with this id. `fleet_wide`: all gateways latch it."""
 
     why: str = ""
     fleet_wide: bool = False
@@ -109,14 +109,14 @@ class EmergencyStop:
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """End the e-stops of these ids; without ids, the hold."""
+    """End the e-stops of these ids. Without ids, end the hold."""
 
     ids: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class TakeLease:
-    """Reserve the car for the sender for a moment, or give it back."""
+    """Reserve the car for the sender for a short time, or end its lease."""
 
     release: bool = False
 
@@ -131,28 +131,28 @@ Action = Drive | SetMode | OneShot | ChangeSpeed | Fan | Stop | EmergencyStop | 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One command as control sees it: parsed, in range, and of a known age."""
+    """One command, parsed and in range."""
 
     id: str
     verb: str
     sender: Sender
     what: Action
     age_s: float | None = None
-    """Seconds from asking to arrival; None if the command does not say when it was asked, which counts as fresh."""
+    """Seconds from sending to arrival; None if the command has no time, which counts as fresh."""
     ttl_s: float = 2.0
     take: bool = False
-    """A person takes the car from an equal."""
+    """True if a person takes the car from another person."""
     note: str = ""
-    """What was wrong with a stop that is carried out all the same."""
+    """The error in a stop that is carried out all the same."""
     asked_ns: int = 0
     """Wall clock, ns since the epoch."""
     streamed: bool = False
-    """One of a stream of publications: nobody waits for an answer, and repetitions are not recorded one by one."""
+    """True for one of a stream of publications: nobody waits for an answer, and repetitions share one record."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the sender is told at once. `status`: sent, queued or rejected."""
+    """The immediate answer to the sender. `status`: sent, queued or rejected."""
 
     status: Phase
     reason: Reason | None = None

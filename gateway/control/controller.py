@@ -1,8 +1,8 @@
-"""Control of one car: commands, readings and link events go in, frames to write and records come out.
+"""Controls one car: takes commands, readings and link events, returns frames to write and records.
 
-No I/O, no threads, no clock: time comes in as an argument, in seconds of one monotonic clock. The loop around it calls
-`poll`, writes what it returns, and says `wrote` or `write_failed` before it polls again: so there is never more than
-one frame on its way.
+No I/O, no threads, no clock: time is an argument, in seconds of one monotonic clock. The loop around it calls `poll`,
+writes the returned frame, and calls `on_written` or `on_write_failed` before the next `poll`. So there is never more
+than one frame in flight.
 """
 
 from collections.abc import Iterable
@@ -31,18 +31,13 @@ from gateway.control.commands import (
     Stop,
     TakeLease,
 )
-from gateway.control.estimate.battery import Battery, BatteryPolicy
-from gateway.control.estimate.mode import ModeEstimator, Verdict
-from gateway.control.estimate.outputs import StateEstimate
-from gateway.control.estimate.platform import PlatformDetector
-from gateway.control.estimate.trust import Basis, CarTrust
+from gateway.control.estimate.battery import BatteryPolicy
+from gateway.control.estimate.mode import Verdict
 from gateway.control.events import FrameOrigin, Level, OutgoingFrame, Record
 from gateway.control.executor import Executor
-from gateway.control.pacing import Pacing
-from gateway.control.safety import LEASE_S, Estop, Hold, PersistedSafety, Safety
-from gateway.control.senders import PAUSE_S
+from gateway.control.safety import LEASE_S, Estop, PersistedSafety, Safety
+from gateway.control.senders import STREAM_PAUSE_S
 from gateway.control.stops import sequences
-from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import Event
 from gateway.protocol.frames import ColorLed, Frame, General, ModeOpen
@@ -52,8 +47,8 @@ from gateway.protocol.platforms import Profile
 class Controller:
     """One car's control. See the module's docstring for how it is driven.
 
-    It holds small objects that share one `CarModel`: `CarMonitor` takes readings, `Executor` sends, `CommandLog` keeps
-    the records. The controller itself takes commands.
+    It holds small objects that share one `CarModel`: `CarMonitor` takes readings, `Executor` sends frames,
+    `StopExecutor` carries out stops, `CommandLog` keeps the records. The controller itself takes commands.
     """
 
     def __init__(
@@ -62,124 +57,55 @@ class Controller:
         profile: Profile,
         *,
         auto: bool = False,
-        kept: PersistedSafety | None = None,
+        persisted: PersistedSafety | None = None,
         battery_policy: BatteryPolicy | None = None,
         speed_max: float = 1.0,
     ) -> None:
         self.car = car
-        self.safety = Safety.restored(kept or PersistedSafety())
-        self._ledger = CommandLog()
-        self.model = CarModel(car, profile, auto, self._ledger, battery_policy or BatteryPolicy())
-        self._executor = Executor(self.model, self._ledger, self.safety)
-        self._monitor = CarMonitor(self.model, self._executor, self._ledger)
+        self.safety = Safety.restore(persisted or PersistedSafety())
+        self._log = CommandLog()
+        self.model = CarModel(car, profile, auto, self._log, battery_policy or BatteryPolicy())
+        self._executor = Executor(self.model, self._log, self.safety)
+        self._monitor = CarMonitor(self.model, self._executor, self._log)
+        self.stops = self._executor.stops
         self._senders = self._executor.senders
-        self._waiting = self._executor.waiting
+        self._queue = self._executor.queue
         self._speed_max = speed_max
         self.was_open = False
-        """The link was open at least once: the car may have been set going."""
+        """True if the link was open at least once, so the car may have been driven."""
 
-    # ------------------------------------------------------------------ what is known
-
-    @property
-    def profile(self) -> Profile:
-        """Return what the car is treated as."""
-        return self.model.profile
-
-    @property
-    def platform(self) -> PlatformDetector:
-        """Return what the car's bytes show of its platform."""
-        return self.model.platform
-
-    @property
-    def mode(self) -> ModeEstimator:
-        """Return what is known of the car's mode."""
-        return self.model.mode
-
-    @property
-    def battery(self) -> Battery:
-        """Return what is known of the car's battery."""
-        return self.model.battery
-
-    @property
-    def pacing(self) -> Pacing:
-        """Return when the next frame may be written."""
-        return self.model.pacing
-
-    @property
-    def believed(self) -> StateEstimate:
-        """Return what was written to the car, as a state."""
-        return self.model.believed
-
-    @property
-    def known(self) -> bool:
-        """Return True if the car reads what is sent as it is meant."""
-        return self.model.known
-
-    @property
-    def running(self) -> StopInProgress | None:
-        """Return the stop that goes on, if one does."""
-        return self._executor.running
-
-    @property
-    def motors(self) -> str:
-        """Return `off`, `on`, `stopping` or `unknown`."""
-        return self.model.motors
-
-    @property
-    def basis(self) -> Basis | None:
-        """Return what `off` rests on: `shown` or `sent`; None if the motors are not off."""
-        return self.model.basis
-
-    @property
-    def motion(self) -> Motion | None:
-        """Return the motion that was sent last; None if the state is unknown or the car moves by itself."""
-        return self.model.motion
-
-    @property
-    def at_rest(self) -> bool:
-        """Return True if the car stands in mode 0 after a stop, as shown or as sent."""
-        return self.model.at_rest
-
-    @property
-    def is_heard(self) -> bool:
-        """Return False if the car is silent for longer than it ever is."""
-        return self.model.trust.state is not CarTrust.UNHEARD
+    # ------------------------------------------------------------------ state
 
     @property
     def lost_frames(self) -> int:
-        """Return how often the car's reports have shown that a frame was lost."""
+        """Return the number of frames that did not arrive, by the car's reports."""
         return self._monitor.lost_frames
 
     @property
     def owner(self) -> str:
-        """Return who holds the motion; empty if nobody does."""
-        return self._waiting.held.sender.name if self._waiting.held else ""
+        """Return the sender of the held motion; empty if none is held."""
+        return self._queue.held.sender.name if self._queue.held else ""
 
     def expires_in_s(self, now: float) -> float | None:
-        """Return how long the held motion lasts; None if none is held."""
-        return max(0.0, self._waiting.held.expires_at - now) if self._waiting.held else None
+        """Return the remaining time of the held motion; None if none is held."""
+        return max(0.0, self._queue.held.expires_at - now) if self._queue.held else None
 
     @property
     def asked(self) -> Mode | None:
-        """Return the mode that the car is in or about to be brought to, as far as we asked; None if unknown."""
-        opening = self._waiting.opening
-        if opening is not None and isinstance(opening.command.what, SetMode):
-            return opening.command.what.mode
-        return self.mode.asked
-
-    @property
-    def hold(self) -> Hold | None:
-        """Return who stopped the car, if it is on hold."""
-        return self.safety.hold
+        """Return the commanded mode, also one that still waits; None if unknown."""
+        pending = self._queue.mode_change
+        if pending is not None and isinstance(pending.command.what, SetMode):
+            return pending.command.what.mode
+        return self.model.mode.asked
 
     @property
     def has_records(self) -> bool:
         """Return True if there are records to take."""
-        return self._ledger.waiting
+        return self._log.has_records
 
     def take_records(self) -> list[Record]:
         """Return the records since the last call."""
-        return self._ledger.take()
+        return self._log.take()
 
     # ------------------------------------------------------------------ link, frames, readings, time
 
@@ -190,90 +116,76 @@ class Controller:
         self._executor.link_up(now)
 
     def link_down(self, reason: str, now: float) -> None:
-        """Fail all that waits: the link is gone, and the car may do anything."""
+        """Fail all commands: the link is down."""
         self._executor.link_down(reason, now, cause=Reason.LINK_DOWN)
 
-    def write_failed(self, reason: str, now: float) -> None:
-        """Take that the frame of `poll` did not go out whole: the caller closes the link and opens it again."""
+    def on_write_failed(self, reason: str, now: float) -> None:
+        """Fail all commands: the link took only a part of the frame. The caller reopens the link."""
         self._executor.link_down(reason, now, cause=Reason.WRITE_FAILED)
 
     def poll(self, now: float) -> OutgoingFrame | None:
         """Return the frame to write now, if any."""
         return self._executor.poll(now)
 
-    def wrote(self, write: OutgoingFrame, now: float) -> None:
-        """Take that the frame of `poll` was handed to the link."""
-        self._executor.wrote(write, now)
+    def on_written(self, write: OutgoingFrame, now: float) -> None:
+        """Update the state: the link has taken the frame that `poll` returned."""
+        self._executor.on_written(write, now)
 
     def next_at(self, now: float) -> float:
         """Return when `poll` may have something to do if nothing happens before; inf if never."""
         return self._executor.next_at(now)
 
-    def heard(self, event: Event, now: float) -> None:
-        """Take an event of the decoder as evidence."""
-        self._monitor.heard(event, now)
+    def on_event(self, event: Event, now: float) -> None:
+        """Update the state with an event of the decoder."""
+        self._monitor.on_event(event, now)
 
     def tick(self, now: float) -> None:
-        """Weigh silence; called a few times a second."""
+        """Check for silence. Call it a few times a second."""
         self._monitor.tick(now)
 
-    def stalled(self, gap_s: float, now: float) -> None:
-        """Take that the loop slept for `gap_s`."""
-        self._monitor.stalled(gap_s, now)
+    def on_stall(self, gap_s: float, now: float) -> None:
+        """Stop a driven car after a gap of the loop."""
+        self._monitor.on_stall(gap_s, now)
 
-    def shutdown(self, now: float) -> None:
-        """Stop the car and accept nothing else: the gateway ends."""
-        self._executor.shutdown(now)
-
-    @property
-    def finished(self) -> bool:
-        """Return True after `shutdown` if the stop is over, or the car did not show it in time."""
-        return self._executor.finished
-
-    @property
-    def not_stopped(self) -> str:
-        """Return why the gateway ends without a stop of the car; empty if it does not."""
-        return self._executor.not_stopped
-
-    def worst_stop_s(self, now: float) -> float:
-        """Return the longest that a stop asked now takes until the motors are off, if its frames arrive."""
-        return self._executor.worst_stop_s(now)
+    def shut_down(self, now: float) -> None:
+        """Stop the car and reject all later commands: the gateway ends."""
+        self._executor.shut_down(now)
 
     # ------------------------------------------------------------------ commands
 
     def command(self, command: Command, now: float) -> Answer:
-        """Take a command: refuse it with a reason, or begin to carry it out. What becomes of it is recorded."""
+        """Refuse a command with a reason, or begin to carry it out. Record each of its transitions."""
         pending, what = Pending(command, now), command.what
-        if self._ledger.known(command) and not isinstance(what, Stop | EmergencyStop):
+        if self._log.has_accepted(command) and not isinstance(what, Stop | EmergencyStop):
             words = f"a command with id {command.id} came already"
-            if not command.streamed:  # not under its id: that is the record of the first
-                self._ledger.log(Level.WARNING, "duplicate", f"{command.verb} by {command.sender.name}: {words}", now)
+            if not command.streamed:  # the record under this id belongs to the first command
+                self._log.log(Level.WARNING, "duplicate", f"{command.verb} by {command.sender.name}: {words}", now)
                 return Answer(Phase.REJECTED, Reason.DUPLICATE, words)
             return self._reject(pending, Reason.DUPLICATE, words, now)
         if not command.streamed:
-            self._ledger.record(pending, Phase.ASKED, now)
+            self._log.record(pending, Phase.ASKED, now)
         if isinstance(what, Stop | EmergencyStop):
             return self._stop(pending, now)
-        # A drive is noted also while it is refused: a lease that lapses after a stop must not set it going.
-        halted = isinstance(what, Drive) and not self._has_let_go(command, what, now)
-        refusal = arbiter.refuse(command, self._situation(now))
+        # Track a drive even if it is refused: after a stop the end of a lease must not start it.
+        halted = isinstance(what, Drive) and not self._may_drive(command, what, now)
+        refusal = arbiter.refuse(command, self._context(now))
         if refusal is not None:
             return self._reject(pending, *refusal, now)
         if halted:
-            words = f"{self.car} was stopped: let go for {PAUSE_S:g} s (or send stop), then drive again"
+            words = f"{self.car} was stopped: let go for {STREAM_PAUSE_S:g} s (or send stop), then drive again"
             return self._reject(pending, Reason.HELD, words, now)
         busy = self._too_busy(what, now)
-        if busy:  # what is refused takes no lease and ends no hold
+        if busy:  # before the lease and the hold: a refused command changes neither
             return self._reject(pending, Reason.EXPIRED, busy, now)
-        self._ledger.accepted(command)
+        self._log.accept(command)
         if arbiter.needs(what).lease:
-            self._lease(command, now)
+            self._grant_lease(command, now)
         moves = isinstance(what, SetMode) or (isinstance(what, Drive) and what.motion is not Motion.STOP)
-        if moves and command.sender.kind is not SenderKind.COORDINATOR:  # letting go hands the car to nobody
+        if moves and command.sender.kind is not SenderKind.COORDINATOR:  # a release ends no hold
             self._end_hold(command.sender, now)
         match what:
             case Drive(Motion.STOP):
-                return self._release_asked(pending, now)
+                return self._release(pending, now)
             case Drive():
                 return self._drive(pending, what, now)
             case SetMode(Mode.MANUAL):
@@ -284,7 +196,7 @@ class Controller:
                 return self._resume(pending, ids, now)
             case TakeLease(release):
                 return self._take_lease(pending, now, release=release)
-            case Fan(bool() as on) if on == self.believed.fan:
+            case Fan(bool() as on) if on == self.model.believed.fan:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
             case Fan():
                 pending.frames.append(General(Motion.STOP, fan=True))
@@ -293,50 +205,49 @@ class Controller:
             case ChangeSpeed(step):
                 pending.frames.append(General(Motion.STOP, speed=step))
             case Find():
-                pending.frames.extend(frame for frame in self._blinks() if self.profile.refusal(frame) is None)
-        self._waiting.acts.append(pending)
+                pending.frames.extend(frame for frame in self._blinks() if self.model.profile.refusal(frame) is None)
+        self._queue.one_shots.append(pending)
         return self._queued(pending, now)
 
     def _blinks(self) -> tuple[Frame, ...]:
-        """The frames of `find`: the LED is at last what it will be after all that waits, also another `find`."""
-        waiting = [each for act in self._waiting.acts for each in act.frames if isinstance(each, ColorLed)]
-        led = waiting[-1] if waiting else self.believed.led
+        """Return the frames of `find`. The last one sets the LED color that the queued commands will leave."""
+        waiting = [each for act in self._queue.one_shots for each in act.frames if isinstance(each, ColorLed)]
+        led = waiting[-1] if waiting else self.model.believed.led
         other = ColorLed(255, 255, 255) if led != ColorLed(255, 255, 255) else ColorLed(0, 0, 0)
         whistle = General(Motion.STOP, whistle=True)
         return whistle, other, whistle, led
 
-    def refused(self, command: Command, reason: Reason, words: str, now: float) -> Answer:
-        """Record a command that was no command, as its parser says."""
+    def record_rejection(self, command: Command, reason: Reason, words: str, now: float) -> Answer:
+        """Record a command that its parser has rejected."""
         pending = Pending(command, now)
         if not command.streamed:
-            self._ledger.record(pending, Phase.ASKED, now)
+            self._log.record(pending, Phase.ASKED, now)
         return self._reject(pending, reason, words, now)
 
-    def sender_alive(self, name: str, *, alive: bool, now: float) -> None:
-        """A sender's liveliness token appeared or went."""
-        driving = self._waiting.held is not None and self._waiting.held.sender.name == name
+    def on_sender_token(self, name: str, *, alive: bool, now: float) -> None:
+        """Update a sender's state: its liveliness token appeared or disappeared."""
+        driving = self._queue.held is not None and self._queue.held.sender.name == name
         if alive:
-            self._senders.appeared(name)
+            self._senders.on_token(name)
         else:
-            self._senders.vanished(name, now, driving=driving)
+            self._senders.on_token_lost(name, now, driving=driving)
         if not driving:
-            self.safety.holder_there(name, there=alive)
+            self.safety.mark_holder(name, connected=alive)
 
-    def unite(self, estops: Iterable[Estop], ended: Iterable[str], shown_by: str, now: float) -> None:
-        """Take over the fleet-wide e-stops, in force and ended, that another gateway of the fleet shows."""
-        begun, over = self.safety.unite(estops, ended)
-        for estop in over:
-            self._ledger.log(Level.WARNING, "estop_ended", f"e-stop {estop.id} has ended, as {shown_by} shows", now)
-        if not begun:
+    def merge_estops(self, estops: Iterable[Estop], ended: Iterable[str], source: str, now: float) -> None:
+        """Merge the fleet-wide e-stops, in force and ended, of another gateway of the fleet."""
+        latched, removed = self.safety.merge(estops, ended)
+        for estop in removed:
+            self._log.log(Level.WARNING, "estop_ended", f"e-stop {estop.id} has ended, as {source} shows", now)
+        if not latched:
             return
-        why = f": {begun[0].why}" if begun[0].why else ""
-        words = f"e-stop {begun[0].id} by {begun[0].by} is in force in the fleet, as {shown_by} shows{why}"
-        self._ledger.log(Level.ERROR, "estop_joined", words, now)
+        why = f": {latched[0].why}" if latched[0].why else ""
+        words = f"e-stop {latched[0].id} by {latched[0].by} is in force in the fleet, as {source} shows{why}"
+        self._log.log(Level.ERROR, "estop_joined", words, now)
         self._executor.halt(words, now)
-        if self.model.link_open and not self._executor.closing:
-            self._executor.begin(self._executor.full(now), FrameOrigin.STOP, now)
+        self.stops.begin_full(now)
 
-    # ------------------------------------------------------------------ one by one
+    # ------------------------------------------------------------------ each command
 
     def _stop(self, pending: Pending, now: float) -> Answer:
         command = pending.command
@@ -345,64 +256,64 @@ class Controller:
             estop = Estop(command.id, sender.name, command.what.why, command.asked_ns, command.what.fleet_wide)
             until = f"latched as {self.safety.latch(estop).id} until it is resumed"
             why = f": {estop.why}" if estop.why else ""
-            self._ledger.log(Level.ERROR, "estop", f"{self.car}: e-stop by {sender.name}{why}; {until}", now)
+            self._log.log(Level.ERROR, "estop", f"{self.car}: e-stop by {sender.name}{why}; {until}", now)
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not SenderKind.COORDINATOR:
-            self.safety.held_by(sender.name, command.asked_ns)
+            self.safety.put_on_hold(sender.name, command.asked_ns)
         self._executor.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
-        if not self.model.link_open or self._executor.closing:
-            why = "its gateway is ending" if self._executor.closing else self.model.link_reason
+        if not self.model.link_open or self.stops.shutting_down:
+            why = "its gateway is ending" if self.stops.shutting_down else self.model.link_reason
             words = f"{self.car} cannot be reached: {why}; it is stopped first when its link is back"
             return self._reject(pending, Reason.LINK_DOWN, f"{words} ({latched})" if latched else words, now)
-        if not self.is_heard:
-            silent = f"{self.car} was not heard for {self.mode.unheard_s(now):.0f} s: it may not get this stop"
+        if not self.model.is_heard:
+            silent = f"{self.car} was not heard for {self.model.mode.unheard_s(now):.0f} s: it may not get this stop"
             latched = f"{silent}; {latched}" if latched else silent
-        worst = self.worst_stop_s(now)
-        self._ledger.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
-        self._executor.begin(self._executor.full(now), FrameOrigin.STOP, now, pending)
+        worst = self.stops.worst_s(now)
+        self._log.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
+        self.stops.begin(self.stops.full(now), FrameOrigin.STOP, now, pending)
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
 
-    def _has_let_go(self, command: Command, drive: Drive, now: float) -> bool:
+    def _may_drive(self, command: Command, drive: Drive, now: float) -> bool:
         release = drive.motion is Motion.STOP
-        return self._senders.drives(command.sender.name, now, streamed=command.streamed, release=release)
+        return self._senders.may_drive(command.sender.name, now, streamed=command.streamed, release=release)
 
     def _resume(self, pending: Pending, ids: tuple[str, ...], now: float) -> Answer:
         sender = pending.command.sender.name
         if ids:
-            over = " ".join(estop.id for estop in self.safety.end(ids))
-            words = f"e-stop {over} was ended by {sender}" if over else "ended already"
-            if over:
-                self._ledger.log(Level.WARNING, "estop_ended", words, now)
-        elif self.hold is not None:
-            words = f"the hold by {self.hold.by} has ended"
+            ended = " ".join(estop.id for estop in self.safety.end(ids))
+            words = f"e-stop {ended} was ended by {sender}" if ended else "ended already"
+            if ended:
+                self._log.log(Level.WARNING, "estop_ended", words, now)
+        elif self.safety.hold is not None:
+            words = f"the hold by {self.safety.hold.by} has ended"
             self._end_hold(pending.command.sender, now)
         else:
             words = f"{self.car} was not on hold"
         if self.safety.estops:
             words += f"; still in force: e-stop {' '.join(estop.id for estop in self.safety.estops)}"
-        elif self.hold is not None:
-            words += f"; on hold (by {self.hold.by}) until a person or script drives, sets a mode or resumes"
+        elif self.safety.hold is not None:
+            words += f"; on hold (by {self.safety.hold.by}) until a person or script drives, sets a mode or resumes"
         return self._done(pending, words, now)
 
-    def _lease(self, command: Command, now: float) -> None:
-        """The car is the sender's while it drives; who had it is told by whom it was taken."""
-        sender, before = command.sender, self.safety.leased(now)
+    def _grant_lease(self, command: Command, now: float) -> None:
+        """Grant the lease for the duration of the command. Log if it was taken from another sender."""
+        sender, before = command.sender, self.safety.lease_at(now)
         match command.what:
             case Drive(duration_s=lasts_s):
                 pass
-            case SetMode(mode):  # until it is in force: sooner nobody can tell whether it is wanted
-                opening_s = 0.0 if mode is Mode.MANUAL else self.profile.block_s(ModeOpen(mode))
-                lasts_s = max(self._executor.free_at(now) - now, 0.0) + opening_s
-            case _:  # what is asked on the way does not shorten it
+            case SetMode(mode):  # until the mode is open
+                opening_s = 0.0 if mode is Mode.MANUAL else self.model.profile.block_s(ModeOpen(mode))
+                lasts_s = max(self.stops.free_at(now) - now, 0.0) + opening_s
+            case _:  # other commands do not shorten the lease of a drive
                 lasts_s = (self.expires_in_s(now) or 0.0) if self.owner == sender.name else 0.0
         self.safety.grant(sender, now + lasts_s)
         if before is None or before.holder == sender:
             return
         words = f"taken over by {sender.name} ({sender.kind}) from {before.holder.name} ({before.holder.kind})"
-        self._ledger.log(Level.INFO, "lease_taken", f"{self.car}: {words}", now)
+        self._log.log(Level.INFO, "lease_taken", f"{self.car}: {words}", now)
         if (
-            self._waiting.held is not None
-            and self._waiting.held.sender != sender
+            self._queue.held is not None
+            and self._queue.held.sender != sender
             and not isinstance(command.what, Drive | SetMode)
         ):
             self._executor.release(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
@@ -413,119 +324,123 @@ class Controller:
             return self._done(pending, f"{self.car} is {sender.name}'s for {LEASE_S:g} s, and while it drives", now)
         if not self.safety.release(sender):
             return self._done(pending, f"{sender.name} had no lease of {self.car}", now)
-        if self._waiting.held is not None and self._waiting.held.sender == sender:
+        if self._queue.held is not None and self._queue.held.sender == sender:
             self._executor.release(Phase.COMPLETE, None, f"released by {sender.name}", now)
         return self._done(pending, f"{self.car} is free", now)
 
     def _too_busy(self, what: Action, now: float) -> str:
-        """Why a drive would be over before it could begin; empty if it would not."""
-        free_at = self._executor.free_at(now)
+        """Return why a drive would expire before its frame could go out; empty if it would not."""
+        free_at = self.stops.free_at(now)
         if not isinstance(what, Drive) or what.motion is Motion.STOP or now + what.duration_s > free_at:
             return ""
-        return f"{self.car} is busy for {free_at - now:.1f} s more, longer than this drive's {what.duration_s:g} s"
+        busy_s = free_at - now
+        return (
+            f"{self.car} is busy for another {busy_s:.1f} s, longer than the requested drive ({what.duration_s:g} s). "
+            "Try again later."
+        )
 
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
-        sender, held = pending.command.sender, self._waiting.held
+        sender, held = pending.command.sender, self._queue.held
         if held is not None and held.motion is drive.motion and held.sender == sender:
-            return self._drive_on(held, pending, now + drive.duration_s, now)
+            return self._prolong_drive(held, pending, now + drive.duration_s, now)
         words = f"{drive.motion} by {sender.name}"
-        self._waiting.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        self._waiting.held = HeldMotion(drive.motion, pending, now + drive.duration_s)
+        self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        self._queue.held = HeldMotion(drive.motion, pending, now + drive.duration_s)
         if held is not None and held.motion is drive.motion and held.pending.sent:
-            self._ledger.sent(pending, now, "the motion is held on")
+            self._log.record_sent(pending, now, "the motion is held on")
             return Answer(Phase.SENT, words="the motion is held on")
-        running = self._executor.running
-        if running is not None and running.recipe.rank == sequences.SOFT.rank:
-            # The car is wanted to move again: the rest of a soft stop would only jerk it.
-            self._executor.running = None
+        running = self.stops.running
+        if running is not None and running.sequence.rank == sequences.SOFT.rank:
+            # The car moves again: the rest of the soft stop would only jerk it.
+            self.stops.running = None
             for other in running.commands:
-                self._ledger.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
+                self._log.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
         return self._queued(pending, now)
 
-    def _drive_on(self, held: HeldMotion, pending: Pending, expires_at: float, now: float) -> Answer:
-        """The same sender wants the same motion for longer: nothing is written again."""
+    def _prolong_drive(self, held: HeldMotion, pending: Pending, expires_at: float, now: float) -> Answer:
+        """Extend a held motion without another frame: its sender has sent the same drive again."""
         held.expires_at = expires_at
         held.pending.count += 1
         if pending.command.streamed:
             return Answer(Phase.SENT if held.pending.sent else Phase.QUEUED)
         if held.pending.sent:
             return self._done(pending, "the motion is held on", now)
-        self._ledger.record(
+        self._log.record(
             held.pending, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words="asked again before it was sent"
         )
         pending.count = held.pending.count
         held.pending = pending
         return self._queued(pending, now)
 
-    def _release_asked(self, pending: Pending, now: float) -> Answer:
+    def _release(self, pending: Pending, now: float) -> Answer:
         sender = pending.command.sender.name
-        self._waiting.close_held(Phase.COMPLETE, None, f"released by {sender}", now)
-        self._waiting.close_opening(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
-        if self._executor.running is None and self.at_rest:
+        self._queue.close_held(Phase.COMPLETE, None, f"released by {sender}", now)
+        self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
+        if self.stops.running is None and self.model.at_rest:
             return self._done(pending, f"{self.car} is at rest", now)
-        worst = self.worst_stop_s(now)
+        worst = self.stops.worst_s(now)
         if not pending.command.streamed:
-            self._ledger.record(pending, Phase.QUEUED, now, worst_case_s=worst)
-        self._executor.begin(
-            self._executor.soft(now), FrameOrigin.STOP, now, None if pending.command.streamed else pending
-        )
+            self._log.record(pending, Phase.QUEUED, now, worst_case_s=worst)
+        self.stops.begin(self.stops.soft(now), FrameOrigin.STOP, now, None if pending.command.streamed else pending)
         return Answer(Phase.QUEUED, worst_case_s=worst)
 
     def _close_mode(self, pending: Pending, now: float) -> Answer:
-        self._waiting.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {pending.command.sender.name}", now)
+        self._queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {pending.command.sender.name}", now)
         answer = self._queued(pending, now)
-        self._executor.begin(self._executor.full(now), FrameOrigin.COMMAND, now, pending)
+        self.stops.begin(self.stops.full(now), FrameOrigin.COMMAND, now, pending)
         return answer
 
     def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
         words = f"mode {mode} by {pending.command.sender.name}"
-        self._waiting.close_opening(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        self._waiting.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        settled = self.known and self._executor.running is None and self.mode.verdict is not Verdict.CONTRADICTED
-        if settled and self.mode.asked is mode:
-            return self._done(pending, f"{self.car} is in {mode} already ({self.mode.verdict})", now)
-        self._waiting.opening = pending
+        self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        settled = (
+            self.model.known and self.stops.running is None and self.model.mode.verdict is not Verdict.CONTRADICTED
+        )
+        if settled and self.model.mode.asked is mode:
+            return self._done(pending, f"{self.car} is in {mode} already ({self.model.mode.verdict})", now)
+        self._queue.mode_change = pending
         return self._queued(pending, now)
 
     # ------------------------------------------------------------------ answers
 
     def _done(self, pending: Pending, words: str, now: float) -> Answer:
         if not pending.command.streamed:
-            self._ledger.sent(pending, now, words)
+            self._log.record_sent(pending, now, words)
         return Answer(Phase.SENT, words=words)
 
     def _queued(self, pending: Pending, now: float) -> Answer:
-        self._ledger.record(pending, Phase.QUEUED, now)
+        self._log.record(pending, Phase.QUEUED, now)
         return Answer(Phase.QUEUED)
 
     def _reject(self, pending: Pending, reason: Reason, words: str, now: float) -> Answer:
-        self._ledger.refused(pending, reason, words, now)
+        self._log.record_rejection(pending, reason, words, now)
         return Answer(Phase.REJECTED, reason, words)
 
     def _end_hold(self, sender: Sender, now: float) -> None:
-        if self.hold is not None:
-            words = f"the hold by {self.hold.by} was ended by {sender.name}"
-            self._ledger.log(Level.INFO, "hold_ended", words, now)
+        if self.safety.hold is not None:
+            words = f"the hold by {self.safety.hold.by} was ended by {sender.name}"
+            self._log.log(Level.INFO, "hold_ended", words, now)
             self.safety.hold = None
 
-    def _situation(self, now: float) -> arbiter.CommandContext:
+    def _context(self, now: float) -> arbiter.CommandContext:
         return arbiter.CommandContext(
             car=self.car,
-            profile=self.profile,
+            profile=self.model.profile,
             now=now,
             link_open=self.model.link_open,
             link_reason=self.model.link_reason,
-            answering=self.is_heard,
-            closing=self._executor.closing,
+            answering=self.model.is_heard,
+            closing=self.stops.shutting_down,
             asked=self.asked,
-            contradicted=self.mode.verdict is Verdict.CONTRADICTED,
-            held_by=self.hold.by if self.hold else None,
+            contradicted=self.model.mode.verdict is Verdict.CONTRADICTED,
+            held_by=self.safety.hold.by if self.safety.hold else None,
             estops=self.safety.estops,
             ended=self.safety.ended,
-            lease=self.safety.leased(now),
-            battery=self.battery.refusal,
-            fan=self.believed.fan,
-            queued=len(self._waiting.acts),
-            speed=self.believed.speed,
+            lease=self.safety.lease_at(now),
+            battery=self.model.battery.refusal,
+            fan=self.model.believed.fan,
+            queued=len(self._queue.one_shots),
+            speed=self.model.believed.speed,
             speed_max=self._speed_max,
         )

@@ -1,4 +1,4 @@
-"""What comes out of control: records of commands, log records, and frames to be written. Values only."""
+"""The output of control: records of commands, log records, and frames to write. Values only."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -25,7 +25,7 @@ class CommandRecord:
 
 
 class Level(StrEnum):
-    """How much a notable event matters."""
+    """The severity of a log record."""
 
     DEBUG = "debug"
     INFO = "info"
@@ -35,7 +35,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LogRecord:
-    """A notable event. `code` is one word for machines, `words` are for a person."""
+    """One log record. `code` is one word for machines, `words` are for a person."""
 
     level: Level
     code: str
@@ -47,7 +47,7 @@ Record = CommandRecord | LogRecord
 
 
 class FrameOrigin(StrEnum):
-    """Why a frame was sent."""
+    """The reason for a frame."""
 
     COMMAND = "command"
     REPEAT = "repeat"
@@ -58,7 +58,7 @@ class FrameOrigin(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OutgoingFrame:
-    """One frame to be written now, in one write."""
+    """One frame to write now, in a single write."""
 
     frame: Frame
     data: bytes

@@ -1,138 +1,137 @@
-"""When the next frame may be written: one at a time, none into a block, and what the car's buffer may still hold.
+"""Decides when the next frame may be written, from the blocks of the last frames and the car's buffer.
 
-Knows frames and times, not commands; what is to be written is decided by the controller.
+It knows frames and times, no commands. `Executor` decides which frame is written.
 """
 
 from typing import Final
 
-from gateway.control.stops.sequences import REPEAT_S, Gate
+from gateway.control.stops.sequences import REPEAT_INTERVAL_S, Gate
 from gateway.protocol.enums import ServoAction
 from gateway.protocol.frames import ArmSet, Frame, General
 from gateway.protocol.platforms import Platform, Profile, StopStyle
 
 FLIGHT_S: Final = 0.06
-"""A frame is in flight for 0.06 s or its block, whichever is longer (docs/reference/protocol.md#pacing): a report may
-be under way."""
+"""Minimum time that a frame is in flight; a longer block counts instead (docs/reference/protocol.md#pacing)."""
 FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
+# After a report the car ranges again no earlier than 0.85 s later (docs/reference/protocol.md#rates: once a second in
+# mode 0). This leaves
+# 0.25 s for the delay of the link.
 AWAKE_S: Final = 0.6
-"""A car that has just reported ranges again no sooner than 0.85 s later (docs/reference/protocol.md#pacing); what is
-written within this time of a reading is read at once, with 0.25 s left for the link's own delays."""
+"""Time after a report in which the car reads a frame at once."""
 REPORT_S: Final = 2.2
-"""A car in mode 0 that can report does so within this time: once a second, and 1.0 s more without an echo."""
+"""Maximum interval of reports in mode 0: one a second, and 1.0 s more without an echo."""
 
 
 class Pacing:
-    """The last frame written, and what follows from it. Times are seconds on one monotonic clock.
+    """Tracks the last written frame. Times: s, monotonic."""
 
-    A frame lies unread in the car's buffer while a ranging without echo blocks it: for 1.0 s, so less than `REPEAT_S`.
-    It is certainly read sooner if the car was awake when it was written, or has sent a reading since; then those that
-    lay there before it may block the car once more. That the last ranging had an echo says nothing of the next.
-    """
+    # A ranging without an echo blocks the car for 1.0 s, less than `REPEAT_INTERVAL_S`. A frame then waits unread in
+    # the buffer. The car reads it earlier if it was awake at the write, or has sent a report since. Frames that waited
+    # before it may then block the car once more. An echo in the last ranging does not predict the next one.
 
     def __init__(self, profile: Profile) -> None:
         self.profile = profile
         self.reset()
 
     def reset(self) -> None:
-        """The link is new: nothing of ours is on it, and nothing is known."""
+        """Forget everything: the link is new."""
         self._written_at = float("-inf")
         self._block_s = 0.0
         self._sure_s = 0.0
         self._before_s = 0.0
         self._read_by = float("-inf")
-        self._heard_at = float("-inf")
+        self._reported_at = float("-inf")
 
-    def wrote(self, frame: Frame, now: float) -> None:
-        """A frame was handed to the link."""
-        awake_at = max(now, self.block_until) if now <= self._heard_at + AWAKE_S else float("inf")
+    def on_written(self, frame: Frame, now: float) -> None:
+        """Record a written frame."""
+        awake_at = max(now, self.block_until) if now <= self._reported_at + AWAKE_S else float("inf")
         self._before_s = max(self._before_s, self._block_s) if now < self._read_by else 0.0
-        self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_S, self.block_until))
+        self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_INTERVAL_S, self.block_until))
         self._written_at = now
         self._block_s = self.profile.block_s(frame)
         self._sure_s = self._block_s if self._surely_blocks(frame) else 0.0
 
     def _surely_blocks(self, frame: Frame) -> bool:
-        """Whether its block has a row for this platform, and is not only allowed for.
+        """Return True if the block of this frame is certain on this platform. Other blocks are only possible.
 
-        See docs/reference/protocol.md#blocking-times.
+        docs/reference/protocol.md#blocking-times has the certain ones.
         """
         if isinstance(frame, General):
             slow = frame.servo is None or frame.servo in FRONT_SERVO
             return slow and not (frame.fan and self.profile.kind is Platform.UNKNOWN)
         return not isinstance(frame, ArmSet)
 
-    def heard(self, at: float) -> None:
-        """A mode-0 reading has come: the car has ranged, and reads what waits."""
-        self._heard_at = at
-        if at >= self._written_at + FLIGHT_S:  # a sooner one was under way when the frame was written
+    def on_report(self, at: float) -> None:
+        """Record a report of mode 0: after it the car reads the waiting frames."""
+        self._reported_at = at
+        if at >= self._written_at + FLIGHT_S:  # an earlier report was under way when the frame was written
             self._read_by = min(self._read_by, at + self._before_s)
 
     @property
-    def heard_at(self) -> float:
-        """When the last mode-0 reading came; -inf if none did."""
-        return self._heard_at
+    def reported_at(self) -> float:
+        """Return when the last report of mode 0 arrived; -inf if none has."""
+        return self._reported_at
 
     @property
     def written_at(self) -> float:
-        """When the last frame was written; -inf if none was."""
+        """Return when the last frame was written; -inf if none was."""
         return self._written_at
 
     @property
     def flight_until(self) -> float:
-        """Until when the last frame is in flight."""
+        """Return the end of the last frame's flight."""
         return self._written_at + max(FLIGHT_S, self._block_s)
 
     @property
     def buffer_until(self) -> float:
-        """Until when the last frame may lie in the car's buffer unread, or is in flight and may still be joined.
-
-        A longer block does not matter: what is written once the frame is read lies in the buffer alone.
-        """
-        return max(self._read_by, min(self.flight_until, self._written_at + REPEAT_S))
+        """Return until when the last frame may be unread, or the next frame may join it in the car's buffer."""
+        # A longer block does not matter: after the car has read the frame, the next one is alone in the buffer.
+        return max(self._read_by, min(self.flight_until, self._written_at + REPEAT_INTERVAL_S))
 
     @property
     def block_from(self) -> float:
-        """When the last frame's block ends at the soonest."""
+        """Return the earliest end of the last frame's block."""
         return self._written_at + self._block_s
 
     @property
     def block_until(self) -> float:
-        """When the last frame's block ends at the latest."""
+        """Return the latest end of the last frame's block."""
         return self._read_by + self._block_s
 
     def blocked_at(self, now: float) -> bool:
-        """The last frame's block runs, not only perhaps, and no ranging, in which that frame would lie unread."""
+        """Return True if the car is certainly busy with our last frame, and not ranging with that frame unread."""
         running = self._sure_s > FLIGHT_S and now < self._written_at + self._sure_s
         return running and self._before_s == 0.0 and self.clear_at(now)
 
     def clear_at(self, now: float) -> bool:
-        """Nothing of ours can be unread when the next frame is written that waits for those in flight."""
+        """Return True if the car will have read all our frames before the next one is sent."""
         return self._read_by <= max(now, self.ready_at(Gate.FLIGHT))
 
     def ready_at(self, gate: Gate) -> float:
-        """From when on a frame that waits for `gate` may be written."""
+        """Return the earliest time for a frame that waits for `gate`."""
         match gate:
             case Gate.NOTHING:
                 return float("-inf")
             case Gate.FLIGHT:
-                return self._written_at + max(FLIGHT_S, self._sure_s)  # it may lie in a block, if there is one
+                return self._written_at + max(FLIGHT_S, self._sure_s)  # a merely possible block does not delay it
             case Gate.ALONE:
                 return self.buffer_until
 
     def act_at(self, frame: Frame) -> float:
-        """From when on a frame that acts once may be written."""
+        """Return the earliest time for the frame of a one-shot."""
         if self.profile.stop_style is StopStyle.RASPBERRY_PI and not isinstance(frame, General):
             return max(self.flight_until, self.buffer_until)  # in one receive behind another it kills the program
         return self.flight_until
 
     def open_at(self, now: float) -> float:
-        """When a mode may be opened: awake, so that its block begins at once; or when no reading will come."""
+        """Return when a mode may be opened."""
+        # The car must be awake, so that the block begins at once. If no report comes, wait until none is due any more.
         alone = max(now, self.buffer_until, self.flight_until)
-        if alone <= self._heard_at + AWAKE_S:
+        if alone <= self._reported_at + AWAKE_S:
             return alone
         return max(now, self.buffer_until + REPORT_S)
 
     @property
     def repeat_at(self) -> float:
-        """From when on a repetition is alone: 1.1 s after the last frame, or after its block if that is later."""
-        return max(self._written_at + REPEAT_S, self.flight_until)
+        """Return the earliest time for a repetition: `REPEAT_INTERVAL_S` after the last frame, and after its block."""
+        return max(self._written_at + REPEAT_INTERVAL_S, self.flight_until)

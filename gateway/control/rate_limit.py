@@ -1,11 +1,11 @@
-"""So much per second and no more: bounds what a car that sends nonsense without end can cost. No clock."""
+"""Limits a rate, so that a car that sends garbage without end costs little. No clock."""
 
 from dataclasses import dataclass, field
 
 
 @dataclass(slots=True)
 class TokenBucket:
-    """Up to `at_once` at any moment, and `per_s` in the long run. Times are seconds on one monotonic clock."""
+    """Grants bursts of up to `at_once`, and `per_s` in the long run. Times: s, monotonic."""
 
     per_s: float
     at_once: float
@@ -15,10 +15,10 @@ class TokenBucket:
     def __post_init__(self) -> None:
         self._left = self.at_once
 
-    def take(self, wanted: int, now: float) -> int:
-        """How much of what is wanted may pass now, 0..wanted."""
+    def take(self, requested: int, now: float) -> int:
+        """Return how many of the requested may pass now, 0..requested."""
         self._left = min(self.at_once, self._left + self.per_s * max(0.0, now - self._at))
         self._at = max(self._at, now)
-        granted = min(wanted, int(self._left))
+        granted = min(requested, int(self._left))
         self._left -= granted
         return granted

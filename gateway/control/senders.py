@@ -1,79 +1,74 @@
-"""Who commands the car, over time: whose liveliness token is gone, and whose stream of drives must pause first."""
+"""Tracks senders: lost liveliness tokens, and drive streams that must pause after a stop."""
 
 from dataclasses import dataclass, field
 from typing import Final
 
 SENDER_GONE_S: Final = 1.0
-"""A sender is lost when its token has been away so long: a restarted hub takes all tokens down for half a second."""
-PAUSE_S: Final = 0.5
-"""After a stop, whoever drives on and on is heard again when that has paused so long, or has said `stop`.
-
-Without it the next sample of a stick that somebody still leans on would drive on, 50 ms after another person's stop.
-"""
-_REMEMBERED: Final = 256
+"""Timeout for a lost token. A restarted hub takes all tokens down for half a second."""
+# Without the pause the next sample of a held joystick would restart the car 50 ms after another person's stop.
+STREAM_PAUSE_S: Final = 0.5
+"""Minimum pause of a drive stream after a stop. A release ends the pause at once."""
+MAX_SENDERS: Final = 256
+"""Maximum senders whose last drive is remembered."""
 
 
 @dataclass(slots=True)
 class Senders:
-    """Tokens and streams, by sender's name. Times are seconds on one monotonic clock."""
+    """Tokens and drive streams by the sender's name. Times: s, monotonic."""
 
     _tokens: dict[str, float | None] = field(default_factory=dict)
-    """None while the token is there; since when it is gone."""
+    """When each token disappeared; None while it exists."""
     _drives: dict[str, tuple[float, bool]] = field(default_factory=dict)
-    """When a sender's last drive came, and whether as a stream's."""
+    """When the last drive of each sender arrived, and whether it was part of a stream."""
     _halted: set[str] = field(default_factory=set)
 
     # ------------------------------------------------------------------ tokens
 
-    def appeared(self, name: str) -> None:
-        """The sender's token is there."""
+    def on_token(self, name: str) -> None:
+        """Record that the sender's token exists."""
         self._tokens[name] = None
 
-    def vanished(self, name: str, now: float, *, driving: bool) -> None:
-        """A sender's liveliness token disappeared. Remember it only if that sender is driving.
-
-        Changes are merged, so a token that came and went may be known only from its end.
-        """
+    def on_token_lost(self, name: str, now: float, *, driving: bool) -> None:
+        """Record that the sender's token disappeared, but only if that sender is driving."""
+        # The bus merges changes, so the first news of a token may be its end.
         if driving:
             self._tokens[name] = now
         else:
             self._tokens.pop(name, None)
 
     def lost_at(self, name: str) -> float:
-        """When the sender counts as lost; inf while its token is there, or if it never was.
-
-        A token need not be there before the first drive is: the bus may deliver them the other way round.
-        """
+        """Return when the sender counts as lost; inf if its token exists, or never did."""
+        # The bus may deliver the first drive before the token.
         gone_at = self._tokens.get(name)
         return float("inf") if gone_at is None else gone_at + SENDER_GONE_S
 
     def forget(self, name: str) -> bool:
-        """The sender drives no more: if its token is gone, so is what was remembered of it. True if it is gone."""
-        gone = self._tokens.get(name) is not None
-        if gone:
+        """Drop a lost token after the sender's drive. Return True if the token was lost."""
+        is_lost = self._tokens.get(name) is not None
+        if is_lost:
             del self._tokens[name]
-        return gone
+        return is_lost
 
-    # ------------------------------------------------------------------ who drives on and on
+    # ------------------------------------------------------------------ drive streams
 
-    def drives(self, name: str, now: float, *, streamed: bool, release: bool) -> bool:
-        """Note a drive; False if it must not be obeyed: its sender has driven on and on since the car was stopped."""
+    def may_drive(self, name: str, now: float, *, streamed: bool, release: bool) -> bool:
+        """Record a drive. Return False if its sender has not paused since the car was stopped."""
         last, _ = self._drives.pop(name, (float("-inf"), False))
-        if release or now - last >= PAUSE_S:
+        if release or now - last >= STREAM_PAUSE_S:
             self._halted.discard(name)
         self._drives[name] = now, streamed
-        while len(self._drives) > _REMEMBERED:
+        while len(self._drives) > MAX_SENDERS:
             oldest = next(iter(self._drives))
             del self._drives[oldest]
             self._halted.discard(oldest)
         return name not in self._halted
 
     def halt(self, now: float, by: str = "") -> None:
-        """The car was stopped: who has just driven must pause before it is heard again.
-
-        Not who stopped it: a script that drives, stops and drives is no stick that somebody leans on. A stream is.
-        """
-        running = (
-            name for name, (last, streamed) in self._drives.items() if now - last < PAUSE_S and (streamed or name != by)
+        """Require a pause of all senders that have just driven: the car was stopped."""
+        # The sender of the stop is exempt, unless it streams: a script may stop and drive again, a held joystick may
+        # not.
+        self._halted.update(
+            name
+            for name, (last, streamed) in self._drives.items()
+            if now - last < STREAM_PAUSE_S and (streamed or name != by)
         )
-        self._halted.update(running)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from gateway.control.stops.sequences import ANSWER_S, UNKNOWN
+from gateway.control.stops.sequences import STOP_REPORT_TIMEOUT_S, UNKNOWN
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode
@@ -90,7 +90,7 @@ class LinkProbe:
                 self.trouble = str(error)
                 return
         self.answered = False
-        await self.listen(ANSWER_S, until_answered=True)
+        await self.listen(STOP_REPORT_TIMEOUT_S, until_answered=True)
 
     def end(self) -> None:
         """Take in what was held back."""

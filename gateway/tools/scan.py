@@ -12,7 +12,7 @@ from collections.abc import Coroutine, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from gateway.control.stops.sequences import ANSWER_S, UNKNOWN
+from gateway.control.stops.sequences import STOP_REPORT_TIMEOUT_S, UNKNOWN
 from gateway.link import parse_url
 from gateway.protocol.frames import encode
 from gateway.tools import cli_support
@@ -131,7 +131,7 @@ class _Scan:
         seconds = f"{UNKNOWN.length_s:g} s"
         cli_support.note(f"sending {frames} within {seconds} to {where}: a car there stops, and goes to mode 0")
         probing = asyncio.gather(*(ear.probe() for ear in asked))
-        await self._with_progress(_all(probing), "probing", UNKNOWN.length_s + ANSWER_S)
+        await self._with_progress(_all(probing), "probing", UNKNOWN.length_s + STOP_REPORT_TIMEOUT_S)
 
     async def _with_progress(self, work: Coroutine[Any, Any, None], what: str, seconds: float) -> None:
         """Tell a person at a terminal how long it may still take."""

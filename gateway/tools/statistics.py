@@ -25,7 +25,7 @@ class LinkStatistics:
 
     def count(self, event: Event, profile: Profile) -> None:
         """Take an event in; `profile`: what the car was said to be."""
-        self.looked_for.heard(event)
+        self.looked_for.on_event(event)
         match event:
             case Sensors():
                 self.kinds["sensors"] += 1

@@ -116,8 +116,8 @@ class Wild:
         self._restart()
 
     def _restart(self) -> None:
-        kept = self.control.safety.kept if hasattr(self, "control") else None
-        self.control = Controller("red", parse_platform(self.moments.choice(PLATFORMS)), kept=kept)
+        kept = self.control.safety.persisted if hasattr(self, "control") else None
+        self.control = Controller("red", parse_platform(self.moments.choice(PLATFORMS)), persisted=kept)
         self.decoder = Decoder()
         self.linked = False
         self.ending = False
@@ -143,22 +143,22 @@ class Wild:
                 self._turn_link()
         elif chance < 0.97:
             name = moments.choice(SENDERS).name if moments.random() < 0.9 else f"n{moments.random()}"
-            self.control.sender_alive(name, alive=moments.random() < 0.5, now=self.now)
+            self.control.on_sender_token(name, alive=moments.random() < 0.5, now=self.now)
         elif chance < 0.98:
-            self.control.stalled(moments.random(), self.now)
+            self.control.on_stall(moments.random(), self.now)
         elif chance < 0.99:
             estops = [Estop(f"id{moments.randrange(40)}", "ann", "", 1, moments.random() < 0.9)]
             shown = estops if moments.random() < 0.1 else []
-            self.control.unite(shown, [f"id{moments.randrange(40)}"], "blue", self.now)
+            self.control.merge_estops(shown, [f"id{moments.randrange(40)}"], "blue", self.now)
         elif chance < 0.9995:
-            self.control.refused(self._command(Stop()), Reason.BAD_VALUE, "no", self.now)
+            self.control.record_rejection(self._command(Stop()), Reason.BAD_VALUE, "no", self.now)
         elif chance < 0.9998:
             self._pass(moments.choice(JUMPS_S))
         else:
-            self.control.shutdown(self.now)
+            self.control.shut_down(self.now)
             self.ending = True
         self._pump()
-        if self.ending and (self.control.finished or moments.random() < 0.01):
+        if self.ending and (self.control.stops.finished or moments.random() < 0.01):
             self._restart()
 
     def _command(self, what: Action) -> Command:
@@ -208,13 +208,13 @@ class Wild:
     def _pass(self, gap_s: float) -> None:
         self.now += gap_s
         for event in self.decoder.tick(self.now):
-            self.control.heard(event, self.now)
+            self.control.on_event(event, self.now)
         self.control.tick(self.now)
 
     def _hear(self, data: bytes) -> None:
         if self.linked:
             for event in self.decoder.feed(data, self.now):
-                self.control.heard(event, self.now)
+                self.control.on_event(event, self.now)
 
     def _turn_link(self) -> None:
         if self.linked:
@@ -239,12 +239,12 @@ class Wild:
             self._check_write(write)
             self.writes += 1
             if self.moments.random() < 0.02:
-                self.control.write_failed("cut", self.now)
+                self.control.on_write_failed("cut", self.now)
                 self.linked = False
             else:
-                self.control.wrote(write, self.now)
+                self.control.on_written(write, self.now)
                 self.decoder.sent(write.data, self.now)
-                self.free_at = self.now + self.control.profile.block_s(write.frame)
+                self.free_at = self.now + self.control.model.profile.block_s(write.frame)
             assert self.control.poll(self.now) is None, "one frame in flight"
         self.control.take_records()
 
@@ -253,8 +253,8 @@ class Wild:
     def _check_write(self, write: OutgoingFrame) -> None:
         frame, control = write.frame, self.control
         assert self.linked, "nothing is written without a link"
-        self.doubted = self.doubted or control.platform.doubted
-        known = control.profile.refusal(frame) is None
+        self.doubted = self.doubted or control.model.platform.doubted
+        known = control.model.profile.refusal(frame) is None
         assert known or (self.doubted and isinstance(frame, ModeClose)), "only what the platform knows"
         if write.why in (FrameOrigin.COMMAND, FrameOrigin.REPEAT) and not isinstance(frame, ModeClose):
             stopping = isinstance(frame, General) and frame == General(Motion.STOP)
@@ -266,10 +266,10 @@ class Wild:
         """E-stopped, held or ending, a car is never set going."""
         if isinstance(frame, ModeOpen) or (isinstance(frame, General) and frame.motion is not Motion.STOP):
             assert not self.control.safety.estops
-            assert self.control.hold is None
+            assert self.control.safety.hold is None
             assert not self.ending
             # A car that is heard but shows no stop may be driven by whoever sees it; a car of unknown state may not.
-            assert self.control.known or self.control.model.trust.state is CarTrust.UNPROVEN
+            assert self.control.model.known or self.control.model.trust.state is CarTrust.UNPROVEN
 
     def _check_once(self, frame: Frame, why: FrameOrigin) -> None:
         """What acts once is written once for each command that was accepted, and never repeated."""
@@ -314,21 +314,21 @@ class Wild:
         last = until_off(control, now)
         assert last is not None, "it has no end"
         # What joined a stop that nobody had answered for long may fail; the stop itself goes on until it is over.
-        assert last.phase is Phase.FAILED or last.basis == control.basis, last
+        assert last.phase is Phase.FAILED or last.basis == control.model.basis, last
         assert last.phase is not Phase.FAILED or last.reason is Reason.NOT_SHOWN, last
         assert (last.phase is Phase.COMPLETE) == (last.basis == Basis.SHOWN), last
-        assert control.motors == "off"
+        assert control.model.motors == "off"
 
 
 def until_off(control: Controller, now: float) -> CommandRecord | None:
     """The link carries everything, and the car reports once a second in which it is not blocked: how the stop ends."""
     end, report_at, last = now + STOP_WITHIN_S, now + 1.0, None
-    pi = control.profile.kind is Platform.RASPBERRY_PI
-    while now < end and (last is None or control.motors != "off"):
+    pi = control.model.profile.kind is Platform.RASPBERRY_PI
+    while now < end and (last is None or control.model.motors != "off"):
         while (write := control.poll(now)) is not None:
             frame = write.frame
             assert isinstance(frame, Reset | ModeClose) or frame == General(Motion.STOP), frame
-            control.wrote(write, now)
+            control.on_written(write, now)
             report_at += 1.0 if isinstance(frame, ModeClose) and not pi else 0.0
         for record in control.take_records():
             if isinstance(record, CommandRecord) and record.command.id == "the-stop" and is_end(record):
@@ -338,7 +338,7 @@ def until_off(control: Controller, now: float) -> CommandRecord | None:
         if now >= report_at:
             report_at = now + 1.0
             for event in Decoder().feed(PI if pi else MANUAL, now):
-                control.heard(event, now)
+                control.on_event(event, now)
             control.tick(now)
     return last
 
@@ -373,6 +373,6 @@ def run(seed: int, steps: int, *, stop_every: int = 500) -> tuple[int, int]:
                 wild.check_stop()
                 wild.check_memory()
         except Exception as error:
-            error.add_note(f"seed {seed}, step {number}, {wild.control.profile.name}")
+            error.add_note(f"seed {seed}, step {number}, {wild.control.model.profile.name}")
             raise
     return wild.writes, wild.stops

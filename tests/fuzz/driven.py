@@ -76,10 +76,10 @@ class Driven:
         elif chance < 0.95:
             self._stall(2 * moments.random())
         elif chance < 0.97:
-            pair.control.sender_alive(moments.choice(SENDERS).name, alive=moments.random() < 0.5, now=pair.now)
+            pair.control.on_sender_token(moments.choice(SENDERS).name, alive=moments.random() < 0.5, now=pair.now)
         elif chance < 0.98:
             for event in pair.decoder.feed(moments.randbytes(moments.randrange(40)).replace(b"$", b""), pair.now):
-                pair.control.heard(event, pair.now)
+                pair.control.on_event(event, pair.now)
         elif chance < 0.985:
             pair.car.brown_out(pair.now)
         self._see_cut()
@@ -92,7 +92,7 @@ class Driven:
     def _stall(self, gap_s: float) -> None:
         """The loop sleeps; the car does not."""
         self.pair.now += gap_s
-        self.pair.control.stalled(gap_s, self.pair.now)
+        self.pair.control.on_stall(gap_s, self.pair.now)
 
     def _ask(self) -> None:
         what = anything(self.moments)
@@ -162,7 +162,7 @@ def run(seed: int, steps: int, *, stop_every: int = 12) -> Fuzzed:
                     states.add(state)
                 driven.pair.ask(Resume(), sender=sender)
         except Exception as error:
-            name = driven.pair.control.profile.name
+            name = driven.pair.control.model.profile.name
             error.add_note(f"seed {seed}, step {number}, {name}, {driven.world}: {driven.pair.sent[-8:]}")
             raise
         if number % LIFE == LIFE - 1:

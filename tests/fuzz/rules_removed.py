@@ -5,7 +5,8 @@ from typing import Any
 
 from gateway.control.estimate.mode import ModeEstimator
 from gateway.control.estimate.trust import Basis
-from gateway.control.executor import Executor
+from gateway.control.stop_executor import StopExecutor
+from gateway.control.stop_renewal import StopRenewal
 from gateway.control.stops import evidence
 from gateway.control.stops.evidence import StopCase, StopEvidence
 from gateway.control.stops.stopping import StopInProgress
@@ -15,16 +16,16 @@ Patch = Callable[[object, str, Any], None]
 
 
 def _time_decides(patch: Patch) -> None:
-    def await_time(self: Executor, running: StopInProgress, now: float) -> None:
+    def await_time(self: StopExecutor, running: StopInProgress, now: float) -> None:
         if now >= running.obeyed_at:
             self._finish(running, Basis.SHOWN, "time", now)
 
-    patch(Executor, "_await", await_time)
+    patch(StopExecutor, "_await", await_time)
 
 
 def _no_second_try(patch: Patch) -> None:
-    patch(Executor, "_try_again", lambda self, running, now: setattr(running, "last_at", now))
-    patch(Executor, "_may_probe", lambda self, running: False)
+    patch(StopExecutor, "_try_again", lambda self, running, now: setattr(running, "last_at", now))
+    patch(StopExecutor, "_may_probe", lambda self, running: False)
 
 
 def _one_pause(patch: Patch) -> None:
@@ -33,7 +34,7 @@ def _one_pause(patch: Patch) -> None:
 
 def _damaged_frames_count(patch: Patch) -> None:
     patch(evidence, "SETTLED_S", -1.0)
-    patch(StopEvidence, "noise", lambda self, at, damaged=True: None)
+    patch(StopEvidence, "on_noise", lambda self, at, damaged=True: None)
 
 
 def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:
@@ -65,7 +66,7 @@ def _silent_mode_without_its_silence(patch: Patch) -> None:
 
 
 def _no_renewal(patch: Patch) -> None:
-    patch(Executor, "_schedule_renewal", lambda self, now: setattr(self, "_renew_at", float("inf")))
+    patch(StopRenewal, "schedule", lambda self, now: self.suspend())
 
 
 def _confirmations_stay(patch: Patch) -> None:
@@ -74,15 +75,17 @@ def _confirmations_stay(patch: Patch) -> None:
 
 def _shutdown_waits_for_time(patch: Patch) -> None:
     patch(
-        Executor, "finished", property(lambda self: self.closing and (self.running is None or self.running.frames_sent))
+        StopExecutor,
+        "finished",
+        property(lambda self: self.shutting_down and (self.running is None or self.running.frames_sent)),
     )
 
 
 def _sent_without_a_report(patch: Patch) -> None:
-    def ends(self: Executor, running: StopInProgress, now: float) -> StopCase | None:
+    def ends(self: StopExecutor, running: StopInProgress, now: float) -> StopCase | None:
         return StopCase.NO_ECHO if running.frames_sent and now >= running.obeyed_at else None
 
-    patch(Executor, "_ends_as_sent", ends)
+    patch(StopExecutor, "_ends_as_sent", ends)
 
 
 def _drives_leave_evidence(patch: Patch) -> None:
@@ -90,11 +93,11 @@ def _drives_leave_evidence(patch: Patch) -> None:
 
 
 def _a_stop_that_is_driven_over_ends_without_a_word(patch: Patch) -> None:
-    patch(Executor, "_give_way", lambda self, now: setattr(self, "running", None))
+    patch(StopExecutor, "give_way", lambda self, now: setattr(self, "running", None))
 
 
 def _commands_wait_for_ever(patch: Patch) -> None:
-    patch(Executor, "_fail_late", lambda self, running, now: None)
+    patch(StopExecutor, "fail_late", lambda self, running, now: None)
 
 
 RULES: dict[str, Callable[[Patch], None]] = {

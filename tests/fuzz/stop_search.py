@@ -437,7 +437,7 @@ class Episode:
         plan = self.plan
         self._run(2.0)
         self._connect()
-        self._until(lambda: self.control.motors == "off", READY_S)
+        self._until(lambda: self.control.model.motors == "off", READY_S)
         self._run(self._moments.random())
         self.zero = self.now + 60.0  # the load says when
         self._load()
@@ -512,8 +512,8 @@ class Episode:
             case Ending.RELEASE:
                 self._ask(Drive(Motion.STOP))
             case Ending.LOST_SENDER:
-                control.sender_alive("mia", alive=True, now=now)
-                control.sender_alive("mia", alive=False, now=now)
+                control.on_sender_token("mia", alive=True, now=now)
+                control.on_sender_token("mia", alive=False, now=now)
                 self._run(1.2)
             case Ending.RECONNECT:
                 self.car.drop_link(now)
@@ -529,14 +529,14 @@ class Episode:
     def _shut_down(self) -> None:
         """End the gateway; where its car was not stopped, another one follows, as under `fleet up`."""
         for _ in range(6):
-            self.control.shutdown(self.now)
-            self._until(lambda: self.control.finished, 18.0)
+            self.control.shut_down(self.now)
+            self._until(lambda: self.control.stops.finished, 18.0)
             ended, self._claim_since = self.control, None
-            self._note(f"ended: not stopped {ended.not_stopped!r}, {ended.basis}")
-            if not ended.not_stopped:
-                self.report.ends[f"shutdown {ended.basis}"] += 1
-                self._complete = ended.basis == "shown"
-                self._ended_as_sent = ended.basis == "sent"
+            self._note(f"ended: not stopped {ended.stops.not_stopped!r}, {ended.model.basis}")
+            if not ended.stops.not_stopped:
+                self.report.ends[f"shutdown {ended.model.basis}"] += 1
+                self._complete = ended.model.basis == "shown"
+                self._ended_as_sent = ended.model.basis == "sent"
                 self.report.sent["shutdown"] += self._ended_as_sent
                 self._complete_since = self.now
                 self._linked = False
@@ -596,7 +596,7 @@ class Episode:
         self._carry(zero)
         if self._linked:
             for event in self.decoder.tick(self.now):
-                self.control.heard(event, self.now)
+                self.control.on_event(event, self.now)
             if self.now >= self._next_tick:
                 self._next_tick = self.now + TICK_S
                 self.control.tick(self.now)
@@ -626,7 +626,7 @@ class Episode:
     def _hear(self, data: bytes, at: float) -> None:
         if self._linked:
             for event in self.decoder.feed(data, max(at, 0.0)):
-                self.control.heard(event, self.now)
+                self.control.on_event(event, self.now)
 
     def _pump(self) -> None:
         if not self._linked:
@@ -645,7 +645,7 @@ class Episode:
                 self._down.put(write.data, now - zero, now + took_s - zero)
             else:
                 self.car.feed(write.data, max(now, self.car.now))
-            control.wrote(write, now)
+            control.on_written(write, now)
             self.decoder.sent(write.data, now)
         else:
             raise AssertionError("control writes without end")
@@ -702,13 +702,13 @@ class Episode:
         if self.zero == float("inf"):
             return
         control, truth, now = self.control, self.car.truth, self.now
-        self._platform_doubted = self._platform_doubted or control.platform.doubted
+        self._platform_doubted = self._platform_doubted or control.model.platform.doubted
         driving = truth.driving
         if not driving:
             self._on_since = None
         elif self._on_since is None:
             self._on_since = now
-        shown = self._linked and control.motors == "off" and control.basis == "shown"
+        shown = self._linked and control.model.motors == "off" and control.model.basis == "shown"
         if not shown:
             self._claim_since = None
         elif self._claim_since is None:
@@ -725,7 +725,11 @@ class Episode:
 
     def _judge_sent(self, *, driving: bool) -> None:
         control = self.control
-        case = control.model.rest.value if self._linked and control.motors == "off" and control.basis == "sent" else ""
+        case = (
+            control.model.rest.value
+            if self._linked and control.model.motors == "off" and control.model.basis == "sent"
+            else ""
+        )
         if case and not self._case:
             self.report.sent[case] += 1
             self._false_counted = False
@@ -738,7 +742,7 @@ class Episode:
             self.report.false_sent[case] += 1
 
     def _judge_verdict(self, true: Mode) -> None:
-        mode = self.control.mode
+        mode = self.control.model.mode
         if not self._linked:
             self._verdict_since = None
             return
@@ -758,7 +762,7 @@ class Episode:
         end = self.now + seconds
         while self.now < end:
             if self.car.truth.driving and self.car.alive:
-                if _is_lost(self.car) or (_is_wedged(self.car) and self.control.basis == "sent"):
+                if _is_lost(self.car) or (_is_wedged(self.car) and self.control.model.basis == "sent"):
                     self.report.wedged = True
                 elif self._ended_as_sent:
                     self.report.false_sent["shutdown"] += 1  # nothing showed it, and no gateway is left

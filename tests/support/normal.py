@@ -53,15 +53,15 @@ class NormalRun:
         self.health = LinkHealth()
         self.alarms: list[str] = []
         self.commands = 0
-        heard = self.pair.control.heard
+        heard = self.pair.control.on_event
 
         def counted(event: Event, now: float) -> None:
             if isinstance(event, Sensors):
-                self.health.heard(event.at)
+                self.health.on_reading(event.at)
             heard(event, now)
 
-        self.pair.control.heard = counted  # type: ignore[method-assign]  # as car.py does
-        self.health.up(self.pair.now)
+        self.pair.control.on_event = counted  # type: ignore[method-assign]  # as car.py does
+        self.health.on_open(self.pair.now)
         self.pair.ready()
         self.pair.logs.clear()
 
@@ -74,13 +74,13 @@ class NormalRun:
 
     def look(self) -> None:
         """Note what is wrong."""
-        pair, mode = self.pair, self.pair.control.mode
-        self.health.judge(
+        pair, mode = self.pair, self.pair.control.model.mode
+        self.health.update(
             now=pair.now,
-            limit_s=mode.silence_limit(fan=bool(pair.control.believed.fan)),
+            limit_s=mode.silence_limit(fan=bool(pair.control.model.believed.fan)),
             unheard_s=mode.unheard_s(pair.now),
             why_quiet="silent",
-            is_heard=pair.control.is_heard,
+            is_heard=pair.control.model.is_heard,
         )
         if self.health.state in (LinkState.STALE, LinkState.LOST):
             self._alarm(f"link {self.health.state}: {self.health.reason}")

@@ -181,7 +181,7 @@ def last_moment(mode: Mode) -> Load:
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(SetMode(mode))
         pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), OPENS_S)
-        pair.run(pair.control.pacing.block_from - pair.now - 0.2 + 0.25 * moments.random())
+        pair.run(pair.control.model.pacing.block_from - pair.now - 0.2 + 0.25 * moments.random())
 
     return load
 
@@ -313,7 +313,7 @@ def within(what: OneShot | SetMode, block_s: float) -> Load:
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(what)
-        pair.until(lambda: pair.car.truth.blocked and pair.control.motors == "off", 12.0)
+        pair.until(lambda: pair.car.truth.blocked and pair.control.model.motors == "off", 12.0)
         pair.run(block_s * moments.random())
 
     return load
@@ -437,31 +437,31 @@ class Seen:
 def state_of(pair: Pair) -> str:
     """What control can tell apart when a stop is asked."""
     control, now = pair.control, pair.now
-    style = control.profile.stop_style
+    style = control.model.profile.stop_style
     kind = {
         StopStyle.MODE_FRAME: "",
         StopStyle.UNKNOWN: "unknown platform, ",
         StopStyle.RASPBERRY_PI: f"{Platform.RASPBERRY_PI}, ",
     }
-    running = control.running
+    running = control.stops.running
     if control.model.trust.state in (CarTrust.UNHEARD, CarTrust.UNPROVEN):
         return f"{kind[style]}{control.model.trust.state}"
-    if not control.known:
+    if not control.model.known:
         return f"{kind[style]}link just restored"
-    if running is not None and running.recipe.rank > 1:
+    if running is not None and running.sequence.rank > 1:
         avoiding = " of obstacle avoidance" if running.worst_at - running.began_at > AVOIDING_S else ""
         return f"{kind[style]}a stop under way{avoiding}"
-    mode = control.mode.asked
-    if control.mode.verdict is Verdict.CONTRADICTED:
+    mode = control.model.mode.asked
+    if control.model.mode.verdict is Verdict.CONTRADICTED:
         return f"{kind[style]}mode contradicted"
     if mode is None or mode is Mode.MANUAL:
-        pacing = control.pacing
-        if control.at_rest and control.basis is Basis.SENT and pacing.blocked_at(now):
+        pacing = control.model.pacing
+        if control.model.at_rest and control.model.basis is Basis.SENT and pacing.blocked_at(now):
             return f"{kind[style]}at rest, a renewal blocks"  # the motors are off, so the ratio says nothing
         unread = "a frame may be unread" if not pacing.clear_at(now) else ""
         what = unread or ("in a block of ours" if pacing.blocked_at(now) else "nothing unread")
         return f"{kind[style]}{Mode.MANUAL}, {what}"
-    if now < control.pacing.block_until:
+    if now < control.model.pacing.block_until:
         return f"{kind[style]}opening {mode}"
     # docs/reference/protocol.md#blocking-times gives these one row, "up to 0.1 s per turn"; the infrared remote is
     # taken as one of them.
@@ -495,8 +495,8 @@ def play(case: StopTestCase, seed: int) -> Seen:
         max(off_at, settled_at) - asked_at if settled_at > asked_at else max(0.0, off_at - asked_at),
         last.at - asked_at if last is not None and last.phase is not Phase.FAILED else float("inf"),
         shown - asked_at if shown is not None else float("inf"),
-        pair.control.motors,
-        pair.control.basis or "",
+        pair.control.model.motors,
+        pair.control.model.basis or "",
         last.phase if last is not None else "",
         last.basis if last is not None else "",
         last.words if last is not None else "",

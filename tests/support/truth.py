@@ -44,7 +44,7 @@ def car_in(mode: Mode, world: str, *, seed: int, platform: str = "arduino") -> P
         pair.ask(SetMode(mode))
         pair.until(lambda: pair.car.truth.mode is mode, 8.0)
         pair.run(4.0)
-    elif pair.control.basis != "shown":
+    elif pair.control.model.basis != "shown":
         pair.run(RENEWED_S)
     pair.run(2.0 * moments.random())
     return pair

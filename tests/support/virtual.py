@@ -75,7 +75,7 @@ class Pair:
     def ready(self) -> "Pair":
         """Connect and wait until recovery is complete and a reading has come."""
         self.connect()
-        self.until(lambda: self.control.known and self.control.mode.inferred is not None, 30.0)
+        self.until(lambda: self.control.model.known and self.control.model.mode.inferred is not None, 30.0)
         return self
 
     def ask(self, what: Action, *, verb: str = "test", sender: Sender | None = None, identity: str = "") -> Answer:
@@ -151,11 +151,11 @@ class Pair:
             if linked and at >= self.deaf_until:
                 for event in self.decoder.feed(data, at):
                     self._touched = True
-                    self.control.heard(event, self.now)
+                    self.control.on_event(event, self.now)
         if linked:
             for event in self.decoder.tick(self.now):
                 self._touched = True
-                self.control.heard(event, self.now)
+                self.control.on_event(event, self.now)
             self.tick()
 
     def tick(self) -> None:
@@ -171,11 +171,11 @@ class Pair:
             if self.cut is not None:
                 self.car.feed(write.data[: self.cut], self.now)
                 self.cut = None
-                self.control.write_failed("the write was cut", self.now)
+                self.control.on_write_failed("the write was cut", self.now)
                 break
             self.sent.append((self.now, write.data))
             self.car.feed(write.data, self.now)
-            self.control.wrote(write, self.now)
+            self.control.on_written(write, self.now)
             self.decoder.sent(write.data, self.now)
         self._take()
 

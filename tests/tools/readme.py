@@ -10,13 +10,14 @@ from typing import Any
 
 from google.protobuf.descriptor import FieldDescriptor
 
-from gateway.bus.requests import LONGEST_DRIVE_S
+from gateway.bus.requests import DEFAULT_MAX_DRIVE_S
 from gateway.control.car_monitor import STALL_S
 from gateway.control.estimate.trust import TRANSITIONS, CarTrust, TrustEvent, TrustState
-from gateway.control.executor import RENEW_S, SHUTDOWN_S
-from gateway.control.senders import PAUSE_S, SENDER_GONE_S
+from gateway.control.senders import SENDER_GONE_S, STREAM_PAUSE_S
+from gateway.control.stop_executor import SHUTDOWN_S
+from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.control.stops.evidence import EVIDENCE
-from gateway.control.stops.sequences import REPEAT_S
+from gateway.control.stops.sequences import REPEAT_INTERVAL_S
 from schemas import messages, topics
 from tests.support import vectors
 from tests.tools.vectors import STOPS
@@ -248,26 +249,29 @@ def failure_table() -> str:
     """Each failure: what the car does, how long, what is seen. Its times are the code's, and the table of stops'."""
     middle, worst = (_longest("manual, nothing unread", column) for column in ("p50_s", "worst_s"))
     driving = f"{middle:.2f} s, at worst {worst:.1f} s"
-    renewed = f"{RENEW_S[0]:g}, {RENEW_S[1]:g} and then every {RENEW_S[2]:g} s"
+    renewed = f"{RENEWAL_INTERVALS_S[0]:g}, {RENEWAL_INTERVALS_S[1]:g} and then every {RENEWAL_INTERVALS_S[2]:g} s"
     restored = _longest("link just restored", "worst_s")
     rows = ["| what happens | what the car does | for how long | what you see |", "|---|---|---|---|"]
     for what, does, long, see in (
         (
             "You let go, or a drive's time is over",
             "stops; the stop is sent again, alone, later",
-            f"{driving} after that; again after {REPEAT_S:g} s, and until something shows it after {renewed}",
+            f"{driving} after that; again after {REPEAT_INTERVAL_S:g} s, and until something shows it after {renewed}",
             "`complete` of the drive on `event/command`; `motors` off, `sent`: nothing shows this stop",
         ),
         (
             "Somebody says `stop`",
             "stops, and is on hold; a stick that is leaned on is not heard before it was let go",
-            f"see below; the stick {PAUSE_S:g} s",
+            f"see below; the stick {STREAM_PAUSE_S:g} s",
             "`worst_case_s` in the answer, `complete` when the car has shown it (see below)",
         ),
         (
             "The program that drives is killed",
             "drives on until its command's time is over, or its token has been gone",
-            f"`duration_s` (0.5 s unless asked, {LONGEST_DRIVE_S:g} s at most) or {SENDER_GONE_S:g} s, and the stop",
+            (
+                f"`duration_s` (0.5 s unless asked, {DEFAULT_MAX_DRIVE_S:g} s at most) or "
+                f"{SENDER_GONE_S:g} s, and the stop"
+            ),
             "the drive ends as `expired`: its sender is gone",
         ),
         (

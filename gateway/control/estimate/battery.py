@@ -1,6 +1,6 @@
-"""What a battery's voltage means: charge, level and what follows, with how far the estimate may be off.
+"""Estimates charge and level of a battery from measured voltages, and the reaction to a level.
 
-Only of a voltage that is measured: a raspberry_pi car sends a constant (see `Profile.measured`).
+A raspberry_pi car sends a constant instead of a measured voltage (see `Profile.measured`).
 """
 
 from dataclasses import dataclass, field
@@ -12,19 +12,19 @@ FULL_V: Final = 8.4  # to 8.4 V full
 LOW_V: Final = 7.0
 CRITICAL_V: Final = 6.6
 SAG_V: Final = 0.4
-"""How far motors under load pull the voltage down; an estimate, not measured."""
-RECOVERS_S: Final = 5.0
-"""How long after a load the voltage may still rise; an estimate, not measured."""
-CURVE: Final = 0.15
-"""A Li-ion cell's curve is flat in the middle: a straight line between empty and full is off by about this share."""
+"""Maximum voltage drop by motors under load; an estimate, not measured."""
+LOAD_RECOVERY_S: Final = 5.0
+"""Maximum time that the voltage rises after a load; an estimate, not measured."""
+CHARGE_ERROR: Final = 0.15
+"""Error of the charge without a load: a Li-ion cell's curve is flat in the middle, and the estimate is linear."""
 HYSTERESIS_V: Final = 0.15
-"""A level is left upwards only so far above its threshold."""
-HOLD_S: Final = 5.0
-"""A level changes when every reading for so long says so: one per second in mode 0, at most two seconds apart."""
+"""Minimum voltage above a threshold that ends the lower level."""
+LEVEL_DEBOUNCE_S: Final = 5.0
+"""Minimum time that all readings must show another level before the level changes. Mode 0 sends one a second."""
 
 
 class BatteryLevel(StrEnum):
-    """Whether a person should do something."""
+    """The level of the battery, for a person."""
 
     OK = "ok"
     LOW = "low"
@@ -32,20 +32,20 @@ class BatteryLevel(StrEnum):
 
 
 class BatteryReaction(StrEnum):
-    """What a level leads to."""
+    """The reaction to a level."""
 
     WARN = "warn"
     REFUSE = "refuse"
-    """No new drive and no new mode; what runs goes on."""
+    """Refuse new drives and modes. A running drive or mode goes on."""
     STOP = "stop"
-    """The same, and the car is stopped."""
+    """Refuse new drives and modes, and stop the car."""
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryPolicy:
-    """What each level leads to, and where it begins, V at rest.
+    """The threshold of each level, V at rest, and the reaction to it.
 
-    A brownout resets the car, which stops it, so nothing is stopped by default.
+    By default no level stops the car: a brownout resets the car, which stops it too.
     """
 
     low: BatteryReaction = BatteryReaction.WARN
@@ -54,13 +54,13 @@ class BatteryPolicy:
     critical_v: float = CRITICAL_V
 
     def level(self, voltage_v: float) -> BatteryLevel:
-        """The level of a voltage at rest, V."""
+        """Return the level of a voltage at rest, V."""
         if voltage_v < self.critical_v:
             return BatteryLevel.CRITICAL
         return BatteryLevel.LOW if voltage_v < self.low_v else BatteryLevel.OK
 
     def action(self, level: BatteryLevel | None) -> BatteryReaction | None:
-        """What this level leads to; nothing if it is fine, or was never measured."""
+        """Return the reaction to a level; None if it is ok or unknown."""
         match level:
             case BatteryLevel.LOW:
                 return self.low
@@ -72,60 +72,64 @@ class BatteryPolicy:
 
 @dataclass(slots=True)
 class Battery:
-    """The level of one car's battery, as its readings show it. Times are seconds on one monotonic clock."""
+    """The level of one car's battery. Times: s, monotonic."""
 
     policy: BatteryPolicy = field(default_factory=BatteryPolicy)
     level: BatteryLevel | None = None
-    """None until a voltage was measured; then OK until readings have shown another level for HOLD_S."""
+    """None until a voltage was measured, then OK until another level has lasted `LEVEL_DEBOUNCE_S`."""
     voltage_v: float | None = None
-    """As measured last."""
-    heard_at: float = float("-inf")
+    """The last measured voltage."""
+    measured_at: float = float("-inf")
     _loaded_at: float = float("-inf")
     _other: BatteryLevel | None = None
     _since: float = 0.0
-    """Which other level the readings show, in the same direction since when."""
+    """The other level that the readings show, and since when they are on that side of `level`."""
 
-    def heard(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
-        """Take a measured voltage in; `loaded`: motors may be on. True if the level has changed."""
+    def on_voltage(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
+        """Update the level with a measured voltage. Return True if it has changed. `loaded`: motors may be on."""
         self.voltage_v = voltage_v
-        self.heard_at = now
+        self.measured_at = now
         if loaded:
             self._loaded_at = now
         low_v, high_v = rest_v(voltage_v, loaded=self.loaded)
         worse, better = self.policy.level(high_v), self.policy.level(low_v - HYSTERESIS_V)
         if self.level is None:
-            # Motors may have run until now, and a single reading may be damaged: the first one decides nothing.
+            # The first reading decides nothing: motors may have run until now, or the reading may be corrupted.
             self.level = BatteryLevel.OK
         shown = self.level
-        if _RANK[worse] > _RANK[shown]:
-            shown = worse  # even if all of a load's sag is added
-        elif _RANK[better] < _RANK[shown]:
+        if _LEVEL_RANK[worse] > _LEVEL_RANK[shown]:
+            shown = worse  # even with the maximum drop by a load
+        elif _LEVEL_RANK[better] < _LEVEL_RANK[shown]:
             shown = better
         if shown is self.level:
             self._other = None
-        elif self._other is None or (_RANK[self._other] > _RANK[self.level]) is not (_RANK[shown] > _RANK[self.level]):
+        elif self._other is None or (_LEVEL_RANK[self._other] > _LEVEL_RANK[self.level]) is not (
+            _LEVEL_RANK[shown] > _LEVEL_RANK[self.level]
+        ):
             self._other, self._since = shown, now
         else:
-            # Readings on both sides of `critical` are at least `low`: the level nearer to the present one has held.
-            self._other = min(self._other, shown, key=lambda each: abs(_RANK[each] - _RANK[self.level or each]))
-            if now - self._since >= HOLD_S:
+            # Readings on both sides of `critical` are all at least `low`: take the level nearer to the current one.
+            self._other = min(
+                self._other, shown, key=lambda each: abs(_LEVEL_RANK[each] - _LEVEL_RANK[self.level or each])
+            )
+            if now - self._since >= LEVEL_DEBOUNCE_S:
                 self.level, self._other = self._other, None
                 return True
         return False
 
     @property
     def loaded(self) -> bool:
-        """Whether the last voltage may be below what it is at rest."""
-        return self.heard_at - self._loaded_at < RECOVERS_S
+        """Return True if the last voltage may be below the voltage at rest."""
+        return self.measured_at - self._loaded_at < LOAD_RECOVERY_S
 
     @property
     def action(self) -> BatteryReaction | None:
-        """What the level leads to."""
+        """Return the reaction to the current level."""
         return self.policy.action(self.level)
 
     @property
     def words(self) -> str:
-        """The level, for a person; empty if nothing was measured."""
+        """Return the level in words; empty if no voltage was measured."""
         if self.level is None or self.voltage_v is None:
             return ""
         share, error = charge(self.voltage_v, loaded=self.loaded)
@@ -133,25 +137,25 @@ class Battery:
 
     @property
     def refusal(self) -> str:
-        """Why no new drive or mode is allowed, for a person; empty if it is."""
+        """Return why new drives and modes are refused; empty if they are allowed."""
         refuses = self.action in (BatteryReaction.REFUSE, BatteryReaction.STOP)
         return f"{self.words}: charge it, then drive; manual, stop, whistle and light work" if refuses else ""
 
 
-_RANK: Final = {each: rank for rank, each in enumerate(BatteryLevel)}
+_LEVEL_RANK: Final = {each: rank for rank, each in enumerate(BatteryLevel)}
 
 
 def rest_v(voltage_v: float, *, loaded: bool) -> tuple[float, float]:
-    """Between which two voltages, V, it would be without a load."""
+    """Return the range of the voltage without a load, V."""
     return voltage_v, voltage_v + (SAG_V if loaded else 0.0)
 
 
 def charge(voltage_v: float, *, loaded: bool) -> tuple[float, float]:
-    """Charge and the half width of its uncertainty, 0..1 each: a straight line between empty and full.
+    """Return the charge and its error (half width), 0..1 each.
 
-    Under a load it is taken from the middle of what the voltage may be at rest.
+    The charge is linear between empty and full. Under a load it uses the middle of the possible voltages at rest.
     """
     low_v, high_v = rest_v(voltage_v, loaded=loaded)
     share = ((low_v + high_v) / 2 - EMPTY_V) / (FULL_V - EMPTY_V)
-    error = CURVE + (high_v - low_v) / 2 / (FULL_V - EMPTY_V)
+    error = CHARGE_ERROR + (high_v - low_v) / 2 / (FULL_V - EMPTY_V)
     return min(1.0, max(0.0, share)), min(1.0, error)

@@ -1,7 +1,7 @@
-"""Which mode the car is in: what was asked, what its readings show, and what follows. The car itself never says.
+"""Estimates the mode of the car from the commanded mode and the readings. The car never reports its mode.
 
-Silence never confirms: the silent modes are at best assumed. What can be told apart and how soon is a table that the
-tests walk, tests/vectors/mode_truth.tsv.
+Silence never confirms a mode, so a silent mode is at best assumed. The table tests/vectors/mode_truth.tsv lists which
+modes can be distinguished and how soon; the tests check it.
 """
 
 from collections import deque
@@ -9,27 +9,26 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-from gateway.control.stops.sequences import REPEAT_S
+from gateway.control.stops.sequences import REPEAT_INTERVAL_S
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Sensors
 from gateway.protocol.platforms import Profile
 from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S, RATE_HZ
 
 CONTRADICTING_FRAMES: Final = 3
-"""Frames running with another mode's signature that contradict the asked one
+"""Number of consecutive readings of another mode that contradict the commanded one
 (docs/explanation/how-sure-is-a-mode.md#contradiction)."""
 MANUAL_SILENCE_S: Final = 3.0
 RUNNING_SILENCE_S: Final = 1.0
-"""Silence that contradicts mode 0, and modes 2, 5 and 6, outside known blocks and a running fan."""
-MIXED_S: Final = 0.5
-"""So soon after a reading of another mode, one may be that mode's, damaged (no checksum); three running are not."""
-
-BLOCKS: Final = 256
-"""So many frames explain a silence at most: a car that is made to whistle without a pause reports nothing meanwhile."""
+"""Minimum silence that contradicts mode 0, and modes 2, 5 and 6. Known blocks and a running fan do not count."""
+CORRUPTED_MATCH_S: Final = 0.5
+"""Period after a reading from another mode in which a single match may be a corrupted frame. Require three in a row."""
+MAX_BLOCKS: Final = 256
+"""Maximum blocking frames that excuse a silence: a car that whistles without a pause reports nothing."""
 
 
 class Verdict(StrEnum):
-    """How far the asked mode is to be believed."""
+    """The confidence in the commanded mode."""
 
     ASSUMED = "assumed"
     CONFIRMED = "confirmed"
@@ -38,43 +37,43 @@ class Verdict(StrEnum):
 
 @dataclass(slots=True)
 class ModeEstimator:
-    """Asked, inferred, verdict, evidence. Times are seconds on one monotonic clock."""
+    """The commanded mode (`asked`), the inferred mode, and the verdict. Times: s, monotonic."""
 
     profile: Profile
     asked: Mode | None = None
     inferred: Mode | None = None
-    """The one mode that what was heard, or the silence since, fits; None if it fits several or none."""
+    """The only mode that fits the last readings or the silence; None if several or none fit."""
     verdict: Verdict = Verdict.ASSUMED
     evidence: str = "nothing heard yet"
     evidence_at: float | None = None
     candidates: tuple[Mode, ...] = ()
-    """The modes that it fits; none for a car that should report in every mode, and does not."""
+    """Candidate modes. Empty if the car should report in every mode but is silent."""
     _asked_at: float = field(default=float("-inf"))
     _settled_at: float = field(default=float("-inf"))
-    """From when on the car is in the asked mode, if it has obeyed."""
+    """When an obedient car is in the commanded mode at the latest."""
     _obeyed_at: float = field(default=float("-inf"))
-    """The same, if it was in that mode before the last frame."""
+    """The same for a car that was in that mode before the last frame."""
     _heard_at: float = field(default=float("-inf"))
     _own_at: float = field(default=float("-inf"))
-    """When the last reading came that fits the asked mode, and the last that does not."""
     _other_at: float = field(default=float("-inf"))
+    """When the last reading arrived that fits the commanded mode, and the last that does not."""
     _excused_at: float = field(default=float("-inf"))
-    """When silence was last expected: its clock begins anew."""
-    _for: int = 0
-    _against: int = 0
-    """Readings running that fit the asked mode, and that do not."""
-    _blocks: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=BLOCKS))
-    """When a frame was written that blocks the car, and for how long."""
+    """When silence was last expected. Unexpected silence is measured from here."""
+    _matches: int = 0
+    _mismatches: int = 0
+    """Number of consecutive readings that fit the commanded mode, and that do not."""
+    _blocks: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_BLOCKS))
+    """Time and duration of each block by one of our frames."""
 
     @property
     def confirmed(self) -> Mode | None:
-        """The asked mode, if it is confirmed."""
+        """Return the commanded mode if it is confirmed."""
         return self.asked if self.verdict is Verdict.CONFIRMED else None
 
-    def ask(self, mode: Mode, *, now: float, block_s: float) -> None:
-        """A frame that should bring the car into `mode` was written, which then blocks it for `block_s`."""
-        # It is obeyed when the block of the frame before is over, and the turn of the mode that is left: of the slowest
-        # one, if that is not known.
+    def on_mode_sent(self, mode: Mode, *, now: float, block_s: float) -> None:
+        """Record a written frame that brings the car into `mode` and blocks it for `block_s`."""
+        # The car obeys after the block of the previous frame and one turn of the previous mode. If that mode is
+        # unknown, assume the slowest one.
         left = self.asked if self.verdict is not Verdict.CONTRADICTED else None
         turn_s = self.profile.mode_turn_s(left or Mode.OBSTACLE_AVOIDANCE)
         self._settled_at = max(self._settled_at, now + turn_s) + block_s
@@ -83,68 +82,70 @@ class ModeEstimator:
             return
         self.asked = mode
         self._asked_at = now
-        self._for = self._against = 0
+        self._matches = self._mismatches = 0
         self._other_at = float("-inf")
         self.verdict = Verdict.ASSUMED
         self.evidence = f"{mode} was asked, nothing heard since"
         self.evidence_at = now
 
-    def wrote(self, block_s: float, *, now: float) -> None:
-        """Any other frame was written; one that blocks the car delays its readings."""
+    def on_written(self, block_s: float, *, now: float) -> None:
+        """Record any other written frame: its block delays the readings."""
         if block_s > FRAME_S:
             self._blocks.append((now, block_s))
 
     def forget(self) -> None:
-        """The link was lost: what the car does is not known."""
+        """Forget the mode: the link was lost."""
         self.asked = None
         self.inferred = None
         self.candidates = ()
-        self._for = self._against = 0
+        self._matches = self._mismatches = 0
         self._blocks.clear()
         self.verdict = Verdict.ASSUMED
         self.evidence = "the link was lost"
         self.evidence_at = None
 
-    def heard(self, event: Sensors, *, counts: bool = True) -> None:
-        """Take a sensors frame as evidence; one that does not count only ends the silence."""
+    def on_reading(self, event: Sensors, *, counts: bool = True) -> None:
+        """Update the estimate with a reading. If it does not count, it only ends the silence."""
         at = event.at
         self._heard_at = at
         if not counts:
             return
         candidates = event.candidates
-        self._fits(candidates)
+        self._set_candidates(candidates)
         if self.asked is None:
             return
         if self.asked in candidates:
-            self._against = 0
+            self._mismatches = 0
             self._own_at = at
             if len(candidates) > 1:
                 return
-            self._for += 1
+            self._matches += 1
             self._settled_at = min(self._settled_at, self._obeyed_at)
-            if at >= self._asked_at and (self._for >= CONTRADICTING_FRAMES or at > self._other_at + MIXED_S):
+            if at >= self._asked_at and (
+                self._matches >= CONTRADICTING_FRAMES or at > self._other_at + CORRUPTED_MATCH_S
+            ):
                 self._conclude(Verdict.CONFIRMED, f"a reading with the shape of {self.asked}", at)
             return
-        self._for = 0
+        self._matches = 0
         self._other_at = at
         if at < self._settled_at:
-            return  # of the old mode, which was still running
-        self._against += 1
-        if self._against >= CONTRADICTING_FRAMES:
+            return  # the previous mode may still have sent it
+        self._mismatches += 1
+        if self._mismatches >= CONTRADICTING_FRAMES:
             shape = " or ".join(candidates)
-            self._conclude(Verdict.CONTRADICTED, f"{self._against} readings running with the shape of {shape}", at)
+            self._conclude(Verdict.CONTRADICTED, f"{self._mismatches} readings running with the shape of {shape}", at)
 
-    def silent(self, *, now: float, fan: bool) -> None:
-        """Weigh silence: it is expected in some modes, while a block of ours lasts and while the fan runs."""
+    def on_silence(self, *, now: float, fan: bool) -> None:
+        """Update the estimate with the silence. Some modes, our blocks and the fan make a car silent."""
         if self.asked is None:
             return
         limit = self.silence_limit(fan=fan)
         if limit is None:
-            self._expected(self.asked, now)
+            self._on_expected_silence(self.asked, now)
             return
         silent_s = self.unheard_s(now)
         if silent_s > MANUAL_SILENCE_S:
-            self._fits(self._silent_modes)
+            self._set_candidates(self._silent_modes)
         if silent_s > limit:
             words = f"silent for {silent_s:.1f} s, {self.asked} reports at least every {limit:g} s"
             if not self._silent_modes:
@@ -157,11 +158,11 @@ class ModeEstimator:
 
     @property
     def heard_at(self) -> float:
-        """Return when the last reading came; -inf if none did."""
+        """Return when the last reading arrived; -inf if none has."""
         return self._heard_at
 
     def fade(self, now: float) -> None:
-        """Take back a confirmation that is older than the silence that the asked mode allows."""
+        """Withdraw a confirmation that is older than the longest silence of the commanded mode."""
         if self.verdict is not Verdict.CONFIRMED or self.asked is None:
             return
         limit = MANUAL_SILENCE_S if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
@@ -171,11 +172,11 @@ class ModeEstimator:
             self._conclude(Verdict.ASSUMED, f"no reading with the shape of {self.asked} for {since_s:.1f} s", now)
 
     def unheard_s(self, now: float) -> float:
-        """Return how long there was no reading, s, what blocks of ours can explain left out; never negative."""
+        """Return the time without a reading beyond the blocks of our frames, s; never negative."""
         return max(0.0, self._silence_s(self._heard_at, now))
 
     def silence_limit(self, *, fan: bool) -> float | None:
-        """The longest silence that fits the asked mode, s; None where silence is normal, or nothing was asked."""
+        """Return the longest silence of the commanded mode, s; None if silence is normal or no mode was commanded."""
         if self.asked is None or self.asked in self.profile.silent_modes or (fan and self.profile.fan_silences):
             return None
         return MANUAL_SILENCE_S if self.asked is Mode.MANUAL else RUNNING_SILENCE_S
@@ -184,31 +185,31 @@ class ModeEstimator:
     def _silent_modes(self) -> tuple[Mode, ...]:
         return tuple(mode for mode in Mode if mode in self.profile.possible_modes and mode not in RATE_HZ)
 
-    def _expected(self, asked: Mode, now: float) -> None:
-        """Silence is what this mode, or the fan, makes of any car: it confirms nothing, and what is older fades."""
+    def _on_expected_silence(self, asked: Mode, now: float) -> None:
+        """Let older evidence expire: silence is normal in this mode or with the fan on, so it proves nothing."""
         silent_s = now - max(self._heard_at, self._asked_at)
         if asked not in self.profile.silent_modes:
             self._excused_at = now
             if silent_s > MANUAL_SILENCE_S and self.verdict is not Verdict.CONTRADICTED:
-                self._fits(tuple(mode for mode in Mode if mode in self.profile.possible_modes))
+                self._set_candidates(tuple(mode for mode in Mode if mode in self.profile.possible_modes))
                 self._conclude(Verdict.ASSUMED, f"silent for {silent_s:.0f} s, as expected while its fan runs", now)
             return
         if now < self._settled_at:
             return
         if self.unheard_s(now) > MANUAL_SILENCE_S:
-            self._against = 0
-            self._fits(self._silent_modes)
-        if self._against == 0 and self.verdict is Verdict.ASSUMED:
+            self._mismatches = 0
+            self._set_candidates(self._silent_modes)
+        if self._mismatches == 0 and self.verdict is Verdict.ASSUMED:
             self._conclude(Verdict.ASSUMED, f"silent for {silent_s:.0f} s, as expected", now)
 
     def _silence_s(self, heard_at: float, now: float) -> float:
         since = max(heard_at, self._settled_at, self._excused_at)
-        # What was written before a reading began was obeyed before it; its ranging took 1.0 s at most.
-        return now - since - sum(block_s for at, block_s in self._blocks if at > since - REPEAT_S)
+        # The car obeyed earlier frames before this reading began. Its ranging took 1.0 s at most.
+        return now - since - sum(block_s for at, block_s in self._blocks if at > since - REPEAT_INTERVAL_S)
 
-    def _fits(self, candidates: tuple[Mode, ...]) -> None:
+    def _set_candidates(self, candidates: tuple[Mode, ...]) -> None:
         self.candidates = candidates
-        # One ambiguous reading takes nothing back from a mode that is confirmed: it may be damaged.
+        # One ambiguous reading withdraws no confirmation: it may be corrupted.
         if len(candidates) == 1 or self.verdict is not Verdict.CONFIRMED:
             self.inferred = candidates[0] if len(candidates) == 1 else None
 

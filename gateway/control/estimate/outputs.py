@@ -1,6 +1,6 @@
-"""What the gateway believes of the car from the frames that it wrote: motion, speed, fan, servo, LED. Estimates all.
+"""Estimates motion, speed, fan, servo and LED of the car from the written frames.
 
-The car confirms none of it; its mode, of which readings give evidence, is in mode.py.
+The car confirms none of them. Readings give evidence of its mode only, see mode.py.
 """
 
 from dataclasses import dataclass, field
@@ -12,13 +12,14 @@ from gateway.protocol.platforms import Profile
 
 @dataclass(slots=True)
 class StateEstimate:
-    """The sum of what was written since the link came up. Times are seconds on one monotonic clock."""
+    """The sum of the frames written since the link came up. Times: s, monotonic."""
 
     profile: Profile
     motion: Motion = Motion.STOP
-    """The last that was sent."""
+    """The last motion sent."""
     repeat: bool = False
-    """The motion changed, and was not sent again alone yet (docs/reference/protocol.md#pacing)."""
+    """True if the motion changed, and was not repeated alone yet (docs/reference/protocol.md#pacing: the 1.1 s
+    rule)."""
     fan: bool | None = None
     fan_at: float = float("-inf")
     """When the fan was last toggled."""
@@ -29,8 +30,8 @@ class StateEstimate:
     def __post_init__(self) -> None:
         self.speed = self.profile.speed.start
 
-    def wrote(self, frame: Frame, now: float) -> None:
-        """A frame went out whole."""
+    def on_written(self, frame: Frame, now: float) -> None:
+        """Apply a written frame."""
         match frame:
             case General():
                 if frame.motion is not Motion.STOP:
@@ -51,7 +52,7 @@ class StateEstimate:
                 pass
 
     def with_motion(self, frame: Frame) -> Frame:
-        """Every general frame carries a motion: the one that holds now."""
+        """Return the frame with the current motion, which every general frame carries."""
         if not isinstance(frame, General):
             return frame
         return General(self.motion, frame.whistle, frame.speed, frame.servo, frame.sing, frame.light, frame.fan)

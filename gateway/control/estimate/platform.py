@@ -1,7 +1,7 @@
-"""Which program runs on the car, as far as its bytes show it: against the profile that was told, or to find one.
+"""Detects from the car's bytes which program runs on it, and checks them against the configured profile.
 
-What bytes cannot show: an arduino from an stm32 (the same program, as far as it was read), and what a car does with
-what it is sent, such as light 1, which a raspberry_pi car cycles. One damaged frame shows nothing: it takes three.
+Two differences leave no trace in the bytes. An arduino and an stm32 send the same. And a car does not report its
+lights, such as light 1, which a raspberry_pi car cycles. A single frame may be corrupted, so it takes three in a row.
 """
 
 from dataclasses import dataclass, field
@@ -11,135 +11,143 @@ from gateway.protocol.enums import Mode
 from gateway.protocol.events import ArmReading, Event, ImuReading, Sensors
 from gateway.protocol.platforms import Platform, Profile, parse_platform
 
-RUNNING: Final = 3
-"""So many frames running show something, or no longer show it: there is no checksum, and one may be damaged."""
+EVIDENCE_FRAMES: Final = 3
+"""Number of consecutive frames that are evidence, or that end it: there is no checksum, and one may be corrupted."""
 
-_MODES: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
-_MEASURED: Final = "mode-0 readings with decimals in CSB, or without the constants PV8.4 and GS0 of a raspberry_pi car"
-_CONSTANTS: Final = "mode-0 readings with PV8.4, GS0 and whole centimetres, the constants of a raspberry_pi car"
+_MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
+_MEASURED_READINGS: Final = (
+    "mode-0 readings with decimals in CSB, or without the constants PV8.4 and GS0 of a raspberry_pi car"
+)
+_CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimetres, the constants of a raspberry_pi car"
 _WITH_MODES: Final = "arduino (or stm32: their bytes are the same)"
 
 
 @dataclass(slots=True)
 class _PlatformEvidence:
-    """Words for something, and whether frames show it."""
+    """Debounces one observation over several frames."""
 
-    stands: bool = False
+    holds: bool = False
     _run: int = 0
 
-    def weigh(self, *, shown: bool) -> bool:
-        """Take one frame in that could show it; True if it stands from now on."""
-        self._run = self._run + 1 if shown is not self.stands else 0
-        if self._run < RUNNING:
+    def update(self, *, shown: bool) -> bool:
+        """Count one frame. Return True if the observation holds from now on."""
+        self._run = self._run + 1 if shown is not self.holds else 0
+        if self._run < EVIDENCE_FRAMES:
             return False
         self._run = 0
-        self.stands = shown
+        self.holds = shown
         return shown
 
 
 @dataclass(slots=True)
 class PlatformDetector:
-    """The profile in force, and what speaks for and against it.
+    """The profile in force, and the evidence for and against it.
 
-    With `auto` the profile is looked for: `profile` is the unknown one until the bytes show another.
+    With `auto` the detector sets `profile`, which is the unknown one at first.
     """
 
-    told: Profile
+    configured: Profile
     auto: bool = False
     profile: Profile = field(init=False)
-    """What the car is treated as: what was told; with `auto` what it was settled on."""
+    """The profile in force: the configured one, or with `auto` the detected one."""
     _against: dict[str, _PlatformEvidence] = field(default_factory=dict)
     _with_modes: str = ""
     _raspberry_pi: str = ""
-    """What showed that it is one, in words; both are filled by a car that is none of those that are known."""
+    """Evidence for a car with modes, and for a Raspberry Pi. If both are set, the car is of an unknown kind."""
     _options: frozenset[str] = frozenset()
     _seen: dict[str, _PlatformEvidence] = field(
-        default_factory=lambda: {word: _PlatformEvidence() for word in (_MODES, _MEASURED, _CONSTANTS)}
+        default_factory=lambda: {
+            word: _PlatformEvidence() for word in (_MODE_READINGS, _MEASURED_READINGS, _CONSTANT_READINGS)
+        }
     )
     _frames: dict[str, int] = field(default_factory=lambda: {"arm": 0, "imu": 0})
-    _more: set[str] = field(default_factory=set)
-    """What speaks for an option that was not told."""
+    _extra_options: set[str] = field(default_factory=set)
+    """Contradictions that only show an option which is not configured."""
 
     def __post_init__(self) -> None:
-        self.profile = self.told
+        self.profile = self.configured
 
     @property
     def contradictions(self) -> tuple[str, ...]:
-        """What speaks against the profile now, in words."""
-        return tuple(words for words, shown in self._against.items() if shown.stands)
+        """Return the contradictions of the profile that hold now, in words."""
+        return tuple(words for words, shown in self._against.items() if shown.holds)
 
     @property
     def doubted(self) -> bool:
-        """Whether its sensors frames speak against the profile now; an option that was not told is no doubt."""
-        return any(shown.stands for words, shown in self._against.items() if words not in self._more)
+        """Return True if readings contradict the profile now. An option that is not configured is no contradiction."""
+        return any(shown.holds for words, shown in self._against.items() if words not in self._extra_options)
 
     @property
     def evidence(self) -> tuple[str, ...]:
-        """Why the car is treated as it is, what speaks against it, and what of its profile was never observed."""
+        """Return the evidence for the profile, its contradictions, and its properties that were never observed."""
         return (*self._why(), *self.contradictions, *self.profile.not_observed)
 
-    def heard(self, event: Event) -> tuple[str, ...]:
-        """Take a frame in; what speaks against the profile from now on, in words. `profile` may be another after it."""
+    def on_event(self, event: Event) -> tuple[str, ...]:
+        """Update the evidence, and with `auto` the profile. Return new contradictions, in words."""
         match event:
             case Sensors():
-                new = self._weigh(event)
+                new = self._check_profile(event)
                 if self.auto:
-                    self._look(event)
+                    self._detect(event)
             case ArmReading() | ImuReading():
-                new = self._count("arm" if isinstance(event, ArmReading) else "imu")
+                new = self._count_option("arm" if isinstance(event, ArmReading) else "imu")
             case _:
                 return ()
         return new
 
-    def _weigh(self, event: Sensors) -> tuple[str, ...]:
-        """What a sensors frame says of the profile. Only a frame of mode 0 shows what mode 0 looks like."""
-        found = self.profile.contradictions(event)
-        if not found and not self._against:
+    def _check_profile(self, event: Sensors) -> tuple[str, ...]:
+        """Update the contradictions of the profile. Only a mode-0 frame can end those of mode 0."""
+        observed = self.profile.contradictions(event)
+        if not observed and not self._against:
             return ()
         in_manual = event.signature is Mode.MANUAL
-        for words in found:
+        for words in observed:
             self._against.setdefault(words, _PlatformEvidence())
-        weighed = [words for words in self._against if in_manual or words in found]
-        new = tuple(words for words in weighed if self._against[words].weigh(shown=words in found))
-        for words in weighed:
-            if words not in found and not self._against[words].stands:
+        affected = [words for words in self._against if in_manual or words in observed]
+        new = tuple(words for words in affected if self._against[words].update(shown=words in observed))
+        for words in affected:
+            if words not in observed and not self._against[words].holds:
                 del self._against[words]
         return new
 
-    def _count(self, option: str) -> tuple[str, ...]:
+    def _count_option(self, option: str) -> tuple[str, ...]:
         self._frames[option] += 1
-        if self._frames[option] != RUNNING or option in self.profile.options:
+        if self._frames[option] != EVIDENCE_FRAMES or option in self.profile.options:
             return ()
         if self.auto:
             self._options |= {option}
-            self._settle()
+            self._apply_evidence()
             return ()
         words = f"{option} frames, which {self.profile.name} cars do not send: is it {self.profile.name}+{option}?"
-        self._more.add(words)
-        self._against[words] = _PlatformEvidence(stands=True)
+        self._extra_options.add(words)
+        self._against[words] = _PlatformEvidence(holds=True)
         return (words,)
 
-    def _look(self, event: Sensors) -> None:
-        """Look for the platform: what has three frames running settles it, once."""
+    def _detect(self, event: Sensors) -> None:
+        """Detect the platform from the first evidence."""
         if len(event.candidates) > 1:
             return
         in_manual = event.signature is Mode.MANUAL
         constants = b",PV8.4,GS0," in event.raw and b"." not in event.raw.partition(b",PV")[0]
-        shown = {_MODES: not in_manual, _MEASURED: in_manual and not constants, _CONSTANTS: in_manual and constants}
+        shown = {
+            _MODE_READINGS: not in_manual,
+            _MEASURED_READINGS: in_manual and not constants,
+            _CONSTANT_READINGS: in_manual and constants,
+        }
         for words, seen in self._seen.items():
-            if seen.weigh(shown=shown[words]):
-                if words is _CONSTANTS:
+            if seen.update(shown=shown[words]):
+                if words is _CONSTANT_READINGS:
                     self._raspberry_pi = words
                 else:
                     self._with_modes = self._with_modes or words
-                self._settle()
+                self._apply_evidence()
 
-    def _settle(self) -> None:
+    def _apply_evidence(self) -> None:
         if bool(self._with_modes) is bool(self._raspberry_pi):
-            kind = self.told.kind
+            kind = self.configured.kind
         else:
             kind = Platform.ARDUINO if self._with_modes else Platform.RASPBERRY_PI
-        profile = parse_platform("+".join((kind, *sorted(self._options | self.told.options))))
+        profile = parse_platform("+".join((kind, *sorted(self._options | self.configured.options))))
         if profile.name != self.profile.name:
             self.profile = profile
             self._against.clear()
@@ -150,7 +158,7 @@ class PlatformDetector:
         if self._with_modes and self._raspberry_pi:
             return (f"both {self._with_modes} and {self._raspberry_pi}: none of the platforms that are known",)
         if self._with_modes:
-            return (f"{_WITH_MODES}: {RUNNING} {self._with_modes}",)
+            return (f"{_WITH_MODES}: {EVIDENCE_FRAMES} {self._with_modes}",)
         if self._raspberry_pi:
-            return (f"raspberry_pi: {RUNNING} {self._raspberry_pi}",)
-        return (f"not settled: it takes {RUNNING} readings running",)
+            return (f"raspberry_pi: {EVIDENCE_FRAMES} {self._raspberry_pi}",)
+        return (f"not settled: it takes {EVIDENCE_FRAMES} readings running",)

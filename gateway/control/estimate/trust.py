@@ -1,7 +1,7 @@
-"""What the gateway believes of the car's motion, as one state machine. Pure.
+"""Tracks as one state machine whether the car is known to stand or to move. Pure.
 
-Each transition names what happened; `TRANSITIONS` is total, so every state answers every event. The state follows from
-frames that were written and from what the car has shown, never from time alone.
+`TRANSITIONS` has a next state for every state and event. Written frames and the car's own readings change the state,
+never time alone.
 """
 
 from dataclasses import dataclass
@@ -10,37 +10,37 @@ from typing import Final
 
 
 class CarTrust(StrEnum):
-    """What the gateway believes of the car."""
+    """The known state of the car."""
 
     UNKNOWN = "unknown"
-    """The link is down: the car may do anything."""
+    """The link is down. The car may stand or move."""
     RECOVERING = "recovering"
-    """The link is open, and the stop that brings the car to a known state goes on."""
+    """The link is open, and a stop that brings the car to a known state is in progress."""
     STOPPING = "stopping"
-    """A stop of a car in a known state goes on."""
+    """A stop of a car in a known state is in progress."""
     STOPPED = "stopped"
-    """The stop is over: the car has shown it, or can show nothing. See `Basis`."""
+    """The stop is complete: the car has shown it, or cannot show it. See `Basis`."""
     DRIVING = "driving"
     """The gateway sent a motion."""
     IN_MODE = "in_mode"
     """The gateway opened a mode in which the car drives by itself."""
     UNHEARD = "unheard"
-    """The car is silent for longer than it ever is, on an open link. The stop goes on."""
+    """The link is open, and the car is silent for longer than any normal silence. The stop goes on."""
     UNPROVEN = "unproven"
-    """The car is heard, and could have shown a stop, and did not within its time. The stop goes on."""
+    """The car reports, could have shown the stop, and did not in time. The stop goes on."""
 
 
 class Basis(StrEnum):
-    """What the claim that the motors are off rests on."""
+    """The basis of the claim that the motors are off."""
 
     SHOWN = "shown"
     """The car's own readings."""
     SENT = "sent"
-    """Frames that were written, to a car that can show nothing of them."""
+    """The written frames. The car cannot show that it obeyed them."""
 
 
 class TrustEvent(StrEnum):
-    """What changes the gateway's belief."""
+    """An event that may change the state of the car."""
 
     LINK_OPENED = "the link was opened"
     LINK_LOST = "the link was lost"
@@ -68,18 +68,18 @@ _ANY: Final = {
     _E.MOTION_SENT: _T.DRIVING,
     _E.MODE_SENT: _T.IN_MODE,
 }
-"""Where each event leads, whatever the state; the table below has the exceptions."""
+"""The next state by event; the tables below have the exceptions."""
 
 _SAME: Final = {
-    # Without a link nothing that was written or heard before counts.
+    # Without a link no frame and no reading counts.
     _T.UNKNOWN: set(TrustEvent) - {_E.LINK_OPENED},
-    # A stop that begins meanwhile joins the recovery, or takes its place: the car's state is as unknown as before.
+    # A stop that begins during recovery joins or replaces it. The car's state stays unknown.
     _T.RECOVERING: {_E.STOP_BEGUN, _E.HEARD},
     _T.STOPPING: {_E.STOP_BEGUN, _E.HEARD},
     _T.STOPPED: {_E.HEARD, _E.NOT_SHOWN},
     _T.DRIVING: {_E.HEARD, _E.NOT_SHOWN, _E.STOP_SHOWN, _E.STOP_SENT},
     _T.IN_MODE: {_E.HEARD, _E.NOT_SHOWN, _E.STOP_SHOWN, _E.STOP_SENT},
-    # Only a reading ends the silence, and only evidence the doubt.
+    # Only a reading ends the silence, and only evidence ends the doubt.
     _T.UNHEARD: {_E.STOP_BEGUN, _E.STOP_SENT, _E.DOUBTED, _E.NOT_SHOWN, _E.SILENT},
     _T.UNPROVEN: {_E.STOP_BEGUN, _E.DOUBTED, _E.NOT_SHOWN, _E.HEARD},
 }
@@ -90,10 +90,10 @@ TRANSITIONS: Final[dict[tuple[CarTrust, TrustEvent], CarTrust]] = {
     for state in CarTrust
     for event in TrustEvent
 }
-"""Every state and event. A test walks all of it."""
+"""The next state for every state and event; a test checks all of them."""
 
 STOP_GOES_ON: Final = frozenset({_T.RECOVERING, _T.STOPPING, _T.UNHEARD, _T.UNPROVEN})
-"""In these states the gateway sends stops until one is shown."""
+"""States in which the gateway sends stops until the car shows one."""
 
 _MOTORS: Final = {
     _T.UNKNOWN: "unknown",
@@ -109,7 +109,7 @@ _MOTORS: Final = {
 
 @dataclass(slots=True)
 class TrustState:
-    """The state in force, since when, and why. Times: s, monotonic."""
+    """The current state, since when, and why. Times: s, monotonic."""
 
     state: CarTrust = CarTrust.UNKNOWN
     since: float = float("-inf")
@@ -120,7 +120,7 @@ class TrustState:
     """When the car showed its last stop."""
 
     def take(self, event: TrustEvent, now: float, evidence: str = "") -> bool:
-        """Take an event. Return True if the state, or what it rests on, changed."""
+        """Apply an event. Return True if the state or its basis has changed."""
         before = self.state, self.basis
         self.state = TRANSITIONS[self.state, event]
         if event is TrustEvent.STOP_SHOWN and self.state is CarTrust.STOPPED:
@@ -142,5 +142,5 @@ class TrustState:
 
     @property
     def shown(self) -> bool:
-        """True if the car has shown that it stands, and nothing was sent since that could move it."""
+        """Return True if the car has shown that it stands, and no frame since then could move it."""
         return self.basis is Basis.SHOWN

@@ -1,9 +1,8 @@
-"""What shows that a stop arrived: one table of the cases, and the watch on the car's readings that decides. Pure.
+"""Detects from the car's readings whether a stop arrived; a table lists the cases. Pure.
 
-The car acknowledges nothing (docs/reference/protocol.md#evidence-of-a-stop). Three things show that it obeyed
-`MODE00`:
-it left a mode that it was seen in, it left a silent mode that was opened from a shown rest, or its reports paused.
-Docs and README print `EVIDENCE`; `tests/tools/readme.py` writes them.
+The car acknowledges nothing (docs/reference/protocol.md#evidence-of-a-stop). A car shows in three ways that it obeyed
+`MODE00`. It leaves a mode that it reported. It leaves a silent mode that was opened from a shown rest. Or its reports
+pause. Docs and README print `EVIDENCE`; `tests/tools/readme.py` writes them.
 """
 
 from dataclasses import dataclass
@@ -14,46 +13,48 @@ from gateway.protocol.enums import Mode
 from gateway.protocol.events import Sensors
 from gateway.protocol.timing import MODE_CLOSE_S
 
+# A reporting mode sends 20 frames a second. A corrupted frame of such a mode can look like mode 0, because there is no
+# checksum. But no silence comes before it.
 SETTLED_S: Final = 0.8
-"""Minimum silence before a mode-0 report that counts. A mode that reports sends 20 frames a second: a damaged frame of
-such a mode can look like mode 0 (there is no checksum), but silence never comes before it."""
+"""Minimum silence before a mode-0 report that counts."""
+# A loaded machine reads a report up to 0.5 s late.
 BUNCHED_S: Final = 0.4
-"""Reports closer than this were delayed by the link, so a pause before them may be the link's. A loaded machine takes a
-report up to 0.5 s late."""
+"""Maximum interval of reports that the link has delayed. A pause before them may be the link's."""
 CLOSED_S: Final = 0.95
-"""A report sooner after `MODE00` was written than this was sent before the car obeyed: closing takes 1.0 s."""
+"""Minimum time from `MODE00` to a report that the car sent after it obeyed: closing takes 1.0 s."""
+# 1.0 s of closing, 0.9 s to the report, and 0.2 s of turn and wire. A `MODE00` that lost a digit opens mode 0 instead,
+# with the motors on. That blocks for 2.3 s, so the report comes later.
 LEFT_S: Final = 2.2
-"""Maximum time from `MODE00` to the first mode-0 report if that frame closed the mode: 1.0 s of closing, 0.9 s to the
-report, and 0.2 s of turn and wire. A `MODE00` that lost a digit opens mode 0 instead, with the motors on. That blocks
-for 2.3 s, so the report comes later."""
+"""Maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
 RANGING_S: Final = 1.0
-"""A report without an echo comes so much later."""
+"""Additional time of a report without an echo."""
 SHAPE_UNTIL_S: Final = 1.0
-"""Readings of the mode that is left end within this time if `MODE00` ended it, before the general stop at 1.1 s."""
+"""Maximum time that readings of a mode go on after the `MODE00` that ends it. The general stop follows at 1.1 s."""
+# Opening alone blocks for 2.5 s. During it a slow link delivers older reports, one a second.
 OPENING_SILENCE_S: Final = 2.3
-"""Minimum silence before the report that shows that a silent mode was left: opening alone blocks for 2.5 s. A slow link
-delivers older reports meanwhile, one a second."""
+"""Minimum silence before the report that shows the end of a silent mode."""
 OPENED_S: Final = 2.5
-"""Minimum time that opening a mode blocks (docs/reference/protocol.md#blocking-times): the car can report that it
-left the mode no sooner."""
+"""Minimum block by opening a mode (docs/reference/protocol.md#blocking-times). The car cannot report the end of the
+mode earlier."""
 PAUSE_MIN_S: Final = 1.88
 PAUSE_MAX_S: Final = 2.6
-"""Two reports around a `MODE00` that was obeyed are 1.9 s apart or a little more
+"""Range of the interval of two reports around an obeyed `MODE00`: 1.9 s or a little more
 (docs/reference/protocol.md#evidence-of-a-stop)."""
 NORMAL_MIN_S: Final = 0.8
 NORMAL_MAX_S: Final = 1.4
-"""Two reports with nothing between them. Closer ones were delayed by the link, so their times show nothing."""
+"""Range of the normal interval of two reports. The link has delayed closer ones, so their times show nothing."""
+# A link that loses both `MODE00` and the report after it leaves the same gap as a pause. Half of all outages of 0.6 s
+# around a stop do that, so one pause is not enough.
 PAUSES: Final = 2
-"""Pauses that show a stop in mode 0. One is not enough: a link that swallows both `MODE00` and the report after it
-leaves the same gap. It does so for half of all gaps of 0.6 s around a stop."""
+"""Number of pauses that show a stop in mode 0."""
 SHAPES: Final = 2
-"""Readings in a row with the shape of another mode that show that the car is in it."""
+"""Number of consecutive readings with the shape of another mode that show that mode."""
 ROUND_TRIP_S: Final = 2.5
-"""From the second try on, reports this long after `MODE00` may still have been sent before it: a slow link."""
+"""Round trip of a slow link, from the second try on: the car may have sent earlier reports before `MODE00`."""
 
 
 class StopCase(StrEnum):
-    """What a stop can rest on."""
+    """The basis of a stop, by what was stopped and what the car can report."""
 
     LEFT_SHAPE = "left_shape"
     LEFT_SILENT = "left_silent"
@@ -68,7 +69,7 @@ class StopCase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class EvidenceRow:
-    """One row of the table. `shown_by` is empty where the car can show nothing."""
+    """One row of the table. `shown_by` is empty if the car cannot show the stop."""
 
     stop: str
     shown_by: str
@@ -134,15 +135,15 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
 
 
 class Finding(StrEnum):
-    """What a reading says about the last `MODE00`."""
+    """The result of one reading, about the last `MODE00`."""
 
     NOTHING = "nothing"
     REPORT = "report"
-    """A report of mode 0 with an echo, to which no pause can be compared: a `MODE00` now will show something."""
+    """A report of mode 0 with an echo, and no `MODE00` before it to judge. The car can react to a `MODE00` now."""
     PAUSE = "pause"
-    """One pause; one more is needed."""
+    """The first pause; a second one is needed."""
     LOST = "lost"
-    """Reports came on as before."""
+    """Reports went on without a pause."""
     NO_ECHO = "no_echo"
     """A report of mode 0 without an echo."""
     SHOWN = "shown"
@@ -151,35 +152,35 @@ class Finding(StrEnum):
 
 @dataclass(slots=True)
 class StopEvidence:
-    """Watches readings and frames for what they show. Times: s, monotonic, when bytes came or frames were written."""
+    """Compares readings with written frames. Times: s, monotonic, when bytes arrived or frames were written."""
 
     obeyed_at: float | None = None
-    """When the car last showed that a frame arrived; None if never on this link."""
+    """When the car last reacted to a frame; None if never on this link."""
     words: str = ""
-    """What `SHOWN` rests on."""
+    """The evidence for `SHOWN`."""
     without_echo: int = 0
-    """Reports without an echo in a row."""
+    """Number of consecutive reports without an echo."""
     _last_at: float = float("-inf")
-    """When the last bytes came that are no report of the options (arm, gyro)."""
+    """When the last bytes arrived, except frames of the options (arm, gyro)."""
     _foreign_at: float = float("-inf")
-    """When the last frame came, whole or damaged, that is no report of mode 0."""
+    """When the last frame arrived, whole or corrupted, that is no report of mode 0."""
     _before: float | None = None
-    """When the last report with an echo came, if nothing else came since."""
+    """When the last report with an echo arrived, if nothing else has arrived since."""
     _pending: float | None = None
-    """When `MODE00` was written whose effect is still open."""
+    """When the last `MODE00` without a result was written."""
     _pauses: int = 0
     _window_s: float = CLOSED_S
     _shapes: int = 0
     _shape_at: float | None = None
-    """When the last reading of another mode came, if the car was seen in one since the last motion or opening."""
+    """When the last reading of another mode arrived, since the last motion or opening."""
     _silent_mode: Mode | None = None
     """The silent mode that was opened from a shown rest."""
     _opened_at: float = float("-inf")
     """When the last mode was opened."""
     _closed_at: float | None = None
-    """When the first `MODE00` since then was written; None if another frame came first."""
+    """When the first `MODE00` since then was written; None if none was."""
     _plain: bool = False
-    """No other frame was written before that `MODE00`."""
+    """True if no other frame was written before that `MODE00`."""
 
     # ------------------------------------------------------------------ frames
 
@@ -188,29 +189,29 @@ class StopEvidence:
         self.obeyed_at = None
         self._last_at = self._foreign_at = float("-inf")
         self._window_s = CLOSED_S
-        self.stalled()
+        self.reset_times()
         self.sent_motion()
 
     def sent_motion(self) -> None:
-        """Forget what was shown: the car may drive."""
+        """Drop the evidence: the car may drive."""
         self._pauses = 0
         self._pending = None
         self._leave_nothing()
 
     def opened(self, mode: Mode, now: float, *, silent: bool, shown: bool) -> None:
-        """Note a mode that was opened; `shown`: from a rest that the car has shown."""
+        """Record the opening of a mode. `shown`: the car had shown its rest before."""
         self.sent_motion()
         self._opened_at = now
         self._plain = True
         self._silent_mode = mode if silent and shown else None
 
     def sent_other(self) -> None:
-        """Note a frame that neither moves the car nor closes a mode."""
+        """Record a frame that neither moves the car nor closes a mode."""
         if self._closed_at is None:
             self._plain = False
 
     def closed(self, now: float, *, awake: bool) -> None:
-        """Note a `MODE00`; `awake`: no block of our own frames runs, so the pause that it makes is 1.0 s."""
+        """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly 1.0 s."""
         self._pending = now if awake else None
         if self._closed_at is None:
             self._closed_at = now
@@ -218,29 +219,29 @@ class StopEvidence:
             self._plain = False
 
     def tried_again(self) -> None:
-        """Give a slow link more time from now on."""
+        """Allow for a slow link from now on."""
         self._window_s = ROUND_TRIP_S
 
-    # ------------------------------------------------------------------ what is heard
+    # ------------------------------------------------------------------ readings
 
-    def noise(self, at: float, *, damaged: bool = True) -> None:
-        """Take bytes that are no reading; `damaged`: they begin like a frame, so the next may be damaged as well."""
+    def on_noise(self, at: float, *, damaged: bool = True) -> None:
+        """Record bytes that are no reading. `damaged`: they begin like a frame, so the next may be corrupted too."""
         self._last_at = at
         self._before = None
         if damaged:
             self._foreign_at = at
 
-    def stalled(self) -> None:
-        """Drop what depends on times: the loop slept, so reports may have come sooner than they were taken."""
+    def reset_times(self) -> None:
+        """Drop the evidence that depends on times: after a stall of the loop the report times are too late."""
         self._before = self._pending = None
         self._pauses = 0
 
     def is_settled(self, event: Sensors) -> bool:
-        """Return False for a report of mode 0 just after other frames: it may be a damaged one of another mode."""
+        """Return False for a report of mode 0 just after other frames: it may be a corrupted one of another mode."""
         return event.at - self._foreign_at >= SETTLED_S or Mode.MANUAL not in event.candidates
 
-    def reading(self, event: Sensors) -> Finding:
-        """Return what a sensors frame shows."""
+    def on_reading(self, event: Sensors) -> Finding:
+        """Record a reading. Return what it shows."""
         at, quiet_s = event.at, event.at - self._last_at
         self._last_at = at
         if Mode.MANUAL not in event.candidates:
@@ -252,7 +253,7 @@ class StopEvidence:
             if quiet_s < BUNCHED_S:
                 self._pauses = 0
             return Finding.NOTHING
-        if event.range_cm is None:  # damaged: it says nothing of an echo either
+        if event.range_cm is None:  # a corrupted frame, which does not show whether there is an echo
             self._before = None
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
@@ -272,7 +273,7 @@ class StopEvidence:
         return self._compare(at - before, at - pending, at)
 
     def _compare(self, gap_s: float, after_s: float, at: float) -> Finding:
-        """Compare two reports, the later one `after_s` after `MODE00`."""
+        """Judge the interval of two reports. The later one came `after_s` after `MODE00`."""
         if after_s <= CLOSED_S:
             return Finding.NOTHING
         if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S:
@@ -298,7 +299,7 @@ class StopEvidence:
             self._silent_mode = None
 
     def _left(self, at: float, quiet_s: float, within_s: float) -> bool:
-        """Return True if this report shows that `MODE00`, alone, closed the mode that the car was in."""
+        """Return True if this report shows that `MODE00` alone closed the mode of the car."""
         closed_at = self._closed_at
         shape_at, silent = self._shape_at, self._silent_mode
         if closed_at is None or at <= closed_at + CLOSED_S:
@@ -319,7 +320,7 @@ class StopEvidence:
     def _obeyed(self, at: float) -> Finding:
         self.obeyed_at = at
         self._pending = None
-        self._pauses = PAUSES  # until a motion is sent, one more pause shows the next stop
+        self._pauses = PAUSES  # until the next motion, one more pause shows the next stop
         self._window_s = CLOSED_S
         self._leave_nothing()
         return Finding.SHOWN

@@ -1,33 +1,35 @@
-"""The stops, as tables of frames and times: what docs/reference/protocol.md#stops prescribes. No state."""
+"""The stop sequences as tables of frames and times, by docs/reference/protocol.md#stops. No state."""
 
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from gateway.protocol.enums import Motion
+from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import Frame, General, ModeClose, Reset
+from gateway.protocol.timing import mode_open_s
 
-REPEAT_S: Final = 1.1
-"""A block that we know nothing of lasts up to 1.0 s; a frame sent 1.1 s after the last is alone in the buffer."""
-SILENCE_S: Final = 3.7
-"""From the first frame of recovery to the one that is certain: longer than any block outside avoidance."""
-ANSWER_S: Final = 4.5
-"""Maximum wait for a mode-0 reading after a stop: avoidance blocks for 4.3 s."""
+REPEAT_INTERVAL_S: Final = 1.1
+"""Minimum interval that leaves a frame alone in the car's buffer: an unknown block lasts up to 1.0 s."""
+# The car must have read all earlier frames by then, also one that opens the mode with the longest block.
+RECOVERY_SILENCE_S: Final = max(mode_open_s(mode) for mode in Mode) + 0.2
+"""Silence before the frame of recovery that the car certainly reads: longer than any block outside avoidance."""
+STOP_REPORT_TIMEOUT_S: Final = 4.5
+"""Timeout for a report of mode 0 after a stop: avoidance blocks for 4.3 s."""
 
 
 class Gate(IntEnum):
-    """What a frame waits for."""
+    """The condition for writing a frame."""
 
     NOTHING = 0
     FLIGHT = 1
     """No frame of ours is in flight."""
     ALONE = 2
-    """None is in flight, and none may be in the car's buffer."""
+    """No frame of ours is in flight or in the car's buffer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame of a recipe, at the earliest so many seconds after the one before it, however late that was."""
+    """One frame of a sequence. `after_s` is the minimum time since the previous frame was written."""
 
     frame: Frame
     gate: Gate = Gate.NOTHING
@@ -36,7 +38,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class StopSequence:
-    """A way to stop. `rank`: a running recipe is only replaced by one of a higher rank."""
+    """A way to stop. `rank`: only a sequence of a higher rank replaces the running one."""
 
     name: str
     rank: int
@@ -44,25 +46,33 @@ class StopSequence:
 
     @property
     def length_s(self) -> float:
-        """From the first frame to the last, s, if nothing is waited for but what is certain."""
+        """Return the minimum time from the first frame to the last, s."""
         return sum(step.after_s for step in self.steps)
 
 
-_STOP: Final = General(Motion.STOP)
+STOP_FRAME: Final = General(Motion.STOP)
 _MANUAL: Final = ModeClose()
 
-# docs/reference/protocol.md#stops, soft
-SOFT: Final = StopSequence("soft", 1, (Step(_STOP, Gate.FLIGHT), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+# docs/reference/protocol.md#stops, stopping, soft
+SOFT: Final = StopSequence(
+    "soft", 1, (Step(STOP_FRAME, Gate.FLIGHT), Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S))
+)
 
-# docs/reference/protocol.md#stops, full
-FULL: Final = StopSequence("full", 2, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+# docs/reference/protocol.md#stops, stopping, full
+FULL: Final = StopSequence(
+    "full", 2, (Step(_MANUAL, Gate.ALONE), Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S))
+)
 
-# The same where a frame of ours may lie in the buffer: `MODE00` behind it would be read at the wrong place, and waits.
-# The general stop need not: behind that frame it is lost without harm, and mostly there is none.
-FULL_BEHIND: Final = StopSequence("full_behind", 2, (Step(_STOP, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
+# The same if a frame of ours may be unread. Behind that frame the car would read `MODE00` at the wrong place, so it
+# waits. The general stop does not wait: behind an unread frame it is lost without harm, and mostly there is none.
+FULL_BEHIND: Final = StopSequence("full_behind", 2, (Step(STOP_FRAME, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
 
-# docs/reference/protocol.md#stops, Raspberry Pi
-_PI_STEPS: Final = (Step(_STOP, Gate.FLIGHT), Step(_STOP, after_s=0.06), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S))
+# docs/reference/protocol.md#stops, stopping, Raspberry Pi
+_PI_STEPS: Final = (
+    Step(STOP_FRAME, Gate.FLIGHT),
+    Step(STOP_FRAME, after_s=0.06),
+    Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S),
+)
 PI_SOFT: Final = StopSequence("raspberry_pi_soft", 1, _PI_STEPS)
 PI: Final = StopSequence("raspberry_pi", 2, _PI_STEPS)
 
@@ -73,8 +83,8 @@ RECOVERY: Final = StopSequence(
     (
         Step(Reset()),
         Step(_MANUAL, after_s=0.05),
-        Step(_MANUAL, after_s=SILENCE_S - 0.05),
-        Step(_STOP, after_s=REPEAT_S),
+        Step(_MANUAL, after_s=RECOVERY_SILENCE_S - 0.05),
+        Step(STOP_FRAME, after_s=REPEAT_INTERVAL_S),
     ),
 )
 
@@ -83,27 +93,29 @@ UNKNOWN: Final = StopSequence(
     "unknown_platform",
     3,
     (
-        Step(_STOP, Gate.FLIGHT),
+        Step(STOP_FRAME, Gate.FLIGHT),
         Step(_MANUAL, after_s=0.06),
-        Step(_STOP, after_s=REPEAT_S),
-        Step(_MANUAL, after_s=SILENCE_S - REPEAT_S - 0.06),
-        Step(_STOP, after_s=REPEAT_S),
+        Step(STOP_FRAME, after_s=REPEAT_INTERVAL_S),
+        Step(_MANUAL, after_s=RECOVERY_SILENCE_S - REPEAT_INTERVAL_S - 0.06),
+        Step(STOP_FRAME, after_s=REPEAT_INTERVAL_S),
     ),
 )
 
-# The same where mode 0 is certain: there general stops stop every platform, behind whatever frame of ours is unread.
-# `MODE00` comes last, alone: in one string with a stop it would undo it, with a servo frame it would open a mode.
+# The same if mode 0 is certain. General stops then stop every platform, even behind an unread frame of ours.
+# `MODE00` comes last and alone: in one string with a stop it would undo it, with a servo frame it would open a mode.
 UNKNOWN_MANUAL: Final = StopSequence(
     "unknown_platform_manual",
     3,
     (
-        Step(_STOP, Gate.FLIGHT),
-        Step(_STOP, after_s=0.06),
-        Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S),
-        Step(_MANUAL, Gate.ALONE, after_s=REPEAT_S),
-        Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S),
+        Step(STOP_FRAME, Gate.FLIGHT),
+        Step(STOP_FRAME, after_s=0.06),
+        Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S),
+        Step(_MANUAL, Gate.ALONE, after_s=REPEAT_INTERVAL_S),
+        Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S),
     ),
 )
 
-# Asks a car that reports in mode 0 to show that it obeys: its reports pause for the second that `MODE00` takes.
-PROBE: Final = StopSequence("probe", 3, (Step(_MANUAL, Gate.ALONE), Step(_STOP, Gate.FLIGHT, after_s=REPEAT_S)))
+# Tests whether a car in mode 0 receives frames: if so, its reports pause for the second that `MODE00` takes.
+PROBE: Final = StopSequence(
+    "probe", 3, (Step(_MANUAL, Gate.ALONE), Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S))
+)

@@ -75,7 +75,7 @@ def test_what_is_not_said_is_as_gateways_have_it() -> None:
     assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.low, policy.critical)
     assert [*BatteryAction] == [*battery.BatteryReaction]
     assert (EMPTY_V, FULL_V, LOW_V, CRITICAL_V) == (battery.EMPTY_V, battery.FULL_V, battery.LOW_V, battery.CRITICAL_V)
-    assert requests.LONGEST_DRIVE_S == DEFAULT_MAX_DRIVE_S
+    assert requests.DEFAULT_MAX_DRIVE_S == DEFAULT_MAX_DRIVE_S
 
 
 def test_all_faults_of_a_fleet_are_told_at_once() -> None:

@@ -20,7 +20,7 @@ from fleet.supervisor.restart_policy import (
     RunState,
     delay_s,
 )
-from gateway.control.executor import SHUTDOWN_S
+from gateway.control.stop_executor import SHUTDOWN_S
 
 LEAVES_BUS_S = 2.0
 """A gateway on a busy machine needs so long to end after its wait."""

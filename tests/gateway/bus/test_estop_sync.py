@@ -42,8 +42,8 @@ async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) ->
             while not asked:  # until the hub knows of it
                 await asyncio.to_thread(lambda: list(opened.query(KEY, timeout_s=0.1)))
             neighbours, before = EstopSync(opened, "fleet", "red"), len(asked)
-            keeping = asyncio.ensure_future(neighbours.keep_united(unite))
-            neighbours.changed({"blue": True})
+            keeping = asyncio.ensure_future(neighbours.keep_synced(unite))
+            neighbours.on_tokens({"blue": True})
             await asyncio.to_thread(wait_for, lambda: len(asked) > before, "it is asked")
             awake.set()
             await asyncio.to_thread(wait_for, lambda: learned, "it is asked again")
@@ -77,15 +77,15 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
             while not all(asked.values()):  # until the hub knows of both
                 await asyncio.to_thread(lambda: list(opened.query("fleet/*/state/safety", timeout_s=0.1)))
             neighbours = EstopSync(opened, "fleet", "red")
-            keeping = asyncio.ensure_future(neighbours.keep_united(learn))
+            keeping = asyncio.ensure_future(neighbours.keep_synced(learn))
             for car in asked:
-                neighbours.changed({car: True})
+                neighbours.on_tokens({car: True})
                 await asyncio.to_thread(wait_for, lambda car=car: car in learned, f"{car} is asked")
             assert learned == ["blue", "green"]
-            neighbours.ask_soon()
+            neighbours.sync_soon()
             await asyncio.to_thread(wait_for, lambda: learned == ["blue", "green"] * 2, "all are asked")
-            neighbours.changed({"blue": False})
-            neighbours.ask_soon()
+            neighbours.on_tokens({"blue": False})
+            neighbours.sync_soon()
             await asyncio.to_thread(wait_for, lambda: len(learned) == 5, "who is there is asked")
             assert learned[4] == "green"
             keeping.cancel()

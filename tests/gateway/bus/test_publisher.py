@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.bus.publisher import SLICE, CarPublisher
+from gateway.bus.publisher import ANSWERS_PER_SLICE, CarPublisher
 from gateway.control.commands import Command, Drive, Find, Phase, Reason, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.control.estimate.link_health import LinkHealth
@@ -31,12 +31,12 @@ def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
     try:
         with Bus.open(fleet.endpoint) as opened:
             out = CarPublisher(opened, "fleet", "red", Controller("red", parse_platform("arduino")), "tcp://x")
-            for number in range(3 * SLICE + 1):
-                out.event(ImuReading(b"", float(number), (number, 0, 0), (0, 0, 0)), None, loaded=False)
+            for number in range(3 * ANSWERS_PER_SLICE + 1):
+                out.publish_event(ImuReading(b"", float(number), (number, 0, 0), (0, 0, 0)), None, loaded=False)
             pauses: queue.Queue[int] = queue.Queue()
 
             def answer(query: zenoh.Query) -> None:
-                pauses.put(len(list(out.answers("sensor", query))))
+                pauses.put(len(list(out.answer_query("sensor", query))))
 
             def ask(parameters: str) -> int:
                 return len(list(fleet.bus.query(f"fleet/red/sensor/*?{parameters}", timeout_s=20.0)))
@@ -44,7 +44,11 @@ def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
             opened.queryable("fleet/red/sensor/*", answer)
             wait_for(lambda: ask(""), "the queryable is known")
             assert pauses.get(timeout=PATIENCE_S) == 0
-            for parameters, count, paused in (("last=1500", 3 * SLICE + 1, 3), ("format=json", 1, 0), ("last=x", 1, 0)):
+            for parameters, count, paused in (
+                ("last=1500", 3 * ANSWERS_PER_SLICE + 1, 3),
+                ("format=json", 1, 0),
+                ("last=x", 1, 0),
+            ):
                 assert (ask(parameters), pauses.get(timeout=PATIENCE_S)) == (count, paused), parameters
     finally:
         fleet.close()
@@ -68,7 +72,7 @@ class Published:
         self._said.put((key.topic, messages.to_dict(sample.message())))
 
     def _states(self) -> None:
-        self._out.states(self.desk.control, self.health, self.desk.now, force=True)
+        self._out.publish_states(self.desk.control, self.health, self.desk.now, force=True)
 
     def states(self) -> dict[str, dict[str, Any]]:
         """Publish all states; return the fields of each, as JSON has them."""
@@ -78,13 +82,13 @@ class Published:
 
     def told_health(self, platform: PlatformDetector) -> dict[str, Any]:
         """Publish the health; return its fields, as JSON has them."""
-        self._out.health(self.desk.now, loop_lag_s=0.0, bus_drops=0, platform=platform)
+        self._out.publish_health(self.desk.now, loop_lag_s=0.0, bus_drops=0, platform=platform)
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
         return self._before["state/health"]
 
     def record(self, record: CommandRecord) -> dict[str, Any]:
         """Publish a command's record; return its fields, as JSON has them."""
-        self._out.command(record, None)
+        self._out.publish_command(record, None)
         while True:
             topic, fields = self._said.get(timeout=PATIENCE_S)
             if topic == "event/command":
@@ -107,7 +111,7 @@ def test_what_speaks_against_the_platform_is_published(published: Published) -> 
     assert published.told_health(told)["platform_contradictions"] == []
     for _ in range(3):
         for event in Decoder().feed(READING, 0.0):
-            told.heard(event)
+            told.on_event(event)
     words = list(told.contradictions)
     assert words
     assert published.told_health(told)["platform_contradictions"] == words
@@ -120,7 +124,7 @@ def test_states_leave_out_what_does_not_apply(published: Published) -> None:
     assert "evidence_age_s" not in states["state/mode"], "there is no evidence"
     assert "expires_in_s" not in states["state/motion"], "nobody holds a motion"
     desk.ready()
-    health.received(9, desk.now - 0.5)
+    health.on_bytes(9, desk.now - 0.5)
     desk.ask(Drive(Motion.FORWARD, 5.0))
     states = published.states()
     assert states["state/link"]["last_rx_s"] == pytest.approx(0.5)

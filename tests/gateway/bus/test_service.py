@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.bus.service import COMMANDS_WAITING, HISTORIES_WAITING, CarService
+from gateway.bus.service import MAX_QUEUED_HISTORY_QUERIES, MAX_QUEUED_QUERIES, CarService
 from schemas import bus, keys
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
@@ -81,7 +81,7 @@ async def test_questions_of_the_past_wait_by_themselves_and_not_too_many(hall: t
     there.attach()
 
     def flood() -> list[str]:
-        words = [ask(asker, "sensor/*?last=1500", timeout_s=0.02) for _ in range(HISTORIES_WAITING + 3)]
+        words = [ask(asker, "sensor/*?last=1500", timeout_s=0.02) for _ in range(MAX_QUEUED_HISTORY_QUERIES + 3)]
         return [each for found in words for each in found if each != "Timeout"]
 
     assert await asyncio.to_thread(flood) == [bus.BUSY] * 3
@@ -96,13 +96,13 @@ async def test_a_stop_finds_room_where_other_commands_find_none(hall: tuple[Hall
     there, asker = hall  # nobody takes anything yet
 
     def fill() -> list[str]:
-        words = [ask(asker, "@cmd/whistle", b"{}", timeout_s=0.005) for _ in range(COMMANDS_WAITING + 2)]
+        words = [ask(asker, "@cmd/whistle", b"{}", timeout_s=0.005) for _ in range(MAX_QUEUED_QUERIES + 2)]
         return [each for found in words for each in found if each != "Timeout"]
 
     assert await asyncio.to_thread(fill) == [bus.BUSY] * 2
     assert set(await asyncio.to_thread(ask, asker, "@cmd/stop")) == {"Timeout"}
     there.attach()
-    await there.until(lambda: len(there.commands) == COMMANDS_WAITING + 1, "all that waited")
+    await there.until(lambda: len(there.commands) == MAX_QUEUED_QUERIES + 1, "all that waited")
     assert str(there.commands[-1][0].key_expr).endswith("/stop"), "and none after a stop that came before it"
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.control.arbiter import QUEUE_LIMIT, TABLE, CommandContext, needs, refuse
+from gateway.control.arbiter import MAX_QUEUED_COMMANDS, TABLE, CommandContext, needs, refuse
 from gateway.control.commands import (
     Action,
     ChangeSpeed,
@@ -167,7 +167,7 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
         assert at.asked in (None, Mode.MANUAL), "the car would ignore it"
         assert not at.contradicted, "the car may ignore it"
     if isinstance(what, OneShot | ChangeSpeed | Fan | Find):
-        assert at.queued < QUEUE_LIMIT
+        assert at.queued < MAX_QUEUED_COMMANDS
 
 
 def _turns(act: OneShot) -> bool:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.backoff import FIRST_S, LONGEST_S, MOST_CAUSES, PROVEN_S, Attempts, delay_s
+from gateway.control.backoff import FIRST_DELAY_S, MAX_DELAY_S, MAX_LOGGED_CAUSES, PROVEN_S, Attempts, delay_s
 
 
 @pytest.mark.parametrize(("failures", "longest_s"), [(1, 0.25), (2, 0.5), (3, 1.0), (4, 1.0), (10**9, 1.0)])
@@ -15,15 +15,15 @@ def test_it_doubles_up_to_a_second_spread_over_the_upper_half(failures: int, lon
 
 @given(st.integers(1, 10_000), st.floats(0, 1))
 def test_it_is_never_nothing_and_never_long(failures: int, jitter: float) -> None:
-    assert FIRST_S / 2 <= delay_s(failures, jitter) <= LONGEST_S
+    assert FIRST_DELAY_S / 2 <= delay_s(failures, jitter) <= MAX_DELAY_S
 
 
 def test_a_link_that_opens_and_dies_at_once_is_waited_for_longer_and_told_once() -> None:
     attempts = Attempts()
     told, waits = [], []
     for cycle in range(6):
-        told.append((attempts.opened(cycle), attempts.proven(cycle + 0.9 * PROVEN_S, heard=False)))
-        told.append((attempts.failed("reset" if cycle % 2 else "closed"), False))
+        told.append((attempts.on_open(cycle), attempts.check_proven(cycle + 0.9 * PROVEN_S, has_reading=False)))
+        told.append((attempts.on_failed("reset" if cycle % 2 else "closed"), False))
         waits.append(attempts.delay_s(1.0))
     assert told == [(True, False)] * 2 + [(False, False), (True, False)] + [(False, False)] * 8
     assert waits == [0.25, 0.5, 1.0, 1.0, 1.0, 1.0]
@@ -33,17 +33,17 @@ def test_a_link_that_opens_and_dies_at_once_is_waited_for_longer_and_told_once()
 def test_one_that_was_of_use_is_tried_again_at_once_and_all_is_news_again(after_s: float, heard: bool) -> None:
     attempts = Attempts()
     for _ in range(5):
-        attempts.opened(0.0)
-        attempts.failed("closed")
-    assert not attempts.opened(10.0)
-    assert attempts.proven(10.0 + after_s, heard=heard), "its opening had not been told"
-    assert not attempts.proven(10.0 + after_s, heard=heard), "once"
-    assert attempts.failed("closed")
-    assert attempts.delay_s(1.0) == FIRST_S
-    assert attempts.opened(20.0)
-    assert not attempts.proven(20.0 + after_s, heard=heard), "its opening had been told"
+        attempts.on_open(0.0)
+        attempts.on_failed("closed")
+    assert not attempts.on_open(10.0)
+    assert attempts.check_proven(10.0 + after_s, has_reading=heard), "its opening had not been told"
+    assert not attempts.check_proven(10.0 + after_s, has_reading=heard), "once"
+    assert attempts.on_failed("closed")
+    assert attempts.delay_s(1.0) == FIRST_DELAY_S
+    assert attempts.on_open(20.0)
+    assert not attempts.check_proven(20.0 + after_s, has_reading=heard), "its opening had been told"
 
 
 def test_causes_that_are_never_the_same_are_not_told_for_ever() -> None:
     attempts = Attempts()
-    assert sum(attempts.failed(f"error {number}") for number in range(100)) == MOST_CAUSES
+    assert sum(attempts.on_failed(f"error {number}") for number in range(100)) == MAX_LOGGED_CAUSES

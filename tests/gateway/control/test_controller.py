@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.control.command_queue import PATIENCE_S
+from gateway.control.command_queue import MAX_QUEUE_TIME_S
 from gateway.control.commands import (
     Action,
     ChangeSpeed,
@@ -26,8 +26,9 @@ from gateway.control.commands import (
 from gateway.control.estimate.mode import Verdict
 from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.control.events import FrameOrigin
-from gateway.control.executor import RENEW_S, SHUTDOWN_S
 from gateway.control.safety import Hold, PersistedSafety
+from gateway.control.stop_executor import SHUTDOWN_S
+from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.control.stops.evidence import EVIDENCE, StopCase
 from gateway.control.stops.stopping import RETRY_S
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
@@ -93,7 +94,7 @@ def test_the_life_of_a_command(desk: Workbench, what: Action, frames: list[bytes
     answer = desk.ask(what, identity="it")
     assert answer.status in (QUEUED, SENT)
     desk.run(4.0)
-    shown = desk.control.basis == Basis.SHOWN or isinstance(what, SetMode)
+    shown = desk.control.model.basis == Basis.SHOWN or isinstance(what, SetMode)
     assert desk.frames == (frames if shown else [*frames, STOP]), "a rest that nothing has shown is renewed"
     assert shown or desk.sent[-1][2] is FrameOrigin.REPEAT
     assert desk.life("it") == life
@@ -192,7 +193,7 @@ def test_a_drive_expires_and_stops_softly(desk: Workbench) -> None:
     desk.run(3.0)
     assert [(round(at - began, 3), data) for at, data, _ in desk.sent] == [(0.0, BACK), (0.7, STOP), (1.8, STOP)]
     assert desk.records[-1].words == "its time is over"
-    assert (desk.control.motors, desk.control.basis) == ("off", Basis.SENT)
+    assert (desk.control.model.motors, desk.control.model.basis) == ("off", Basis.SENT)
 
 
 def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Workbench) -> None:
@@ -205,13 +206,13 @@ def test_a_rest_that_nothing_has_shown_is_renewed_with_growing_pauses(desk: Work
     assert {why for _, _, why in renewed} == {FrameOrigin.REPEAT}
     times = [0.0, *(at for at, _, _ in renewed)]
     gaps = [round(later - earlier, 1) for earlier, later in pairwise(times)]
-    assert gaps[:3] == list(RENEW_S)
-    assert set(gaps[2:]) == {RENEW_S[-1]}
+    assert gaps[:3] == list(RENEWAL_INTERVALS_S)
+    assert set(gaps[2:]) == {RENEWAL_INTERVALS_S[-1]}
 
 
 def test_a_rest_that_was_shown_is_left_alone(desk: Workbench) -> None:
     desk.run(60.0)
-    assert (desk.frames, desk.control.basis) == ([], Basis.SHOWN)
+    assert (desk.frames, desk.control.model.basis) == ([], Basis.SHOWN)
 
 
 def test_a_drive_that_had_to_wait_says_how_long_the_car_was_driven(desk: Workbench) -> None:
@@ -240,7 +241,7 @@ def test_a_drive_within_a_full_stop_waits_for_its_end_or_is_refused(desk: Workbe
     desk.ask(Stop())
     short = desk.ask(Drive(Motion.BACK, 0.5))
     assert (short.status, short.reason) == (Phase.REJECTED, Reason.EXPIRED)
-    assert short.words == "red is busy for 3.1 s more, longer than this drive's 0.5 s"
+    assert short.words == "red is busy for another 3.1 s, longer than the requested drive (0.5 s). Try again later."
     assert desk.ask(Drive(Motion.BACK, 9.0), identity="it").status is QUEUED
     desk.until(lambda: SENT in desk.life("it"))
     assert desk.frames == [RUN, *SHOWN_STOP, BACK], "not before the stop is shown"
@@ -256,22 +257,22 @@ def test_a_drive_released_by_hand(desk: Workbench) -> None:
     assert desk.life("off") == [ASKED, QUEUED, SENT, SENT]
     last = desk.records[-1]
     assert (last.basis, last.words) == (Basis.SENT, EVIDENCE[StopCase.SOFT].words)
-    assert desk.control.hold is None, "a release is no stop"
+    assert desk.control.safety.hold is None, "a release is no stop"
 
 
 # ---------------------------------------------------------------------- senders, stalls
 
 
 def test_a_sender_that_is_away_for_a_second_is_lost(desk: Workbench) -> None:
-    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
     desk.run(2.0)
-    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    desk.control.on_sender_token("mia", alive=False, now=desk.now)
     desk.run(0.5)
-    desk.control.sender_alive("mia", alive=True, now=desk.now)  # the hub was restarted
+    desk.control.on_sender_token("mia", alive=True, now=desk.now)  # the hub was restarted
     desk.run(2.0)
     assert desk.frames == [RUN, RUN]
-    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    desk.control.on_sender_token("mia", alive=False, now=desk.now)
     gone = desk.now
     desk.run(3.0)
     assert [(round(at - gone, 3), data) for at, data, _ in desk.sent[2:]] == [(1.0, STOP), (2.1, STOP)]
@@ -282,9 +283,9 @@ def test_a_sender_that_is_away_for_a_second_is_lost(desk: Workbench) -> None:
 def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
     desk.run(0.01)
-    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.run(1.0)
-    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    desk.control.on_sender_token("mia", alive=False, now=desk.now)
     gone = desk.now
     desk.run(3.0)
     assert round(desk.sent[-2][0] - gone, 3) == 1.0
@@ -294,7 +295,7 @@ def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) 
 
 def test_a_sender_without_a_token_is_not_watched(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 5.0), PERSON)
-    desk.control.sender_alive("ann", alive=False, now=desk.now)
+    desk.control.on_sender_token("ann", alive=False, now=desk.now)
     desk.run(4.0)
     assert desk.frames == [RUN, RUN]
 
@@ -302,16 +303,16 @@ def test_a_sender_without_a_token_is_not_watched(desk: Workbench) -> None:
 def test_a_stalled_loop_stops_the_car_first(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it")
     desk.run(2.0)
-    desk.control.stalled(0.4, desk.now)
+    desk.control.on_stall(0.4, desk.now)
     desk.pump()
     assert desk.frames == [RUN, RUN]
-    desk.control.stalled(0.6, desk.now)
+    desk.control.on_stall(0.6, desk.now)
     desk.pump()
     assert desk.frames == [RUN, RUN, STOP]
     assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
     assert [entry.code for entry in desk.logs] == ["stalled"]
     desk.run(2.0)
-    desk.control.stalled(9.0, desk.now)
+    desk.control.on_stall(9.0, desk.now)
     assert len(desk.logs) == 1, "nothing is held now"
 
 
@@ -343,7 +344,7 @@ def test_what_waits_too_long_for_a_busy_car_expires(what: Action) -> None:
     desk.control.link_up(desk.now)
     desk.pump()
     desk.ask(what, identity="it")
-    desk.run(PATIENCE_S + 0.1, reports=False)
+    desk.run(MAX_QUEUE_TIME_S + 0.1, reports=False)
     assert desk.life("it") == [ASKED, QUEUED, Phase.EXPIRED]
     assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
 
@@ -374,7 +375,7 @@ def test_a_mode_asked_while_driving_stops_first_then_what_waits_then_opens(desk:
 def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Workbench) -> None:
     assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
     desk.ask(Stop(), PERSON)
-    assert desk.control.hold == Hold("mia", int(desk.now * 1e9))
+    assert desk.control.safety.hold == Hold("mia", int(desk.now * 1e9))
     desk.run(600.0)
     everything: list[Action] = [FORWARD, Drive(Motion.STOP), SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), LIGHT, Fan()]
     for what in [*everything, ChangeSpeed(SpeedStep.UP), Find(), Resume()]:
@@ -382,12 +383,12 @@ def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Workbench) -
         assert (answer.status, answer.reason) == (Phase.REJECTED, Reason.HELD), what
     for what in (Stop(), EmergencyStop("smoke")):
         assert desk.ask(what, COORDINATOR, identity=type(what).__name__).status is QUEUED
-    assert desk.control.hold is not None
-    assert desk.control.hold.by == "mia", "the first keeps it"
+    assert desk.control.safety.hold is not None
+    assert desk.control.safety.hold.by == "mia", "the first keeps it"
     assert desk.ask(Resume(("EmergencyStop",)), PERSON).status is SENT
     for what in (LIGHT, WHISTLE, Find()):
         assert desk.ask(what, PERSON).status is QUEUED
-    assert desk.control.hold is not None, "only a drive, a mode or resume end it"
+    assert desk.control.safety.hold is not None, "only a drive, a mode or resume end it"
 
 
 @pytest.mark.parametrize("what", [FORWARD, SetMode(Mode.TRACKING), SetMode(Mode.MANUAL), Resume()])
@@ -396,7 +397,7 @@ def test_a_persons_or_scripts_drive_mode_or_resume_ends_the_hold(desk: Workbench
     desk.ask(Stop(), PERSON)
     desk.run(2.0)
     assert desk.ask(what, sender).status is not Phase.REJECTED
-    assert desk.control.hold is None
+    assert desk.control.safety.hold is None
     assert desk.logs[-1].code == "hold_ended"
 
 
@@ -405,14 +406,14 @@ def test_a_refused_command_does_not_end_the_hold(desk: Workbench) -> None:
     assert desk.ask(FORWARD, age_s=9.0).reason is Reason.STALE
     desk.control.link_down("unplugged", desk.now)
     assert desk.ask(FORWARD).reason is Reason.LINK_DOWN
-    assert desk.control.hold is not None
+    assert desk.control.safety.hold is not None
     assert desk.ask(Resume()).status is SENT, "resume needs no car"
-    assert desk.control.hold is None
+    assert desk.control.safety.hold is None
 
 
 def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Workbench) -> None:
     desk.ask(Stop(), COORDINATOR)
-    assert desk.control.hold is None
+    assert desk.control.safety.hold is None
     desk.run(2.0)
     assert desk.ask(Resume(), COORDINATOR).reason is Reason.HELD
     assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
@@ -510,10 +511,14 @@ def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Workbench) -> None:
     desk.take()
     for identity in ("held", "act"):
         assert desk.end(identity) == (Phase.FAILED, Reason.LINK_DOWN), identity
-    assert (desk.control.motors, desk.control.motion, desk.control.believed.fan) == ("unknown", None, None)
+    assert (desk.control.model.motors, desk.control.model.motion, desk.control.model.believed.fan) == (
+        "unknown",
+        None,
+        None,
+    )
     stop = desk.ask(Stop(), PERSON)
     assert (stop.status, stop.reason) == (Phase.REJECTED, Reason.LINK_DOWN)
-    assert desk.control.hold is not None, "a stop by hand holds, reached or not"
+    assert desk.control.safety.hold is not None, "a stop by hand holds, reached or not"
     desk.run(60.0)
     assert desk.frames == [RUN]
 
@@ -523,7 +528,7 @@ def test_a_failed_write_fails_its_command_and_what_waits(desk: Workbench) -> Non
     desk.ask(WHISTLE, identity="act", pump=False)
     write = desk.control.poll(desk.now)
     assert write is not None
-    desk.control.write_failed("a write failed: gone", desk.now)
+    desk.control.on_write_failed("a write failed: gone", desk.now)
     desk.take()
     for identity in ("it", "act"):
         assert desk.end(identity) == (Phase.FAILED, Reason.WRITE_FAILED)
@@ -554,7 +559,7 @@ def test_a_recovery_that_nobody_answers_goes_on_for_ever_with_growing_pauses() -
     times = [at - began for at, _, _ in desk.sent]
     assert [round(at, 2) for at in times[:4]] == [0.0, 0.05, 3.7, 4.8]
     assert max(later - earlier for earlier, later in pairwise(times)) <= RETRY_S[-1]
-    assert (desk.control.motors, desk.control.basis) == ("unknown", None)
+    assert (desk.control.model.motors, desk.control.model.basis) == ("unknown", None)
     assert desk.control.model.trust.state is CarTrust.UNHEARD
     assert [log.code for log in desk.logs].count("unheard") == 1
     assert desk.end("it") == (Phase.FAILED, Reason.NOT_SHOWN)
@@ -564,7 +569,7 @@ def test_a_recovery_that_nobody_answers_goes_on_for_ever_with_growing_pauses() -
     assert desk.end("again") == (Phase.FAILED, Reason.NOT_SHOWN)
     desk.hear()
     desk.run(15.0)
-    assert (desk.control.motors, desk.control.basis) == ("off", Basis.SHOWN)
+    assert (desk.control.model.motors, desk.control.model.basis) == ("off", Basis.SHOWN)
 
 
 def test_reports_alone_confirm_nothing_and_two_pauses_do() -> None:
@@ -574,9 +579,9 @@ def test_reports_alone_confirm_nothing_and_two_pauses_do() -> None:
     for _ in range(4):
         desk.run(0.95, reports=False)
         desk.hear()
-        assert not desk.control.known, "it reports, and nothing shows that it reads"
-    desk.until(lambda: desk.control.known)
-    assert desk.control.basis == Basis.SHOWN
+        assert not desk.control.model.known, "it reports, and nothing shows that it reads"
+    desk.until(lambda: desk.control.model.known)
+    assert desk.control.model.basis == Basis.SHOWN
     assert desk.control.model.trust.evidence.startswith("2 pauses")
     assert desk.logs[-1].code == "recovered"
 
@@ -621,15 +626,15 @@ def test_a_shutdown_ends_when_its_stop_is_shown_or_sent(platform: str, state: Ca
     desk = Workbench(platform).ready()
     state(desk)
     began, sent = desk.now, len(desk.sent)
-    desk.control.shutdown(desk.now)
-    desk.control.shutdown(desk.now)
-    while not desk.control.finished:
+    desk.control.shut_down(desk.now)
+    desk.control.shut_down(desk.now)
+    while not desk.control.stops.finished:
         assert desk.now - began <= SHUTDOWN_S
         desk.run(0.01)
-    assert not desk.control.not_stopped
-    assert (desk.control.motors, desk.control.basis is not None) == ("off", True)
-    assert platform != "arduino" or desk.control.basis == Basis.SHOWN
-    assert platform != "raspberry_pi" or desk.control.basis == Basis.SENT
+    assert not desk.control.stops.not_stopped
+    assert (desk.control.model.motors, desk.control.model.basis is not None) == ("off", True)
+    assert platform != "arduino" or desk.control.model.basis == Basis.SHOWN
+    assert platform != "raspberry_pi" or desk.control.model.basis == Basis.SENT
     if state is idle and platform == "arduino":
         assert (desk.now, len(desk.sent)) == (began, sent), "it has shown that it stands: nothing is sent"
     if desk.life("it"):
@@ -645,26 +650,26 @@ def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_st
 ) -> None:
     desk = Workbench(platform).ready()
     state(desk)
-    if desk.control.basis is not None:
+    if desk.control.model.basis is not None:
         desk.ask(Drive(Motion.FORWARD, 0.2))
         desk.run(0.1)
     began = desk.now
-    desk.control.shutdown(desk.now)
-    while not desk.control.finished:
+    desk.control.shut_down(desk.now)
+    while not desk.control.stops.finished:
         assert desk.now - began <= SHUTDOWN_S
         desk.run(0.01, reports=False)
     desk.take()
     assert desk.now - began == pytest.approx(SHUTDOWN_S, abs=0.02)
-    assert desk.control.not_stopped == "did not show that it stopped"
+    assert desk.control.stops.not_stopped == "did not show that it stopped"
     assert desk.logs[-1].code == "not_stopped"
     assert desk.logs[-1].words.startswith("red may still be moving: red did not show that it stopped")
-    assert desk.control.basis is None
+    assert desk.control.model.basis is None
 
 
 def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_stopped(desk: Workbench) -> None:
     desk.control.link_down("unplugged", desk.now)
-    desk.control.shutdown(desk.now)
-    assert desk.control.finished
+    desk.control.shut_down(desk.now)
+    assert desk.control.stops.finished
     desk.take()
     assert [(entry.code, entry.words) for entry in desk.logs] == [
         ("not_stopped", "red may still be moving: red cannot be reached (unplugged). Look at it.")
@@ -674,11 +679,11 @@ def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_sto
 def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() -> None:
     """The gateway before this one may have left it driving."""
     desk = Workbench()
-    desk.control.shutdown(desk.now)
-    assert desk.control.finished
+    desk.control.shut_down(desk.now)
+    assert desk.control.stops.finished
     desk.take()
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
-    assert desk.control.not_stopped
+    assert desk.control.stops.not_stopped
 
 
 def test_a_gateway_that_ends_while_its_car_tracks_on_says_so() -> None:
@@ -688,10 +693,10 @@ def test_a_gateway_that_ends_while_its_car_tracks_on_says_so() -> None:
     pair.run(8.0)
     pair.car.feed = lambda data, now: None  # type: ignore[method-assign]
     began = pair.now
-    pair.control.shutdown(began)
-    pair.until(lambda: pair.control.finished, SHUTDOWN_S + 0.1)
+    pair.control.shut_down(began)
+    pair.until(lambda: pair.control.stops.finished, SHUTDOWN_S + 0.1)
     assert pair.car.truth.mode is Mode.TRACKING
-    assert pair.control.not_stopped
+    assert pair.control.stops.not_stopped
     assert pair.logs[-1].code == "not_stopped"
 
 
@@ -699,21 +704,21 @@ def test_a_gateway_that_ends_while_its_car_tracks_waits_until_it_has_shown_that_
     pair = Pair(start_s=2.0).ready()
     pair.ask(SetMode(Mode.TRACKING))
     pair.run(8.0)
-    pair.control.shutdown(pair.now)
-    assert pair.until(lambda: pair.control.finished, SHUTDOWN_S) <= 1.1 + 4.5
-    assert pair.control.mode.verdict is Verdict.CONFIRMED
-    assert pair.control.basis == Basis.SHOWN
-    assert not pair.control.not_stopped
+    pair.control.shut_down(pair.now)
+    assert pair.until(lambda: pair.control.stops.finished, SHUTDOWN_S) <= 1.1 + 4.5
+    assert pair.control.model.mode.verdict is Verdict.CONFIRMED
+    assert pair.control.model.basis == Basis.SHOWN
+    assert not pair.control.stops.not_stopped
 
 
 def test_a_link_that_goes_during_the_last_stop_is_said(desk: Workbench) -> None:
     desk.ask(FORWARD)
-    desk.control.shutdown(desk.now)
+    desk.control.shut_down(desk.now)
     desk.run(0.5)
     assert desk.frames == [RUN, MODE00]
     desk.control.link_down("unplugged", desk.now)
     desk.take()
-    assert desk.control.finished
+    assert desk.control.stops.finished
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
 
 
@@ -751,16 +756,16 @@ def test_whatever_is_asked_never_two_frames_in_flight_nothing_doubled_and_stop_w
         assert set(desk.frames[before:]) <= stops, seed
         ends = [each for each in desk.records if each.command.id == "the-stop"]
         if (
-            desk.car.fan and not desk.control.believed.fan
+            desk.car.fan and not desk.control.model.believed.fan
         ):  # it ran when the link was lost: nobody knows why it is silent
             assert (ends[-1].phase, ends[-1].reason) == (Phase.FAILED, Reason.NOT_SHOWN), seed
-            assert desk.control.motors == "unknown", seed
+            assert desk.control.model.motors == "unknown", seed
             continue
-        assert desk.control.motors == "off", seed
+        assert desk.control.model.motors == "off", seed
         assert (ends[-1].phase is COMPLETE) == (ends[-1].basis == Basis.SHOWN), seed
         assert ends[-1].phase is COMPLETE or (ends[-1].phase, ends[-1].basis) == (SENT, Basis.SENT), seed
 
-        profile = desk.control.profile
+        profile = desk.control.model.profile
         for index in set(range(1, len(desk.sent))) - links:
             (earlier, first, _), (later, second, why) = desk.sent[index - 1 : index + 1]
             frame = parse_sent(first)
@@ -788,11 +793,11 @@ def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
     for _ in range(3):
         pair.ask(Fan())
         pair.run(2.5)
-        assert pair.car.truth.fan is pair.control.believed.fan
+        assert pair.car.truth.fan is pair.control.model.believed.fan
     for step in (SpeedStep.DOWN, SpeedStep.DOWN, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP):
         pair.ask(ChangeSpeed(step))
         pair.run(0.5)
-        assert pair.car.truth.speed == pair.control.believed.speed
+        assert pair.car.truth.speed == pair.control.model.believed.speed
 
 
 @pytest.mark.parametrize("mode", [Mode.COLOR_LED, Mode.OBSTACLE_AVOIDANCE, Mode.TRACKING])
@@ -803,7 +808,7 @@ def test_what_is_asked_while_a_mode_is_left_is_not_lost(mode: Mode) -> None:
         pair.run(6.0 + 2.0 * random.Random(seed).random())
         pair.ask(SetMode(Mode.MANUAL))
         control = pair.control
-        pair.until(lambda control=control: control.running is None, 20.0)
+        pair.until(lambda control=control: control.stops.running is None, 20.0)
         before = pair.car.truth.fan
         pair.ask(Fan())
         pair.run(7.0)

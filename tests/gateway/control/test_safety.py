@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.commands import Sender, SenderKind
-from gateway.control.safety import REMEMBERED_ENDED, Estop, Hold, LeaseState, PersistedSafety, Safety
+from gateway.control.safety import MAX_ENDED_ESTOPS, Estop, Hold, LeaseState, PersistedSafety, Safety
 
 ANN, BOB = Sender("ann", SenderKind.PERSON), Sender("bob", SenderKind.PERSON)
 SCRIPT, PLAN = Sender("ann", SenderKind.SCRIPT), Sender("plan", SenderKind.COORDINATOR)
@@ -48,31 +48,31 @@ def test_what_is_kept_is_restored() -> None:
     safety.latch(estop("b"))
     safety.end(["a"])
     safety.grant(ANN, 5.0)
-    restored = Safety.restored(safety.kept)
-    assert restored.kept == safety.kept == PersistedSafety(Hold("eve", 7), (estop("b"),), ("a",))
+    restored = Safety.restore(safety.persisted)
+    assert restored.persisted == safety.persisted == PersistedSafety(Hold("eve", 7), (estop("b"),), ("a",))
     assert restored.lease is None, "who drives says so again"
 
 
 def test_ended_ids_are_bounded() -> None:
     safety = Safety()
-    for number in range(REMEMBERED_ENDED + 9):
+    for number in range(MAX_ENDED_ESTOPS + 9):
         safety.latch(estop(str(number)))
         safety.end([str(number)])
-    assert safety.ended == tuple(str(number) for number in range(9, REMEMBERED_ENDED + 9))
+    assert safety.ended == tuple(str(number) for number in range(9, MAX_ENDED_ESTOPS + 9))
 
 
 def test_only_fleet_wide_ids_are_united_and_ended_wins() -> None:
     red, blue = Safety(), Safety()
     red.latch(estop("fleet"))
     red.latch(estop("own", fleet_wide=False))
-    begun, over = blue.unite(red.estops, red.ended)
+    begun, over = blue.merge(red.estops, red.ended)
     assert ([each.id for each in begun], over) == (["fleet"], [])
     assert blue.hold == Hold("eve", 7)
     blue.end(["fleet"])
-    begun, over = red.unite(blue.estops, blue.ended)
+    begun, over = red.merge(blue.estops, blue.ended)
     assert (begun, [each.id for each in over]) == ([], ["fleet"])
     assert [each.id for each in red.estops] == ["own"]
-    assert blue.unite((estop("fleet"),), ()) == ([], []), "ended wins over one who has not heard of it"
+    assert blue.merge((estop("fleet"),), ()) == ([], []), "ended wins over one who has not heard of it"
 
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.sampled_from("abcd"), st.booleans()), max_size=30))
@@ -87,7 +87,7 @@ def test_gateways_that_see_each_other_agree(steps: list[tuple[int, str, bool]]) 
         for one in cars:
             for other in cars:
                 if one is not other:
-                    one.unite(other.estops, other.ended)
+                    one.merge(other.estops, other.ended)
     assert len({frozenset(each.id for each in car.estops) for car in cars}) == 1
     ended = {each for car in cars for each in car.ended}
     assert not ended & {each.id for car in cars for each in car.estops}
@@ -96,9 +96,9 @@ def test_gateways_that_see_each_other_agree(steps: list[tuple[int, str, bool]]) 
 def test_a_lease() -> None:
     safety = Safety()
     safety.grant(SCRIPT, 10.0)
-    lease = safety.leased(11.9)
+    lease = safety.lease_at(11.9)
     assert lease == LeaseState(SCRIPT, 12.0)
-    assert safety.leased(12.0) is None
+    assert safety.lease_at(12.0) is None
     assert not lease.refuses(SCRIPT, 11.0, take=False)
     assert not lease.refuses(ANN, 11.0, take=False), "a person outranks a script"
     assert lease.refuses(PLAN, 11.0, take=True)
@@ -107,8 +107,8 @@ def test_a_lease() -> None:
     persons = LeaseState(ANN, 12.0)
     assert persons.refuses(BOB, 11.0, take=False), "between equals the holder keeps it"
     assert not persons.refuses(BOB, 11.0, take=True)
-    safety.driven_no_more(5.0)
-    assert safety.leased(6.9) == LeaseState(SCRIPT, 7.0)
+    safety.shorten_lease(5.0)
+    assert safety.lease_at(6.9) == LeaseState(SCRIPT, 7.0)
     assert not safety.release(ANN)
     assert safety.release(SCRIPT)
-    assert safety.leased(5.0) is None
+    assert safety.lease_at(5.0) is None

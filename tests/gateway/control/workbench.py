@@ -82,7 +82,7 @@ class Workbench:
 
     def __init__(self, platform: str = "arduino", *, kept: PersistedSafety | None = None) -> None:
         self.now = 100.0
-        self.control = Controller("red", parse_platform(platform), kept=kept)
+        self.control = Controller("red", parse_platform(platform), persisted=kept)
         self.car = ObedientCar(platform, self.now)
         self.sent: list[tuple[float, bytes, FrameOrigin]] = []
         self.records: list[CommandRecord] = []
@@ -95,8 +95,8 @@ class Workbench:
         """Connect, recover, and forget what was written until then: the car has shown that it stands."""
         self.control.link_up(self.now)
         self.pump()
-        self.until(lambda: self.control.known, 12.0)
-        assert self.control.motors == "off"
+        self.until(lambda: self.control.model.known, 12.0)
+        assert self.control.model.motors == "off"
         self.run(1.5)
         self.sent.clear()
         self.take()
@@ -111,7 +111,7 @@ class Workbench:
 
     def _hear(self, frame: bytes) -> None:
         for event in Decoder().feed(frame, self.now):
-            self.control.heard(event, self.now)
+            self.control.on_event(event, self.now)
         self.pump()
 
     def ask(
@@ -170,7 +170,7 @@ class Workbench:
         """Write what is to be written."""
         while (write := self.control.poll(self.now)) is not None:
             self.sent.append((self.now, write.data, write.why))
-            self.control.wrote(write, self.now)
+            self.control.on_written(write, self.now)
             self.car.wrote(write.frame, self.now)
         self.take()
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.estimate.battery import (
-    HOLD_S,
+    LEVEL_DEBOUNCE_S,
     LOW_V,
     Battery,
     BatteryLevel,
@@ -54,11 +54,11 @@ def test_always_a_share_and_an_error(voltage_v: float, loaded: bool) -> None:
 
 def hear(battery: Battery, *voltages: float, loaded: bool = False, from_s: float = 0.0) -> list[float]:
     """One reading a second; when the level changed."""
-    start = max(battery.heard_at + 1.0, from_s)
+    start = max(battery.measured_at + 1.0, from_s)
     return [
         start + second
         for second, voltage_v in enumerate(voltages)
-        if battery.heard(voltage_v, loaded=loaded, now=start + second)
+        if battery.on_voltage(voltage_v, loaded=loaded, now=start + second)
     ]
 
 
@@ -142,7 +142,7 @@ def test_the_level_does_not_flap_from_the_first_reading_on(seed: int, rest_v: fl
         voltage_v = rest_v - sag_v + moments.uniform(-0.04, 0.04)
         if moments.random() < 0.1:
             voltage_v = moments.choice([0.0, 12.0])
-        battery.heard(voltage_v, loaded=now < stops_at, now=now)
+        battery.on_voltage(voltage_v, loaded=now < stops_at, now=now)
         assert battery.level is not None
         if battery.level != levels[-1]:
             levels.append(str(battery.level))
@@ -167,4 +167,4 @@ def test_a_policy_may_stop_or_only_warn() -> None:
 
 
 def test_the_hold_outlasts_a_few_readings() -> None:
-    assert HOLD_S > 3.0, "a report comes every one to two seconds"
+    assert LEVEL_DEBOUNCE_S > 3.0, "a report comes every one to two seconds"

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.estimate.platform import RUNNING, PlatformDetector
+from gateway.control.estimate.platform import EVIDENCE_FRAMES, PlatformDetector
 from gateway.protocol.decoder import SILENCE_S, Decoder
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
@@ -28,7 +28,7 @@ def event_of(text: str) -> Event:
 
 
 def hear(truth: PlatformDetector, *frames: str) -> list[str]:
-    return [words for frame in frames for words in truth.heard(event_of(frame))]
+    return [words for frame in frames for words in truth.on_event(event_of(frame))]
 
 
 @pytest.mark.parametrize("row", CASES, ids=ids(CASES))
@@ -73,13 +73,15 @@ def test_readings_of_another_mode_say_nothing_of_mode_0() -> None:
 
 @given(
     st.lists(
-        st.tuples(st.integers(RUNNING, 9), st.sampled_from([PI, TRACKING, "$4WD,CSB57,PV7.9,GS3,LF1011,HW01,GM10#"]))
+        st.tuples(
+            st.integers(EVIDENCE_FRAMES, 9), st.sampled_from([PI, TRACKING, "$4WD,CSB57,PV7.9,GS3,LF1011,HW01,GM10#"])
+        )
     )
 )
 def test_one_damaged_frame_never_contradicts(bursts: list[tuple[int, str]]) -> None:
     truth = PlatformDetector(parse_platform("arduino"))
     auto = PlatformDetector(parse_platform("unknown"), auto=True)
-    hear(auto, *[ARDUINO] * RUNNING)
+    hear(auto, *[ARDUINO] * EVIDENCE_FRAMES)
     for good, damaged in bursts:
         assert not hear(truth, *[ARDUINO] * good, damaged)
         hear(auto, *[ARDUINO] * good, damaged)
@@ -91,15 +93,15 @@ def test_auto_adds_the_options_that_it_hears() -> None:
     truth = PlatformDetector(parse_platform("unknown"), auto=True)
     hear(truth, ARM, ARM, ARM)
     assert truth.profile.name == "unknown+arm"
-    hear(truth, *[ARDUINO] * RUNNING)
+    hear(truth, *[ARDUINO] * EVIDENCE_FRAMES)
     assert truth.profile.name == "arduino+arm"
 
 
 def test_a_car_that_is_neither_is_treated_as_unknown() -> None:
     truth = PlatformDetector(parse_platform("unknown"), auto=True)
-    hear(truth, *[ARDUINO] * RUNNING)
+    hear(truth, *[ARDUINO] * EVIDENCE_FRAMES)
     assert truth.profile.name == "arduino"
-    hear(truth, *[PI] * RUNNING)
+    hear(truth, *[PI] * EVIDENCE_FRAMES)
     assert truth.profile.name == "unknown"
     assert truth.evidence[0].startswith("both ")
     hear(truth, *[ARDUINO] * 9, *[PI] * 9)
@@ -118,8 +120,8 @@ def test_the_simulated_cars_are_found_and_contradict_nothing_of_their_own(platfo
         for tenth in range(300):
             for at, data in car.advance(tenth / 10):
                 for event in decoder.feed(data, at):
-                    assert not told.heard(event)
-                    auto.heard(event)
+                    assert not told.on_event(event)
+                    auto.on_event(event)
         silent = mode in (Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED) and platform != "raspberry_pi"
         running = mode is not Mode.MANUAL and platform != "raspberry_pi"
         kind = "unknown" if silent else "raspberry_pi" if platform == "raspberry_pi" else "arduino"

@@ -61,7 +61,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
     assert desk.ask(Stop(), SCRIPT).status is QUEUED
     assert desk.ask(Resume(("e2",)), PERSON).reason is Reason.BAD_VALUE
     assert "still in force: e-stop e1" in desk.ask(Resume(), PERSON).words, "without ids it ends the hold"
-    assert desk.control.hold is None
+    assert desk.control.safety.hold is None
     assert desk.ask(Resume(("e1",)), SCRIPT).status is SENT
     assert desk.logs[-1].code == "estop_ended"
     desk.run(5.0)
@@ -91,28 +91,28 @@ def test_an_e_stop_survives_a_restart() -> None:
     desk = Workbench(kept=PersistedSafety(None, (estop,), ())).ready()
     assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
     desk.ask(Resume(("e1",)), PERSON)
-    assert desk.control.safety.kept == PersistedSafety(None, (), ("e1",))
+    assert desk.control.safety.persisted == PersistedSafety(None, (), ("e1",))
 
 
 def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT, identity="d")
     estop = Estop("e1", "mia", "smoke", 7, fleet_wide=True)
-    desk.control.unite([estop], [], "blue", desk.now)
+    desk.control.merge_estops([estop], [], "blue", desk.now)
     desk.run(3.0)
     assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert desk.logs[0].code == "estop_joined"
     assert "as blue shows: smoke" in desk.logs[0].words
     desk.sent.clear()
-    desk.control.unite([estop], [], "green", desk.now)
+    desk.control.merge_estops([estop], [], "green", desk.now)
     desk.run(3.0)
     assert desk.frames == [], "it is known already"
-    desk.control.unite([], ["e1"], "blue", desk.now)
+    desk.control.merge_estops([], ["e1"], "blue", desk.now)
     assert desk.ask(FORWARD, PERSON).status is QUEUED
 
 
 def test_an_e_stop_at_rest_is_carried_out_too(desk: Workbench) -> None:
-    desk.control.unite([Estop("e1", "mia", "", 7, fleet_wide=True)], [], "blue", desk.now)
+    desk.control.merge_estops([Estop("e1", "mia", "", 7, fleet_wide=True)], [], "blue", desk.now)
     desk.run(3.0)
     assert desk.frames == [MODE00, STOP]
 
@@ -135,10 +135,10 @@ def test_who_drives_has_the_car_and_two_seconds_more(desk: Workbench) -> None:
 
 def test_a_command_line_that_is_done_keeps_the_car_from_those_of_lower_rank_only(desk: Workbench) -> None:
     """A person who stops a car, and drives it a little, is not to see it driven off by the coordinator at once."""
-    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
     desk.run(1.1)
-    desk.control.sender_alive("mia", alive=False, now=desk.now)
+    desk.control.on_sender_token("mia", alive=False, now=desk.now)
     for other in (SCRIPT, COORDINATOR):
         assert desk.ask(FORWARD, other).reason is Reason.LEASED
     desk.run(1.8)
@@ -150,18 +150,18 @@ def test_a_command_line_that_is_done_keeps_the_car_from_those_of_lower_rank_only
 
 def test_a_holder_that_is_back_has_its_lease_again(desk: Workbench) -> None:
     """A hub that was restarted takes all tokens down for a moment."""
-    desk.control.sender_alive("mia", alive=True, now=desk.now)
+    desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
     desk.run(1.1)
     for alive in (False, True):
-        desk.control.sender_alive("mia", alive=alive, now=desk.now)
+        desk.control.on_sender_token("mia", alive=alive, now=desk.now)
     assert desk.ask(FORWARD, BOB).reason is Reason.LEASED
 
 
 def test_a_held_car_is_no_coordinators(desk: Workbench) -> None:
     desk.ask(FORWARD, COORDINATOR)
     desk.ask(Stop(), PERSON)
-    assert desk.control.safety.leased(desk.now) is None
+    assert desk.control.safety.lease_at(desk.now) is None
 
 
 def test_a_release_shortens_the_lease(desk: Workbench) -> None:
@@ -236,7 +236,7 @@ def test_a_stick_that_is_leaned_on_after_anothers_stop_does_not_drive_on(desk: W
         assert (refused.reason, "let go" in refused.words) == (Reason.HELD, True)
         desk.run(0.1)
     assert desk.frames == [RUN, *SHOWN_STOP]
-    assert desk.control.hold is not None, "what was refused ends no hold"
+    assert desk.control.safety.hold is not None, "what was refused ends no hold"
     rejected = [record for record in desk.records if record.phase is REJECTED]
     assert len(rejected) == 1, "one record for the whole stream"
     desk.run(0.5)
@@ -302,12 +302,12 @@ def test_a_drive_that_is_refused_and_a_stick_that_is_let_go_end_no_hold(desk: Wo
     desk.ask(Stop(), PERSON)
     desk.run(0.55)
     assert desk.ask(Drive(Motion.FORWARD, 0.1), SCRIPT).reason is Reason.EXPIRED, "the stop takes longer"
-    assert desk.control.hold is not None
+    assert desk.control.safety.hold is not None
     assert desk.control.safety.lease is None or desk.control.safety.lease.holder == SCRIPT
     desk.run(3.0)
     desk.ask(Drive(Motion.STOP), SCRIPT, streamed=True)
     desk.ask(Drive(Motion.STOP), PERSON)
-    assert desk.control.hold is not None
+    assert desk.control.safety.hold is not None
     assert desk.ask(SetMode(Mode.TRACKING), COORDINATOR).reason is Reason.HELD
 
 
@@ -315,7 +315,7 @@ def test_a_car_that_went_its_own_way_is_not_said_to_stand(desk: Workbench) -> No
     for _ in range(3):
         desk.run(0.3, reports=False)
         desk.hear(TRACKING)
-    assert (desk.control.motors, desk.control.motion) == ("unknown", None)
+    assert (desk.control.model.motors, desk.control.model.motion) == ("unknown", None)
     assert desk.ask(OneShot(ColorLed(1, 2, 3)), PERSON).reason is Reason.WRONG_MODE, "it would be lost"
 
 
@@ -332,7 +332,7 @@ def test_a_token_that_is_known_only_from_its_end_ends_the_drive() -> None:
     """Changes of tokens are merged: one that came and went within 50 ms is told as gone."""
     desk = Workbench().ready()
     desk.ask(Drive(Motion.FORWARD, 60.0), SCRIPT, identity="drive")
-    desk.control.sender_alive(SCRIPT.name, alive=False, now=desk.now)
+    desk.control.on_sender_token(SCRIPT.name, alive=False, now=desk.now)
     desk.run(1.5)
     assert desk.life("drive")[-1] is Phase.EXPIRED
     assert STOP in desk.frames

@@ -29,12 +29,12 @@ def paired(platform: str) -> Pair:
 )
 def test_a_car_is_found_out_and_stopped_as_what_it_is(platform: str, settled: str, first: bytes) -> None:
     pair = paired(platform)
-    assert pair.control.profile.name == "unknown"
-    pair.until(lambda: pair.control.known, 20.0)
+    assert pair.control.model.profile.name == "unknown"
+    pair.until(lambda: pair.control.model.known, 20.0)
     assert pair.sent[0][1] == b"$0,0,0,0,0,0,0,0,0#", "not knowing what it is, the frame that every car obeys first"
-    pair.until(lambda: pair.control.profile.name == settled, 10.0)
+    pair.until(lambda: pair.control.model.profile.name == settled, 10.0)
     assert any(log.code == "platform_settled" and settled in log.words for log in pair.logs)
-    assert settled in pair.control.platform.evidence[0]
+    assert settled in pair.control.model.platform.evidence[0]
     pair.ask(Drive(Motion.FORWARD, 5.0))
     pair.run(1.9)
     pair.sent.clear()
@@ -48,20 +48,20 @@ def test_a_car_is_found_out_and_stopped_as_what_it_is(platform: str, settled: st
 def test_before_it_is_settled_only_what_every_car_knows_is_sent() -> None:
     pair = paired("arduino")
     assert pair.ask(SetMode(Mode.TRACKING)).reason == "unsupported"
-    pair.until(lambda: pair.control.profile.name == "arduino", 20.0)
+    pair.until(lambda: pair.control.model.profile.name == "arduino", 20.0)
     assert pair.ask(SetMode(Mode.TRACKING)).reason is None
 
 
 def test_a_link_that_comes_back_may_have_another_car_behind_it() -> None:
     pair = paired("arduino")
-    pair.until(lambda: pair.control.profile.name == "arduino", 20.0)
+    pair.until(lambda: pair.control.model.profile.name == "arduino", 20.0)
     pair.control.link_down("unplugged", pair.now)
     other = Pair("raspberry_pi", transport=Transport.TCP)
     other.control = pair.control
     other.run(pair.now, linked=False)
     other.connect()
-    assert other.control.profile.name == "unknown"
-    other.until(lambda: other.control.profile.name == "raspberry_pi", 30.0)
+    assert other.control.model.profile.name == "unknown"
+    other.until(lambda: other.control.model.profile.name == "raspberry_pi", 30.0)
 
 
 @pytest.mark.parametrize(("told", "name"), [("auto", "unknown"), ("auto+arm", "unknown+arm"), ("stm32", "stm32")])
@@ -82,4 +82,4 @@ def test_a_contradicted_profile_is_told_of_once() -> None:
     told = [log for log in pair.logs if log.code == "platform_contradicted"]
     assert told
     assert len({log.words for log in told}) == len(told)
-    assert parse_platform("arduino").name == pair.control.profile.name, "what was told stays"
+    assert parse_platform("arduino").name == pair.control.model.profile.name, "what was told stays"

@@ -54,7 +54,7 @@ def test_a_car_can_be_stopped_by_its_battery() -> None:
     desk.run(11.0)
     assert desk.frames[0] == RUN
     assert MODE00 in desk.frames
-    assert desk.control.motors == "off"
+    assert desk.control.model.motors == "off"
     assert desk.end("d") == (Phase.SUPERSEDED, Reason.SUPERSEDED)
     assert STOP in desk.frames
 
@@ -66,5 +66,5 @@ def test_a_constant_is_no_battery(platform: str) -> None:
     for _ in range(20):
         desk.run(1.0, reports=False)
         desk.hear(b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#")
-    assert desk.control.battery.level is None
+    assert desk.control.model.battery.level is None
     assert not [log for log in desk.logs if log.code.startswith("battery")]

@@ -36,9 +36,9 @@ def test_a_drive_of_a_car_that_hears_is_complete() -> None:
 @pytest.mark.parametrize("seconds", [3.0, 30.0, 90.0])
 def test_no_mode_is_confirmed_by_old_evidence_while_a_stop_goes_on(seconds: float) -> None:
     pair = Pair(start_s=2.0).ready()
-    assert pair.control.mode.confirmed is not None
+    assert pair.control.model.mode.confirmed is not None
     pair.deaf_until = float("inf")
     pair.run(4.5)
     for _ in range(int(seconds)):
         pair.run(1.0)
-        assert pair.control.mode.confirmed is None
+        assert pair.control.model.mode.confirmed is None

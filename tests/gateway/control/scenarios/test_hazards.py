@@ -88,7 +88,7 @@ def stops(pair: Pair, *, sent: StopCase | None = None) -> Answer:
     else:
         words = EVIDENCE[case].words.format(car="red")
         assert (last.phase, last.basis, last.words) == (Phase.SENT, Basis.SENT, words)
-    assert (pair.control.motors, pair.control.basis) == ("off", last.basis)
+    assert (pair.control.model.motors, pair.control.model.basis) == ("off", last.basis)
     pair.records.clear()
     return answer
 
@@ -96,13 +96,13 @@ def stops(pair: Pair, *, sent: StopCase | None = None) -> Answer:
 def recovers(pair: Pair) -> None:
     """The link is back: recovery brings the car to rest in mode 0, and the gateway knows it."""
     since = pair.now
-    assert pair.control.motors == "unknown"
+    assert pair.control.model.motors == "unknown"
     pair.connect()
-    pair.until(lambda: pair.control.known, 30.0)
+    pair.until(lambda: pair.control.model.known, 30.0)
     pair.run(SETTLED_S)
     assert pair.off_for_good_at() - since <= RECOVERED_S
     assert pair.car.truth.mode is Mode.MANUAL
-    assert pair.control.motors == "off"
+    assert pair.control.model.motors == "off"
 
 
 def refused(pair: Pair, what: OneShot | SetMode) -> None:
@@ -338,8 +338,8 @@ def pi_lone_hash(pair: Pair) -> None:
 def pi_hang_up(pair: Pair) -> None:
     """No gateway at this end can prevent it, so it says what is so. What it can: close only after a stop."""
     driving(pair)
-    pair.control.shutdown(pair.now)
-    pair.until(lambda: pair.control.finished, 3.0)
+    pair.control.shut_down(pair.now)
+    pair.until(lambda: pair.control.stops.finished, 3.0)
     pair.lose("closed")
     pair.run(SETTLED_S, linked=False)
     assert not pair.car.alive
@@ -351,7 +351,7 @@ def pi_hang_up(pair: Pair) -> None:
     cut_off.run(2.0, linked=False)
     assert not cut_off.car.alive
     assert cut_off.car.truth.driving
-    assert cut_off.control.motors == "unknown"
+    assert cut_off.control.model.motors == "unknown"
     answer = cut_off.ask(Stop(), verb="stop")
     assert answer.reason is Reason.LINK_DOWN
     assert "cannot be reached: connection refused" in answer.words

@@ -54,15 +54,15 @@ def test_a_car_that_is_not_heard_may_be_moving_and_is_stopped_when_it_is_heard_a
     pair.ask(FORWARD)
     pair.run(0.2)
     wire.stuck = True
-    took = pair.until(lambda: pair.control.motors == "unknown", 6.0)
+    took = pair.until(lambda: pair.control.model.motors == "unknown", 6.0)
     assert took > 1.9, "the silence that a report without echo explains is none"
     pair.run(5.0)
     assert pair.car.truth.motor_left, "its stop is in the wire"
-    assert pair.control.motors == "unknown"
+    assert pair.control.model.motors == "unknown"
     pair.ask(Drive(Motion.BACK, 0.5))  # also this is kept by the wire, with its stops, and arrives with them
     pair.run(3.0)
     wire.free()
-    pair.until(lambda: pair.control.motors == "off", 12.0)
+    pair.until(lambda: pair.control.model.motors == "off", 12.0)
     assert not pair.car.truth.motor_left
     codes = [log.code for log in pair.logs]
     assert codes.index("recovered") > codes.index("answers_again") > codes.index("unheard"), "no claim before it"
@@ -76,7 +76,7 @@ def test_a_car_that_is_driven_on_is_not_thought_to_be_heard() -> None:
     for number in range(20):
         pair.ask(Drive((Motion.FORWARD, Motion.BACK)[number % 2], 0.5))
         pair.run(0.25)
-    assert pair.control.motors == "unknown"
+    assert pair.control.model.motors == "unknown"
     assert "unheard" in [log.code for log in pair.logs]
     assert pair.ask(Drive(Motion.FORWARD, 5.0)).reason is Reason.LINK_DOWN, "it would be kept by the wire"
 
@@ -90,7 +90,7 @@ def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
     pair.ask(FORWARD)
     pair.run(0.2)
     wire.stuck = True
-    pair.until(lambda: pair.control.motors == "unknown", 6.0)
+    pair.until(lambda: pair.control.model.motors == "unknown", 6.0)
     answer = pair.ask(Stop(), identity="stop")
     assert "was not heard for" in answer.words
     pair.until(lambda: pair.last_of("stop") is not None, ENDS_S)
@@ -106,7 +106,7 @@ def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
     assert last is not None
     assert (last.phase, last.basis) == ends
     assert not pair.car.truth.motor_left
-    assert pair.control.motors == "off"
+    assert pair.control.model.motors == "off"
 
 
 def test_a_stop_in_obstacle_avoidance_takes_its_time_and_is_no_silence() -> None:
@@ -115,7 +115,7 @@ def test_a_stop_in_obstacle_avoidance_takes_its_time_and_is_no_silence() -> None
     pair.run(8.0)
     for _ in range(10):
         pair.ask(Stop())
-        pair.until(lambda: pair.control.motors == "off", 8.0)
+        pair.until(lambda: pair.control.model.motors == "off", 8.0)
         pair.run(6.0)
         pair.ask(SetMode(Mode.OBSTACLE_AVOIDANCE))
         pair.run(8.7)
@@ -176,12 +176,12 @@ def test_a_stop_that_is_lost_on_the_way_is_never_said_to_be_complete_and_goes_on
         assert (last.phase, last.reason) == (Phase.FAILED, Reason.NOT_SHOWN)
         codes = [log.code for log in pair.logs]
         assert codes.count("not_obeyed") == codes.count("not_shown") == 1, "said once"
-        assert (pair.control.motors, pair.control.basis) == ("unknown", None)
+        assert (pair.control.model.motors, pair.control.model.basis) == ("unknown", None)
         assert pair.control.model.trust.state is CarTrust.UNPROVEN
         assert pair.control.lost_frames
         pair.car.feed = hears  # type: ignore[method-assign]
-        pair.until(lambda pair=pair: pair.control.motors == "off", 20.0)
-        assert pair.control.basis == Basis.SHOWN
+        pair.until(lambda pair=pair: pair.control.model.motors == "off", 20.0)
+        assert pair.control.model.basis == Basis.SHOWN
         assert not pair.car.truth.motor_left, "stopped when it hears again, without being asked"
         assert pair.logs[-1].code in ("hears", "recovered")
 
@@ -214,7 +214,7 @@ def test_a_deaf_car_that_somebody_drives_all_the_same_is_stopped_again_and_never
         last = pair.last_of(f"stop{number}")
         assert last is not None
         assert last.phase is Phase.FAILED
-        assert pair.control.basis != Basis.SHOWN
+        assert pair.control.model.basis != Basis.SHOWN
     assert not pair.shown_at
 
 
@@ -224,10 +224,10 @@ def test_a_car_that_was_doubted_for_no_reason_is_known_to_hear_before_anybody_as
     deaf(pair)
     pair.connect()
     pair.until(lambda: "not_obeyed" in [log.code for log in pair.logs], 20.0)
-    assert pair.control.motors == "unknown"
+    assert pair.control.model.motors == "unknown"
     pair.car.feed = hears  # type: ignore[method-assign]
-    pair.until(lambda: pair.control.motors == "off", 15.0)
-    assert pair.control.basis == Basis.SHOWN
+    pair.until(lambda: pair.control.model.motors == "off", 15.0)
+    assert pair.control.model.basis == Basis.SHOWN
     assert {"not_obeyed", "hears"} <= {log.code for log in pair.logs}
 
 
@@ -244,11 +244,11 @@ def test_a_slow_link_is_no_deaf_one(delay_s: float) -> None:
         pair.ask(Stop(), identity=f"stop{number}")
         pair.until(lambda number=number: pair.last_of(f"stop{number}") is not None, ENDS_S)
         assert pair.phases(f"stop{number}")[-1] is Phase.COMPLETE
-        assert pair.control.basis == Basis.SHOWN
+        assert pair.control.model.basis == Basis.SHOWN
         assert not pair.car.truth.motor_left
         pair.run(2.0 * moments.random())
     assert pair.control.lost_frames == 0
-    assert pair.control.motors == "off"
+    assert pair.control.model.motors == "off"
 
 
 @pytest.mark.parametrize("world", [World.room, World.open_field], ids=["echo", "no-echo"])

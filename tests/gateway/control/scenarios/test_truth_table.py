@@ -42,18 +42,18 @@ def modes(row: Row) -> tuple[Mode, Mode]:
 
 def contradicted(pair: Pair, row: Row, within: str, since: float) -> None:
     """It is contradicted in time, and by what the table says."""
-    pair.until(lambda: pair.control.mode.verdict is Verdict.CONTRADICTED, LONG_S)
-    assert pair.now - since <= float(row[within]), pair.control.mode
-    assert any(words in pair.control.mode.evidence for words in BY[row["by"]]), pair.control.mode.evidence
+    pair.until(lambda: pair.control.model.mode.verdict is Verdict.CONTRADICTED, LONG_S)
+    assert pair.now - since <= float(row[within]), pair.control.model.mode
+    assert any(words in pair.control.model.mode.evidence for words in BY[row["by"]]), pair.control.model.mode.evidence
     assert pair.logs[-1].code in ("mode_contradicted", "unheard")
 
 
 def never(pair: Pair, row: Row) -> None:
     """What cannot be told apart stays assumed, and the candidates say so."""
     pair.run(LONG_S)
-    assert pair.control.mode.verdict is Verdict(row["verdict"]) is Verdict.ASSUMED
-    assert set(modes(row)) <= set(pair.control.mode.candidates)
-    assert pair.control.mode.inferred is None
+    assert pair.control.model.mode.verdict is Verdict(row["verdict"]) is Verdict.ASSUMED
+    assert set(modes(row)) <= set(pair.control.model.mode.candidates)
+    assert pair.control.model.mode.inferred is None
 
 
 def test_the_table_has_every_pair_and_says_what_cannot_be_known() -> None:
@@ -72,21 +72,23 @@ def test_the_table_has_every_pair_and_says_what_cannot_be_known() -> None:
 def test_another_writer_brings_the_car_to_another_mode(row: Row, world: str, platform: str) -> None:
     asked, true = modes(row)
     pair = car_in(asked, world, seed=TABLE.index(row), platform=platform)
-    assert pair.control.mode.verdict is (Verdict.CONFIRMED if asked in TALKING else Verdict.ASSUMED)
+    assert pair.control.model.mode.verdict is (Verdict.CONFIRMED if asked in TALKING else Verdict.ASSUMED)
     if asked is not true:
         pair.car.feed(frame_of(true), pair.now)
         if asked is Mode.OBSTACLE_AVOIDANCE and world == "no-echo":
             pair.run(LONG_S)
-            assert pair.car.truth.mode is asked, "docs/reference/protocol.md#blocking-times: deaf without an echo"
-            assert pair.control.mode.verdict is Verdict.ASSUMED
+            assert pair.car.truth.mode is asked, (
+                "docs/reference/protocol.md#blocking-times: with no echo at all it is deaf for ever"
+            )
+            assert pair.control.model.mode.verdict is Verdict.ASSUMED
             return
         pair.until(lambda: pair.car.truth.mode is true, 6.0)
     if row["verdict"] == "contradicted":
         contradicted(pair, row, "within_s", pair.now)
     elif asked in TALKING:
         pair.run(LONG_S)
-        assert pair.control.mode.confirmed is asked
-        assert pair.control.mode.candidates == (asked,)
+        assert pair.control.model.mode.confirmed is asked
+        assert pair.control.model.mode.candidates == (asked,)
     else:
         never(pair, row)
 
@@ -99,7 +101,7 @@ def test_a_reset_brings_the_car_to_mode_0(row: Row, world: str) -> None:
     pair.car.brown_out(pair.now)
     if asked is Mode.MANUAL:
         pair.run(LONG_S)
-        assert pair.control.mode.confirmed is Mode.MANUAL, "a reset in mode 0 cannot be seen"
+        assert pair.control.model.mode.confirmed is Mode.MANUAL, "a reset in mode 0 cannot be seen"
     else:
         contradicted(pair, row, "within_s", pair.now)
 
@@ -127,13 +129,13 @@ def told_again(pair: Pair, world: str) -> None:
     """Silence contradicts no stop that goes on: the car is told again, and until then nothing is claimed."""
     true, end = pair.car.truth.mode, pair.now + LONG_S
     while pair.car.truth.mode is true and pair.now < end:
-        assert pair.control.mode.verdict is not Verdict.CONFIRMED
-        assert pair.control.motors in ("stopping", "unknown")
+        assert pair.control.model.mode.verdict is not Verdict.CONFIRMED
+        assert pair.control.model.motors in ("stopping", "unknown")
         pair.run(0.01)
     if true is Mode.OBSTACLE_AVOIDANCE and world == "no-echo":
         assert pair.car.truth.mode is true, "docs/reference/protocol.md#blocking-times: deaf without an echo"
         return
-    pair.until(lambda: pair.control.mode.confirmed is Mode.MANUAL, LONG_S)
+    pair.until(lambda: pair.control.model.mode.confirmed is Mode.MANUAL, LONG_S)
     assert pair.car.truth.mode is Mode.MANUAL
 
 
@@ -153,9 +155,9 @@ def test_a_mode_that_is_so_is_confirmed(row: Row, before: Mode, world: str) -> N
     asked, _ = modes(row)
     pair = car_in(before, world, seed=TABLE.index(row))
     pair.ask(SetMode(asked))
-    pair.until(lambda: pair.control.mode.asked is asked, 6.0)
+    pair.until(lambda: pair.control.model.mode.asked is asked, 6.0)
     asked_at = pair.now
-    pair.until(lambda: pair.control.mode.confirmed is asked, LONG_S)
+    pair.until(lambda: pair.control.model.mode.confirmed is asked, LONG_S)
     assert pair.now - asked_at <= float(row["asked_s"])
     assert not [log for log in pair.logs if log.code in ("mode_contradicted", "unheard")]
 
@@ -166,10 +168,10 @@ def test_a_raspberry_pi_car_knows_mode_0_only(world: str) -> None:
     for mode in Mode:
         pair.car.feed(frame_of(mode), pair.now)
         pair.run(5.0)
-        assert pair.car.truth.mode is pair.control.mode.confirmed is Mode.MANUAL
+        assert pair.car.truth.mode is pair.control.model.mode.confirmed is Mode.MANUAL
     pair.car.feed(b"$1#", pair.now)  # shorter than its nine fields: the program dies
     pair.until(lambda: not pair.car.alive, 2.0)
-    took = pair.until(lambda: pair.control.mode.verdict is Verdict.CONTRADICTED, 4.0)
+    took = pair.until(lambda: pair.control.model.mode.verdict is Verdict.CONTRADICTED, 4.0)
     assert took <= 3.2
-    assert "its program has ended" in pair.control.mode.evidence
-    assert pair.control.mode.candidates == ()
+    assert "its program has ended" in pair.control.model.mode.evidence
+    assert pair.control.model.mode.candidates == ()

@@ -42,7 +42,7 @@ class Source:
         self.pair = pair
         self.sent: deque[Sent] = deque(maxlen=400)
         self.published: list[tuple[Sensors, frozenset[str], tuple[bool, bool] | None]] = []
-        send, heard = pair.car._send, pair.control.heard
+        send, heard = pair.car._send, pair.control.on_event
         seen: dict[str, Any] = {name: self._noted(name) for name in ("obstacle", "line", "light")}
 
         def noting(data: bytes) -> None:
@@ -52,13 +52,13 @@ class Source:
 
         def publishing(event: Event, now: float) -> None:
             if isinstance(event, Sensors):
-                profile, confirmed = pair.control.profile, pair.control.mode.confirmed
+                profile, confirmed = pair.control.model.profile, pair.control.model.mode.confirmed
                 published = profile.measured(event, confirmed), profile.obstacle(event, confirmed)
                 self.published.append((event, *published))
             heard(event, now)
 
         pair.car._send = noting  # type: ignore[method-assign]  # where a frame leaves the program
-        pair.control.heard = publishing  # type: ignore[method-assign]  # where car.py publishes it
+        pair.control.on_event = publishing  # type: ignore[method-assign]  # where car.py publishes it
 
     def _noted(self, name: str) -> deque[Any]:
         """What the program has read of one sensor last."""
@@ -79,7 +79,7 @@ class Source:
 
     def check(self) -> None:
         """Nothing but what was measured was published, with the sense that it has."""
-        constants = {"battery", "grayscale"} if self.pair.control.profile.kind == "raspberry_pi" else set()
+        constants = {"battery", "grayscale"} if self.pair.control.model.profile.kind == "raspberry_pi" else set()
         for event, measured, obstacle in self.published:
             sent = self.origin(event)
             assert measured <= MEASURED[sent.mode] - constants, (event.raw, sent.mode)

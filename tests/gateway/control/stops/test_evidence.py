@@ -52,7 +52,7 @@ class EvidenceWatch:
 
     def reports(self, *times: float, frame: bytes = ECHO) -> list[Finding]:
         """Hear reports of mode 0."""
-        return [self.evidence.reading(event(frame, at)) for at in times]
+        return [self.evidence.on_reading(event(frame, at)) for at in times]
 
     def closed(self, at: float, *, awake: bool = True) -> None:
         """`MODE00` is written."""
@@ -163,10 +163,10 @@ def test_damaged_bytes_begin_anew(when: str) -> None:
     watch = EvidenceWatch()
     watch.reports(10.0)
     if when == "before":
-        watch.evidence.noise(10.2)
+        watch.evidence.on_noise(10.2)
     watch.closed(10.5)
     if when == "within":
-        watch.evidence.noise(10.9)
+        watch.evidence.on_noise(10.9)
     assert watch.reports(11.95)[-1] not in (PAUSE, SHOWN)
 
 
@@ -182,7 +182,7 @@ def test_a_loop_that_slept_has_perhaps_taken_reports_late() -> None:
     assert watch.pause(10.0) is PAUSE
     watch.reports(12.95)
     watch.closed(13.4)
-    watch.evidence.stalled()
+    watch.evidence.reset_times()
     assert watch.reports(14.9) == [REPORT]
 
 
@@ -216,7 +216,7 @@ def tracking(until: float) -> EvidenceWatch:
     watch = EvidenceWatch()
     watch.evidence.opened(Mode.TRACKING, 0.0, silent=False, shown=True)
     for number in range(40):
-        assert watch.evidence.reading(event(TRACKING, until - 2.0 + 0.05 * number)) is NOTHING
+        assert watch.evidence.on_reading(event(TRACKING, until - 2.0 + 0.05 * number)) is NOTHING
     return watch
 
 
@@ -270,14 +270,14 @@ def test_the_shape_of_the_mode_long_after_mode00_shows_the_opposite() -> None:
     watch = tracking(10.0)
     watch.closed(10.0)
     for number in range(30):
-        watch.evidence.reading(event(TRACKING, 10.0 + 0.05 * number))
+        watch.evidence.on_reading(event(TRACKING, 10.0 + 0.05 * number))
     assert watch.reports(12.3)[-1] is not SHOWN
 
 
 def test_one_damaged_reading_is_no_mode_that_was_seen() -> None:
     watch = EvidenceWatch()
     watch.evidence.opened(Mode.TRACKING, 0.0, silent=False, shown=True)
-    watch.evidence.reading(event(TRACKING, 9.0))
+    watch.evidence.on_reading(event(TRACKING, 9.0))
     watch.closed(10.0)
     assert watch.reports(11.95)[-1] is not SHOWN
 
@@ -358,7 +358,7 @@ def test_a_row_of_the_table(case: StopCase, situation: Callable[[], Pair], words
     shown = case in (StopCase.LEFT_SHAPE, StopCase.LEFT_SILENT, StopCase.MANUAL)
     assert (phase, basis) == ((Phase.COMPLETE, Basis.SHOWN) if shown else (Phase.SENT, Basis.SENT))
     assert words in said
-    assert (pair.control.motors, pair.control.basis) == ("off", basis)
+    assert (pair.control.model.motors, pair.control.model.basis) == ("off", basis)
     assert bool(EVIDENCE[case].shown_by) == shown or case is StopCase.UNKNOWN_PLATFORM
     assert not pair.car.truth.driving
     assert shown or pair.control.model.rest is case
@@ -368,16 +368,16 @@ def test_a_soft_stop_shows_nothing() -> None:
     """The row `soft`: the drive's own end is complete, and the rest after it is only sent."""
     pair = driven()
     assert ended(pair, Drive(Motion.STOP)) == (Phase.SENT, Basis.SENT, EVIDENCE[StopCase.SOFT].words)
-    assert (pair.control.motors, pair.control.basis) == ("off", Basis.SENT)
+    assert (pair.control.model.motors, pair.control.model.basis) == ("off", Basis.SENT)
     assert pair.control.model.rest is StopCase.SOFT
 
 
 def test_a_frame_at_a_rest_that_was_shown_leaves_it_only_sent() -> None:
     """The row `acted`."""
     pair = Pair(start_s=2.0).ready()
-    assert pair.control.basis == Basis.SHOWN
+    assert pair.control.model.basis == Basis.SHOWN
     pair.ask(Fan())
-    assert (pair.control.motors, pair.control.basis) == ("off", Basis.SENT)
+    assert (pair.control.model.motors, pair.control.model.basis) == ("off", Basis.SENT)
     assert pair.control.model.rest is StopCase.ACTED
 
 
@@ -395,7 +395,7 @@ def test_line_ends_between_reports_hide_no_pause(monkeypatch: pytest.MonkeyPatch
 
     def hear_a_line(frame: bytes = b"") -> None:
         hear(frame)
-        desk.control.heard(Rejected(b"\r\n", desk.now, Cause.NO_START), desk.now)
+        desk.control.on_event(Rejected(b"\r\n", desk.now, Cause.NO_START), desk.now)
 
     monkeypatch.setattr(desk, "hear", hear_a_line)
     desk.ask(Drive(Motion.FORWARD, 5.0))

@@ -81,8 +81,8 @@ def test_avoiding_without_an_echo_the_car_is_deaf_with_its_motors_braked() -> No
         asked_at = pair.now
         pair.run(20.0)
         assert pair.off_for_good_at() < asked_at
-        assert pair.car.truth.mode is AVOIDANCE, "docs/reference/protocol.md#blocking-times: forever"
-        assert pair.control.motors == "unknown", "it is not heard"
+        assert pair.car.truth.mode is AVOIDANCE, "docs/reference/protocol.md#blocking-times: for ever"
+        assert pair.control.model.motors == "unknown", "it is not heard"
 
 
 @pytest.mark.xfail(reason="docs/reference/protocol.md#hazards: no frame of recovery clears this string")
@@ -101,7 +101,7 @@ def test_recovery_of_a_car_that_wakes_in_one_millisecond_of_it() -> None:
     pair.run(wakes_at - 0.05 - 0.0016 - pair.now, linked=False)
     pair.connect()
     pair.run(20.0)
-    assert pair.control.motors == "off"
+    assert pair.control.model.motors == "off"
     assert pair.off_for_good_at() < pair.now
 
 
@@ -119,7 +119,7 @@ def test_a_drive_that_is_over_stops_the_car_softly(platform: str, world: Callabl
         pair.run(6.0)
         assert pair.off_for_good_at() <= asked_at + 0.7 + bound, f"seed {seed}"
         assert pair.phases("drive") == [Phase.ASKED, Phase.QUEUED, Phase.SENT, Phase.COMPLETE]
-        assert (pair.control.motors, pair.control.basis) == ("off", Basis.SENT), "a soft stop shows nothing"
+        assert (pair.control.model.motors, pair.control.model.basis) == ("off", Basis.SENT), "a soft stop shows nothing"
         assert not any(b"MODE" in data for at, data in pair.sent if at > asked_at), (
             "a soft stop keeps the car in mode 0"
         )
@@ -197,14 +197,14 @@ def test_every_recipe_ends_alone_in_the_buffer() -> None:
     for situation in situations():
         for recipe in (stopping.full(situation), stopping.soft(situation)):
             last = recipe.steps[-1]
-            assert last.after_s >= sequences.REPEAT_S - 1e-9 or last.gate is sequences.Gate.ALONE, recipe
+            assert last.after_s >= sequences.REPEAT_INTERVAL_S - 1e-9 or last.gate is sequences.Gate.ALONE, recipe
 
 
 def test_what_is_announced_is_never_less_than_what_is_waited_for() -> None:
     for each in situations():
         for ago_s in (0.0, 0.05, 0.3, 1.0, 2.0, 9.0):
             pacing = Pacing(each.profile)
-            pacing.wrote(sequences.SOFT.steps[0].frame, 100.0 - ago_s)
+            pacing.on_written(sequences.SOFT.steps[0].frame, 100.0 - ago_s)
             situation = replace(each, clear=pacing.clear_at(100.0), blocked=False)
             for recipe in (stopping.full(situation), stopping.soft(situation)):
                 worst_s = stopping.worst_s(recipe, situation, pacing, 100.0)

@@ -1,0 +1,43 @@
+"""Measures CPU, memory and uptime of the gateway's process."""
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from schemas.gen import fleet_v1_pb2 as pb
+
+_STATM: Final = Path("/proc/self/statm")
+
+
+class ProcessStats:
+    """CPU, memory and uptime of this process."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+        self._cpu_s = time.process_time()
+        self._at = self._started
+
+    def fill(self, message: pb.Health, now: float) -> None:
+        """Fill in pid, uptime, CPU share since the last call, and memory."""
+        cpu_s = time.process_time()
+        message.pid = os.getpid()
+        message.uptime_s = now - self._started
+        message.cpu = (cpu_s - self._cpu_s) / max(now - self._at, 1e-3)
+        message.rss_mb = _rss_mb()
+        self._cpu_s, self._at = cpu_s, now
+
+
+def _rss_mb() -> float:
+    try:
+        pages = int(_STATM.read_bytes().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except FileNotFoundError:
+        pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3

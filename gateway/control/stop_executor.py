@@ -1,0 +1,326 @@
+"""Carries out the stops of one car: sends each again until the car shows it, or cannot show it. Pure.
+
+`Executor` writes the frames. `CarMonitor` reports what the car's readings show.
+"""
+
+from typing import Final
+
+from gateway.control.car_model import CarModel
+from gateway.control.command_log import CommandLog, Pending
+from gateway.control.commands import Phase, Reason, SetMode
+from gateway.control.estimate.trust import STOP_GOES_ON, Basis, CarTrust, TrustEvent
+from gateway.control.events import FrameOrigin, Level
+from gateway.control.pacing import FLIGHT_S
+from gateway.control.stop_renewal import StopRenewal
+from gateway.control.stops import sequences, stopping
+from gateway.control.stops.evidence import CLOSED_S, EVIDENCE, Finding, StopCase
+from gateway.control.stops.sequences import StopSequence
+from gateway.control.stops.stopping import StopInProgress
+from gateway.protocol.platforms import StopStyle
+
+SHUTDOWN_S: Final = 16.0
+"""Maximum time that a gateway that shuts down waits for its car to show the stop."""
+UNKNOWN_PROBES: Final = 2
+"""Maximum probes of a car of an unknown platform: a Raspberry Pi does not react to them."""
+RESETTING_STEPS: Final = 1
+"""Index of recovery's first `MODE00`. The frames up to it are written before a probe may replace the rest."""
+
+
+class StopExecutor:
+    """The stop in progress, if any, and the renewals after it."""
+
+    def __init__(self, model: CarModel, log: CommandLog) -> None:
+        self.model = model
+        self.running: StopInProgress | None = None
+        self.renewal = StopRenewal(model)
+        self.shutting_down = False
+        self.not_stopped = ""
+        """Why the gateway ends without a stop of the car; empty if the car is stopped."""
+        self._log = log
+        self._shutdown_until = float("inf")
+
+    # ------------------------------------------------------------------ begin
+
+    def soft(self, now: float) -> StopSequence:
+        """Return the stop that ends a drive."""
+        return stopping.soft(self.model.for_stop(now))
+
+    def full(self, now: float) -> StopSequence:
+        """Return the stop that `stop`, `estop` and a shutdown send."""
+        return stopping.full(self.model.for_stop(now))
+
+    def begin(self, sequence: StopSequence, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
+        """Begin a stop, or join the running one if that is no weaker."""
+        model = self.model
+        model.believed.repeat = False
+        joining = [pending] if pending is not None else []
+        running = self.running
+        if running is None or running.sequence.rank < sequence.rank or running.at_rest:
+            self._start(sequence, why, now, [*(running.commands if running is not None else ()), *joining])
+            return
+        running.commands.extend(joining)
+        if why is FrameOrigin.SHUTDOWN:
+            running.why = why
+        # A new command need not wait for the next try, but only after this silence the next frame is certain.
+        if pending is not None and running.frames_sent and now >= running.closed_at + sequences.RECOVERY_SILENCE_S:
+            running.begin_try(self.full(now), now)
+        if running.first_at is not None and pending is not None:
+            self._log.record_sent(pending, now, f"joined the {running.sequence.name} stop under way")
+
+    def begin_full(self, now: float) -> None:
+        """Begin a full stop, unless the link is down or the gateway shuts down."""
+        if self.model.link_open and not self.shutting_down:
+            self.begin(self.full(now), FrameOrigin.STOP, now)
+
+    def stop_again(self, now: float) -> None:
+        """Send general stops to a car that had shown that it stands, and is silent now."""
+        self._start(self.soft(now), FrameOrigin.RECOVERY, now, [])
+        assert self.running is not None
+        self.running.at_rest = True
+
+    def recover(self, now: float, words: str) -> None:
+        """Bring the car to a known state. Commands that wait for a running stop wait for this one."""
+        before = self.running
+        why, commands = (before.why, before.commands) if before is not None else (FrameOrigin.RECOVERY, [])
+        self.model.learn(TrustEvent.DOUBTED, now, words)
+        self.begin_recovery(why, now, commands)
+
+    def begin_recovery(self, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
+        """Begin the recovery sequence, in place of any running stop."""
+        self._start(stopping.recovery(self.model.for_stop(now)), why, now, commands)
+
+    def _start(self, sequence: StopSequence, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
+        model = self.model
+        worst_s = stopping.worst_s(sequence, model.for_stop(now), model.pacing, now)
+        timeout_s = min(worst_s, stopping.MAX_ANNOUNCED_WORST_S) + stopping.EVIDENCE_TIMEOUT_S
+        self.running = StopInProgress(
+            sequence, why, now, now, commands, worst_at=now + worst_s, timeout_s=timeout_s, case=self._case(sequence)
+        )
+        model.learn(TrustEvent.STOP_BEGUN, now, f"{sequence.name} stop ({why})")
+
+    def _case(self, sequence: StopSequence) -> StopCase:
+        """Return what this stop rests on if the car does not show it."""
+        style = self.model.stop_style
+        if style is StopStyle.RASPBERRY_PI:
+            return StopCase.RASPBERRY_PI
+        if sequence.rank == sequences.SOFT.rank:
+            return StopCase.SOFT
+        return StopCase.UNKNOWN_PLATFORM if style is StopStyle.UNKNOWN else StopCase.MANUAL
+
+    # ------------------------------------------------------------------ link, shutdown
+
+    def link_down(self, reason: str, now: float, *, cause: Reason) -> None:
+        """Fail the commands of the running stop: the link is down."""
+        self.renewal.suspend()
+        running, self.running = self.running, None
+        for pending in running.commands if running else ():
+            self._log.record(pending, Phase.FAILED, now, reason=cause, words=reason)
+        if self.shutting_down and running is not None:
+            self._end_unstopped(f"cannot be reached ({reason})", now)
+
+    def shut_down(self, now: float) -> None:
+        """Stop the car for the last time."""
+        self.shutting_down = True
+        self._shutdown_until = now + SHUTDOWN_S
+        if not self.model.link_open:
+            self._end_unstopped(f"cannot be reached ({self.model.link_reason})", now)
+        elif not (self.model.at_rest and self.model.trust.shown) or self.running is not None:
+            self.begin(self.full(now), FrameOrigin.SHUTDOWN, now)
+
+    @property
+    def finished(self) -> bool:
+        """Return True after `shut_down` if the stop is over, or the car did not show it in time."""
+        return self.shutting_down and self.running is None
+
+    def is_shutdown_over(self, now: float) -> bool:
+        """Return True if the gateway waits no longer for the car to show the stop."""
+        return self.shutting_down and now >= self._shutdown_until
+
+    def give_up(self, running: StopInProgress, now: float) -> None:
+        """End without a stop that the car showed."""
+        self.running = None
+        self._end_unstopped("did not show that it stopped", now)
+        for pending in running.commands:
+            self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=self.not_stopped)
+
+    def _end_unstopped(self, why: str, now: float) -> None:
+        car = self.model.name
+        self.not_stopped = why
+        self._log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at it.", now)
+
+    # ------------------------------------------------------------------ tries
+
+    def is_step_due(self, running: StopInProgress, now: float) -> bool:
+        """Return True if the next frame of the stop is due. After the last frame, wait for evidence."""
+        if running.frames_sent:
+            self._await(running, now)
+            if self.running is not running or running.frames_sent:
+                return False
+        return now >= running.due_at(self.model.pacing)
+
+    def _await(self, running: StopInProgress, now: float) -> None:
+        """End a stop that the car cannot show. If the car can show it, and did not in time, send the stop again."""
+        case = self._ends_as_sent(running, now)
+        if case is not None:
+            self._finish(running, Basis.SENT, EVIDENCE[case].words.format(car=self.model.name), now, case)
+            return
+        if now >= max(running.next_try_at, self.model.pacing.flight_until):
+            self._try_again(running, now)
+
+    def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
+        """Return why the stop ends without evidence; None if the car may still show it."""
+        model = self.model
+        if running.at_rest or model.trust.state is CarTrust.UNHEARD:
+            return None
+        reported = running.report_at > running.last_at
+        is_time_up = now >= running.obeyed_at
+        if not running.frames_sent or not (is_time_up or reported):
+            return None
+        if running.case is StopCase.SOFT:
+            return StopCase.SOFT if is_time_up else None
+        if running.case is StopCase.RASPBERRY_PI:
+            has_report = running.report_at > running.try_at or running.sequence.rank == sequences.SOFT.rank
+            return StopCase.RASPBERRY_PI if is_time_up and has_report else None
+        if is_time_up and model.believed.fan and model.profile.fan_silences:
+            return StopCase.FAN
+        if running.no_echo_at > running.closed_at:
+            return StopCase.NO_ECHO
+        if running.case is StopCase.UNKNOWN_PLATFORM and reported and running.probes >= UNKNOWN_PROBES:
+            return StopCase.UNKNOWN_PLATFORM
+        return None
+
+    def _try_again(self, running: StopInProgress, now: float) -> None:
+        running.tries += 1
+        context = self.model.for_stop(now)
+        running.begin_try(stopping.soft(context) if running.at_rest else stopping.recovery(context), now)
+        self.model.evidence.tried_again()
+
+    def fail_late(self, running: StopInProgress, now: float) -> None:
+        """Fail the commands that have waited too long for evidence. The stop goes on."""
+        car = self.model.name
+        words = f"{car} has not shown that it stopped. The gateway goes on stopping it. Look whether it moves."
+        waiting: list[Pending] = []
+        for pending in running.commands:
+            if now < pending.received_at + running.timeout_s:
+                waiting.append(pending)
+            else:
+                self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
+        running.commands[:] = waiting
+        if now >= running.gives_up_at and not running.overdue:
+            running.overdue = True
+            if self.model.mode.heard_at > running.began_at:
+                self.model.learn(TrustEvent.NOT_SHOWN, now)
+                self._log.log(Level.ERROR, "not_shown", words, now)
+            elif self.model.trust.state is not CarTrust.UNHEARD:
+                words = f"{car} was not heard since the stop began. The gateway goes on stopping it."
+                self.model.learn(TrustEvent.SILENT, now, words)
+                self._log.log(Level.WARNING, "unheard", words, now)
+
+    def give_way(self, now: float) -> None:
+        """End an overdue stop: a new drive takes its place."""
+        running, self.running = self.running, None
+        words = f"{self.model.name} was driven before it showed that it stopped"
+        for pending in running.commands if running is not None else ():
+            self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
+
+    # ------------------------------------------------------------------ evidence
+
+    def on_finding(self, finding: Finding, at: float, now: float) -> None:
+        """Apply what a reading of mode 0 shows to the running stop."""
+        running = self.running
+        if running is None or running.first_at is None:
+            return
+        if finding is not Finding.NOTHING and at > running.closed_at + FLIGHT_S and at > running.first_at + FLIGHT_S:
+            running.report_at = at
+        match finding:
+            case Finding.SHOWN:
+                self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
+            case Finding.NO_ECHO if at > running.closed_at + CLOSED_S:
+                running.without_echo += 1
+                if max(running.without_echo, self.model.evidence.without_echo) >= 2:
+                    running.no_echo_at = at
+            case Finding.LOST:
+                self._handle_loss(running, now)
+            case _:
+                pass
+        if self.running is running and running.frames_sent:
+            self._await(running, now)
+        if self.running is running and finding in (Finding.REPORT, Finding.PAUSE) and self._may_probe(running):
+            running.probes += 1
+            running.begin_try(sequences.PROBE, now)
+
+    def on_contact(self, now: float, words: str) -> None:
+        """Stop a car that reports again after a silence: frames of that time may be lost, or arrive all at once."""
+        running = self.running
+        if running is not None and running.at_rest:
+            self.recover(now, words)
+        elif running is not None:
+            self._try_again(running, now)
+
+    def _may_probe(self, running: StopInProgress) -> bool:
+        """Return True if the car could react to a `MODE00` now."""
+        if running.case is StopCase.SOFT or running.case is StopCase.RASPBERRY_PI:
+            return False
+        if running.case is StopCase.UNKNOWN_PLATFORM:
+            return running.frames_sent and running.probes < UNKNOWN_PROBES
+        # First the `#` that ends half a frame: `MODE00` behind one would open a mode.
+        return running.sequence is not sequences.RECOVERY or running.index > RESETTING_STEPS
+
+    def _handle_loss(self, running: StopInProgress, now: float) -> None:
+        """Send the stop again at once: the reports came on as before. Those of a Raspberry Pi always do."""
+        running.probes += 1
+        unknown = running.case is StopCase.UNKNOWN_PLATFORM
+        if not unknown and running.tries == 1 and (running.frames_sent or running.sequence is sequences.PROBE):
+            self._try_again(running, now)
+
+    def _finish(
+        self, running: StopInProgress, basis: Basis, words: str, now: float, case: StopCase = StopCase.MANUAL
+    ) -> None:
+        """End the stop: the car showed it, or cannot show it."""
+        model, shown = self.model, basis is Basis.SHOWN
+        self.running = None
+        recovered = model.trust.state in STOP_GOES_ON and not model.known
+        model.rest = case
+        self.renewal.left_mode = model.left_at >= running.began_at
+        model.learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
+        if recovered:
+            how = "shown" if shown else f"sent: {words}"
+            known = f"{model.name} is in a known state: stopped ({how}), mode manual"
+            self._log.log(Level.INFO, "recovered", known, now)
+        if not shown:
+            self.renewal.restart(now)
+        phase, reason, evidence = (Phase.COMPLETE, "", (words,)) if shown else (Phase.SENT, words, ())
+        for pending in running.commands:
+            if not isinstance(pending.command.what, SetMode):
+                self._log.record(pending, phase, now, words=reason, evidence=evidence, basis=basis)
+
+    # ------------------------------------------------------------------ times
+
+    def deadlines(self, running: StopInProgress, now: float) -> list[float]:
+        """Return when the running stop needs attention."""
+        times = [pending.received_at + running.timeout_s for pending in running.commands]
+        if running.frames_sent:
+            times.append(max(running.next_try_at, self.model.pacing.flight_until))
+            if running.obeyed_at > now:
+                times.append(running.obeyed_at)
+        else:
+            times.append(running.due_at(self.model.pacing))
+        if not running.overdue:
+            times.append(running.gives_up_at)
+        if self.shutting_down:
+            times.append(self._shutdown_until)
+        return times
+
+    def worst_s(self, now: float) -> float:
+        """Return the longest time until the motors are off if a stop is requested now and its frames arrive."""
+        sequence, running = self.full(now), self.running
+        if running is not None and running.sequence.rank >= sequence.rank:
+            return running.worst_s(now)
+        return stopping.worst_s(sequence, self.model.for_stop(now), self.model.pacing, now)
+
+    def free_at(self, now: float) -> float:
+        """Return when the car can take a motion, as far as that is known."""
+        running, ready_at = self.running, self.model.ready_at
+        if running is None or running.overdue or running.sequence.rank == sequences.SOFT.rank:
+            return ready_at
+        return max(running.over_at(self.model.pacing, now), ready_at)
