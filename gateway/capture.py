@@ -1,6 +1,6 @@
-"""A file of raw bytes with their times: what `gateway monitor --raw` keeps, and looks at again. One JSON object a line.
+"""Capture files of `gateway monitor --raw`: raw bytes with their times, one JSON object per line.
 
-The first line says what the file is; every other one has `t` (seconds since the start) and `rx` (bytes as Latin-1).
+The first line describes the file. Every other line has `t` (seconds since the start) and `rx` (bytes as Latin-1).
 """
 
 import json
@@ -12,26 +12,26 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 FORMAT: Final = "zenoh-car-fleet raw 1"
-LINE_LIMIT: Final = 8 * 1024 * 1024
-"""A link hands out at most 1 MiB at once, and a byte takes at most 6 of JSON; no capture has a longer line."""
+# A link returns at most 1 MiB at once, and JSON needs at most 6 bytes for one.
+MAX_LINE_BYTES: Final = 8 * 1024 * 1024
 
 
 class BadCapture(ValueError):
-    """A file that is no capture; its text names the file, the line and what is wrong."""
+    """A file that is no capture. The message names the file, the line and the fault."""
 
 
 @dataclass(frozen=True, slots=True)
 class CapturedBytes:
-    """Bytes as they came; `at`: seconds since the start of the capture, kept to the microsecond."""
+    """Bytes as they arrived. `at`: seconds since the start of the capture; the file has microseconds."""
 
     at: float
     data: bytes
 
 
 class CaptureWriter:
-    """Appends pieces to a new file; each is handed to the system at once, so that a killed monitor loses nothing.
+    """Appends pieces to a new file and flushes each one, so that a killed monitor loses nothing.
 
-    Raises OSError, FileExistsError among them: a capture is never written over.
+    Raises OSError; FileExistsError if the file exists, as a capture is never overwritten.
     """
 
     def __init__(self, path: Path, link: str, started: str) -> None:
@@ -40,7 +40,7 @@ class CaptureWriter:
         self._line({"format": FORMAT, "link": link, "started": started})
 
     def add(self, piece: CapturedBytes) -> None:
-        """Keep one piece."""
+        """Write one piece."""
         self._line({"t": round(piece.at, 6), "rx": piece.data.decode("latin-1")})
 
     def close(self) -> None:
@@ -48,7 +48,7 @@ class CaptureWriter:
         self._file.close()
 
     def discard(self) -> None:
-        """Close the file and remove it: nothing will come."""
+        """Close the empty file and remove it."""
         self.close()
         self.path.unlink(missing_ok=True)
 
@@ -58,21 +58,21 @@ class CaptureWriter:
 
 
 def read(path: Path) -> Iterator[CapturedBytes]:
-    """The pieces of a capture, in order; a last line that was cut is left out. Raises BadCapture and OSError."""
+    """Yield the pieces of a capture in order, without a truncated last line; raise BadCapture and OSError."""
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISFIFO(mode)):
         kind = "directory" if stat.S_ISDIR(mode) else "device"
         raise BadCapture(f"{path}: this is a {kind}, not a file that `gateway monitor --raw` kept")
     with path.open("rb") as file:
-        first = file.readline(LINE_LIMIT)
+        first = file.readline(MAX_LINE_BYTES)
         if not first:
             raise BadCapture(f"{path}: the file is empty, not one that `gateway monitor --raw` kept")
         if _parse(path, 1, first).get("format") != FORMAT:
             raise BadCapture(f"{path}: not a file that `gateway monitor --raw` kept: its first line is not {FORMAT!r}")
         number, last = 1, 0.0
-        while line := file.readline(LINE_LIMIT):
+        while line := file.readline(MAX_LINE_BYTES):
             number += 1
-            if not line.endswith(b"\n") and len(line) < LINE_LIMIT:
+            if not line.endswith(b"\n") and len(line) < MAX_LINE_BYTES:
                 return
             piece = _piece(path, number, _parse(path, number, line))
             if piece.at < last:

@@ -1,7 +1,6 @@
-"""The `gateway` command: the table of its subcommands, and `gateway run`.
+"""The `gateway` command: the table of its subcommands, and `gateway run`."""
 
-argparse, and everything else imported where it is used: `gateway run` is started a hundred times.
-"""
+# argparse and lazy imports keep the start short: a fleet starts `gateway run` a hundred times.
 
 import argparse
 import importlib
@@ -18,7 +17,7 @@ COMMANDS: Final = {
     "monitor": ("gateway.tools.monitor", "what a car says, decoded beside the raw bytes"),
     "send": ("gateway.tools.send", "one frame to a car on the desk, checked against the table"),
 }
-"""Subcommand: the module with its `add_arguments` and `run`, imported when it is called; its line in the help."""
+"""Subcommand: the module with its `add_arguments` and `run`, imported when called, and its line in the help."""
 
 _EPILOG: Final = "Exit codes: 0 done, 1 failed, 2 wrong use, 130 Ctrl-C."
 _RUN_EPILOG: Final = """\
@@ -30,24 +29,24 @@ Ctrl-C stops the car before the process ends."""
 
 
 def main() -> None:
-    """Entry point; exit code 2 for wrong use, 1 for a failure."""
+    """Run the command line. Exit codes: 1 failure, 2 wrong use."""
     stdio.complete()
     parser = argparse.ArgumentParser(
-        prog="gateway", description="One process per car: its bytes, keyed on the bus.", epilog=_EPILOG
+        prog="gateway", description="Connects one robot car to the Zenoh bus.", epilog=_EPILOG
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
-    others = {name: commands.add_parser(name, help=words) for name, (_, words) in COMMANDS.items()}
+    subparsers = {name: commands.add_parser(name, help=words) for name, (_, words) in COMMANDS.items()}
     called = sys.argv[1] if sys.argv[1:] else ""
     if called not in COMMANDS:
-        sys.exit(_run(_parsed(parser)))
+        sys.exit(_run(_parse_arguments(parser)))
     command = importlib.import_module(COMMANDS[called][0])
-    command.add_arguments(others[called])
-    sys.exit(command.run(_parsed(parser)))
+    command.add_arguments(subparsers[called])
+    sys.exit(command.run(_parse_arguments(parser)))
 
 
-def _parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Parse the command line; after a help that could not be written, say so and exit with 1."""
+def _parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Parse the command line. If the help cannot be written, print an error and exit with 1."""
     try:
         return parser.parse_args()
     except SystemExit:
@@ -112,12 +111,12 @@ def _run(arguments: argparse.Namespace) -> int:
     parent = os.getppid() if arguments.with_parent else None
     from gateway.bus.service import AlreadyServed, CarService
     from gateway.link import BadUrl, LinkError, parse_url
-    from gateway.protocol.platforms import parse_told
+    from gateway.protocol.platforms import parse_platform_option
     from schemas.bus import BadEndpoint, Bus, BusError
 
     try:
         car, fleet = check_name(arguments.car), check_name(arguments.fleet, "fleet name")
-        url, (profile, auto) = parse_url(arguments.link), parse_told(arguments.platform)
+        url, (profile, auto) = parse_url(arguments.link), parse_platform_option(arguments.platform)
     except (BadKey, BadUrl, ValueError) as error:
         return _failed(str(error), 2)
     longest_s, speed_max = arguments.longest_drive, arguments.speed_max
@@ -127,14 +126,14 @@ def _run(arguments: argparse.Namespace) -> int:
     if not 0 < speed_max <= 1:
         return _failed(f"--speed-max {speed_max:g}: allowed are more than 0 and at most 1, of full speed", 2)
     if not 0 < critical_v <= low_v <= 30:
-        words = (
+        message = (
             f"--battery-critical-v {critical_v:g}, --battery-low-v {low_v:g}: allowed are 0 < critical <= low <= 30 V"
         )
-        return _failed(words, 2)
+        return _failed(message, 2)
     try:
         with Bus.open(arguments.connect, start_hub=True) as opened:
-            doors = CarService(opened, fleet, car)
-            # The car is on the bus; what follows takes as long again to import.
+            service = CarService(opened, fleet, car)
+            # The car is on the bus now. The following imports take as long again.
             import asyncio
             import logging
             from pathlib import Path
@@ -163,18 +162,18 @@ def _run(arguments: argparse.Namespace) -> int:
                 longest_drive_s=longest_s,
                 parent=parent,
             )
-            stopped = asyncio.run(serve(settings, opened, doors))
+            stopped = asyncio.run(serve(settings, opened, service))
     except BadEndpoint as error:
         return _failed(str(error), 2)
     except (AlreadyServed, LinkError, BusError) as error:
         return _failed(str(error), 1)
-    except KeyboardInterrupt:  # a second one, after the car was stopped
+    except KeyboardInterrupt:  # a second Ctrl-C, after the car was stopped
         return startup.INTERRUPTED
     return 0 if stopped else 1
 
 
-def _failed(words: str, code: int) -> int:
-    sys.stderr.write(f"gateway: {words}\n")
+def _failed(message: str, code: int) -> int:
+    sys.stderr.write(f"gateway: {message}\n")
     return code
 
 

@@ -1,23 +1,24 @@
-"""The wall clock's time of moments of the loop's monotonic clock, in their order."""
+"""Converts times of the event loop's monotonic clock to wall-clock times, in order."""
 
 import time
 from collections.abc import Callable
 from typing import Final
 
-STEP_NS: Final = 2_000_000
-"""Less between the two clocks is left alone: a slewed wall clock may gain 0.5 ms a second, and is followed in steps."""
-CLOSE_NS: Final = 100_000
-"""Three looks at clocks take less, unless the process does not run in between: then it looks again."""
-TRIES: Final = 10
-"""So often at most; of machines on which it never runs undisturbed the best counts."""
+# A slewed wall clock may gain 0.5 ms per second: the offset follows it in steps.
+MIN_STEP_NS: Final = 2_000_000
+"""Minimum change of the offset between the clocks that is applied."""
+# Three readings of the clocks take less than this, unless the scheduler interrupts the process.
+MAX_ERROR_NS: Final = 100_000
+"""Maximum error of an undisturbed measurement. A larger error causes another attempt."""
+MAX_ATTEMPTS: Final = 10
+"""Maximum attempts. If the scheduler disturbs all of them, the best one counts."""
 
 
 class WallClock:
-    """One offset between the two clocks, kept until the wall clock is seen to have moved.
+    """Keeps one offset between the two clocks until the wall clock steps.
 
-    Two moments keep their order and their distance, whenever they are asked for. With an offset taken anew for each
-    they would not: a process that does not run between its looks at the two clocks would give an event a stamp before
-    that of an earlier one.
+    So two times keep their order and their distance, whenever they are converted. With a new offset for each event, a
+    process that is interrupted between reading the two clocks could stamp an event before an earlier one.
     """
 
     def __init__(
@@ -25,26 +26,26 @@ class WallClock:
     ) -> None:
         self._monotonic_ns = monotonic_ns
         self._wall_ns = wall_ns
-        self._offset_ns, _ = self._measured()
+        self._offset_ns, _ = self._measure_offset()
 
     def ns(self, at: float) -> int:
-        """Nanoseconds since the epoch at `at`, seconds of the monotonic clock."""
-        offset_ns, wrong_ns = self._measured()
-        if abs(offset_ns - self._offset_ns) > STEP_NS + wrong_ns:
+        """Return nanoseconds since the epoch. `at`: seconds of the monotonic clock."""
+        offset_ns, error_ns = self._measure_offset()
+        if abs(offset_ns - self._offset_ns) > MIN_STEP_NS + error_ns:
             self._offset_ns = offset_ns
         return self._offset_ns + int(at * 1e9)
 
-    def _measured(self) -> tuple[int, int]:
-        """The offset, and by how much it may be wrong: the wall clock is read between two looks at the other."""
-        best = self._once()
-        for _ in range(TRIES - 1):
-            if best[1] <= CLOSE_NS:
+    def _measure_offset(self) -> tuple[int, int]:
+        """Return the offset and its maximum error. Read the wall clock between two readings of the monotonic one."""
+        best = self._measure_once()
+        for _ in range(MAX_ATTEMPTS - 1):
+            if best[1] <= MAX_ERROR_NS:
                 break
-            best = min(best, self._once(), key=lambda found: found[1])
+            best = min(best, self._measure_once(), key=lambda found: found[1])
         return best
 
-    def _once(self) -> tuple[int, int]:
+    def _measure_once(self) -> tuple[int, int]:
         before = self._monotonic_ns()
         wall = self._wall_ns()
-        wrong_ns = (self._monotonic_ns() - before) // 2
-        return wall - before - wrong_ns, wrong_ns
+        error_ns = (self._monotonic_ns() - before) // 2
+        return wall - before - error_ns, error_ns

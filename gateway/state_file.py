@@ -1,4 +1,4 @@
-"""What survives a restart of the gateway, in one small JSON file a car: its hold, its e-stops and the ended ones."""
+"""Persists the safety state of one car (its hold, its e-stops, the ended ones) in a small JSON file."""
 
 import json
 import os
@@ -15,7 +15,7 @@ class SafetyStateFile:
         self.path = directory / f"{fleet}.{car}.json"
 
     def load(self, now_ns: int) -> PersistedSafety:
-        """What was in force; a file that cannot be read counts as a hold: better held than driven off."""
+        """Return the persisted state. A corrupted file counts as a hold, so that the car does not drive off."""
         try:
             text = self.path.read_text(encoding="utf-8")
         except FileNotFoundError:
@@ -23,21 +23,21 @@ class SafetyStateFile:
         except (OSError, UnicodeDecodeError) as error:
             return PersistedSafety(Hold(f"unreadable {self.path.name}: {error}", now_ns))
         try:
-            return _kept(json.loads(text), now_ns)
+            return _parse(json.loads(text), now_ns)
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
             return PersistedSafety(Hold(f"unreadable {self.path.name}", now_ns))
 
-    def save(self, kept: PersistedSafety) -> None:
-        """Write the file whole or not at all; raises OSError."""
+    def save(self, state: PersistedSafety) -> None:
+        """Replace the file atomically; raise OSError."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        hold = kept.hold
+        hold = state.hold
         content = {
             "hold": None if hold is None else {"by": hold.by, "since_ns": hold.since_ns},
             "estops": [
                 {"id": each.id, "by": each.by, "why": each.why, "at_ns": each.at_ns, "fleet_wide": each.fleet_wide}
-                for each in kept.estops
+                for each in state.estops
             ],
-            "ended": list(kept.ended),
+            "ended": list(state.ended),
         }
         scratch = self.path.with_suffix(".new")
         with scratch.open("w", encoding="utf-8") as file:
@@ -47,8 +47,8 @@ class SafetyStateFile:
         scratch.replace(self.path)
 
 
-def _kept(content: Any, now_ns: int) -> PersistedSafety:
-    """Raises what a wrong type or a missing name raises. A file of an earlier version has only the hold."""
+def _parse(content: Any, now_ns: int) -> PersistedSafety:
+    """Return the state in a file; raise ValueError, TypeError or KeyError. Older versions only have the hold."""
     hold = content["hold"]
     return PersistedSafety(
         None if hold is None else Hold(_text(hold["by"]), _past(hold["since_ns"], now_ns)),
@@ -64,10 +64,10 @@ def _estop(content: Any, now_ns: int) -> Estop:
 
 def _text(value: Any) -> str:
     text = str(value)
-    text.encode()  # JSON can say half a surrogate pair, a message cannot
+    text.encode()  # JSON can express half a surrogate pair, a protobuf message cannot
     return text
 
 
 def _past(value: Any, now_ns: int) -> int:
-    """A moment on the wall clock; a clock that was set back since makes none of the future."""
+    # If the clock was set back, a time in the future becomes now.
     return min(max(0, int(value)), now_ns)

@@ -30,8 +30,9 @@ from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import FleetFile
 from fleet.fleetfile.models import validate_link
 from fleet.fleetfile.scan import FoundLink
-from fleet.links import LinkKind, parse_link
+from fleet.links import may_be_same, parse_fleet_link
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from schemas.links import TcpUrl
 from schemas.process import signals
 from schemas.yaml_document.document import BadFile, read_text
 
@@ -85,8 +86,10 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
 
 
 def _unknown(found: FoundLink, fleet: FleetFile) -> bool:
-    link = parse_link(found.url)
-    return link.kind is not LinkKind.TCP and not any(link.may_be(parse_link(car.link)) for car in fleet.cars.values())
+    link = parse_fleet_link(found.url)
+    if isinstance(link, TcpUrl):
+        return False
+    return not any(may_be_same(link, parse_fleet_link(car.link)) for car in fleet.cars.values())
 
 
 @contextlib.contextmanager

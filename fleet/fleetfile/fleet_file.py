@@ -19,8 +19,9 @@ from fleet.fleetfile.models import (
     FileEntry,
     LimitsEntry,
 )
-from fleet.links import BadLink, LinkKind, LinkUrl, parse_link, shared_ports
-from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_told
+from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
+from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_platform_option
+from schemas.links import BadLink
 from schemas.yaml_document.document import Document, read_text
 from schemas.yaml_document.messages import Where, quote_value, suggest
 
@@ -122,7 +123,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
 
 def profile_capabilities(platform: str) -> frozenset[str]:
     """Return the parts and modes of a platform's cars; for `auto` those of all platforms."""
-    _, auto = parse_told(platform)
+    _, auto = parse_platform_option(platform)
     kinds = [kind for kind in Platform if kind is not Platform.UNKNOWN] if auto else [platform.partition("+")[0]]
     options = platform.partition("+")[1] + platform.partition("+")[2]
     profiles = [parse_platform(f"{kind}{options}") for kind in kinds]
@@ -201,7 +202,7 @@ def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[st
         at = next(where for (where, _), there in zip(layers, given_limits, strict=True) if there)
         yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}: it is at most that"
     platform, given = merged.get("platform", AUTO), merged.get("capabilities")
-    if car.get("link") == LinkKind.SIMULATED and str(platform).partition("+")[0] in (AUTO, Platform.UNKNOWN):
+    if car.get("link") == LINK_SIM and str(platform).partition("+")[0] in (AUTO, Platform.UNKNOWN):
         kinds = ", ".join(kind for kind in Platform if kind is not Platform.UNKNOWN)
         yield ("cars", name, "platform"), f"a simulated car is of some platform: {kinds}, with +arm, +imu"
     if not isinstance(platform, str) or not isinstance(given, list):
@@ -217,12 +218,12 @@ def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[st
 
 
 def _find_shared_ports(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Where, str]]:
-    links: dict[str, LinkUrl] = {}
+    links: dict[str, FleetLink] = {}
     for name, car in cars.items():
         given = car.get("link")
         if isinstance(given, str):
             try:
-                links[name] = parse_link(given)
+                links[name] = parse_fleet_link(given)
             except BadLink:
                 continue  # reported as a fault of the link
     for first, second in shared_ports(links):

@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Final
 
 from fleet.fleetfile.fleet_file import FleetCar
-from fleet.links import LinkKind, LinkUrl, parse_link
+from fleet.links import FleetLink, SimLink, parse_fleet_link
 from gateway.protocol.platforms import Platform
+from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
 
 HOST_TIMEOUT_S: Final = 3.0
 """Timeout for the reply of a host."""
@@ -47,21 +48,21 @@ def check_link(car: FleetCar, served: Mapping[str, tuple[str, str]]) -> LinkChec
         ok = state in ("online", "quiet")
         words = f"its gateway runs, the link is {state}" + (f": {reason}" if reason and not ok else "")
         return LinkCheck(car.name, car.link, ok, words)
-    ok, words = _check(parse_link(car.link), car.platform)
+    ok, words = _check(parse_fleet_link(car.link), car.platform)
     return LinkCheck(car.name, car.link, ok, words)
 
 
-def _check(link: LinkUrl, platform: str) -> tuple[bool, str]:
-    match link.kind:
-        case LinkKind.SIMULATED:
+def _check(link: FleetLink, platform: str) -> tuple[bool, str]:
+    match link:
+        case SimLink():
             return True, "`fleet up` simulates it"
-        case LinkKind.DEVICE:
-            return check_device(link.where)
-        case LinkKind.USB:
+        case SerialUrl(path=path):
+            return check_device(path)
+        case UsbUrl():
             return _check_usb(link)
-        case LinkKind.TCP:
+        case TcpUrl():
             return _check_tcp(link, platform)
-        case LinkKind.BLE:
+        case BleUrl():
             return _check_ble()
 
 
@@ -119,17 +120,11 @@ def _list_ports() -> list[str]:
     return [str(port.device) for port in list_ports.comports()]
 
 
-def _check_usb(link: LinkUrl) -> tuple[bool, str]:
+def _check_usb(link: UsbUrl) -> tuple[bool, str]:
     from serial.tools import list_ports
 
-    ids_wanted = dict(link.ids)
-    matching = []
-    for port in list_ports.comports():
-        ids = {"serial": port.serial_number or ""}
-        if port.vid is not None and port.pid is not None:
-            ids |= {"vid": f"{port.vid:04x}", "pid": f"{port.pid:04x}"}
-        if ids_wanted.items() <= ids.items():
-            matching.append(str(port.device))
+    ports = list_ports.comports()
+    matching = [str(port.device) for port in ports if link.fits(port.vid, port.pid, port.serial_number)]
     if not matching:
         return False, "no such USB device is plugged in: plug the car in, or bind it again (fleet bind)"
     if len(matching) > 1:
@@ -138,23 +133,23 @@ def _check_usb(link: LinkUrl) -> tuple[bool, str]:
     return ok, f"{matching[0]}: {words}"
 
 
-def _check_tcp(link: LinkUrl, platform: str) -> tuple[bool, str]:
+def _check_tcp(link: TcpUrl, platform: str) -> tuple[bool, str]:
     bridge = platform.partition("+")[0] in _BRIDGED_PLATFORMS
-    port = int(dict(link.ids)["port"])
+    port = link.port
     try:
-        with socket.create_connection((link.where, port if bridge else CLOSED_PORT), timeout=HOST_TIMEOUT_S):
+        with socket.create_connection((link.host, port if bridge else CLOSED_PORT), timeout=HOST_TIMEOUT_S):
             pass
     except ConnectionRefusedError:
         if bridge:
-            return False, f"{link.where} is there, and nothing listens on port {port}: start the car's bridge"
+            return False, f"{link.host} is there, and nothing listens on port {port}: start the car's bridge"
     except TimeoutError:
-        return False, f"no answer from {link.where} within {HOST_TIMEOUT_S:g} s: switch the car on, join its network"
+        return False, f"no answer from {link.host} within {HOST_TIMEOUT_S:g} s: switch the car on, join its network"
     except (OSError, UnicodeError) as error:  # UnicodeError: a name that DNS cannot express
         words = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        return False, f"{link.where}: {words}: switch the car on, join its network"
+        return False, f"{link.host}: {words}: switch the car on, join its network"
     if bridge:
         return True, "its bridge accepts connections"
-    return True, f"{link.where} is there; not connected to port {port}, which would end the car's program"
+    return True, f"{link.host} is there; not connected to port {port}, which would end the car's program"
 
 
 def _check_ble() -> tuple[bool, str]:

@@ -8,10 +8,11 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
-from fleet.links import ALLOWED, BadLink, parse_link
+from fleet.links import ALLOWED_LINKS, parse_fleet_link
 from gateway.protocol.enums import Mode
-from gateway.protocol.platforms import AUTO, OPTIONS, Platform, parse_platform, parse_told
+from gateway.protocol.platforms import AUTO, OPTIONS, Platform, parse_platform, parse_platform_option
 from schemas import bus, keys
+from schemas.links import BadLink
 from schemas.yaml_document.document import Entry
 from schemas.yaml_document.messages import quote_value
 
@@ -34,17 +35,17 @@ def validate_name(name: str) -> str:
 
 
 def validate_link(text: str) -> str:
-    """Return a link if parse_link accepts it; raises ValueError."""
+    """Return a link if parse_fleet_link accepts it; raises ValueError."""
     try:
-        parse_link(text)
+        parse_fleet_link(text)
     except BadLink as error:
-        raise ValueError(f"{quote_value(text)} is not allowed, {error}: {ALLOWED}") from None
+        raise ValueError(f"{quote_value(text)} is not allowed, {error}: {ALLOWED_LINKS}") from None
     return text
 
 
 def validate_platform(text: str) -> str:
     """Return a platform (or auto) if it is valid; raises ValueError."""
-    parse_told(text)
+    parse_platform_option(text)
     return text
 
 

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fleet.links import LinkKind, parse_link
+from fleet.links import parse_fleet_link
 from gateway.protocol.platforms import AUTO, Platform
+from schemas.links import SerialUrl, UsbUrl
 
 LIKELY_VERDICTS: Final = ("car", "ble", "given")
 POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, "silent", "busy")
@@ -48,7 +49,7 @@ def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
 
     Typed TCP and Bluetooth links are not scanned: closing a TCP connection may end the car's program.
     """
-    given = [link for link in links if parse_link(link).kind not in (LinkKind.DEVICE, LinkKind.USB)]
+    given = [link for link in links if not isinstance(parse_fleet_link(link), SerialUrl | UsbUrl)]
     taken = [FoundLink(link, "given", "not listened to") for link in dict.fromkeys(given)]
     links = [link for link in links if link not in given]
     if taken and not links:

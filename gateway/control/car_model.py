@@ -13,10 +13,11 @@ from gateway.control.estimate.platform import PlatformDetector
 from gateway.control.estimate.trust import Basis, CarTrust, TrustEvent, TrustState
 from gateway.control.events import Level
 from gateway.control.pacing import AWAKE_S, FLIGHT_S, Pacing
-from gateway.control.stops import sequences, stopping
+from gateway.control.stops import stopping
 from gateway.control.stops.evidence import StopCase, StopEvidence
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.platforms import Profile, StopStyle
+from gateway.protocol.timing import RECOVERY_SILENCE_S
 
 KNOWN = frozenset({CarTrust.STOPPING, CarTrust.STOPPED, CarTrust.DRIVING, CarTrust.IN_MODE})
 """States in which the last recovery is over and no write has failed since, so the car reads frames as meant."""
@@ -141,4 +142,4 @@ class CarModel:
             return False
         if self.known and self.manual:
             return True
-        return now >= pacing.written_at + sequences.RECOVERY_SILENCE_S - 0.1
+        return now >= pacing.written_at + RECOVERY_SILENCE_S - 0.1

@@ -17,6 +17,7 @@ from gateway.control.stops.evidence import CLOSED_S, EVIDENCE, Finding, StopCase
 from gateway.control.stops.sequences import StopSequence
 from gateway.control.stops.stopping import StopInProgress
 from gateway.protocol.platforms import StopStyle
+from gateway.protocol.timing import RECOVERY_SILENCE_S
 
 SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""
@@ -62,7 +63,7 @@ class StopExecutor:
         if why is FrameOrigin.SHUTDOWN:
             running.why = why
         # A new command need not wait for the next try, but only after this silence the next frame is certain.
-        if pending is not None and running.frames_sent and now >= running.closed_at + sequences.RECOVERY_SILENCE_S:
+        if pending is not None and running.frames_sent and now >= running.closed_at + RECOVERY_SILENCE_S:
             running.begin_try(self.full(now), now)
         if running.first_at is not None and pending is not None:
             self._log.record_sent(pending, now, f"joined the {running.sequence.name} stop under way")

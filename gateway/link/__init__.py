@@ -1,17 +1,22 @@
-"""Byte streams to a car: serial, TCP, Bluetooth LE. Bytes only; what they mean is the protocol's."""
+"""Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.protocol` gives the bytes their meaning.
+
+`base` has the interface and its errors. `serial`, `tcp` and `ble` implement it. `usb` finds the port of a USB device,
+`url` accepts a link from the command line.
+"""
 
 from gateway.link.base import BadUrl, Busy, CannotOpen, Link, LinkError, LinkLost
-from gateway.link.url import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl, parse_url
+from gateway.link.url import parse_url
+from schemas.links import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
 
 __all__ = ["BadUrl", "Busy", "CannotOpen", "Link", "LinkError", "LinkLost", "LinkUrl", "open_link", "parse_url"]
 
 OPEN_TIMEOUT_S = 5.0
+# A module advertises about once a second, and a scan often misses the first one. The fourth car needs 4 s to connect.
 BLE_TIMEOUT_S = 20.0
-"""A module advertises about once a second, and is seldom heard the first time; the fourth car needs 4 s to connect."""
 
 
 async def open_link(url: LinkUrl, *, timeout_s: float | None = None) -> Link:
-    """Open the link within this time; raises CannotOpen, whose text says what is wrong and what to do."""
+    """Open the link within this time; raise CannotOpen, whose message says what is wrong and what to do."""
     match url:
         case SerialUrl() | UsbUrl():
             from gateway.link.serial import open_serial

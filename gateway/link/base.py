@@ -1,22 +1,25 @@
-"""What every link is: read, write and close, and the errors that they raise."""
+"""The interface of every link (read, write, close) and its errors."""
 
 from abc import ABC, abstractmethod
 from typing import Final
 
 CLOSE_S: Final = 1.0
-"""How long `close` waits for a port or a peer (Bluetooth: 4 s); one that is not done then is left to itself, or cut."""
+"""Timeout for closing a port or a connection (Bluetooth: 4 s). After it, `close` abandons or cuts the link."""
+# Over a minute of a car's 960 bytes/s.
+MAX_BUFFERED_BYTES: Final = 64 * 1024
+"""Maximum of unread bytes. Above it, TCP stops reading the socket; Bluetooth, without flow control, ends the link."""
 
 
 class LinkError(Exception):
-    """A link cannot be had, or is gone. The text is one line for a person: what, where, what to do."""
+    """A link cannot be opened, or is lost. The message is one line for a person: what, where, what to do."""
 
 
 class BadUrl(LinkError):
-    """A URL that names no link: wrong use."""
+    """A URL that is no link: wrong use."""
 
 
 class CannotOpen(LinkError):
-    """The link was not opened; nothing was sent."""
+    """The link was not opened. Nothing was sent."""
 
 
 class Busy(CannotOpen):
@@ -24,7 +27,7 @@ class Busy(CannotOpen):
 
 
 class LinkLost(LinkError):
-    """The link is gone. A write that raises this may have sent all, some or none of its bytes."""
+    """The link is lost. A write that raises this may have sent all, some or none of its bytes."""
 
 
 class Link(ABC):
@@ -32,15 +35,15 @@ class Link(ABC):
 
     @abstractmethod
     async def read(self) -> bytes:
-        """The next bytes as they came, at least one; raises LinkLost when there will be no more."""
+        """Return the next bytes as they arrived, at least one; raise LinkLost at the end."""
 
     @abstractmethod
     async def write(self, data: bytes) -> None:
-        """Hand over these bytes whole, with nothing between them; raises LinkLost.
+        """Send these bytes, with nothing between them; raise LinkLost.
 
-        Serial and TCP: in one write of their own, and without waiting. Bluetooth: in pieces, and within a second.
+        Serial and TCP: in one write of their own, without waiting. Bluetooth: in pieces, within a second.
         """
 
     @abstractmethod
     async def close(self) -> None:
-        """Let go of the port within CLOSE_S; what is pending raises LinkLost. Never raises; may be called again."""
+        """Release the port within CLOSE_S; pending reads and writes raise LinkLost. Never raise; idempotent."""

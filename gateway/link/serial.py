@@ -1,9 +1,10 @@
-"""A serial port through pyserial: one thread finds, opens and closes it, which can block; the loop reads and writes.
+"""A serial port through pyserial. One thread finds, opens and closes it, as these calls can block.
 
-Where the loop cannot watch a port (Windows), the thread reads it too; a reading is there sooner without that.
-A write never waits: a port has room for far more than one frame, so a port that does not take a frame whole and at
-once has stopped taking bytes, and the link is lost. Who uses the descriptor holds `_hold`: the thread lets go
-of a port that died at any moment, and the number of a closed descriptor may be another car's a moment later.
+The event loop reads and writes. On Windows it cannot watch a port, so there the thread reads as well.
+A write never waits. A port buffers far more than one frame, so a port that does not accept a whole frame at once is
+stuck, and the link is lost.
+Every use of the descriptor needs `_lock`. The thread may close a dead port at any moment, and another car's port may
+get the same descriptor number a moment later.
 """
 
 import asyncio
@@ -17,21 +18,21 @@ from typing import Final
 import serial
 
 from gateway.link.base import CLOSE_S, Busy, CannotOpen, Link, LinkLost
-from gateway.link.url import SerialUrl, UsbUrl
-from gateway.link.usb import UsbSerialPort, at, choose, plugged, refuse_another
+from gateway.link.usb import UsbSerialPort, check_same_device, choose, list_usb_ports, port_at
+from schemas.links import SerialUrl, UsbUrl
 
-WRITE_TIMEOUT_S: Final = 0.25
-"""Only where the port cannot be written without waiting (Windows)."""
-WAITING_CHUNKS: Final = 256
-"""Chunks that may wait for who reads; then the port is not read any more, and fills."""
+SERIAL_WRITE_TIMEOUT_S: Final = 0.25
+"""Timeout of pyserial's own write, used on Windows only."""
+MAX_BUFFERED_CHUNKS: Final = 256
+"""Maximum of buffered chunks. When it is reached, the link stops reading the port."""
 READ_BYTES: Final = 4096
-WATCHED: Final = os.name == "posix"
-"""The loop can watch the port."""
+CAN_WATCH: Final = os.name == "posix"
+"""True if the event loop can watch the port."""
 
 try:
     import termios
 
-    # tcflush and tcsetattr of a port that is gone raise termios.error, which is no OSError.
+    # tcflush and tcsetattr of an unplugged port raise termios.error, which is no OSError.
     _GONE: tuple[type[Exception], ...] = (OSError, termios.error)
 except ImportError:  # Windows
     _GONE = (OSError,)
@@ -40,39 +41,40 @@ except ImportError:  # Windows
 _NOT_OPENED: Final[tuple[type[Exception], ...]] = (*_GONE, ValueError)
 _BUSY: Final = frozenset({errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK})
 _UNPLUGGED: Final = frozenset({errno.EIO, errno.ENXIO, errno.ENODEV})
-"""What an open port says while it goes; once it has gone it is an end of file."""
+"""Errors of an open port while it is being unplugged. Afterwards a read returns end of file."""
 
 
 _opening: Final[set[str]] = set()
-"""Ports that a thread is opening now."""
+"""URLs that a thread is opening now."""
+# After a replug, the same path may lead to another car, which would then get this car's commands.
 _first: Final[dict[str, UsbSerialPort]] = {}
-"""The device that each URL led to first. A path is soon another's: its car would be given what this one was to do."""
-# The system tells nothing of a pseudo terminal; `gateway run` starts faster without the lists.
+"""The first device opened for each URL."""
+# The system knows nothing about pseudo terminals, and `gateway run` starts faster without listing the ports.
 _PSEUDO: Final = re.compile(r"/dev/(pts/|ttys)\d+")
 
 
 class SerialLink(Link):
-    """One open port. Made by `open_serial`."""
+    """One open port, created by `open_serial`."""
 
     def __init__(self, url: SerialUrl | UsbUrl, loop: asyncio.AbstractEventLoop) -> None:
         self._url = url
         self._loop = loop
-        self._hold = threading.Lock()
+        self._lock = threading.Lock()
         self._port: serial.Serial | None = None
         self._chunks: list[bytes] = []
         self._came = asyncio.Event()
-        self._room = threading.Semaphore(WAITING_CHUNKS)
+        self._room = threading.Semaphore(MAX_BUFFERED_CHUNKS)
         self._paused = False
         self._closing = threading.Event()
         self._lost: str | None = None
         self._stuck = False
         self._opened: asyncio.Future[None] = loop.create_future()
         self._ended: asyncio.Future[None] = loop.create_future()
-        # A daemon: opening or closing a port can block (a Bluetooth tty does), and must not keep the process.
+        # A daemon thread: opening or closing a port can block (a Bluetooth tty does) and must not keep the process.
         self._thread = threading.Thread(target=self._run, name=f"read {url}", daemon=True)
 
     async def open(self, timeout_s: float) -> None:
-        """Start the thread and wait until the port is open; raises CannotOpen."""
+        """Start the thread and wait until the port is open; raise CannotOpen."""
         self._thread.start()
         try:
             await asyncio.wait_for(asyncio.shield(self._opened), timeout_s)
@@ -86,14 +88,14 @@ class SerialLink(Link):
             ) from None
 
     async def read(self) -> bytes:
-        """The next bytes as they came; raises LinkLost."""
+        """Return the next bytes as they arrived; raise LinkLost."""
         while not self._chunks:
             if self._lost is not None:
                 raise LinkLost(self._lost)
             self._came.clear()
             await self._came.wait()
         chunks, self._chunks = self._chunks, []
-        if not WATCHED:
+        if not CAN_WATCH:
             self._room.release(len(chunks))
         elif self._paused:
             self._paused = False
@@ -101,18 +103,18 @@ class SerialLink(Link):
         return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
     async def write(self, data: bytes) -> None:
-        """Write these bytes whole; raises LinkLost, after which some of them may be out."""
+        """Write these bytes; raise LinkLost, in which case some of them may have been sent."""
         if self._lost is not None:
             raise LinkLost(self._lost)
         try:
-            with self._hold:
+            with self._lock:
                 written = None if self._port is None else _write_now(self._port, data)
         except serial.SerialTimeoutException:
             written = 0
         except _GONE as error:
             raise self._lose(f"{self._url} is gone: {_why_gone(error)}") from None
         if written is None:
-            raise self._lose(f"{self._url} is gone: unplugged")  # the thread knows, and is about to say so
+            raise self._lose(f"{self._url} is gone: unplugged")  # the thread has closed it and is about to report that
         self._stuck = written != len(data)
         if written == 0 and data:
             raise self._lose(f"{self._url} takes no bytes: unplugged, or stuck?")
@@ -120,7 +122,7 @@ class SerialLink(Link):
             raise self._lose(f"{self._url} took {written} of {len(data)} bytes: unplugged, or stuck?")
 
     async def close(self) -> None:
-        """Let go of the port, and wait for that; one that does not close in time is left to the thread."""
+        """Close the port and wait for that. If it does not close in time, leave it to the thread."""
         self._lose(f"{self._url} was closed")
         if self._opened.done() and not self._opened.cancelled() and self._opened.exception() is None:
             with contextlib.suppress(TimeoutError):
@@ -128,17 +130,17 @@ class SerialLink(Link):
                 self._thread.join()
 
     def _lose(self, reason: str) -> LinkLost:
-        """The link is of no more use; the first reason is kept."""
+        """Mark the link as lost and return the error. The first reason stays."""
         self._lost = self._lost or reason
         self._came.set()
         self._end()
         return LinkLost(self._lost)
 
     def _end(self) -> None:
-        """Tell the thread to end, whatever it waits for; one that still opens the port closes it again."""
-        with self._hold, contextlib.suppress(*_GONE):
+        """Stop the thread. If it is still opening the port, it closes the port afterwards."""
+        with self._lock, contextlib.suppress(*_GONE):
             if self._port is not None:
-                if WATCHED:
+                if CAN_WATCH:
                     self._loop.remove_reader(self._port.fileno())
                 else:
                     self._port.cancel_read()
@@ -148,17 +150,17 @@ class SerialLink(Link):
     # ------------------------------------------------------------------ reading in the loop
 
     def _watch(self) -> None:
-        with self._hold:
+        with self._lock:
             if self._port is not None and not self._closing.is_set():
                 self._loop.add_reader(self._port.fileno(), self._readable)
 
     def _readable(self) -> None:
         try:
-            with self._hold:
+            with self._lock:
                 if self._port is None:
                     return
                 data = os.read(self._port.fileno(), READ_BYTES)
-                self._paused = len(self._chunks) >= WAITING_CHUNKS
+                self._paused = len(self._chunks) >= MAX_BUFFERED_CHUNKS
                 if self._paused:
                     self._loop.remove_reader(self._port.fileno())
         except BlockingIOError:
@@ -167,7 +169,7 @@ class SerialLink(Link):
             self._lose(f"{self._url} is gone: {_why_gone(error)}")
             return
         if data:
-            self._received(data)
+            self._on_data(data)
         else:
             self._lose(f"{self._url} is gone: unplugged")
 
@@ -179,18 +181,18 @@ class SerialLink(Link):
             port = self._open_port()
         except CannotOpen as error:
             port = error
-        except Exception as error:  # noqa: BLE001 - whatever a driver does: the thread must not end without a word
+        except Exception as error:  # noqa: BLE001 - whatever a driver raises, the thread must report it
             port = CannotOpen(f"{self._url}: the port cannot be opened ({_cause(error)})")
-        _opening.discard(str(self._url))  # before anybody is told, who may try again at once
+        _opening.discard(str(self._url))  # before the report: its receiver may retry at once
         if isinstance(port, CannotOpen):
-            self._tell(self._failed_to_open, port)
+            self._call_on_loop(self._on_open_failed, port)
             return
-        with self._hold:
+        with self._lock:
             self._port = port
-        self._tell(self._succeeded)
+        self._call_on_loop(self._on_opened)
         reason = f"{self._url} was closed"
         try:
-            if WATCHED:
+            if CAN_WATCH:
                 self._closing.wait()
             while not self._closing.is_set():
                 data = port.read(1)
@@ -198,35 +200,35 @@ class SerialLink(Link):
                     data += port.read(waiting)
                 if data:
                     self._room.acquire()
-                    self._tell(self._received, data)
+                    self._call_on_loop(self._on_data, data)
         except _GONE as error:
             reason = f"{self._url} is gone: {_why_gone(error)}"
         finally:
-            with self._hold:
+            with self._lock:
                 self._port = None
             if self._stuck:
-                # What it never took must not reach the car later; and closing would wait for it, 30 s on a UART.
+                # Unsent bytes must not reach the car later. Closing would also wait for them, 30 s on a UART.
                 with contextlib.suppress(*_GONE):
                     port.reset_output_buffer()
             with contextlib.suppress(*_GONE):
                 port.close()
-            self._tell(self._over, reason)
+            self._call_on_loop(self._on_closed, reason)
 
     def _open_port(self) -> serial.Serial:
-        """Find the port, each time again, and open it; raises CannotOpen."""
+        """Find the port anew and open it; raise CannotOpen."""
         first = _first.get(str(self._url))
         found: UsbSerialPort | None
         if isinstance(self._url, SerialUrl):
             path = self._url.path
-            found = _device(path, needed=first is not None)
+            found = _device(path, required=first is not None)
         else:
-            found = choose(self._url, plugged())
+            found = choose(self._url, list_usb_ports())
             path = found.device
-        refuse_another(self._url, path, first, found)
+        check_same_device(self._url, path, first, found)
         try:
-            # `exclusive` locks it against a second gateway.
+            # `exclusive` locks the port against a second gateway.
             port = serial.Serial(
-                path, self._url.baud, timeout=None, write_timeout=WRITE_TIMEOUT_S, exclusive=_exclusive()
+                path, self._url.baud, timeout=None, write_timeout=SERIAL_WRITE_TIMEOUT_S, exclusive=_exclusive()
             )
         except _NOT_OPENED as error:
             kind = Busy if getattr(error, "errno", None) in _BUSY else CannotOpen
@@ -235,28 +237,28 @@ class SerialLink(Link):
             _first.setdefault(str(self._url), found)
         return port
 
-    def _tell(self, what: object, *arguments: object) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to tell
-            self._loop.call_soon_threadsafe(what, *arguments)  # type: ignore[arg-type]  # a method of this class
+    def _call_on_loop(self, method: object, *arguments: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            self._loop.call_soon_threadsafe(method, *arguments)  # type: ignore[arg-type]  # a method of this class
 
-    # ------------------------------------------------------------------ told by the thread, on the loop
+    # ------------------------------------------------------------------ reports of the thread, on the loop
 
-    def _failed_to_open(self, error: CannotOpen) -> None:
+    def _on_open_failed(self, error: CannotOpen) -> None:
         if not self._opened.done():
             self._opened.set_exception(error)
-            self._opened.exception()  # looked at even if `open` has timed out meanwhile
+            self._opened.exception()  # retrieved, in case `open` has timed out meanwhile
 
-    def _succeeded(self) -> None:
+    def _on_opened(self) -> None:
         if not self._opened.done():
             self._opened.set_result(None)
-        if WATCHED:
+        if CAN_WATCH:
             self._watch()
 
-    def _received(self, data: bytes) -> None:
+    def _on_data(self, data: bytes) -> None:
         self._chunks.append(data)
         self._came.set()
 
-    def _over(self, reason: str) -> None:
+    def _on_closed(self, reason: str) -> None:
         self._lost = self._lost or reason
         self._came.set()
         if not self._ended.done():
@@ -264,8 +266,8 @@ class SerialLink(Link):
 
 
 async def open_serial(url: SerialUrl | UsbUrl, timeout_s: float) -> Link:
-    """Open a serial port; raises CannotOpen. A USB device is looked for at each opening."""
-    if str(url) in _opening:  # each further try would be one more thread that hangs
+    """Open a serial port; raise CannotOpen. Each call searches for a USB device anew."""
+    if str(url) in _opening:  # each further attempt would be one more hanging thread
         raise CannotOpen(f"{url}: the port still hangs in an earlier try to open it: unplug it, and plug it in again")
     _opening.add(str(url))
     link = SerialLink(url, asyncio.get_running_loop())
@@ -274,10 +276,8 @@ async def open_serial(url: SerialUrl | UsbUrl, timeout_s: float) -> Link:
 
 
 def _write_now(port: serial.Serial, data: bytes) -> int:
-    """Write what the port takes at once; how much that was.
-
-    Not pyserial's write: without a write_timeout a full port makes it spin for ever, with one it waits in the loop.
-    """
+    """Write as much as the port accepts at once; return the number of bytes."""
+    # Not pyserial's write: if the port is full it spins for ever without a write_timeout, and blocks the loop with one.
     if os.name != "posix":
         return port.write(data) or 0
     try:
@@ -287,7 +287,7 @@ def _write_now(port: serial.Serial, data: bytes) -> int:
 
 
 def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
-    """One line: what is wrong with the port at this path, and what to do."""
+    """Return one line for a person: the trouble with the port at this path, and what to do."""
     code = getattr(error, "errno", None)
     which = f"{url}: " if isinstance(url, SerialUrl) else f"{url}: {path}: "
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
@@ -311,26 +311,26 @@ def _cause(error: Exception) -> str:
     code = getattr(error, "errno", None)
     if isinstance(code, int):
         return os.strerror(code).lower()
-    if "readiness to read" in str(error):  # pyserial's words for an end of file, which is what an unplug looks like
+    if "readiness to read" in str(error):  # pyserial's message for an end of file, as after an unplug
         return "unplugged"
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _device(path: str, *, needed: bool) -> UsbSerialPort | None:
-    """What is at this path; None if the system does not tell, or, unless `needed`, does not list its ports now."""
+def _device(path: str, *, required: bool) -> UsbSerialPort | None:
+    """Return the port at this path. None if it is unknown, or if the ports cannot be listed and it is not required."""
     if _PSEUDO.fullmatch(path):
         return None
     try:
-        return at(path, plugged())
+        return port_at(path, list_usb_ports())
     except CannotOpen:
-        if needed:
+        if required:
             raise
         return None
 
 
 def _ports() -> str:
     try:
-        found = sorted(port.device for port in plugged())
+        found = sorted(port.device for port in list_usb_ports())
     except CannotOpen as error:
         return str(error)
     return f"there are: {', '.join(found)}" if found else "no serial port is plugged in"
@@ -347,5 +347,5 @@ def _group(path: str) -> str:
 
 
 def _exclusive() -> bool | None:
-    """A lock between programs is a matter of POSIX; Windows ports are exclusive anyway, and refuse the argument."""
+    # Ports are always exclusive on Windows, where pyserial refuses the argument.
     return True if os.name == "posix" else None

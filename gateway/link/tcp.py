@@ -1,4 +1,4 @@
-"""A TCP connection to a car, or to a bridge: one write per frame, never two frames in one segment by our doing."""
+"""A TCP connection to a car or a bridge. Each frame is one write; the link never merges two frames into a segment."""
 
 import asyncio
 import contextlib
@@ -9,22 +9,20 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from typing import Any, Final
 
-from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkLost
-from gateway.link.url import TcpUrl
+from gateway.link.base import CLOSE_S, MAX_BUFFERED_BYTES, CannotOpen, Link, LinkLost
+from schemas.links import TcpUrl
 
-HELD_BYTES: Final = 64 * 1024
-"""Bytes that may wait for a loop that does not read; then the socket is not read, and the car's side waits."""
+# A vanished peer is noticed within about five seconds, where the system has these options.
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
-"""A peer that has vanished without a word is noticed within about five seconds, where the system allows."""
 
 _Addresses = list[tuple[int, Any]]
-"""(family, socket address), as getaddrinfo gives them."""
-_asked: Final[dict[TcpUrl, "Future[_Addresses]"]] = {}
-"""What the name server was asked last for each link."""
+"""(family, socket address), as from getaddrinfo."""
+_lookups: Final[dict[TcpUrl, "Future[_Addresses]"]] = {}
+"""The last name lookup for each link."""
 
 
 class TcpLink(asyncio.Protocol, Link):
-    """One connection. Made by `open_tcp`."""
+    """One connection, created by `open_tcp`."""
 
     def __init__(self, url: TcpUrl) -> None:
         self._url = url
@@ -33,11 +31,11 @@ class TcpLink(asyncio.Protocol, Link):
         self._came = asyncio.Event()
         self._ended = asyncio.Event()
         self._lost: str | None = None
-        self._heard = False
+        self._has_received = False
         self._paused = False
 
     async def read(self) -> bytes:
-        """The next bytes as they came; raises LinkLost."""
+        """Return the next bytes as they arrived; raise LinkLost."""
         while not self._data:
             if self._lost is not None:
                 raise LinkLost(self._lost)
@@ -51,25 +49,25 @@ class TcpLink(asyncio.Protocol, Link):
         return data
 
     async def write(self, data: bytes) -> None:
-        """Send these bytes in a segment of their own; raises LinkLost."""
+        """Send these bytes in a segment of their own; raise LinkLost."""
         transport = self._transport
         if transport is not None and self._lost is None and transport.is_closing():
-            await self._ended.wait()  # which says why
+            await self._ended.wait()  # connection_lost sets the reason
         if transport is None or self._lost is not None:
             raise LinkLost(self._lost or f"{self._url} is closed")
         if transport.get_write_buffer_size():
-            # What waits would go out together with this, and a car obeys only the first frame of a segment.
+            # The buffered frame would go out together with this one, and a car obeys only the first in a segment.
             self._lost = f"{self._url} takes no bytes: the car or its bridge has stopped reading"
             self._came.set()
             transport.abort()
             raise LinkLost(self._lost)
         transport.write(data)
-        if transport.is_closing():  # it met a reset: asyncio does not raise, but tells connection_lost why
+        if transport.is_closing():  # after a reset, asyncio does not raise but calls connection_lost
             await self._ended.wait()
             raise LinkLost(self._lost)
 
     async def close(self) -> None:
-        """Close in order; what is not closed after a second is cut."""
+        """Close the connection; cut it if it is not closed after a second."""
         transport = self._transport
         if transport is None:
             return
@@ -85,13 +83,12 @@ class TcpLink(asyncio.Protocol, Link):
     # ------------------------------------------------------------------ asyncio's side
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Set the socket up."""
+        """Set the socket options."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         peer: socket.socket = transport.get_extra_info("socket")
-        with contextlib.suppress(
-            OSError
-        ):  # macOS refuses on a connection that is reset already; connection_lost follows
+        # macOS refuses on a connection that is already reset; connection_lost follows.
+        with contextlib.suppress(OSError):
             peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             for name, value in _KEEPALIVE:
@@ -100,19 +97,19 @@ class TcpLink(asyncio.Protocol, Link):
                     peer.setsockopt(socket.IPPROTO_TCP, option, value)
 
     def data_received(self, data: bytes) -> None:
-        """Keep bytes until they are read, so many and no more."""
-        self._heard = True
+        """Buffer bytes for `read`, and pause the socket if the buffer is full."""
+        self._has_received = True
         self._data += data
         self._came.set()
-        if len(self._data) > HELD_BYTES and not self._paused and self._transport is not None:
+        if len(self._data) > MAX_BUFFERED_BYTES and not self._paused and self._transport is not None:
             self._paused = True
             self._transport.pause_reading()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Note why."""
+        """Store the reason."""
         why = "the car closed it" if exc is None else _cause(exc)
-        if not self._heard and (exc is None or isinstance(exc, ConnectionResetError)):
-            # A car has one client, and sends the next away.
+        if not self._has_received and (exc is None or isinstance(exc, ConnectionResetError)):
+            # A car serves one client and rejects the next.
             why += " before it sent anything: perhaps its gateway, or another program, has it"
         self._lost = self._lost or f"{self._url} is gone: {why}"
         self._came.set()
@@ -120,7 +117,7 @@ class TcpLink(asyncio.Protocol, Link):
 
 
 async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
-    """Connect; raises CannotOpen."""
+    """Connect; raise CannotOpen."""
     try:
         async with asyncio.timeout(timeout_s):
             return await connect_first(url, await _look_up(url))
@@ -129,44 +126,40 @@ async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
     except (socket.gaierror, UnicodeError):  # UnicodeError: a label too long for a host name
         raise CannotOpen(f"{url}: there is no host {url.host!r}: check the name, or give its address") from None
     except ConnectionRefusedError:
-        words = (
+        reason = (
             "nothing listens on that port (a Raspberry Pi car's program dies with its last client: its motors stay as "
             "they were and nothing can reach them, so look whether it drives, switch it off, restart the program there)"
         )
-        raise CannotOpen(f"{url}: {words}") from None
+        raise CannotOpen(f"{url}: {reason}") from None
     except OSError as error:
         raise CannotOpen(f"{url}: no connection, {_cause(error)}") from None
 
 
 async def _look_up(url: TcpUrl) -> _Addresses:
-    """Where the name leads; raises what getaddrinfo raises.
-
-    A name server that is silent holds getaddrinfo for a minute, which nothing can end: not on one of the loop's own
-    threads, for which the process would wait, and not once more for each try, which waits for the same answer.
-    """
-    found = _asked.get(url)
+    """Return the addresses of the host; raise the errors of getaddrinfo."""
+    # If the name server is silent, getaddrinfo blocks for a minute and cannot be cancelled. Run it in a daemon thread,
+    # as the process would wait for the loop's own threads. All attempts share one lookup.
+    found = _lookups.get(url)
     if found is None or found.done():
         found = Future()
-        found.set_running_or_notify_cancel()  # one who waits no longer does not cancel it
-        threading.Thread(target=_ask, args=(url, found), name=f"look up {url}", daemon=True).start()
-        _asked[url] = found
+        found.set_running_or_notify_cancel()  # a cancelled waiter must not cancel it
+        threading.Thread(target=_resolve, args=(url, found), name=f"look up {url}", daemon=True).start()
+        _lookups[url] = found
     return await asyncio.wrap_future(found)
 
 
-def _ask(url: TcpUrl, found: "Future[_Addresses]") -> None:
+def _resolve(url: TcpUrl, found: "Future[_Addresses]") -> None:
     try:
         answers = socket.getaddrinfo(url.host, url.port, type=socket.SOCK_STREAM)
-    except Exception as error:  # noqa: BLE001 - it is raised again where it is waited for
+    except Exception as error:  # noqa: BLE001 - the waiter raises it again
         found.set_exception(error)
     else:
         found.set_result([(family, address) for family, _, _, _, address in answers])
 
 
 async def connect_first(url: TcpUrl, addresses: Iterable[tuple[int, Any]]) -> Link:
-    """Connect to the first (family, socket address) that accepts; raises the OSError of the first that does not.
-
-    `create_connection` given a name would hide the error numbers of several addresses in one text.
-    """
+    """Connect to the first (family, socket address) that accepts; raise the first OSError if none does."""
+    # Not `create_connection` with a name: it hides the error numbers of several addresses in one text.
     loop = asyncio.get_running_loop()
     first: OSError | None = None
     for family, address in addresses:

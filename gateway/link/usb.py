@@ -1,4 +1,4 @@
-"""Which serial port a USB device has now: it may have another at each plugging in. Nothing is opened here."""
+"""Finds the serial port of a USB device, which may change each time it is plugged in. Opens nothing."""
 
 import os
 import time
@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from gateway.link.base import CannotOpen
-from gateway.link.url import SerialUrl, UsbUrl
+from schemas.links import SerialUrl, UsbUrl
 
 if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo
 
-LISTINGS: Final = 3
-LIST_AGAIN_S: Final = 0.05
+LIST_ATTEMPTS: Final = 3
+LIST_RETRY_DELAY_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class UsbSerialPort:
-    """A serial port that is there. vid, pid and serial only if it is a USB device that tells them."""
+    """A serial port of this computer. vid, pid and serial are set only for a USB device that reports them."""
 
     device: str
     vid: int | None = None
@@ -27,7 +27,7 @@ class UsbSerialPort:
 
     @property
     def ids(self) -> tuple[int | None, int | None, str | None]:
-        """What the device says of itself, wherever it is plugged in."""
+        """The ids of the device, which stay the same wherever it is plugged in."""
         return self.vid, self.pid, self.serial
 
     def __str__(self) -> str:
@@ -36,60 +36,58 @@ class UsbSerialPort:
         return f"{self.device} ({ids}{number})"
 
 
-def plugged() -> list[UsbSerialPort]:
-    """The serial ports of this computer; raises CannotOpen. It reads the system's lists, which can take a while."""
-    return [UsbSerialPort(port.device, port.vid, port.pid, port.serial_number) for port in listed()]
+def list_usb_ports() -> list[UsbSerialPort]:
+    """Return the serial ports of this computer; raise CannotOpen. Slow on some systems."""
+    return [UsbSerialPort(port.device, port.vid, port.pid, port.serial_number) for port in list_ports()]
 
 
-def listed() -> "list[ListPortInfo]":
-    """The same in pyserial's words."""
-    from serial.tools import list_ports
+def list_ports() -> "list[ListPortInfo]":
+    """Return the serial ports of this computer as pyserial describes them; raise CannotOpen."""
+    from serial.tools import list_ports as system
 
     failure: Exception | None = None
-    for _ in range(LISTINGS):
+    for _ in range(LIST_ATTEMPTS):
         try:
-            return list(list_ports.comports())
+            return list(system.comports())
         except (OSError, TypeError, ValueError) as error:
-            # A device that goes while it is looked at: pyserial takes the number of what it could not read.
+            # The device was unplugged while pyserial read its entry: it parses a number that it could not read.
             failure = error
-            time.sleep(LIST_AGAIN_S)
-    words = " ".join(str(failure).split()) or type(failure).__name__
-    raise CannotOpen(f"the serial ports cannot be listed ({words}): is a device just being unplugged?")
+            time.sleep(LIST_RETRY_DELAY_S)
+    reason = " ".join(str(failure).split()) or type(failure).__name__
+    raise CannotOpen(f"the serial ports cannot be listed ({reason}): is a device just being unplugged?")
 
 
 def choose(url: UsbUrl, ports: Iterable[UsbSerialPort]) -> UsbSerialPort:
-    """The one port that fits; raises CannotOpen, which says what was asked and what is there."""
-    there = sorted(ports, key=lambda port: port.device)
-    fit = [
-        port
-        for port in there
-        if url.vid in (None, port.vid) and url.pid in (None, port.pid) and url.serial in (None, port.serial)
-    ]
+    """Return the only matching port; raise CannotOpen, whose message lists the ports."""
+    available = sorted(ports, key=lambda port: port.device)
+    fit = [port for port in available if url.fits(port.vid, port.pid, port.serial)]
     if len(fit) == 1:
         return fit[0]
     if fit:
         raise CannotOpen(
             f"{url}: {len(fit)} devices fit, {_named(fit)}: add a serial= that only one has, or give its device path"
         )
-    found = f"there are: {_named(there)}" if there else "no serial port is plugged in"
+    found = f"there are: {_named(available)}" if available else "no serial port is plugged in"
     raise CannotOpen(f"{url}: no such USB device is plugged in; {found}")
 
 
-def at(path: str, ports: Iterable[UsbSerialPort]) -> UsbSerialPort | None:
-    """The port that a device path, or a symlink, leads to; None if the system does not list it."""
+def port_at(path: str, ports: Iterable[UsbSerialPort]) -> UsbSerialPort | None:
+    """Return the port at a device path or symlink. None if the system does not list it."""
     try:
         real = os.path.realpath(path)
-    except ValueError:  # a path that the system cannot express
+    except ValueError:  # a path with a null byte
         return None
     return next((port for port in ports if os.path.realpath(port.device) == real), None)
 
 
-def refuse_another(url: SerialUrl | UsbUrl, path: str, first: UsbSerialPort | None, now: UsbSerialPort | None) -> None:
-    """Raise CannotOpen if there is another device than the first time, as far as they say which they are."""
+def check_same_device(
+    url: SerialUrl | UsbUrl, path: str, first: UsbSerialPort | None, now: UsbSerialPort | None
+) -> None:
+    """Raise CannotOpen if the ids differ from those of the first device at this URL."""
     if first is None or first.vid is None or (now is not None and now.ids == first.ids):
         return
     if now is None and not os.path.exists(path):  # noqa: PTH110 - a device path, not a file to work with
-        return  # opening it says so
+        return  # opening it raises the error
     found = f"{path}, of which the system says nothing" if now is None else _named([now])
     raise CannotOpen(
         f"{url}: another device is there, {found}; it was {_named([first])}: plug that in again, or restart this "
@@ -98,5 +96,5 @@ def refuse_another(url: SerialUrl | UsbUrl, path: str, first: UsbSerialPort | No
 
 
 def _named(ports: list[UsbSerialPort]) -> str:
-    """For one line, without what a device has chosen to be called that cannot be printed."""
+    """Return the ports as one line. A device chooses its own name: replace what cannot be printed."""
     return "".join(each if each.isprintable() else "?" for each in ", ".join(map(str, ports)))

@@ -1,13 +1,13 @@
-"""The closed sets of words that frames and readings are made of, with their digits on the wire.
+"""The closed sets of words in frames and readings.
 
-The words are those of the messages; the digits are those of the protocol table. No framing and no ranges live here.
+The words are those of the messages. The digits are those of the protocol table; the digits of a mode are in `modes`.
 """
 
 from enum import StrEnum
 
 
 class Motion(StrEnum):
-    """What the wheels do. Places 1 and 2 of the general frame."""
+    """A motion of the wheels: places 1 and 2 of the general frame."""
 
     STOP = "stop"
     FORWARD = "forward"
@@ -24,7 +24,7 @@ class Motion(StrEnum):
 
 
 class Mode(StrEnum):
-    """What the car's program does by itself; `MANUAL` is mode 0, the app's control."""
+    """A mode of the car's program. In `MANUAL`, mode 0, the app drives. Each mode has a row in `modes.MODES`."""
 
     MANUAL = "manual"
     REMOTE_CONTROL = "remote_control"
@@ -34,14 +34,9 @@ class Mode(StrEnum):
     LIGHT_SEEKING = "light_seeking"
     FOLLOWING = "following"
 
-    @property
-    def digit(self) -> int:
-        """The x of `MODE<x><y>`, 0..6."""
-        return _MODE_DIGITS[self]
-
 
 class Light(StrEnum):
-    """Place 7 of the general frame."""
+    """A color of the light: place 7 of the general frame."""
 
     WHITE = "white"
     RED = "red"
@@ -78,7 +73,7 @@ class ServoAction(StrEnum):
 
 
 class SpeedStep(StrEnum):
-    """Place 4 of the general frame: speed is only ever relative."""
+    """A step of the speed, which is only relative: place 4 of the general frame."""
 
     UP = "up"
     DOWN = "down"
@@ -98,8 +93,24 @@ _MOTION_DIGITS = {
     Motion.SPIN_LEFT: (0, 1),
     Motion.SPIN_RIGHT: (0, 2),
 }
-_MODE_DIGITS = {mode: digit for digit, mode in enumerate(Mode)}
-_LIGHT_DIGITS = {light: digit for digit, light in enumerate(Light, start=1)}
-_SERVO_DIGITS = {action: (digit, 0) for digit, action in enumerate(ServoAction, start=1)} | {
-    ServoAction.FRONT_RESET: (0, 1)
+_LIGHT_DIGITS = {
+    Light.WHITE: 1,
+    Light.RED: 2,
+    Light.GREEN: 3,
+    Light.BLUE: 4,
+    Light.CYAN: 5,
+    Light.MAGENTA: 6,
+    Light.YELLOW: 7,
+    Light.OFF: 8,
+}
+_SERVO_DIGITS = {
+    ServoAction.FRONT_LEFT: (1, 0),
+    ServoAction.FRONT_RIGHT: (2, 0),
+    ServoAction.VERTICAL_UP: (3, 0),
+    ServoAction.VERTICAL_DOWN: (4, 0),
+    ServoAction.VERTICAL_RESET: (5, 0),
+    ServoAction.HORIZONTAL_LEFT: (6, 0),
+    ServoAction.HORIZONTAL_RIGHT: (7, 0),
+    ServoAction.HORIZONTAL_RESET: (8, 0),
+    ServoAction.FRONT_RESET: (0, 1),
 }

@@ -1,6 +1,6 @@
-"""What a decoder hands out: one value per event, and what a sensors frame's own text says about the car's mode.
+"""The events of a decoder, one value each.
 
-No parsing lives here (see `decode`), and nothing that depends on the platform (see `profile`).
+The parsing is in `parser`; everything that depends on the platform is in `platforms`.
 """
 
 from dataclasses import dataclass
@@ -8,10 +8,11 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from gateway.protocol.enums import Mode
+from gateway.protocol.modes import matching_modes
 
 
 class Cause(StrEnum):
-    """Why bytes are no reading (docs/reference/protocol.md#bad-input)."""
+    """Why bytes are not a reading (docs/reference/protocol.md#bad-input)."""
 
     NO_START = "no_start"
     OVERLONG = "overlong"
@@ -35,11 +36,11 @@ class Sensors(NamedTuple):
     """The sensors frame, each field as on the wire; None where the field was rejected.
 
     `at` is the time of its last byte. `range_cm` 0 means no echo, not a distance. `line` is left-outer, left-inner,
-    right-inner, right-outer. `obstacle` is not inverted here, whatever the mode (see `Profile.obstacle`).
-    Whether a field is measured or filler is not said here either (see `Profile.measured`).
-    A named tuple, because a frozen dataclass of this size costs as much as decoding the frame.
+    right-inner, right-outer. `obstacle` is as on the wire; `Profile.obstacle` undoes the inversion of following.
+    `Profile.measured` tells measurements from filler.
     """
 
+    # A named tuple: creating a frozen dataclass of this size costs as much as decoding the frame.
     raw: bytes
     at: float
     range_cm: float | None
@@ -50,16 +51,16 @@ class Sensors(NamedTuple):
     light: tuple[bool, bool] | None
     rejects: tuple[Reject, ...] = ()
     terminated: bool = True  # by `#`
-    by_silence: bool = False  # not terminated, and nothing followed (for 50 ms, or at all): a `#` may be late
+    by_silence: bool = False  # not terminated, and nothing followed for 50 ms or to the end: a `#` may be late
 
     @property
     def candidates(self) -> tuple[Mode, ...]:
-        """The modes whose frame has this text, by the constant filler in it; never empty, in order of digit."""
-        return _candidates(self.raw, terminated=self.terminated, by_silence=self.by_silence)
+        """The modes whose frame has this text, by its filler; never empty, in order of digit."""
+        return matching_modes(self.raw, self.terminated, self.by_silence)
 
     @property
     def signature(self) -> Mode | None:
-        """The one mode whose frame has this text; None if there is more than one candidate."""
+        """The only candidate mode. None if there are several."""
         candidates = self.candidates
         return candidates[0] if len(candidates) == 1 else None
 
@@ -94,7 +95,7 @@ class Echo:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """Bytes that are no reading, why, and in words for a person. `at` is the time of the last byte."""
+    """Bytes that are not a reading, with the cause. `detail` is for a person; `at` is the time of the last byte."""
 
     raw: bytes
     at: float
@@ -103,23 +104,3 @@ class Rejected:
 
 
 Event = Sensors | ArmReading | ImuReading | Echo | Rejected
-
-# Spelling counts: mode 0 has decimals on Arduino, PV8.4 on Raspberry Pi (docs/reference/protocol.md#placeholders).
-_TRACKING = b"$4WD,CSB0,PV8,GS0,LF"
-_LIGHT_OR_FOLLOWING = b"$4WD,CSB120,PV8.3,GS000,LF0000,HW"
-
-
-def _candidates(raw: bytes, *, terminated: bool, by_silence: bool) -> tuple[Mode, ...]:
-    text = raw[:-1] if terminated else raw
-    if text.startswith(_TRACKING):
-        return (Mode.TRACKING,) if text.endswith(b",HW00,GM00") else (Mode.MANUAL,)
-    if not text.startswith(_LIGHT_OR_FOLLOWING):
-        return (Mode.MANUAL,)
-    no_obstacle, no_light = text[-7:-5] == b"00", text[-2:] == b"00"
-    if not no_light:
-        return (Mode.LIGHT_SEEKING,) if no_obstacle else (Mode.MANUAL,)
-    if terminated:
-        # HWab with a `#` fits neither row: following with a `#` got from somewhere, or a curious mode 0
-        return (Mode.LIGHT_SEEKING,) if no_obstacle else (Mode.MANUAL, Mode.FOLLOWING)
-    # without `#` before a `$` it is following; before a silence the `#` of light seeking may still be on its way
-    return (Mode.LIGHT_SEEKING, Mode.FOLLOWING) if no_obstacle and by_silence else (Mode.FOLLOWING,)

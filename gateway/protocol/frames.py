@@ -1,6 +1,6 @@
 """Frames to the car: one value per frame of the table, to bytes and back.
 
-Whether a particular car knows a frame is not decided here (see `profile`), nor when it may be sent.
+`platforms` decides which cars know a frame, `gateway.control` when it is sent.
 """
 
 import re
@@ -9,6 +9,7 @@ from enum import StrEnum
 from typing import Final, TypeVar
 
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
+from gateway.protocol.modes import MODES
 
 ARM_JOINTS: Final = 6
 DEG_MAX: Final = 180  # docs/reference/protocol.md#named-frames: PTZ and joints 0..180 degrees
@@ -16,14 +17,14 @@ COLOR_MAX: Final = 255  # docs/reference/protocol.md#named-frames: color LED 0..
 
 
 class EncodeError(ValueError):
-    """A value that the table does not allow; the words name the field, the value and the range."""
+    """A value that the table does not allow. The message names the field, the value and the range."""
 
 
 @dataclass(frozen=True, slots=True)
 class General:
-    """The nine-field frame. It always carries a motion: the default, stop, stops the car.
+    """The nine-field frame. It always carries a motion.
 
-    All but `motion` are one-shot: sent again they act again (the fan toggles, speed climbs).
+    All other fields are one-shot: sent again, they act again (the fan toggles, the speed climbs).
     """
 
     motion: Motion
@@ -37,14 +38,14 @@ class General:
 
 @dataclass(frozen=True, slots=True)
 class Ptz:
-    """The front servo, 0..180 degrees; observed: the car drives its servo to 180 - deg."""
+    """The angle of the front servo, 0..180 degrees. Observed: the car drives its servo to 180 - deg."""
 
     deg: int
 
 
 @dataclass(frozen=True, slots=True)
 class ColorLed:
-    """The colour LED, 0..255 each."""
+    """The color LED, 0..255 each."""
 
     r: int
     g: int
@@ -74,7 +75,7 @@ class ArmSet:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """A lone `#`: ends a half frame in the car's buffer; with nothing pending it is a stop in mode 0."""
+    """A lone `#`: ends a truncated frame in the car's buffer. If the buffer is empty, it is a stop in mode 0."""
 
 
 _Word = TypeVar("_Word", bound=StrEnum)
@@ -82,7 +83,7 @@ Frame = General | Ptz | ColorLed | ModeOpen | ModeClose | ArmSet | Reset
 
 
 def encode(frame: Frame) -> bytes:
-    """The bytes of a frame; raises EncodeError for a value that the table does not allow."""
+    """Return the bytes of a frame; raise EncodeError for a value that the table does not allow."""
     match frame:
         case General():
             return _general(frame)
@@ -92,12 +93,12 @@ def encode(frame: Frame) -> bytes:
             rgb = (_ranged("r", r, COLOR_MAX), _ranged("g", g, COLOR_MAX), _ranged("b", b, COLOR_MAX))
             return b"$4WD,CLR%d,CLG%d,CLB%d#" % rgb
         case ModeOpen(mode):
-            digit = _member("mode", mode, Mode).digit
+            digit = MODES[_member("mode", mode, Mode)].digit
             if not digit:
                 raise EncodeError("mode: 'manual' cannot be opened (MODE01); allowed are the other six, or close it")
             return b"$4WD,MODE%d1#" % digit
         case ModeClose(mode):
-            return b"$4WD,MODE%d0#" % _member("mode", mode, Mode).digit
+            return b"$4WD,MODE%d0#" % MODES[_member("mode", mode, Mode)].digit
         case ArmSet(joints):
             if len(joints) != ARM_JOINTS:
                 raise EncodeError(f"joint_deg: {len(joints)} values, allowed are {ARM_JOINTS}, each 0..{DEG_MAX}")
@@ -108,10 +109,10 @@ def encode(frame: Frame) -> bytes:
 
 
 def parse_sent(data: bytes) -> Frame | None:
-    """The frame that these bytes are, or None if they are not one whole frame of the table.
+    """Return the frame with these bytes. None if they are not one whole frame of the table.
 
-    Rotation wins over place 1, as in the car. None also for what a `Frame` cannot say: MODE01, and a servo moved
-    (place 5) and reset (place 9) at once.
+    Rotation wins over place 1, as in the car. A `Frame` cannot express MODE01, nor a servo that moves (place 5) and
+    resets (place 9) at once: None too.
     """
     if data == b"#":
         return Reset()
@@ -179,7 +180,7 @@ _MOTION_AT = {motion.digits: motion for motion in Motion}
 _SPEED_AT = {step.digit: step for step in SpeedStep}
 _SERVO_AT = {action.digits: action for action in ServoAction}
 _LIGHT_AT = {light.digit: light for light in Light}
-_MODE_AT = {mode.digit: mode for mode in Mode}
+_MODE_AT = {row.digit: mode for mode, row in MODES.items()}
 
 # Nine one-digit fields, always all nine (docs/reference/protocol.md#general-frame).
 _GENERAL = re.compile(rb"\$([0-4]),([0-2]),([01]),([0-2]),([0-8]),([01]),([0-8]),([01]),([01])#")
@@ -187,7 +188,7 @@ _GENERAL = re.compile(rb"\$([0-4]),([0-2]),([01]),([0-2]),([0-8]),([01]),([0-8])
 _NAMED = re.compile(
     rb"\$4WD,(?:PTZ(?P<deg>\d{1,3})"
     rb"|CLR(?P<r>\d{1,3}),CLG(?P<g>\d{1,3}),CLB(?P<b>\d{1,3})"
-    rb"|MODE(?P<mode>[0-6])(?P<open>[01])"
+    rb"|MODE(?P<mode>[%b])(?P<open>[01])"
     rb"|ServoJ1(?P<j1>\d{1,3}),J2(?P<j2>\d{1,3}),J3(?P<j3>\d{1,3}),J4(?P<j4>\d{1,3}),J5(?P<j5>\d{1,3}),J6(?P<j6>\d{1,3})"
-    rb")#"
+    rb")#" % b"".join(b"%d" % digit for digit in _MODE_AT)
 )

@@ -1,6 +1,6 @@
-"""What one event of a decoder comes to on the bus: its verdict, and per topic the fields that were measured. Pure.
+"""Turns a decoder's event into its verdict and the measured fields per topic. Pure.
 
-What the gateway knows besides (charge and level of a battery) is not decoded, and not said here.
+The level of the battery is an estimate of the gateway and is not set here.
 """
 
 from gateway.protocol.enums import Mode
@@ -15,7 +15,7 @@ _IMU = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw", "accel_x_raw", "accel_y_raw", 
 
 
 def verdict_of(event: Event) -> str:
-    """What the bytes were: `sensors`, `arm`, `imu`, `echo`, or the cause of their rejection."""
+    """Return `sensors`, `arm`, `imu`, `echo`, or the cause of the rejection."""
     match event:
         case Sensors():
             return "sensors"
@@ -30,16 +30,16 @@ def verdict_of(event: Event) -> str:
 
 
 def measured(event: Event, profile: Profile, confirmed: Mode | None) -> dict[str, Fields]:
-    """By topic, in the order of publication, the fields of its message; units are those of the messages.
+    """Return the measured fields by topic, in the order of publication, in the units of the messages.
 
-    `confirmed`: the mode that the car is known to be in, or None. A field that was not measured is left out.
+    `confirmed`: the confirmed mode of the car, or None. Fields that were not measured are omitted.
     """
     match event:
         case Sensors():
             return _sensors(event, profile, confirmed)
         case ArmReading(joint_deg=joints):
-            there = tuple(joint for joint in joints if joint is not None)
-            return {"sensor/arm": {"joint_deg": there}} if len(there) == len(joints) else {}
+            degrees = tuple(joint for joint in joints if joint is not None)
+            return {"sensor/arm": {"joint_deg": degrees}} if len(degrees) == len(joints) else {}
         case ImuReading():
             return {"sensor/imu": dict(zip(_IMU, (*event.gyro, *event.accel), strict=True))}
         case Echo() | Rejected():
@@ -48,20 +48,20 @@ def measured(event: Event, profile: Profile, confirmed: Mode | None) -> dict[str
 
 def _sensors(event: Sensors, profile: Profile, confirmed: Mode | None) -> dict[str, Fields]:
     names = profile.measured(event, confirmed)
-    found: dict[str, Fields] = {}
+    topics: dict[str, Fields] = {}
     if "range" in names and event.range_cm is not None:
-        # 0 is no echo, not a distance (docs/reference/protocol.md#ranges).
-        found["sensor/range"] = (
+        # A range of 0 is no echo, not a distance (docs/reference/protocol.md#ranges).
+        topics["sensor/range"] = (
             {"no_echo": False, "range_m": round(event.range_cm / 100, 4)} if event.range_cm else {"no_echo": True}
         )
     if "battery" in names and event.voltage_v is not None:
-        found["sensor/battery"] = {"voltage_v": event.voltage_v}
+        topics["sensor/battery"] = {"voltage_v": event.voltage_v}
     if "grayscale" in names and event.grayscale is not None:
-        found["sensor/grayscale"] = {"raw": event.grayscale}
+        topics["sensor/grayscale"] = {"raw": event.grayscale}
     if "line" in names and event.line is not None:
-        found["sensor/line"] = dict(zip(_LINE, event.line, strict=True))
+        topics["sensor/line"] = dict(zip(_LINE, event.line, strict=True))
     if "obstacle" in names and (obstacle := profile.obstacle(event, confirmed)) is not None:
-        found["sensor/obstacle"] = {"left": obstacle[0], "right": obstacle[1]}
+        topics["sensor/obstacle"] = {"left": obstacle[0], "right": obstacle[1]}
     if "light" in names and event.light is not None:
-        found["sensor/light"] = {"left": event.light[0], "right": event.light[1]}
-    return found
+        topics["sensor/light"] = {"left": event.light[0], "right": event.light[1]}
+    return topics

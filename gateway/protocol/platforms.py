@@ -1,7 +1,6 @@
-"""What each kind of car knows, how it is stopped, and which of its readings are measured.
+"""The kinds of cars: the frames that they know, their way of stopping, and which of their readings are measured.
 
-Every number cites its row of docs/reference/protocol.md; the times are in `timing`. When to send is not
-decided here (see `control`).
+Every number cites its row of docs/reference/protocol.md. The times are in `timing` and `modes`.
 """
 
 from dataclasses import dataclass
@@ -12,11 +11,13 @@ from typing import Final
 from gateway.protocol.enums import Light, Mode, ServoAction, SpeedStep
 from gateway.protocol.events import Sensors
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
-from gateway.protocol.timing import MODE_TURN_S, RASPBERRY_PI_FAN_S, RATE_HZ, block_s
+from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES
+from gateway.protocol.sensor_fields import ATTRIBUTES
+from gateway.protocol.timing import RASPBERRY_PI_FAN_S, block_s
 
 
 class Platform(StrEnum):
-    """The programs that run on the cars."""
+    """The program that runs on a car."""
 
     ARDUINO = "arduino"
     STM32 = "stm32"
@@ -25,7 +26,7 @@ class Platform(StrEnum):
 
 
 class StopStyle(StrEnum):
-    """Which of the stop recipes (docs/reference/protocol.md#stops) a car gets."""
+    """The stop sequences of a car (docs/reference/protocol.md#stops)."""
 
     MODE_FRAME = "mode_frame"
     RASPBERRY_PI = "raspberry_pi"
@@ -33,14 +34,6 @@ class StopStyle(StrEnum):
 
 
 OPTIONS: Final = frozenset({"arm", "imu"})
-
-# What the frame of each mode measures (docs/reference/protocol.md#placeholders).
-_ALL: Final = frozenset({"range", "battery", "grayscale", "line", "obstacle", "light"})
-_MEASURED: Final = {
-    Mode.TRACKING: frozenset({"line"}),
-    Mode.LIGHT_SEEKING: frozenset({"light"}),
-    Mode.FOLLOWING: frozenset({"obstacle"}),
-}
 
 _FRONT: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 _VERTICAL: Final = frozenset({ServoAction.VERTICAL_UP, ServoAction.VERTICAL_DOWN, ServoAction.VERTICAL_RESET})
@@ -51,59 +44,48 @@ _HORIZONTAL: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class SpeedModel:
-    """Speed as the gateway estimates it: in the car's own unit, known only by counting steps."""
+    """The gateway's estimate of the speed, by counting steps, in the car's own unit."""
 
     start: float
     increment: float
-    low: float  # a step down that would end below this ends at `rebound`
+    low: float  # a step down to less than this ends at `rebound`
     rebound: float
     top: float
 
     def step(self, value: float, step: SpeedStep) -> float:
-        """The value after one step."""
+        """Return the speed after one step."""
         if step is SpeedStep.UP:
             return min(value + self.increment, self.top)
         lower = value - self.increment
         return lower if lower >= self.low else self.rebound
 
     def fraction(self, value: float) -> float:
-        """The value as 0..1 of the greatest."""
+        """Return the speed as a fraction of the maximum, 0..1."""
         return min(max(value / self.top, 0.0), 1.0)
 
 
-# platforms: speed. Arduino 150 of 255, +-50, ceiling 255, a step that would end below 50 becomes 100
+# platforms: speed. Arduino 150 of 255, +-50, ceiling 255, a step down to less than 50 becomes 100
 ARDUINO_SPEED: Final = SpeedModel(start=150, increment=50, low=50, rebound=100, top=255)
-# platforms: speed. Raspberry Pi +-20 in 20..100 %; no row gives the start: half of full speed is assumed
+# platforms: speed. Raspberry Pi +-20 in 20..100 %; the table has no start value: half of full speed is assumed
 RASPBERRY_PI_SPEED: Final = SpeedModel(start=50, increment=20, low=20, rebound=20, top=100)
 
-# platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimetres
+# platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimeters
 _PI_VOLTAGE_V, _PI_GRAYSCALE = 8.4, 0
 _CONSTANTS: Final = (("battery", _PI_VOLTAGE_V), ("grayscale", float(_PI_GRAYSCALE)))
 
 
-_FIELDS: Final = {
-    "range": "range_cm",
-    "battery": "voltage_v",
-    "grayscale": "grayscale",
-    "line": "line",
-    "obstacle": "obstacle",
-    "light": "light",
-}
-"""Where a sensors frame has them."""
-
-
 @cache
-def _sure(candidates: tuple[Mode, ...]) -> frozenset[str]:
-    """What is measured whichever of these modes a frame comes from."""
-    sure = frozenset.intersection(*(_MEASURED.get(candidate, _ALL) for candidate in candidates))
+def _common_measurements(candidates: tuple[Mode, ...]) -> frozenset[str]:
+    """Return the measurements that all these modes have in common. A silent mode excludes none."""
+    common = EVERY_MEASUREMENT.intersection(*(MODES[mode].measures for mode in candidates if mode not in SILENT_MODES))
     if len(candidates) > 1 and Mode.FOLLOWING in candidates:
-        return sure - {"obstacle"}  # inverted in one of them
-    return sure
+        return common - {"obstacle"}  # following inverts it
+    return common
 
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One kind of car: one column of docs/reference/protocol.md#platforms."""
+    """One kind of car: a column of docs/reference/protocol.md#platforms's table of platforms."""
 
     kind: Platform
     options: frozenset[str]
@@ -113,43 +95,43 @@ class Profile:
     servos: frozenset[ServoAction]
     stop_style: StopStyle
     speed: SpeedModel
-    constants: tuple[tuple[str, float], ...] = ()  # readings that are constants of the platform in mode 0
-    not_observed: tuple[str, ...] = ()  # what is only read or assumed, in words
+    constants: tuple[tuple[str, float], ...] = ()  # readings that are constants in mode 0
+    not_observed: tuple[str, ...] = ()  # properties that were only read or assumed, for a person
 
     @property
     def name(self) -> str:
-        """As `parse_platform` takes it."""
+        """The text that `parse_platform` accepts."""
         return "+".join((self.kind, *sorted(self.options)))
 
     @property
     def observed(self) -> bool:
-        """Whether all of this profile was observed on a running program."""
+        """True if all of this profile was observed on a running program."""
         return not self.not_observed
 
     @property
     def silent_modes(self) -> frozenset[Mode]:
-        """The modes in which this car sends no readings (docs/reference/protocol.md#placeholders: 1, 3, 4)."""
-        return self.modes & {Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED}
+        """The modes in which this car sends no readings."""
+        return self.modes & SILENT_MODES
 
     @property
     def possible_modes(self) -> frozenset[Mode]:
-        """The modes that this car may be in, whoever brought it there; any, if its platform is not known."""
+        """The modes that this car may be in, whoever opened them. All modes if the platform is unknown."""
         return frozenset(Mode) if self.kind is Platform.UNKNOWN else self.modes
 
     @property
     def fan_silences(self) -> bool:
-        """Whether it may send no readings while its fan runs (hazards: the fan on; Raspberry Pi: it blocks 1 s)."""
+        """True if a running fan may silence the car (hazards: the fan on; a Raspberry Pi only blocks for 1 s)."""
         return self.kind is not Platform.RASPBERRY_PI
 
     def refusal(self, frame: Frame) -> str | None:
-        """Why this frame is never sent to this car, in words for a person; None if the car knows it."""
+        """Return why the car must not get this frame, for a person. None if the car knows the frame."""
         match frame:
             case General():
                 return self._general_refusal(frame)
             case Ptz():
                 return self._unless("servo_deg", "the pan/tilt frame (a servo angle in degrees)")
             case ColorLed():
-                return self._unless("led", "the colour LED frame")
+                return self._unless("led", "the color LED frame")
             case ModeOpen(mode):
                 if mode in self.modes and mode is not Mode.MANUAL:
                     return None
@@ -165,23 +147,19 @@ class Profile:
                 return self._unless("mode", "a lone '#'")
 
     def block_s(self, frame: Frame) -> float:
-        """How long the car may be blocked after this frame, seconds (see `timing.block_s`)."""
+        """Return the maximum time in seconds for which this frame blocks the car (see `timing.block_s`)."""
         slow_fan = self.kind in {Platform.RASPBERRY_PI, Platform.UNKNOWN}
         return block_s(frame, fan_s=RASPBERRY_PI_FAN_S if slow_fan else 0.0)
 
     def mode_turn_s(self, mode: Mode) -> float:
-        """The longest block of one turn of this mode's own loop, during which nothing is obeyed."""
-        return MODE_TURN_S[mode]
-
-    def rate_hz(self, mode: Mode) -> float:
-        """Sensors frames per second at most; 0 in a silent mode."""
-        return RATE_HZ.get(mode, 0.0)
+        """Return the longest block of one turn of this mode's own loop; the car obeys nothing meanwhile."""
+        return MODES[mode].turn_s
 
     def resolved(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
-        """The modes this frame may come from.
+        """Return the modes that this frame may come from.
 
-        `mode`, the confirmed one, chooses among the candidates; a frame of none but other modes may be one of `mode`
-        with a byte damaged, until three of them have contradicted it.
+        The confirmed `mode` decides between the candidates. If it is none of them, the frame may be a corrupted frame
+        of that mode, until three frames in a row contradict it.
         """
         candidates = event.candidates
         if mode is None:
@@ -189,26 +167,27 @@ class Profile:
         return (mode,) if mode in candidates else (*candidates, mode)
 
     def measured(self, event: Sensors, mode: Mode | None = None) -> frozenset[str]:
-        """Which of range, battery, grayscale, line, obstacle, light are measurements here, in every candidate mode.
+        """Return which fields of this frame are measurements in every mode that it may come from.
 
-        The frame's text decides first; `mode` is the confirmed mode, or None (see `resolved`).
-        A rejected field is never measured. No echo is: it is the range's business to say so.
+        `mode` is the confirmed mode, or None (see `resolved`). A rejected field is not measured; a range without echo
+        is.
         """
-        there = {name for name in _sure(self.resolved(event, mode)) if getattr(event, _FIELDS[name]) is not None}
+        common = _common_measurements(self.resolved(event, mode))
+        names = {name for name in common if getattr(event, ATTRIBUTES[name]) is not None}
         if self.constants and self._may_be_constant(event):
-            there -= {name for name, value in self.constants if getattr(event, _FIELDS[name]) == value}
-        return frozenset(there)
+            names -= {name for name, value in self.constants if getattr(event, ATTRIBUTES[name]) == value}
+        return frozenset(names)
 
     def measurable(self, mode: Mode) -> frozenset[str]:
-        """What a car of this kind can ever measure in this mode; constants of the platform are no measurements."""
+        """Return everything that a car of this kind can measure in this mode, without constants of the platform."""
         if mode not in self.modes or mode in self.silent_modes:
             return frozenset()
         if mode is not Mode.MANUAL:
-            return _MEASURED[mode]
-        return (_ALL | (self.options & OPTIONS)) - {name for name, _ in self.constants}
+            return MODES[mode].measures
+        return (EVERY_MEASUREMENT | (self.options & OPTIONS)) - {name for name, _ in self.constants}
 
     def obstacle(self, event: Sensors, mode: Mode | None = None) -> tuple[bool, bool] | None:
-        """Obstacle left, right, with the inversion of following undone; None if it is not measured here."""
+        """Return obstacle left, right, with the inversion of following undone. None if it is not measured."""
         if event.obstacle is None or "obstacle" not in self.measured(event, mode):
             return None
         left, right = event.obstacle
@@ -216,7 +195,7 @@ class Profile:
         return (not left, not right) if self.resolved(event, mode) == (Mode.FOLLOWING,) else (left, right)
 
     def contradictions(self, event: Sensors) -> tuple[str, ...]:
-        """What in this frame speaks against this platform, in words; empty is no proof of it."""
+        """Return the contradictions between this frame and the platform, for a person. None found proves nothing."""
         if self.kind is Platform.UNKNOWN:
             return ()
         candidates = event.candidates
@@ -266,8 +245,8 @@ class Profile:
 AUTO: Final = "auto"
 
 
-def parse_told(text: str) -> tuple[Profile, bool]:
-    """As `parse_platform`, and whether to find out: `auto` begins as `unknown`, and settles on what the bytes show."""
+def parse_platform_option(text: str) -> tuple[Profile, bool]:
+    """Return the profile, and True if the gateway has to detect the platform: `auto` starts as `unknown`."""
     auto = text.partition("+")[0] == AUTO
     try:
         return parse_platform(text.replace(AUTO, Platform.UNKNOWN, 1) if auto else text), auto
@@ -276,7 +255,7 @@ def parse_told(text: str) -> tuple[Profile, bool]:
 
 
 def parse_platform(text: str) -> Profile:
-    """The profile of `arduino`, `stm32`, `raspberry_pi` or `unknown`, with `+arm` and `+imu`; else ValueError."""
+    """Return the profile of a platform such as `arduino` or `raspberry_pi+arm+imu`; raise ValueError."""
     kind, *options = text.split("+")
     allowed = f"allowed are {', '.join(Platform)}, each with +arm, +imu or both"
     if kind not in set(Platform):

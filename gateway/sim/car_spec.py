@@ -1,4 +1,4 @@
-"""What a user writes to describe a car, simulated or replayed: words checked, one-line errors, nothing opened. Pure."""
+"""Parses the description of a simulated or replayed car, with one-line errors. Opens nothing. Pure."""
 
 import re
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ _REPLAY: Final = re.compile(r"(?P<file>.+?)(?::(?P<name>[a-z0-9_-]+)(?::(?P<link
 
 
 class BadSpec(ValueError):
-    """A description that is not allowed; its text names what, where and what is."""
+    """A description that is not allowed. The message names the place, the value and what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
 class PtyPath:
-    """A pseudo terminal; `path`: a symlink to it that stays the same when the link comes back."""
+    """A pseudo terminal. `path`: a symlink to it that stays the same when the link returns."""
 
     path: str | None = None
 
@@ -48,7 +48,7 @@ class CarSpec:
 
 @dataclass(frozen=True, slots=True)
 class ReplaySpec:
-    """A file that `gateway monitor --raw` kept, as a car."""
+    """A capture of `gateway monitor --raw` that plays as a car."""
 
     name: str
     path: str
@@ -56,7 +56,7 @@ class ReplaySpec:
 
 
 def parse_car(text: str) -> CarSpec:
-    """NAME:PLATFORM[+OPTION...]:LINK; raises BadSpec."""
+    """Parse NAME:PLATFORM[+OPTION...]:LINK; raise BadSpec."""
     parts = text.split(":", 2)
     if len(parts) != 3:
         raise BadSpec(f"car {text!r} is not allowed: write NAME:PLATFORM:LINK, for example red:arduino:pty")
@@ -76,7 +76,7 @@ def parse_car(text: str) -> CarSpec:
 
 
 def parse_replay(text: str) -> ReplaySpec:
-    """FILE[:NAME[:LINK]]; the name is `replay` and the link a pty if they are left out. Raises BadSpec."""
+    """Parse FILE[:NAME[:LINK]], by default with the name `replay` and a pty; raise BadSpec."""
     match = _REPLAY.fullmatch(text)
     if match is None:
         raise BadSpec(f"replay {text!r} is not allowed: write FILE[:NAME[:LINK]], for example red.raw:red:tcp")
@@ -105,14 +105,14 @@ def _parse_link(what: str, link: str) -> PtyPath | TcpListen:
 
 
 def parse_cars(texts: Sequence[str]) -> list[CarSpec]:
-    """Several cars; raises BadSpec also for two of one name, port or path."""
+    """Parse several cars; raise BadSpec, also for two cars with one name, port or path."""
     cars = [parse_car(text) for text in texts]
     refuse_twins(cars)
     return cars
 
 
 def refuse_twins(cars: Sequence[CarSpec | ReplaySpec]) -> None:
-    """Raises BadSpec for two cars of one name, port or path."""
+    """Raise BadSpec if two cars have the same name, port or path."""
     _refuse("name", [car.name for car in cars])
     _refuse("path", [car.link.path for car in cars if isinstance(car.link, PtyPath) and car.link.path])
     tcp = [car.link for car in cars if isinstance(car.link, TcpListen)]

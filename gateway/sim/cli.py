@@ -1,6 +1,6 @@
-"""`gateway sim`: arguments, the line per car, what is scheduled on the command line, a clean end.
+"""`gateway sim`: the arguments, one line of output per car, scheduled faults, a clean end.
 
-What comes in on stdin while it runs is channel.py's part.
+`control_channel` obeys the commands on stdin.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from typing import Final
 
 from gateway import capture
 from gateway.sim.car_spec import BadSpec, CarSpec, ReplaySpec, parse_cars, parse_replay, refuse_twins
-from gateway.sim.control_channel import obey, say
+from gateway.sim.control_channel import print_json, serve_commands
 from gateway.sim.endpoints import EndpointError, Taken
 from gateway.sim.faults import Fault, Scheduled, parse_fault, parse_press, targets
 from gateway.sim.model.capture_car import CaptureCar
@@ -24,7 +24,7 @@ from schemas import keys
 from schemas.process import signals
 
 WORLDS: Final = {"room": World.room, "open": World.open_field}
-PARENT_EVERY_S: Final = 0.1
+PARENT_CHECK_INTERVAL_S: Final = 0.1
 RATES: Final = (0.01, 100.0)
 
 EPILOG: Final = """\
@@ -65,7 +65,7 @@ TCP it begins when a host connects, over a pty at once:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of `gateway sim`."""
+    """Declare the options."""
     parser.description = (
         "Simulated cars that behave as the real ones do, hazards included, in one world and one process."
     )
@@ -114,7 +114,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until SIGINT or SIGTERM; the exit code."""
+    """Run until SIGINT or SIGTERM; return the exit code."""
     try:
         specs = parse_cars(args.car)
         replays = [parse_replay(text) for text in args.replay]
@@ -137,7 +137,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[tuple[ReplaySpec, CaptureCar]]:
-    """The files, read whole: what is wrong with one is said before anything is opened. Raises BadSpec."""
+    """Read the captures whole, before any link opens; raise BadSpec."""
     if not replays and not args.car:
         raise BadSpec("nothing to simulate: give --car NAME:PLATFORM:LINK or --replay FILE")
     if not replays and (args.loop or args.rate is not None):
@@ -162,19 +162,19 @@ def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[t
 
 
 def _world(words: str, cars: list[str]) -> World:
-    """A world by its name or from its file. Raises BadSpec."""
+    """Return a world by its name or from its file; raise BadSpec."""
     if words in WORLDS:
         return WORLDS[words]()
-    # YAML is read for a world file only: a simulator starts faster without it.
+    # Imported only for a world file: the simulator starts faster without YAML.
     from gateway.sim.world_file import read_world
-    from gateway.sim.yaml_reader import LARGEST_BYTES, BadWorld
+    from gateway.sim.yaml_reader import MAX_WORLD_BYTES, BadWorld
 
     try:
-        if Path(words).exists() and not Path(words).is_file():  # a FIFO would be waited for
+        if Path(words).exists() and not Path(words).is_file():  # opening a FIFO would block
             raise BadSpec(f"world {words}: is a directory, FIFO or device, not a file: save the text as a file")
         with Path(words).open("rb") as file:
-            data = file.read(LARGEST_BYTES + 1)
-        text = data.decode("utf-8-sig", errors="strict" if len(data) <= LARGEST_BYTES else "replace")
+            data = file.read(MAX_WORLD_BYTES + 1)
+        text = data.decode("utf-8-sig", errors="strict" if len(data) <= MAX_WORLD_BYTES else "replace")
         return read_world(text, words, cars).world()
     except OSError as error:
         raise BadSpec(f"world {words}: {error.strerror}: write {', '.join(WORLDS)} or the path of a file") from None
@@ -186,12 +186,12 @@ def _world(words: str, cars: list[str]) -> World:
         raise BadSpec(f"world {words!r} is no path: {error}") from None
 
 
-def _complain(words: str) -> None:
+def _print_error(words: str) -> None:
     sys.stderr.write(f"gateway sim: {words}\n")
 
 
 def _fail(words: str, code: int) -> int:
-    _complain(words)
+    _print_error(words)
     return code
 
 
@@ -218,13 +218,13 @@ async def _serve(
     signals.calls_in(loop, lambda _: ended.set())
     simulation = Simulation(specs, seed=args.seed, world=world, replays=replays)
     for car in simulation.cars.values():
-        car.failed = lambda failed, error: _complain(f"car {failed.spec.name}: {error}")
+        car.on_failed = lambda failed, error: _print_error(f"car {failed.spec.name}: {error}")
     await simulation.start()
-    tasks = [loop.create_task(_strike(simulation, each)) for each in scheduled]
+    tasks = [loop.create_task(_run_scheduled(simulation, each)) for each in scheduled]
     if endpoint is not None:
         from gateway.sim.truth_publisher import TruthPublisher
 
-        tasks.append(loop.create_task(TruthPublisher(simulation, endpoint, args.fleet, _complain).run()))
+        tasks.append(loop.create_task(TruthPublisher(simulation, endpoint, args.fleet, _print_error).run()))
     if args.with_parent:
         tasks.append(loop.create_task(_watch_parent(parent, ended)))
 
@@ -236,9 +236,9 @@ async def _serve(
         task.add_done_callback(end)
     try:
         for car in simulation.cars.values():
-            _introduce(car)
-            car.moved, car.ended = _introduce, _take_leave
-        tasks.append(loop.create_task(obey(simulation)))
+            _print_link(car)
+            car.on_renamed, car.on_ended = _print_link, _print_ended
+        tasks.append(loop.create_task(serve_commands(simulation)))
         tasks[-1].add_done_callback(end)
         await ended.wait()
     finally:
@@ -251,18 +251,18 @@ async def _serve(
             raise failure
 
 
-def _introduce(car: SimCar) -> None:
+def _print_link(car: SimCar) -> None:
     if isinstance(car.spec, CarSpec):
-        say({"car": car.spec.name, "platform": car.spec.platform_words, "link": car.url})
+        print_json({"car": car.spec.name, "platform": car.spec.platform_words, "link": car.url})
     else:
-        say({"car": car.spec.name, "replay": car.spec.path, "link": car.url})
+        print_json({"car": car.spec.name, "replay": car.spec.path, "link": car.url})
 
 
-def _take_leave(car: SimCar) -> None:
-    say({"car": car.spec.name, "replay": "ended"})
+def _print_ended(car: SimCar) -> None:
+    print_json({"car": car.spec.name, "replay": "ended"})
 
 
-async def _strike(simulation: Simulation, scheduled: Scheduled) -> None:
+async def _run_scheduled(simulation: Simulation, scheduled: Scheduled) -> None:
     await asyncio.sleep(scheduled.at_s)
     if not isinstance(scheduled.act, Fault):
         simulation.press(scheduled.act)
@@ -270,10 +270,10 @@ async def _strike(simulation: Simulation, scheduled: Scheduled) -> None:
     try:
         await simulation.inflict(scheduled.act)
     except EndpointError as error:
-        _complain(str(error))
+        _print_error(str(error))
 
 
 async def _watch_parent(parent: int, ended: asyncio.Event) -> None:
-    while os.getppid() == parent:  # noqa: ASYNC110 - the system tells of a dead parent in no other portable way
-        await asyncio.sleep(PARENT_EVERY_S)
+    while os.getppid() == parent:  # noqa: ASYNC110 - no portable notification exists
+        await asyncio.sleep(PARENT_CHECK_INTERVAL_S)
     ended.set()

@@ -1,4 +1,4 @@
-"""The control channel of `gateway sim`: JSON objects on stdin, one a line, each answered by one line on stdout."""
+"""The control channel of `gateway sim`: one JSON object per line on stdin, one answer per line on stdout."""
 
 import asyncio
 import json
@@ -16,37 +16,35 @@ from gateway.sim.simulation import Simulation
 from gateway.sim.world_commands import change_of
 from schemas.process import stdio
 
-LINE_LIMIT: Final = 65536
+MAX_COMMAND_BYTES: Final = 65536
 
 
-def say(line: dict[str, object]) -> None:
-    """One line of JSON on stdout. Whoever reads may have gone, or the disk be full: the cars go on, without words."""
+def print_json(line: dict[str, object]) -> None:
+    """Print one line of JSON to stdout. If the reader has gone or the disk is full, the cars go on silently."""
     try:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
     except OSError as error:
         stdio.silence(sys.stdout)
-        if not isinstance(error, BrokenPipeError):  # whoever closed a pipe knows
+        if not isinstance(error, BrokenPipeError):  # a closed pipe needs no message
             sys.stderr.write(
                 f"gateway sim: stdout cannot be written ({error.strerror}): the cars go on, and no more is said there\n"
             )
 
 
-async def obey(simulation: Simulation) -> None:
-    """Answer what comes on stdin, until cancelled."""
+async def serve_commands(simulation: Simulation) -> None:
+    """Obey and answer the commands on stdin, until cancelled."""
     lines: asyncio.Queue[bytes] = asyncio.Queue()
     threading.Thread(target=_read_lines, args=(asyncio.get_running_loop(), lines), daemon=True).start()
     while True:
         line = await lines.get()
         if line.strip():
-            say(await _answer(simulation, line))
+            print_json(await _answer(simulation, line))
 
 
 def _read_lines(loop: asyncio.AbstractEventLoop, lines: "asyncio.Queue[bytes]") -> None:
-    """Stdin may be a pipe, a terminal, a file or nothing, so a thread reads it; its end ends nothing.
-
-    `os.read` instead of the buffered stdin: a daemon thread that holds that one's lock breaks the interpreter's end.
-    """
+    """Read stdin, which may be a pipe, a terminal, a file or closed. Its end does not end the simulator."""
+    # `os.read`, not the buffered stdin: a daemon thread that holds the lock of stdin breaks the interpreter's shutdown.
     if hasattr(signal, "pthread_sigmask"):
         # Reading a terminal from the background would stop the whole process.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})
@@ -59,7 +57,7 @@ def _read_lines(loop: asyncio.AbstractEventLoop, lines: "asyncio.Queue[bytes]") 
         if not data:
             return
         *whole, rest = (rest + data).split(b"\n")
-        rest = rest[-LINE_LIMIT:]
+        rest = rest[-MAX_COMMAND_BYTES:]
         try:
             for line in whole:
                 loop.call_soon_threadsafe(lines.put_nowait, line)
@@ -82,7 +80,7 @@ async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
             return {"ok": True, "ir": press.button.value, "obeyed": simulation.press(press)}
         fault = fault_of(fields)
         return {"ok": True, "fault": fault.kind.value, "cars": await simulation.inflict(fault)}
-    except ValueError as error:  # BadSpec, and whatever is no JSON
+    except ValueError as error:  # BadSpec, or invalid JSON
         words = str(error) if isinstance(error, BadSpec) else f"no JSON: {error}"
     except RecursionError:
         words = "no JSON: it is nested too deep"

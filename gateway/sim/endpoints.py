@@ -1,7 +1,6 @@
-"""The ends of a simulated car's link that a host opens: a pseudo terminal or a listening TCP port.
+"""The end of a simulated car's link that a host opens: a pseudo terminal or a listening TCP port.
 
-Bytes only; pacing and meaning are the core's. What comes from a host goes to the link's owner; what nobody
-takes is swallowed, as by a wire.
+A link passes the host's bytes to its owner. Bytes without a host are lost, as on a wire.
 """
 
 import asyncio
@@ -17,68 +16,68 @@ from typing import Protocol
 
 READ_SIZE = 128
 _TERMINAL = re.compile(r"/dev/(pts/|ttys)\d+")
-_CLOCKS_S = 2.0
-"""A file system may keep whole seconds only."""
+# A file system may store whole seconds only.
+_FILE_TIME_MARGIN_S = 2.0
 
 
 class EndpointError(Exception):
-    """A link cannot be opened; its text says why and what to do."""
+    """A link cannot be opened. The message says why and what to do."""
 
 
 class Taken(EndpointError):
-    """Something else is at the path that a link was to have: wrong use."""
+    """The path of a link is in use: wrong use."""
 
 
 class Owner(Protocol):
-    """Who runs the car behind a link."""
+    """The car behind a link."""
 
     def received(self, data: bytes) -> None:
-        """Bytes from the host."""
+        """Accept bytes from the host."""
         ...
 
     def connected(self) -> None:
-        """A host has connected (TCP only: a wire does not tell)."""
+        """Note that a host has connected (TCP only)."""
         ...
 
     def disconnected(self) -> None:
-        """The host has gone away (TCP only)."""
+        """Note that the host has disconnected (TCP only)."""
         ...
 
 
 class SimLink(Protocol):
-    """What the shell needs of either link."""
+    """The interface of both kinds of links."""
 
     @property
     def url(self) -> str:
-        """What a gateway opens."""
+        """The URL that a gateway opens."""
         ...
 
     async def up(self) -> None:
-        """Be there; raises LinkError."""
+        """Open the link for a host; raise EndpointError."""
         ...
 
     async def down(self) -> None:
-        """Be gone, as after an unplugged cable or a lost network; `up` brings it back."""
+        """Close the link, as an unplugged cable or a lost network does; `up` opens it again."""
         ...
 
     def send(self, data: bytes) -> None:
-        """Bytes to the host, if there is one."""
+        """Send bytes to the host, if there is one."""
         ...
 
     def hold(self, *, on: bool) -> None:
-        """Stop or resume taking bytes from the host, which may go on until the system's buffers are full."""
+        """Pause or resume reading. The host can write until the system's buffers are full."""
         ...
 
     def stick(self, *, on: bool) -> None:
-        """Take nothing more, as a device that has stopped reading; a host's writes wait where the system lets them."""
+        """Stop or resume reading, as a stuck device does. The host's writes block where the system allows."""
         ...
 
     def rename(self, path: str | None) -> None:
-        """Be another device when `up` comes next, at another path if one is given; raises LinkError."""
+        """Become another device at the next `up`, at another path if one is given; raise EndpointError."""
         ...
 
     async def close(self) -> None:
-        """Be gone for good, leaving nothing behind."""
+        """Close the link for good and remove its traces."""
         ...
 
 
@@ -107,14 +106,14 @@ class PtySimLink:
 
     @property
     def url(self) -> str:
-        """`serial://` and the device, or the stable symlink to it."""
+        """The device, or the stable symlink to it, as `serial://` URL."""
         return f"serial://{self._path.absolute() if self._path else self._name}"
 
     async def up(self) -> None:
-        """Open a new terminal, and point the symlink at it."""
+        """Open a new terminal and point the symlink at it."""
         self._master, self._slave = self._next or self._open()
         self._next = None
-        # Our own hold on the slave keeps the terminal and its raw mode while no host has it open.
+        # Our open slave keeps the terminal and its raw mode while no host has it open.
         self._setraw(self._slave)
         os.set_blocking(self._master, False)
         self._name = os.ttyname(self._slave)
@@ -125,7 +124,7 @@ class PtySimLink:
                 await self.down()
                 raise
         self._held = False
-        self._settle()
+        self._update_reading()
         self._tcflow(self._slave, self._flow_off if self._stuck else self._flow_on)
 
     def _open(self) -> tuple[int, int]:
@@ -135,8 +134,8 @@ class PtySimLink:
             raise EndpointError(f"no pseudo terminal to be had: {error.strerror}") from None
 
     def _point(self, path: Path) -> None:
-        """What a killed simulator has left may be replaced, anything else may not."""
-        if self._left_over(path):
+        """Create the symlink. Replace only the leftover of a killed simulator."""
+        if self._is_leftover(path):
             path.unlink(missing_ok=True)
         try:
             path.symlink_to(self._name)
@@ -150,16 +149,16 @@ class PtySimLink:
         except OSError as error:
             raise EndpointError(f"no symlink can be made at {path}: {error.strerror}") from None
 
-    def _left_over(self, path: Path) -> bool:
-        """Whether this symlink's terminal is gone, or its number another's by now, opened after the link was made."""
+    def _is_leftover(self, path: Path) -> bool:
+        """Return True if the symlink's terminal is gone, or if its number belongs to a newer terminal."""
         if not path.is_symlink() or not _TERMINAL.fullmatch(target := str(path.readlink())):
             return False
         try:
             opened_s = path.stat().st_ctime
         except OSError:
             return True
-        # macOS keeps the nodes of its terminals.
-        newer = sys.platform == "linux" and opened_s > path.lstat().st_mtime + _CLOCKS_S
+        # macOS never removes the nodes of its terminals.
+        newer = sys.platform == "linux" and opened_s > path.lstat().st_mtime + _FILE_TIME_MARGIN_S
         return target == self._name or newer
 
     def _readable(self) -> None:
@@ -167,23 +166,23 @@ class PtySimLink:
             data = os.read(self._master, READ_SIZE)
         except BlockingIOError:
             return
-        except OSError:  # macOS: the last host has closed the slave; the next one is waited for
+        except OSError:  # macOS: the last host has closed the slave; wait for the next one
             return
         self._owner.received(data)
 
     def hold(self, *, on: bool) -> None:
-        """Stop or resume reading; a host that goes on writing blocks after some kilobytes."""
+        """Pause or resume reading. A host that goes on writing blocks after some kilobytes."""
         self._held = on
-        self._settle()
+        self._update_reading()
 
     def stick(self, *, on: bool) -> None:
-        """As with flow control: a host's next write blocks at once."""
+        """Stop or resume the flow: the host's next write blocks at once."""
         self._stuck = on
-        self._settle()
+        self._update_reading()
         if self._master >= 0:
             self._tcflow(self._slave, self._flow_off if on else self._flow_on)
 
-    def _settle(self) -> None:
+    def _update_reading(self) -> None:
         reading = not (self._held or self._stuck)
         if self._master < 0 or reading == self._reading:
             return
@@ -195,7 +194,7 @@ class PtySimLink:
         self._reading = reading
 
     def rename(self, path: str | None) -> None:
-        """The next terminal is opened while this one still has its number, so that it gets another."""
+        """Open the next terminal now, while this one is still open, so that it gets another number."""
         if path is not None:
             new = Path(path)
             if new != self._path and (new.exists() or new.is_symlink()):
@@ -209,13 +208,13 @@ class PtySimLink:
             self._path = Path(path)
 
     def send(self, data: bytes) -> None:
-        """A UART does not wait: what does not fit is lost."""
+        """Send bytes. As on a UART, bytes that do not fit are lost."""
         if self._master >= 0:
             with contextlib.suppress(BlockingIOError, OSError):
                 os.write(self._master, data)
 
     async def down(self) -> None:
-        """Close both ends: for a host the same as an unplugged cable."""
+        """Close both ends: a host sees an unplugged cable."""
         if self._master < 0:
             return
         self.hold(on=True)
@@ -229,7 +228,7 @@ class PtySimLink:
             self._path.unlink(missing_ok=True)
 
     async def close(self) -> None:
-        """The same: its symlink goes with it."""
+        """Close both ends and remove the symlink."""
         await self.down()
         for end in self._next or ():
             os.close(end)
@@ -254,7 +253,7 @@ class TcpSimLink:
         return f"tcp://[{self._host}]:{self._port}" if ":" in self._host else f"tcp://{self._host}:{self._port}"
 
     async def up(self) -> None:
-        """Listen; after the first time on the same port again."""
+        """Listen, after the first time on the same port."""
         if self._server is not None:
             return
         loop = asyncio.get_running_loop()
@@ -275,7 +274,7 @@ class TcpSimLink:
         return EndpointError(f"cannot listen on {self._host}:{port}: {words}; name another port, or 0 for any free one")
 
     def rename(self, path: str | None) -> None:
-        """Another port, taken while this one is still in use."""
+        """Bind another port now, while this one is still in use."""
         if path is not None:
             raise EndpointError(f"{path} is not for a TCP link: it has no path")
         if self._next is None:
@@ -289,42 +288,42 @@ class TcpSimLink:
                 raise self._cannot_listen(0, error) from None
 
     def joined(self, transport: asyncio.Transport) -> bool:
-        """Whether this host is the one; a second is sent away."""
+        """Accept a host; return False for a second one."""
         if self._transport is not None:
             return False
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._transport = transport
         self._held = False
-        self._settle()
+        self._update_reading()
         self._owner.connected()
         return True
 
     def received(self, data: bytes) -> None:
-        """Bytes from the host."""
+        """Pass bytes to the owner."""
         self._owner.received(data)
 
     def left(self, transport: asyncio.Transport) -> None:
-        """A connection has ended; it may have been cut from here before."""
+        """Note the end of a connection, unless the link has cut it."""
         if transport is self._transport:
             self._transport = None
             self._owner.disconnected()
 
     def send(self, data: bytes) -> None:
-        """A host that does not read loses bytes, not we memory."""
+        """Send bytes. They are lost if the host does not read."""
         if self._transport is not None and self._transport.get_write_buffer_size() < 65536:
             self._transport.write(data)
 
     def hold(self, *, on: bool) -> None:
-        """Stop or resume reading."""
+        """Pause or resume reading."""
         self._held = on
-        self._settle()
+        self._update_reading()
 
     def stick(self, *, on: bool) -> None:
-        """The systems at both ends go on taking some hundred kilobytes; all of it arrives when it is over."""
+        """Stop or resume reading. The systems at both ends buffer some hundred kilobytes, which arrive later."""
         self._stuck = on
-        self._settle()
+        self._update_reading()
 
-    def _settle(self) -> None:
+    def _update_reading(self) -> None:
         if self._transport is not None:
             if self._held or self._stuck:
                 self._transport.pause_reading()
@@ -332,12 +331,12 @@ class TcpSimLink:
                 self._transport.resume_reading()
 
     async def down(self) -> None:
-        """Refuse, and reset the connection there is."""
+        """Stop listening and reset the connection."""
         if self._server is not None:
             self._server.close()
             self._server = None
         if self._transport is not None:
-            # Linger 0 makes the close a reset, which is what a host sees of a bridge that lost its power.
+            # Linger 0 turns the close into a reset, as a host sees from a bridge without power.
             linger = struct.pack("HH" if os.name == "nt" else "ii", 1, 0)
             self._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
             transport, self._transport = self._transport, None
@@ -345,7 +344,7 @@ class TcpSimLink:
             self._owner.disconnected()
 
     async def close(self) -> None:
-        """The same."""
+        """Close the connection and all sockets."""
         await self.down()
         if self._next is not None:
             self._next.close()
@@ -353,7 +352,7 @@ class TcpSimLink:
 
 
 class _Client(asyncio.BufferedProtocol):
-    """One TCP connection, read in small pieces so that a firehose can be held back early."""
+    """One TCP connection, read in small pieces so that a firehose can be paused early."""
 
     def __init__(self, link: TcpSimLink) -> None:
         self._link = link

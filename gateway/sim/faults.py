@@ -1,6 +1,6 @@
-"""What a user writes to do something to a simulated car: faults and presses of the infrared remote, checked. Pure.
+"""Parses faults and presses of the infrared remote, from the command line and from the control channel. Pure.
 
-What each fault does is the part of core/line.py, links.py and shell.py.
+`simulation` carries them out, with `model.faulty_link` and `endpoints`.
 """
 
 import math
@@ -14,14 +14,14 @@ from gateway.sim.car_spec import BadSpec, CarSpec, PtyPath, ReplaySpec
 from gateway.sim.model.faulty_link import Direction, Flood
 from gateway.sim.model.ir_remote import Button
 
-GARBAGE_LIMIT: Final = 100_000
-LIMIT_S: Final = 86_400.0
-FLOOD_LIMIT: Final = 10_000_000.0
-CUT_LIMIT: Final = 256
+MAX_GARBAGE_BYTES: Final = 100_000
+MAX_FAULT_S: Final = 86_400.0
+MAX_FLOOD_BYTES_PER_S: Final = 10_000_000.0
+MAX_CUT_BYTES: Final = 256
 
 
 class FaultKind(StrEnum):
-    """What can be done to a car or its link."""
+    """A kind of fault of a car or its link."""
 
     LINK_DROP = "link_drop"
     RENAME = "rename"
@@ -39,30 +39,30 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault; no `car` means every car. Fields that a kind does not have keep their defaults and mean nothing."""
+    """One fault. Without `car` it hits every car. A kind ignores fields that it does not have."""
 
     kind: FaultKind
     car: str | None = None
     for_s: float | None = None
-    """How long, s; 0 ends it now; None: until the same kind comes with 0 (a link that is gone: link_drop)."""
+    """Duration in seconds. 0 ends the fault now. None: until the same kind comes with 0 (a lost link: link_drop)."""
     bytes: int = 0
-    """How many bytes of garbage, or of the next frame before the cut."""
+    """Number of bytes of garbage, or of the next frame before the cut."""
     ways: tuple[Direction, ...] = tuple(Direction)
-    """Which ways of the link `lossy` and `garbage` hit."""
+    """Directions of `lossy` and `garbage`."""
     factor: float = 1.0
-    """Speed of a slow link as a part of 960 bytes/s."""
+    """Speed of a slow link as a fraction of 960 bytes/s."""
     share: float = 0.0
-    """Part of the bytes that a lossy link loses."""
+    """Fraction of the bytes that a lossy link loses."""
     rate: float = 0.0
-    """Bytes/s of a firehose; what the host does not read in time is lost."""
+    """Bytes/s of a firehose. Bytes that the host does not read in time are lost."""
     flood: Flood = Flood.NOISE
     path: str | None = None
-    """Where a renamed pseudo terminal comes back; None: the path stays, the device behind it is another."""
+    """New path of a renamed pseudo terminal. None: the path stays and leads to another device."""
 
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """A press of a button of the remote; without `car` every car sees it."""
+    """A press of a button of the remote. Without `car` every car gets it."""
 
     button: Button
     car: str | None = None
@@ -70,14 +70,14 @@ class Press:
 
 @dataclass(frozen=True, slots=True)
 class Scheduled:
-    """What the command line says will happen, s after the start."""
+    """A fault or press of the command line, with its time after the start."""
 
     at_s: float
     act: Fault | Press
 
 
 def targets(cars: Sequence[CarSpec | ReplaySpec], act: Fault | Press) -> list[str]:
-    """The names of the cars that this is for; raises BadSpec if it is for one that is not here or cannot have it."""
+    """Return the names of the cars that this hits; raise BadSpec if a car does not exist or cannot have it."""
     names = [car.name for car in cars]
     if act.car is not None and act.car not in names:
         raise BadSpec(f"car {act.car!r} is not simulated here: use {', '.join(names)}")
@@ -116,17 +116,17 @@ _FIELDS: Final[Mapping[FaultKind, Mapping[str, object]]] = {
     FaultKind.GARBAGE: {"bytes": 100, "to": "host"},
     FaultKind.BROWNOUT: {},
 }
-"""The fields of each kind with what they are when they are left out."""
+"""The fields of each kind with their defaults."""
 _RANGES: Final = {
-    "for_s": (0.0, LIMIT_S),
+    "for_s": (0.0, MAX_FAULT_S),
     "factor": (0.001, 1.0),
     "share": (0.0, 1.0),
-    "rate": (1.0, FLOOD_LIMIT),
+    "rate": (1.0, MAX_FLOOD_BYTES_PER_S),
 }
 
 
 def fault_of(fields: object) -> Fault:
-    """A fault from the JSON object of the control channel; raises BadSpec."""
+    """Return the fault in a JSON object of the control channel; raise BadSpec."""
     if not isinstance(fields, dict):
         raise BadSpec('write one JSON object a line, for example {"car": "red", "fault": "link_drop", "for_s": 2}')
     try:
@@ -143,7 +143,7 @@ def fault_of(fields: object) -> Fault:
     }
     count, path = 0, given.get("path")
     if "bytes" in known:
-        low, high = (0, CUT_LIMIT) if kind is FaultKind.CUT_WRITE else (1, GARBAGE_LIMIT)
+        low, high = (0, MAX_CUT_BYTES) if kind is FaultKind.CUT_WRITE else (1, MAX_GARBAGE_BYTES)
         count = int(number("bytes", given["bytes"], low, high))
     if path is not None and (not isinstance(path, str) or not path):
         raise BadSpec(f"path {path!r} is not allowed: write where the symlink is to be made")
@@ -165,7 +165,7 @@ def fault_of(fields: object) -> Fault:
 
 
 def press_of(fields: Mapping[str, object]) -> Press:
-    """A press from the JSON object of the control channel; raises BadSpec."""
+    """Return the press in a JSON object of the control channel; raise BadSpec."""
     _check_words(fields, {"ir", "car"}, set(), "ir")
     return Press(_button(fields.get("ir")), _car(fields))
 
@@ -193,7 +193,7 @@ def _choice(what: str, value: object, allowed: list[str]) -> str:
 
 
 def number(what: str, value: object, low: float, high: float) -> float:
-    """A number of the control channel if it is in its range; raises BadSpec."""
+    """Return a number of the control channel; raise BadSpec if it is out of range."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise BadSpec(f"{what} {value!r} is not allowed: a number from {low:.12g} to {high:.12g}")
     return float(value)
@@ -206,7 +206,7 @@ _FIELD: Final = re.compile(r"(?P<word>[a-z_]+)=(?P<value>.+)")
 
 
 def parse_fault(text: str) -> Scheduled:
-    """[CAR:]FAULT@SECONDS[+AMOUNT][,FIELD=VALUE...]; the amount is `for_s`, of garbage `bytes`; raises BadSpec."""
+    """Parse [CAR:]FAULT@SECONDS[+AMOUNT][,FIELD=VALUE...]; raise BadSpec. The amount is `for_s`, of garbage `bytes`."""
     match = _SCHEDULED.fullmatch(text)
     if match is None:
         raise BadSpec(
@@ -230,7 +230,7 @@ def parse_fault(text: str) -> Scheduled:
 
 
 def parse_press(text: str) -> Scheduled:
-    """[CAR:]BUTTON@SECONDS; raises BadSpec."""
+    """Parse [CAR:]BUTTON@SECONDS; raise BadSpec."""
     match = _SCHEDULED.fullmatch(text)
     if match is None or match["amount"] or match["more"]:
         raise BadSpec(f"ir {text!r} is not allowed: write [CAR:]BUTTON@SECONDS, for example red:forward@5")
@@ -242,8 +242,8 @@ def parse_press(text: str) -> Scheduled:
 
 def _at(text: str) -> float:
     at = float(text)
-    if not math.isfinite(at) or at > LIMIT_S:
-        raise BadSpec(f"at most {LIMIT_S:g} s after the start")
+    if not math.isfinite(at) or at > MAX_FAULT_S:
+        raise BadSpec(f"at most {MAX_FAULT_S:g} s after the start")
     return at
 
 

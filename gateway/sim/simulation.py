@@ -1,6 +1,6 @@
-"""The simulator as it runs: cars of the core on real time, each behind its link, all in one asyncio loop.
+"""Runs the cars of the model in real time, each behind its link, all in one asyncio loop.
 
-Here lies the only clock. Faults on demand are carried out here; what a user may write is faults.py's part.
+The loop's clock is the only clock of the simulator. Carries out the faults that `faults` parses.
 """
 
 import asyncio
@@ -17,18 +17,18 @@ from gateway.sim.model.factory import build
 from gateway.sim.model.faulty_link import Direction, FaultyLink
 from gateway.sim.model.firmware import Firmware, Pose, Truth
 from gateway.sim.model.ir_remote import Button
-from gateway.sim.model.raspberry_pi import BOOT_S, RaspberryPiCar, Transport
+from gateway.sim.model.raspberry_pi import PI_BOOT_S, RaspberryPiCar, Transport
 from gateway.sim.model.world import World
-from gateway.sim.world_commands import Change, Said, as_it_is
+from gateway.sim.world_commands import Change, WorldState, as_it_is
 
-HOLD_ABOVE: Final = 128
-"""Bytes on a car's wire above which its host is not read from: the sum of what is fed is bounded."""
+MAX_WIRE_BYTES: Final = 128
+"""Maximum bytes on a car's wire. Above it, the link stops reading from the host, so that memory is bounded."""
 
 Watcher = Callable[["SimCar"], None]
 
 
 class Machine(Protocol):
-    """What stands behind a link: a car's program, or a capture."""
+    """The machine behind a link: a car's program, or a capture."""
 
     @property
     def alive(self) -> bool:
@@ -37,43 +37,43 @@ class Machine(Protocol):
 
     @property
     def truth(self) -> Truth | None:
-        """What is so; None where nobody knows."""
+        """The true state; None if unknown."""
         ...
 
     def pose(self, now: float) -> Pose | None:
-        """Where it is; None where nobody knows."""
+        """Return the pose; None if unknown."""
         ...
 
     def feed(self, data: bytes, now: float) -> None:
-        """Bytes from the host."""
+        """Accept bytes from the host."""
         ...
 
     def advance(self, now: float) -> list[tuple[float, bytes]]:
-        """Go on to `now`; what was sent since."""
+        """Run up to `now`; return the pieces sent since the last call."""
         ...
 
     def next_event(self) -> float:
-        """When something next happens by itself."""
+        """Return the time of the next event."""
         ...
 
     def backlog(self, now: float) -> int:
-        """Bytes fed that are still on the wire."""
+        """Return the number of bytes still on the wire."""
         ...
 
     def drop_link(self, now: float) -> None:
-        """The link is cut."""
+        """Cut the link."""
         ...
 
 
 class SimCar:
-    """One car: firmware, link, what is between them, and the timer that keeps all going."""
+    """One car: its program, its link, the faults between them, and the timer that drives all."""
 
     def __init__(self, spec: CarSpec | ReplaySpec, firmware: Machine, seed: str) -> None:
         self.spec = spec
         self.firmware = firmware
-        # Of their own, so that a fault changes nothing of what the car itself does by chance.
+        # Separate generators, so that a fault does not change the car's own random numbers.
         self._rng = _rng(f"{seed}:faults")
-        self._line = FaultyLink(_rng(f"{seed}:to_car"), _rng(f"{seed}:to_host"))
+        self._faults = FaultyLink(_rng(f"{seed}:to_car"), _rng(f"{seed}:to_host"))
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._held = False
@@ -89,12 +89,12 @@ class SimCar:
         self._alive = firmware.alive
         self.watchers: list[Watcher] = []
         """Called after every change of the truth."""
-        self.moved: Watcher = lambda _: None
-        """Called when the link has come back under another name."""
-        self.ended: Watcher = lambda _: None
-        """Called when a capture has played to its end and will not begin again."""
-        self.failed: Callable[[SimCar, EndpointError], None] = lambda *_: None
-        """Called when a link that was to come back cannot."""
+        self.on_renamed: Watcher = lambda _: None
+        """Called when the link has returned under another name."""
+        self.on_ended: Watcher = lambda _: None
+        """Called at the end of a capture that does not loop."""
+        self.on_failed: Callable[[SimCar, EndpointError], None] = lambda *_: None
+        """Called when a link cannot return."""
         self._link: SimLink
         if isinstance(spec.link, PtyPath):
             self._link = PtySimLink(self, spec.link.path)
@@ -103,35 +103,35 @@ class SimCar:
 
     @property
     def url(self) -> str:
-        """What a gateway opens to reach this car."""
+        """The URL that a gateway opens to reach this car."""
         return self._link.url
 
     @property
     def lost_bytes(self) -> dict[str, int]:
-        """What faults of the link have lost so far, to the car and to the host."""
-        return {way.value: count for way, count in self._line.lost_bytes.items()}
+        """Bytes lost to faults of the link, to the car and to the host."""
+        return {way.value: count for way, count in self._faults.lost_bytes.items()}
 
     @property
     def truth(self) -> Truth | None:
-        """What is so now; None for a capture."""
+        """The true state now; None for a capture."""
         self._pump()
         return self.firmware.truth
 
     @property
     def pose(self) -> Pose | None:
-        """Where the car truly is now; None for a capture."""
+        """The true pose now; None for a capture."""
         return self.firmware.pose(self._loop.time())
 
     async def start(self) -> None:
-        """Open the link and let the program run; raises LinkError."""
+        """Open the link and start the program; raise EndpointError."""
         await self._link.up()
         self._known_as = self.url
         if isinstance(self.firmware, CaptureCar) and isinstance(self.spec.link, PtyPath):
-            self.firmware.begin(self._loop.time())  # a terminal does not tell when a host comes
+            self.firmware.begin(self._loop.time())  # a terminal does not report a new host
         self._pump()
 
     async def stop(self) -> None:
-        """Close the link and stand still."""
+        """Close the link and stop the timers."""
         self._dropped = True
         for task in list(self._closing):
             await task
@@ -140,15 +140,15 @@ class SimCar:
             if timer is not None:
                 timer.cancel()
 
-    # The link's side.
+    # Calls of the link.
 
     def received(self, data: bytes) -> None:
-        """Bytes from the host."""
-        self._line.from_host(data, self._loop.time())
+        """Accept bytes from the host."""
+        self._faults.from_host(data, self._loop.time())
         self._pump()
 
     def connected(self) -> None:
-        """A TCP host has come."""
+        """Note that a TCP host has connected."""
         if isinstance(self.firmware, RaspberryPiCar):
             self.firmware.connected(self._loop.time())
         elif isinstance(self.firmware, CaptureCar):
@@ -156,35 +156,35 @@ class SimCar:
             self._pump()
 
     def disconnected(self) -> None:
-        """A TCP host has gone."""
+        """Note that a TCP host has disconnected."""
         if isinstance(self.firmware, RaspberryPiCar):
             self.firmware.disconnected(self._loop.time())
             self._pump()
 
-    # The core's side.
+    # The program and the faults.
 
     def _pump(self) -> None:
         now = self._loop.time()
         was_alive, before = self._alive, self._truth
-        for data in self._line.to_car(now):
+        for data in self._faults.to_car(now):
             self.firmware.feed(data, now)
         for _, data in self.firmware.advance(now):
             if not self._dropped:
-                self._line.from_car(data, now)
-        for data in self._line.to_host(now):
+                self._faults.from_car(data, now)
+        for data in self._faults.to_host(now):
             if not self._dropped:
                 self._link.send(data)
         backlog = self.firmware.backlog(now)
-        if self._line.cut and backlog == 0 and not self._cutting:
+        if self._faults.cut and backlog == 0 and not self._cutting:
             self._cutting = True
             self._later(self._drop(self._cut_for_s))
-        backlog += self._line.waiting()
-        if backlog > HOLD_ABOVE or (self._held and backlog > HOLD_ABOVE // 2):
+        backlog += self._faults.waiting()
+        if backlog > MAX_WIRE_BYTES or (self._held and backlog > MAX_WIRE_BYTES // 2):
             self._hold(on=True)
         elif self._held:
             self._hold(on=False)
-        due = min(self.firmware.next_event(), self._line.next_event())
-        if self._held or self._line.cut:
+        due = min(self.firmware.next_event(), self._faults.next_event())
+        if self._held or self._faults.cut:
             due = min(due, now + 0.02)
         if self._timer is not None:
             self._timer.cancel()
@@ -198,7 +198,7 @@ class SimCar:
             self._later(self._link.down())
         if isinstance(self.firmware, CaptureCar) and self.firmware.done and not self._ended:
             self._ended = True
-            self.ended(self)
+            self.on_ended(self)
 
     def _hold(self, *, on: bool) -> None:
         if on != self._held:
@@ -206,26 +206,26 @@ class SimCar:
             self._link.hold(on=on)
 
     def _later(self, work: Coroutine[None, None, None]) -> None:
-        async def told() -> None:
+        async def run() -> None:
             try:
                 await work
             except EndpointError as error:
-                self.failed(self, error)
+                self.on_failed(self, error)
 
-        task = self._loop.create_task(told())
+        task = self._loop.create_task(run())
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
 
-    # What is done to it.
+    # Commands.
 
     def press(self, button: Button) -> bool:
-        """Press a button of the infrared remote; whether the car obeys it."""
+        """Press a button of the infrared remote; return True if the car obeys it."""
         obeyed = isinstance(self.firmware, Firmware) and self.firmware.press(button, self._loop.time())
         self._pump()
         return obeyed
 
     async def inflict(self, fault: Fault) -> None:
-        """Carry out a fault now; raises LinkError if a link that was to come back cannot."""
+        """Carry out a fault now; raise EndpointError if a link cannot return."""
         self._pump()
         now = self._loop.time()
         until = inf if fault.for_s is None else now + fault.for_s
@@ -239,21 +239,21 @@ class SimCar:
                 await self._drop(fault.for_s)
             case FaultKind.CUT_WRITE:
                 self._cut_for_s = fault.for_s
-                self._line.cut_next(fault.bytes)
+                self._faults.cut_next(fault.bytes)
             case FaultKind.SLOW:
-                self._line.slow(fault.factor, until)
+                self._faults.slow(fault.factor, until)
             case FaultKind.LOSSY:
-                self._line.lossy(fault.share, fault.ways, until)
+                self._faults.lossy(fault.share, fault.ways, until)
             case FaultKind.STUCK:
                 self._stick(fault.for_s)
             case FaultKind.DEAF:
-                self._line.close(Direction.TO_CAR, until)
+                self._faults.close(Direction.TO_CAR, until)
             case FaultKind.MUTE:
-                self._line.close(Direction.TO_HOST, until)
+                self._faults.close(Direction.TO_HOST, until)
             case FaultKind.ECHO:
-                self._line.echo(until)
+                self._faults.echo(until)
             case FaultKind.FIREHOSE:
-                self._line.flood(fault.flood, fault.rate, now, until)
+                self._faults.flood(fault.flood, fault.rate, now, until)
             case FaultKind.GARBAGE:
                 if Direction.TO_CAR in fault.ways:
                     self.received(self._rng.randbytes(fault.bytes))
@@ -265,8 +265,8 @@ class SimCar:
 
     async def _brown_out(self) -> None:
         if isinstance(self.firmware, RaspberryPiCar) and isinstance(self._link, TcpSimLink):
-            # The whole machine goes down, its sockets with it, before the program starts with none.
-            await self._drop(BOOT_S)
+            # The whole machine goes down with its sockets, before the program starts without a client.
+            await self._drop(PI_BOOT_S)
         if isinstance(self.firmware, Firmware):
             self.firmware.brown_out(self._loop.time())
 
@@ -286,9 +286,9 @@ class SimCar:
         if not self._dropped:
             self._dropped = True
             self.firmware.drop_link(self._loop.time())
-            self._line.clear()
+            self._faults.clear()
             await self._link.down()
-            self._line.mend()
+            self._faults.mend()
             self._held = self._cutting = False
         if for_s is not None:
             self._restore = self._loop.call_later(for_s, lambda: self._later(self._bring_back()))
@@ -305,7 +305,7 @@ class SimCar:
             await self._link.up()
             if self.url != self._known_as:
                 self._known_as = self.url
-                self.moved(self)
+                self.on_renamed(self)
 
 
 def _rng(seed: str) -> random.Random:
@@ -327,7 +327,7 @@ class Simulation:
         self.cars: dict[str, SimCar] = {}
         now = asyncio.get_running_loop().time()
         for index, spec in enumerate(specs):
-            # Seeded by the name too, so that a car behaves the same whatever other cars there are.
+            # The seed includes the name, so that a car behaves the same beside any other cars.
             seeded = f"{seed}:{spec.name}"
             transport = Transport.SERIAL if isinstance(spec.link, PtyPath) else Transport.TCP
             rng, options = _rng(seeded), spec.options
@@ -339,7 +339,7 @@ class Simulation:
             self.cars[replay.name] = SimCar(replay, played, f"{seed}:{replay.name}")
 
     async def start(self) -> None:
-        """Open every link; raises LinkError, after closing what was open, naming the car."""
+        """Open every link. If one fails, close all and raise EndpointError with the name of the car."""
         for name, car in self.cars.items():
             try:
                 await car.start()
@@ -353,7 +353,7 @@ class Simulation:
             await car.stop()
 
     async def inflict(self, fault: Fault) -> list[str]:
-        """Carry out a fault on one car or all; the names of those it hit. Raises BadSpec for a car that is not here."""
+        """Carry out a fault on one car or all; return their names. Raise BadSpec for an unknown car."""
         names = targets([car.spec for car in self.cars.values()], fault)
         for name in names:
             await self.cars[name].inflict(fault)
@@ -365,13 +365,13 @@ class Simulation:
         self.world.advance(now)
         change(self.world, now)
 
-    def world_as_it_is(self) -> Said:
-        """Lamps and things now."""
+    def world_as_it_is(self) -> WorldState:
+        """Return the lamps and things now."""
         now = asyncio.get_running_loop().time()
         self.world.advance(now)
         return as_it_is(self.world, now)
 
     def press(self, press: Press) -> list[str]:
-        """Press a button before one car or all; the names of those that obey. Raises BadSpec as `inflict`."""
+        """Press a button for one car or all; return the names of those that obey. Raise BadSpec as `inflict`."""
         names = targets([car.spec for car in self.cars.values()], press)
         return [name for name in names if self.cars[name].press(press.button)]

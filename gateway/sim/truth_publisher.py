@@ -1,8 +1,7 @@
-"""What is so, published: `<fleet>/<car>/sim/truth` at 10 Hz and on every change, as long as there is a hub.
+"""Publishes the true state of the simulated cars: `<fleet>/<car>/sim/truth` at 10 Hz and on every change.
 
-Of a world with anything in it also `<fleet>/@sim/world`: at 10 Hz while it changes, else at 1 Hz.
-
-The simulator runs without a bus just as well; this waits for a hub, never starts one.
+Publishes a world that is not empty as `<fleet>/@sim/world`: at 10 Hz while it changes, otherwise at 1 Hz.
+Waits for a hub and never starts one. The simulator runs without a hub as well.
 """
 
 import asyncio
@@ -15,35 +14,36 @@ from typing import Final
 from gateway.sim.model.geometry import Point
 from gateway.sim.model.world import World
 from gateway.sim.simulation import SimCar, Simulation
-from gateway.sim.world_commands import Said
+from gateway.sim.world_commands import WorldState
 from schemas import keys
 from schemas.bus import Bus, BusError, Publisher
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
 
-PERIOD_S: Final = 0.1
-REPEAT_S: Final = 1.0
-LOOK_AGAIN_S: Final = 0.3
-OPEN_WITHIN_S: Final = 0.3
-PATIENCE_S: Final = 10.0
-"""Cars may be started before their gateways; after so long somebody may wonder."""
+TRUTH_INTERVAL_S: Final = 0.1
+WORLD_REPEAT_INTERVAL_S: Final = 1.0
+HUB_RETRY_DELAY_S: Final = 0.3
+HUB_OPEN_TIMEOUT_S: Final = 0.3
+# Cars may start before their gateways, which start the hub.
+HUB_WARNING_DELAY_S: Final = 10.0
+"""Time without a hub after which the simulator prints a warning."""
 
 
 class TruthPublisher:
-    """Publishes every car of a simulation once a hub is there."""
+    """Publishes every car of a simulation as soon as there is a hub."""
 
     def __init__(
-        self, simulation: Simulation, endpoint: str, fleet: str, complain: Callable[[str], object] = lambda _: None
+        self, simulation: Simulation, endpoint: str, fleet: str, warn: Callable[[str], object] = lambda _: None
     ) -> None:
         self._simulation = simulation
         self._endpoint = endpoint
         self._fleet = fleet
-        self._complain = complain
+        self._warn = warn
         self._bus: Bus | None = None
         self._publishers: dict[str, Publisher] = {}
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Publish until cancelled."""
         loop = asyncio.get_running_loop()
         try:
             self._bus = await self._open(loop)
@@ -59,8 +59,8 @@ class TruthPublisher:
                 for car in cars.values():
                     self._put(car)
                 publish_world(loop.time())
-                # From one origin, so that the rate does not drift; a stalled loop does not catch up.
-                due = max(due + PERIOD_S, loop.time())
+                # Due times count from one origin, so that the rate does not drift. A stalled loop does not catch up.
+                due = max(due + TRUTH_INTERVAL_S, loop.time())
                 await asyncio.sleep(due - loop.time())
         finally:
             for car in self._simulation.cars.values():
@@ -70,32 +70,33 @@ class TruthPublisher:
                 self._bus.close()
 
     def _world_publisher(self) -> Callable[[float], None]:
-        """What publishes the world, if there is anything in it but cars."""
+        """Return the function that publishes the world, unless the world is empty."""
         world, topic = self._simulation.world, TOPICS["@sim/world"]
         if self._bus is None or not (world.lively or world.lamps or world.walls or world.line):
             return lambda _: None
         key = keys.topic_key(self._fleet, keys.SIMULATOR, "world")
         publisher = self._bus.publisher(key, topic, keys.SIMULATOR)
-        last, said_at = fleet_v1_pb2.World(), -inf
+        last, published_at = fleet_v1_pb2.World(), -inf
 
         def publish(now: float) -> None:
-            nonlocal last, said_at
+            nonlocal last, published_at
             message = world_message(world, self._simulation.world_as_it_is())
-            if message == last and now - said_at < REPEAT_S:
+            if message == last and now - published_at < WORLD_REPEAT_INTERVAL_S:
                 return
             last.CopyFrom(message)
-            said_at = now
+            published_at = now
             publisher.put(message, time.time_ns())
 
         return publish
 
     async def _open(self, loop: asyncio.AbstractEventLoop) -> Bus:
-        """Opening blocks, so it has a thread; a daemon, since a hub that is not there must not hold up our end."""
-        patience_until = loop.time() + PATIENCE_S
+        """Open the bus, with retries."""
+        # Opening blocks, so it runs in a thread: a daemon, so that a missing hub does not delay our end.
+        warn_at = loop.time() + HUB_WARNING_DELAY_S
         while True:
-            if loop.time() >= patience_until:
-                patience_until = inf
-                self._complain(
+            if loop.time() >= warn_at:
+                warn_at = inf
+                self._warn(
                     f"there is no hub at {self._endpoint} yet, so nobody can see what is true of the cars: "
                     "gateway run and fleet up start one (--no-truth: publish nothing)"
                 )
@@ -104,11 +105,11 @@ class TruthPublisher:
             bus = await opened
             if bus is not None:
                 return bus
-            await asyncio.sleep(LOOK_AGAIN_S)
+            await asyncio.sleep(HUB_RETRY_DELAY_S)
 
     def _try(self, loop: asyncio.AbstractEventLoop, opened: "asyncio.Future[Bus | None]") -> None:
         try:
-            bus = Bus.open(self._endpoint, timeout_s=OPEN_WITHIN_S)
+            bus = Bus.open(self._endpoint, timeout_s=HUB_OPEN_TIMEOUT_S)
         except BusError:
             bus = None
 
@@ -142,12 +143,12 @@ class TruthPublisher:
         self._publishers[car.spec.name].put(message, time.time_ns())
 
 
-def world_message(world: World, said: Said) -> fleet_v1_pb2.World:
-    """The world as it is: what never moves, and lamps and things as the control channel has them."""
+def world_message(world: World, state: WorldState) -> fleet_v1_pb2.World:
+    """Return the message of the world. `state`: its lamps and things as in the control channel."""
     walls = [((x1, y1), (x2, y2)) for x1, y1, x2, y2 in world.walls]
     return fleet_v1_pb2.World(
-        lamps=[fleet_v1_pb2.SimLamp(name=name, **fields) for name, fields in said["lamps"].items()],
-        things=[fleet_v1_pb2.SimThing(name=name, **fields) for name, fields in said["things"].items()],
+        lamps=[fleet_v1_pb2.SimLamp(name=name, **fields) for name, fields in state["lamps"].items()],
+        things=[fleet_v1_pb2.SimThing(name=name, **fields) for name, fields in state["things"].items()],
         walls=[fleet_v1_pb2.SimWall(begin=_point(begin), end=_point(end)) for begin, end in walls],
         line=[_point(point) for point in world.line],
     )

@@ -1,7 +1,4 @@
-"""What a user writes to change or ask the world while it runs: lamps and things, checked. Pure.
-
-How a lamp or a thing is made is worldfile.py's part.
-"""
+"""Parses commands that change lamps and things of the running world, and reports their state. Pure."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeVar
@@ -12,8 +9,8 @@ from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import World
 
 Change = Callable[[World, float], None]
-"""Carried out on a world at a time."""
-Said = Mapping[str, Mapping[str, Mapping[str, Any]]]
+"""A change of a world at a time."""
+WorldState = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """`lamps` and `things`: by name, their fields."""
 
 _Kind = TypeVar("_Kind", Lamp, MovingObject)
@@ -23,7 +20,7 @@ _THING: Final = {**_PLACE, "speed_m_s": (0.0, FASTEST_M_S)}
 
 
 def change_of(fields: Mapping[str, object], world: World) -> Change:
-    """A change from the JSON object of the control channel; raises BadSpec."""
+    """Return the change in a JSON object of the control channel; raise BadSpec."""
     if "lamp" in fields:
         return _lamp_change(fields, _named("lamp", fields["lamp"], world.lamps))
     return _thing_change(fields, _named("thing", fields["thing"], world.things))
@@ -74,8 +71,8 @@ def _numbers(
     return {word: number(word, fields[word], *ranges[word]) for word in ranges if word in fields}
 
 
-def as_it_is(world: World, now: float) -> Said:
-    """Lamps and things as they are, for the control channel; without those whose carrier is not there."""
+def as_it_is(world: World, now: float) -> WorldState:
+    """Return the state of lamps and things for the control channel, without those whose carrier is missing."""
     lamps: dict[str, dict[str, Any]] = {}
     things: dict[str, dict[str, Any]] = {}
     for lamp in world.lamps:

@@ -1,7 +1,7 @@
-"""A world file (YAML 1.2) into a World: which fields there are, their ranges, and what does not fit together. Pure.
+"""Reads a world file (YAML 1.2): checks its fields, their ranges, and contradictions between them. Pure.
 
-Distances in metres, speeds in m/s, angles in degrees counter-clockwise from x. deploy/world.follow.yaml has a
-comment for each field.
+Distances in meters, speeds in m/s, angles in degrees counter-clockwise from x. deploy/world.follow.yaml has a comment
+for each field.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,9 +19,9 @@ from gateway.sim.model.world import RADIUS_M, World
 from gateway.sim.yaml_reader import MarkedYaml
 from schemas import keys
 
-SMALLEST_M: Final = 0.02
-MOST: Final = 200
-"""Of walls, boxes, things or lamps, and of the points of a path or line."""
+MIN_SIZE_M: Final = 0.02
+MAX_ITEMS: Final = 200
+"""Maximum of walls, boxes, things or lamps, and of the points of a path or line."""
 
 _TOP: Final = {"room": False, "walls": False, "boxes": False, "line": False, "cars_meet": False, "cars": False}
 _BOX: Final = {"x_m": True, "y_m": True, "width_m": True, "depth_m": True}
@@ -47,7 +47,7 @@ _CAR: Final = {"x_m": True, "y_m": True, "heading_deg": False}
 
 @dataclass(frozen=True, slots=True)
 class WorldSpec:
-    """What a world file says. A World changes while it runs, so each run makes its own."""
+    """The content of a world file. A World changes while it runs, so each run creates its own."""
 
     walls: tuple[Segment, ...]
     line: tuple[Point, ...]
@@ -57,16 +57,16 @@ class WorldSpec:
     cars_meet: bool
 
     def world(self) -> World:
-        """The world as it begins."""
+        """Return a new world."""
         return World(
             self.walls, self.line, self.lamps, things=self.things, starts=self.starts, cars_meet=self.cars_meet
         )
 
 
 def read_world(text: str, source: str, cars: Sequence[str] | None = None) -> WorldSpec:
-    """The world in a text; raises BadWorld with every fault.
+    """Return the world in a text; raise BadWorld with every fault.
 
-    `source`: its name in errors. `cars`: who can carry something; None: any car.
+    `source`: the name of the file in errors. `cars`: the cars that can carry something; None: any car.
     """
     return _WorldParser(MarkedYaml(text, source), cars).read()
 
@@ -85,7 +85,7 @@ class _WorldParser:
         if "room" in top:
             parts = marks.fields(top["room"], "room", {"width_m": True, "depth_m": True})
             room = self._size(parts, "width_m", "room"), self._size(parts, "depth_m", "room")
-            if not marks.faulty:  # else every car would begin outside it, too
+            if not marks.faulty:  # otherwise every car would start outside the room as well
                 self._room = room
                 self._walls += box(0.0, 0.0, *room)
         for field, node in self._few(top, "boxes"):
@@ -98,10 +98,10 @@ class _WorldParser:
             if wall is None:
                 continue
             x1, y1, x2, y2 = wall
-            if hypot(x2 - x1, y2 - y1) >= SMALLEST_M:
+            if hypot(x2 - x1, y2 - y1) >= MIN_SIZE_M:
                 self._walls.append((x1, y1, x2, y2))
             else:
-                marks.complain(node, field, f"is shorter than {SMALLEST_M:g} m: write [x1, y1, x2, y2]")
+                marks.complain(node, field, f"is shorter than {MIN_SIZE_M:g} m: write [x1, y1, x2, y2]")
         line = self._line(top["line"]) if "line" in top else ()
         things = {name: self._thing(name, node) for name, node in self._named(top, "things").items()}
         lamps = tuple(self._lamp(name, node, things) for name, node in self._named(top, "lamps").items())
@@ -213,7 +213,7 @@ class _WorldParser:
                 marks.complain(node, field, f"begins in a wall: at least {RADIUS_M:g} m from each")
             for thing in things:
                 at = thing.pose(0.0)
-                # One without an extent is faulty itself.
+                # A thing without an extent has a fault of its own.
                 if thing.extent_m and not thing.carried_by and thing.depth(at, pose.x_m, pose.y_m, RADIUS_M) > 0:
                     marks.complain(node, field, f"begins in {thing.name}, a thing: at least {RADIUS_M:g} m from it")
         for (one, first), (other, second) in combinations(found.items(), 2):
@@ -227,27 +227,27 @@ class _WorldParser:
 
     def _few(self, top: Mapping[str, yaml.Node], name: str) -> list[tuple[str, yaml.Node]]:
         items = self._marks.items(top[name], name) if name in top else []
-        if len(items) > MOST:
-            self._marks.complain(items[MOST][1], name, f"has {len(items)} of them: at most {MOST}")
-        return items[:MOST]
+        if len(items) > MAX_ITEMS:
+            self._marks.complain(items[MAX_ITEMS][1], name, f"has {len(items)} of them: at most {MAX_ITEMS}")
+        return items[:MAX_ITEMS]
 
     def _named(self, top: Mapping[str, yaml.Node], name: str) -> dict[str, yaml.Node]:
         found = self._marks.entries(top[name], name) if name in top else {}
-        if len(found) > MOST:
-            self._marks.complain(top[name], name, f"has {len(found)} of them: at most {MOST}")
+        if len(found) > MAX_ITEMS:
+            self._marks.complain(top[name], name, f"has {len(found)} of them: at most {MAX_ITEMS}")
         for each, node in found.items():
             try:
                 keys.check_name(each, "name")
             except keys.BadKey as error:
                 self._marks.complain(node, name, str(error))
-        return dict(list(found.items())[:MOST])
+        return dict(list(found.items())[:MAX_ITEMS])
 
     def _points(self, node: yaml.Node, field: str) -> tuple[Point, ...]:
         items = self._marks.items(node, field)
-        if len(items) > MOST:
-            self._marks.complain(items[MOST][1], field, f"has {len(items)} points: at most {MOST}")
+        if len(items) > MAX_ITEMS:
+            self._marks.complain(items[MAX_ITEMS][1], field, f"has {len(items)} points: at most {MAX_ITEMS}")
         points = []
-        for name, each in items[:MOST]:
+        for name, each in items[:MAX_ITEMS]:
             point = self._marks.numbers(each, name, 2, -FAR_M, FAR_M)
             if point is not None:
                 points.append((point[0], point[1]))
@@ -258,8 +258,8 @@ class _WorldParser:
 
     def _size(self, parts: Mapping[str, yaml.Node], name: str, field: str) -> float:
         if name not in parts:
-            return 1.0  # and `fields` has said so
-        return self._marks.number(parts[name], f"{field}.{name}", SMALLEST_M, FAR_M)
+            return 1.0  # `fields` has reported it
+        return self._marks.number(parts[name], f"{field}.{name}", MIN_SIZE_M, FAR_M)
 
     def _heading(self, parts: Mapping[str, yaml.Node], field: str) -> float:
         if "heading_deg" not in parts:

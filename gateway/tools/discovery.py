@@ -1,4 +1,4 @@
-"""What there is that could be a car: serial ports and Bluetooth LE devices. Nothing is opened or connected to here."""
+"""Lists serial ports and Bluetooth LE devices that could be cars. Opens and connects nothing."""
 
 import asyncio
 import re
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gateway.link.url import BleUrl, LinkUrl, SerialUrl, UsbUrl
-from gateway.link.usb import listed
+from gateway.link.usb import list_ports
+from schemas.links import BleUrl, LinkUrl, SerialUrl, UsbUrl
 
 if TYPE_CHECKING:
     from bleak.backends.scanner import AdvertisementData
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 _SHORT: Final = re.compile(r"0000([0-9a-f]{4})-0000-1000-8000-00805f9b34fb")
 BY_ID: Final = Path("/dev/serial/by-id")
-_START_S: Final = 5.0
-"""A Bluetooth stack that has not begun to scan by then never will."""
+BLE_START_TIMEOUT_S: Final = 5.0
+"""Timeout for the start of a Bluetooth scan, on top of its duration."""
 
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port, as the system knows it. `url`: the most lasting that names it; vid and pid: four hex digits."""
+    """A serial port of this computer. `url`: its most stable URL. vid and pid: four hexadecimal digits."""
 
     device: str
     url: str
@@ -36,7 +36,7 @@ class SerialPort:
 
 @dataclass(frozen=True, slots=True)
 class BleDevice:
-    """A Bluetooth LE device that advertises. `uart`: the UART service among its own, as cars' modules have."""
+    """An advertising Bluetooth LE device. `uart`: its UART service, which cars' modules have."""
 
     address: str
     url: str
@@ -47,16 +47,16 @@ class BleDevice:
 
 
 class NoBluetooth(Exception):
-    """Bluetooth cannot be looked at; the text is one line: why, what to do."""
+    """Bluetooth cannot be scanned. The message is one line: why, what to do."""
 
 
 def serial_ports() -> list[SerialPort]:
-    """The serial ports of this computer, by name; raises CannotOpen if the system does not list them."""
-    return described(listed(), by_id(BY_ID))
+    """Return the serial ports of this computer by name; raise CannotOpen if the system does not list them."""
+    return described(list_ports(), by_id(BY_ID))
 
 
 def by_id(directory: Path) -> dict[str, str]:
-    """Device: the name that stays the same when it is plugged in again (Linux)."""
+    """Return by device the name that stays the same after a replug (Linux)."""
     try:
         return {str(name.resolve()): str(name) for name in sorted(directory.iterdir())}
     except OSError:
@@ -64,7 +64,7 @@ def by_id(directory: Path) -> dict[str, str]:
 
 
 def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> list[SerialPort]:
-    """The ports that pyserial found, each with the URL that names it best; `lasting` as `by_id` gives it."""
+    """Return pyserial's ports, each with its most stable URL. `lasting`: the result of `by_id`."""
     ports = sorted(found)
     same = Counter((port.vid, port.serial_number) for port in ports)
     result = []
@@ -88,7 +88,7 @@ def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> li
 
 
 async def ble_devices(seconds: float) -> list[BleDevice]:
-    """The devices that advertise within this time, likely cars first; raises NoBluetooth."""
+    """Return the devices that advertise within this time, likely cars first; raise NoBluetooth."""
     try:
         from bleak import BleakScanner
 
@@ -98,21 +98,21 @@ async def ble_devices(seconds: float) -> list[BleDevice]:
             "Bluetooth was not looked at: pip install 'zenoh-car-fleet[ble]' adds what that takes"
         ) from None
     try:
-        async with asyncio.timeout(seconds + _START_S):
+        async with asyncio.timeout(seconds + BLE_START_TIMEOUT_S):
             found = await BleakScanner.discover(timeout=seconds, return_adv=True)
     except TimeoutError:
         raise NoBluetooth("Bluetooth was not looked at: it does not answer: is its service running?") from None
-    except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, the ports are still shown
+    except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, `scan` still lists the ports
         words = " ".join(str(error).split()) or type(error).__name__
         raise NoBluetooth(f"Bluetooth was not looked at: {words}: is there an adapter, and is it on?") from None
-    devices = [_device(address, device.name, heard, UART_SERVICES) for address, (device, heard) in found.items()]
+    devices = [_device(address, device.name, advert, UART_SERVICES) for address, (device, advert) in found.items()]
     return sorted(devices, key=lambda device: (device.uart is None, -(device.rssi or -999), device.address))
 
 
-def _device(address: str, name: str | None, heard: "AdvertisementData", uarts: Sequence[str]) -> BleDevice:
-    services = tuple(service.lower() for service in heard.service_uuids)
+def _device(address: str, name: str | None, advert: "AdvertisementData", uarts: Sequence[str]) -> BleDevice:
+    services = tuple(service.lower() for service in advert.service_uuids)
     uart = next((service for service in services if service in uarts), None)
     if uart is not None and (short := _SHORT.fullmatch(uart)):
         uart = short[1].upper()
     url = str(BleUrl(address=address.upper()))
-    return BleDevice(address, url, heard.local_name or name, heard.rssi, services, uart)
+    return BleDevice(address, url, advert.local_name or name, advert.rssi, services, uart)

@@ -1,6 +1,6 @@
-"""`gateway monitor`: what a car says, decoded beside the raw bytes, live or from a file. It only listens.
+"""`gateway monitor`: prints a car's bytes beside their decoded readings, live or from a file. Sends nothing.
 
-How an event is shown is in `MonitorOutput`; what it says, and what is counted, in `heard`.
+`MonitorOutput` prints the events; `statistics` describes and counts them.
 """
 
 import argparse
@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Listen until Ctrl-C, or read the file; the exit code."""
-    return cli_support.explained("gateway monitor", lambda: _run(arguments))
+    """Listen until Ctrl-C, or read the file; return the exit code."""
+    return cli_support.run_command("gateway monitor", lambda: _run(arguments))
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -76,20 +76,20 @@ def _pieces(path: Path) -> Iterator[capture.CapturedBytes]:
 
 
 def _run_live(url: LinkUrl, raw: Path | None, lines: "MonitorOutput") -> None:
-    keep = None if raw is None else _new_capture(raw, url)
-    cli_support.warn_of(url)
+    writer = None if raw is None else _new_capture(raw, url)
+    cli_support.warn_before_opening(url)
     origin = time.monotonic()
     try:
-        cli_support.run_until_interrupted(_live(url, lines, keep, origin))
+        cli_support.run_until_interrupted(_live(url, lines, writer, origin))
     except (LinkLost, cli_support.Failed, KeyboardInterrupt):
         lines.end(time.monotonic() - origin)
         raise
     finally:
-        if keep is not None and lines.tally.since is None:
-            keep.discard()
-        elif keep is not None:
-            keep.close()
-            cli_support.note(f"the bytes are in {keep.path}")
+        if writer is not None and lines.statistics.since is None:
+            writer.discard()
+        elif writer is not None:
+            writer.close()
+            cli_support.print_note(f"the bytes are in {writer.path}")
 
 
 def _new_capture(path: Path, url: LinkUrl) -> capture.CaptureWriter:
@@ -101,86 +101,88 @@ def _new_capture(path: Path, url: LinkUrl) -> capture.CaptureWriter:
         raise cli_support.WrongUse(f"{path}: the file cannot be made: {error.strerror}") from None
 
 
-async def _live(url: LinkUrl, lines: "MonitorOutput", keep: capture.CaptureWriter | None, origin: float) -> None:
+async def _live(url: LinkUrl, lines: "MonitorOutput", writer: capture.CaptureWriter | None, origin: float) -> None:
     link = await open_link(url)
     try:
         lines.begin(time.monotonic() - origin)
-        await _listen(link, lines, keep, origin)
+        await _listen(link, lines, writer, origin)
     finally:
         await link.close()
 
 
-async def _listen(link: Link, lines: "MonitorOutput", keep: capture.CaptureWriter | None, origin: float) -> None:
+async def _listen(link: Link, lines: "MonitorOutput", writer: capture.CaptureWriter | None, origin: float) -> None:
     reading = asyncio.ensure_future(link.read())
     try:
         while True:
             deadline = lines.deadline()
             timeout = None if deadline is None else max(0.0, deadline - (time.monotonic() - origin))
             done, _ = await asyncio.wait([reading], timeout=timeout)
-            now = round(time.monotonic() - origin, 6)  # as the file has it, so that it is decoded there as here
+            now = round(
+                time.monotonic() - origin, 6
+            )  # rounded as in the file, so that the file decodes in the same way
             if not done:
                 lines.tick(now)
                 continue
             piece = capture.CapturedBytes(now, reading.result())
             reading = asyncio.ensure_future(link.read())
-            if keep is not None:
-                _add(keep, piece)
+            if writer is not None:
+                _add(writer, piece)
             lines.feed(piece)
     finally:
         reading.cancel()
 
 
-def _add(keep: capture.CaptureWriter, piece: capture.CapturedBytes) -> None:
+def _add(writer: capture.CaptureWriter, piece: capture.CapturedBytes) -> None:
     try:
-        keep.add(piece)
+        writer.add(piece)
     except OSError as error:
-        raise cli_support.Failed(f"{keep.path}: the file cannot be written: {error.strerror}") from None
+        raise cli_support.Failed(f"{writer.path}: the file cannot be written: {error.strerror}") from None
 
 
 class MonitorOutput:
-    """A line for each event of one link's bytes, as text or JSON, and a summary at the end."""
+    """Prints a line for each event of one link's bytes, as text or JSON, and a summary at the end."""
 
     def __init__(self, profile: Profile, *, as_json: bool) -> None:
         self._profile = profile
         self._as_json = as_json
         self._decoder = Decoder()
         self._paint = cli_support.Paint(sys.stdout)
-        self.tally = LinkStatistics()
+        self.statistics = LinkStatistics()
 
     def begin(self, at: float) -> None:
-        """The link is open; seconds since the start, as all times here."""
-        self.tally.since = at
+        """Start the statistics when the link is open. Times are seconds since the start."""
+        self.statistics.since = at
 
     def feed(self, piece: capture.CapturedBytes) -> None:
-        """Show what these bytes complete; raises OSError of the output."""
-        self.tally.bytes += len(piece.data)
-        self.tally.until = piece.at
-        self._show(self._decoder.feed(piece.data, piece.at))
+        """Print the events that these bytes complete; raise OSError of the output."""
+        self.statistics.bytes += len(piece.data)
+        self.statistics.until = piece.at
+        self._print(self._decoder.feed(piece.data, piece.at))
 
     def tick(self, now: float) -> None:
-        """Show what silence completes."""
-        self._show(self._decoder.tick(now))
+        """Print the events that silence completes."""
+        self._print(self._decoder.tick(now))
 
     def deadline(self) -> float | None:
-        """When `tick` is next wanted."""
+        """Return the time at which to call `tick`."""
         return self._decoder.deadline()
 
     def end(self, at: float | None = None) -> None:
-        """Show what is still held, and the summary; nothing if the link was never open."""
-        if self.tally.since is None:
+        """Print the last events and the summary; nothing if the link was never open."""
+        if self.statistics.since is None:
             return
-        self._show(self._decoder.end())
+        self._print(self._decoder.end())
         if at is not None:
-            self.tally.until = at
+            self.statistics.until = at
         if self._as_json:
-            sys.stdout.write(json.dumps({"kind": "summary", **self.tally.fields()}) + "\n")
+            sys.stdout.write(json.dumps({"kind": "summary", **self.statistics.fields()}) + "\n")
             sys.stdout.flush()
         else:
-            sys.stderr.write(self.tally.words() + "\n")
+            sys.stderr.write(self.statistics.words() + "\n")
 
-    def _show(self, events: Sequence[Event]) -> None:
+    def _print(self, events: Sequence[Event]) -> None:
         for event in events:
-            self.tally.count(event, self._profile)
+            self.statistics.count(event, self._profile)
             fields = describe(event, self._profile)
             line = self._json(event, fields) if self._as_json else self._text(event, fields)
             sys.stdout.write(line + "\n")
@@ -193,17 +195,17 @@ class MonitorOutput:
     def _text(self, event: Event, fields: dict[str, Any]) -> str:
         raw = cli_support.printable(event.raw)
         at = self._paint("dim", f"{event.at:9.3f}")
-        # What does not fit its column has a line of its own, and is never cut.
+        # Bytes that do not fit their column get a line of their own and are never truncated.
         gap = " " * (_RAW_WIDTH - len(raw)) if len(raw) <= _RAW_WIDTH else "\n" + " " * (_RAW_WIDTH + 11)
-        colour = (
+        color = (
             "red" if isinstance(event, Rejected) else "yellow" if {"rejected", "contradicts"} & fields.keys() else ""
         )
         words = "  ".join(_words(fields))
-        return f"{at}  {raw}{gap}  {self._paint(colour, words) if colour else words}"
+        return f"{at}  {raw}{gap}  {self._paint(color, words) if color else words}"
 
 
 def _words(fields: dict[str, Any]) -> Iterator[str]:
-    """The fields for a person; the kind of a sensors frame goes without saying."""
+    """Yield the fields for a person, without the kind of a sensors frame."""
     for name, value in fields.items():
         match name:
             case "kind":

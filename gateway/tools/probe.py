@@ -1,4 +1,4 @@
-"""One link that is listened to, and probed if wanted: what it is, by what came over it. Nothing is shown here."""
+"""Listens to one link, probes it on request, and decides whether a car is on it. Prints nothing."""
 
 import asyncio
 import time
@@ -19,7 +19,7 @@ from gateway.tools.statistics import LinkStatistics
 
 
 class LinkVerdict(StrEnum):
-    """What a link is, by what came over it."""
+    """The kind of a link, by the bytes from it."""
 
     CAR = "car"
     OTHER = "other"
@@ -30,31 +30,31 @@ class LinkVerdict(StrEnum):
 
 @dataclass(slots=True)
 class LinkProbe:
-    """One link that is listened to, and what was heard."""
+    """One link with its statistics and its verdict."""
 
     url: LinkUrl
     port: SerialPort | None = None
     link: Link | None = None
-    tally: LinkStatistics = field(default_factory=LinkStatistics)
+    statistics: LinkStatistics = field(default_factory=LinkStatistics)
     trouble: str | None = None
     busy: bool = False
     probed: bool = False
     answered: bool = False
-    """A reading of mode 0 has come (after the last frame, if it was probed)."""
+    """True after a reading of mode 0; if the link was probed, only after the last frame of the probe."""
     _decoder: Decoder = field(default_factory=Decoder)
     _profile: Profile = field(default_factory=lambda: cli_support.profile_of("unknown"))
 
     async def open(self) -> None:
-        """Open the link; trouble is noted, not raised."""
+        """Open the link; store an error in `trouble`."""
         try:
             self.link = await open_link(self.url)
         except LinkError as error:
             self.trouble, self.busy = str(error), isinstance(error, Busy)
         else:
-            self.tally.since = time.monotonic()
+            self.statistics.since = time.monotonic()
 
     async def listen(self, seconds: float, *, until_answered: bool = False) -> None:
-        """Take in what comes for so long, or until mode 0 has answered; a link that is lost is trouble."""
+        """Read for this time, or until a reading of mode 0; store the loss of the link in `trouble`."""
         assert self.link is not None
         end = time.monotonic() + seconds
         while (now := time.monotonic()) < end and not (until_answered and self.answered):
@@ -69,12 +69,12 @@ class LinkProbe:
                 self.trouble = str(error)
                 break
             else:
-                self.tally.bytes += len(data)
+                self.statistics.bytes += len(data)
                 self._count(self._decoder.feed(data, time.monotonic()))
-        self.tally.until = time.monotonic()
+        self.statistics.until = time.monotonic()
 
     async def probe(self) -> None:
-        """Send an unknown car's stop (docs/reference/protocol.md#stops), and wait for a reading of mode 0."""
+        """Send the stop of an unknown platform (docs/reference/protocol.md#stops) and wait for a reading of mode 0."""
         assert self.link is not None
         self.probed = True
         last = time.monotonic()
@@ -93,22 +93,22 @@ class LinkProbe:
         await self.listen(STOP_REPORT_TIMEOUT_S, until_answered=True)
 
     def end(self) -> None:
-        """Take in what was held back."""
+        """Count the last events of the decoder."""
         self._count(self._decoder.end())
 
     @property
     def verdict(self) -> LinkVerdict:
-        """What it is, so far."""
+        """The kind of the link, so far."""
         if self.link is None:
             return LinkVerdict.BUSY if self.busy else LinkVerdict.FAILED
-        if self.tally.readings:
+        if self.statistics.readings:
             return LinkVerdict.CAR
         if self.trouble is not None:
             return LinkVerdict.FAILED
-        return LinkVerdict.OTHER if self.tally.bytes else LinkVerdict.SILENT
+        return LinkVerdict.OTHER if self.statistics.bytes else LinkVerdict.SILENT
 
     def _count(self, events: Sequence[Event]) -> None:
         for event in events:
-            self.tally.count(event, self._profile)
+            self.statistics.count(event, self._profile)
             if isinstance(event, Sensors) and event.candidates == (Mode.MANUAL,):
                 self.answered = True

@@ -1,6 +1,6 @@
-"""`gateway scan`: what there is that could be a car, and which of it speaks as a car does.
+"""`gateway scan`: lists ports and Bluetooth devices, and listens for cars on the ports.
 
-It opens serial ports and listens; it sends nothing unless asked to (`--probe`). What there is, `candidates` lists.
+Sends nothing without `--probe`. `discovery` lists the ports, `probe` listens to one.
 """
 
 import argparse
@@ -31,11 +31,11 @@ Bluetooth devices are only listed, not connected to. A TCP car is never looked f
 --probe stops every car that it finds and closes whatever mode it is in. Ports that send something else are not
 probed."""
 
-SECONDS: Final = 6.0
-"""An Arduino that was reset by opening its port has started after two; in mode 0 a car reports once in one, and three
-readings show its platform."""
-_LEAST_S, _MOST_S = 0.5, 120.0
-_TICK_S: Final = 0.5
+# Opening its port resets an Arduino, which starts within 2 s. In mode 0 a car reports once a second, and three readings
+# show its platform.
+DEFAULT_LISTEN_S: Final = 6.0
+_MIN_LISTEN_S, _MAX_LISTEN_S = 0.5, 120.0
+PROGRESS_INTERVAL_S: Final = 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,27 +45,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--link", action="append", metavar="URL", help=f"look at this link, and at no other; {cli_support.LINK_HELP}"
     )
     parser.add_argument(
-        "--seconds", type=float, default=SECONDS, metavar="S", help=f"how long to listen (default {SECONDS:g})"
+        "--seconds",
+        type=float,
+        default=DEFAULT_LISTEN_S,
+        metavar="S",
+        help=f"how long to listen (default {DEFAULT_LISTEN_S:g})",
     )
     parser.add_argument("--probe", action="store_true", help="send cars and silent ones an unknown car's stop")
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Look, listen, tell; the exit code."""
-    return cli_support.explained("gateway scan", lambda: _run(arguments))
+    """List, listen and print; return the exit code."""
+    return cli_support.run_command("gateway scan", lambda: _run(arguments))
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    if not _LEAST_S <= arguments.seconds <= _MOST_S:
-        raise cli_support.WrongUse(f"--seconds {arguments.seconds:g}: a number from {_LEAST_S:g} to {_MOST_S:g}")
+    if not _MIN_LISTEN_S <= arguments.seconds <= _MAX_LISTEN_S:
+        raise cli_support.WrongUse(
+            f"--seconds {arguments.seconds:g}: a number from {_MIN_LISTEN_S:g} to {_MAX_LISTEN_S:g}"
+        )
     if arguments.link:
-        ears = [LinkProbe(url) for url in dict.fromkeys(map(parse_url, arguments.link))]
+        probes = [LinkProbe(url) for url in dict.fromkeys(map(parse_url, arguments.link))]
     else:
-        ears = [LinkProbe(parse_url(port.device), port) for port in serial_ports()]
-    for ear in ears:
-        cli_support.warn_of(ear.url)
-    scan = _Scan(ears, arguments.seconds, probe=arguments.probe, bluetooth=not arguments.link)
+        probes = [LinkProbe(parse_url(port.device), port) for port in serial_ports()]
+    for probe in probes:
+        cli_support.warn_before_opening(probe.url)
+    scan = _Scan(probes, arguments.seconds, probe=arguments.probe, bluetooth=not arguments.link)
     cli_support.run_until_interrupted(scan.run())
     if arguments.json:
         for fields in scan.fields():
@@ -73,111 +79,115 @@ def _run(arguments: argparse.Namespace) -> None:
     else:
         for line in scan.lines(cli_support.Paint(sys.stdout)):
             sys.stdout.write(line + "\n")
-    failed = [ear for ear in ears if ear.verdict is LinkVerdict.FAILED]
+    failed = [probe for probe in probes if probe.verdict is LinkVerdict.FAILED]
     if arguments.link and failed:
         sys.stdout.flush()
-        raise cli_support.Failed(f"could not listen to {', '.join(str(ear.url) for ear in failed)}")
+        raise cli_support.Failed(f"could not listen to {', '.join(str(probe.url) for probe in failed)}")
 
 
 class _Scan:
-    """All links at once, and Bluetooth meanwhile."""
+    """Scans all links and Bluetooth at once."""
 
-    def __init__(self, ears: Sequence[LinkProbe], seconds: float, *, probe: bool, bluetooth: bool) -> None:
-        self._ears = ears
+    def __init__(self, probes: Sequence[LinkProbe], seconds: float, *, probe: bool, bluetooth: bool) -> None:
+        self._probes = probes
         self._seconds = seconds
         self._probe = probe
         self._bluetooth = bluetooth
         self._devices: list[BleDevice] = []
 
     async def run(self) -> None:
-        """Open, listen, probe, close."""
+        """Open, listen, probe and close."""
         try:
             await self._with_progress(self._look(), "opening and listening", self._seconds)
             if self._probe:
                 await self._probe_silent()
         finally:
-            await asyncio.gather(*(ear.link.close() for ear in self._ears if ear.link is not None))
-        for ear in self._ears:
-            ear.end()
+            await asyncio.gather(*(probe.link.close() for probe in self._probes if probe.link is not None))
+        for probe in self._probes:
+            probe.end()
 
     async def _look(self) -> None:
         async with asyncio.TaskGroup() as tasks:
-            for ear in self._ears:
-                tasks.create_task(self._hear(ear))
+            for probe in self._probes:
+                tasks.create_task(self._hear(probe))
             if self._bluetooth:
                 tasks.create_task(self._look_for_devices())
 
-    async def _hear(self, ear: LinkProbe) -> None:
-        await ear.open()
-        if ear.link is not None:
-            await ear.listen(self._seconds)
+    async def _hear(self, probe: LinkProbe) -> None:
+        await probe.open()
+        if probe.link is not None:
+            await probe.listen(self._seconds)
 
     async def _look_for_devices(self) -> None:
         try:
             self._devices = await ble_devices(self._seconds)
         except NoBluetooth as error:
-            cli_support.note(str(error))
+            cli_support.print_note(str(error))
 
     async def _probe_silent(self) -> None:
-        # A car in mode 0, too: its readings do not tell whether it drives.
-        asked = [
-            ear for ear in self._ears if ear.trouble is None and ear.verdict in (LinkVerdict.SILENT, LinkVerdict.CAR)
+        # Also a car in mode 0: its readings do not show whether it drives.
+        probed = [
+            probe
+            for probe in self._probes
+            if probe.trouble is None and probe.verdict in (LinkVerdict.SILENT, LinkVerdict.CAR)
         ]
-        if not asked:
-            cli_support.note("nothing to probe: nothing is open, or what is sends something else")
+        if not probed:
+            cli_support.print_note("nothing to probe: nothing is open, or what is sends something else")
             return
         frames = ", ".join(encode(step.frame).decode() for step in UNKNOWN.steps)
-        where = ", ".join(str(ear.url) for ear in asked)
+        where = ", ".join(str(probe.url) for probe in probed)
         seconds = f"{UNKNOWN.length_s:g} s"
-        cli_support.note(f"sending {frames} within {seconds} to {where}: a car there stops, and goes to mode 0")
-        probing = asyncio.gather(*(ear.probe() for ear in asked))
+        cli_support.print_note(f"sending {frames} within {seconds} to {where}: a car there stops, and goes to mode 0")
+        probing = asyncio.gather(*(probe.probe() for probe in probed))
         await self._with_progress(_all(probing), "probing", UNKNOWN.length_s + STOP_REPORT_TIMEOUT_S)
 
     async def _with_progress(self, work: Coroutine[Any, Any, None], what: str, seconds: float) -> None:
-        """Tell a person at a terminal how long it may still take."""
-        showing = asyncio.ensure_future(self._show(what, seconds)) if sys.stderr.isatty() and seconds > 1 else None
+        """Run the work; show its remaining time at a terminal."""
+        progress = None
+        if sys.stderr.isatty() and seconds > 1:
+            progress = asyncio.ensure_future(self._show_progress(what, seconds))
         try:
             await work
         finally:
-            if showing is not None:
-                showing.cancel()
+            if progress is not None:
+                progress.cancel()
                 sys.stderr.write("\r\x1b[K")
                 sys.stderr.flush()
 
-    async def _show(self, what: str, seconds: float) -> None:
+    async def _show_progress(self, what: str, seconds: float) -> None:
         end = time.monotonic() + seconds
         while True:
-            links = f"{len(self._ears)} link{'' if len(self._ears) == 1 else 's'}"
+            links = f"{len(self._probes)} link{'' if len(self._probes) == 1 else 's'}"
             sys.stderr.write(f"\r\x1b[K{what}: {links}, {max(0.0, end - time.monotonic()):.0f} s left")
             sys.stderr.flush()
-            await asyncio.sleep(_TICK_S)
+            await asyncio.sleep(PROGRESS_INTERVAL_S)
 
     def fields(self) -> Iterator[dict[str, Any]]:
-        """One object for each link and device."""
-        for ear in self._ears:
-            named = {"device": None} if ear.port is None else asdict(ear.port)
-            url = str(ear.url) if ear.port is None else ear.port.url
+        """Yield one object for each link and device."""
+        for probe in self._probes:
+            named = {"device": None} if probe.port is None else asdict(probe.port)
+            url = str(probe.url) if probe.port is None else probe.port.url
             yield {
-                "kind": "link" if ear.port is None else "serial",
+                "kind": "link" if probe.port is None else "serial",
                 **named,
                 "url": url,
-                "verdict": ear.verdict,
-                "words": _words(ear),
-                "probed": ear.probed,
-                **ear.tally.fields(),
+                "verdict": probe.verdict,
+                "words": _words(probe),
+                "probed": probe.probed,
+                **probe.statistics.fields(),
             }
         for device in self._devices:
             yield {"kind": "ble", **asdict(device)}
 
     def lines(self, paint: cli_support.Paint) -> Iterator[str]:
-        """For a person."""
-        if not self._ears:
+        """Yield the result as text for a person."""
+        if not self._probes:
             yield "no serial port is plugged in"
-        for ear in self._ears:
-            yield f"{paint('cyan', _name(ear))}"
-            yield f"  {_words(ear)}"
-            if ear.port is not None:
-                yield f"  --link '{ear.port.url}'"
+        for probe in self._probes:
+            yield f"{paint('cyan', _name(probe))}"
+            yield f"  {_words(probe)}"
+            if probe.port is not None:
+                yield f"  --link '{probe.port.url}'"
         likely = [device for device in self._devices if device.uart is not None]
         for device in likely:
             yield f"{paint('cyan', device.address)}  {_safe(device.name) or 'no name'}, {device.rssi} dBm"
@@ -191,34 +201,34 @@ async def _all(probing: "asyncio.Future[list[None]]") -> None:
     await probing
 
 
-def _name(ear: LinkProbe) -> str:
-    if ear.port is None:
-        return str(ear.url)
-    usb = f"{ear.port.vid}:{ear.port.pid}" if ear.port.vid else ""
-    number = f"serial number {_safe(ear.port.serial_number)}" if ear.port.serial_number else ""
-    about = ", ".join(part for part in (_safe(ear.port.description), usb, number) if part)
-    return f"{ear.port.device}  {about}".rstrip()
+def _name(probe: LinkProbe) -> str:
+    if probe.port is None:
+        return str(probe.url)
+    usb = f"{probe.port.vid}:{probe.port.pid}" if probe.port.vid else ""
+    number = f"serial number {_safe(probe.port.serial_number)}" if probe.port.serial_number else ""
+    about = ", ".join(part for part in (_safe(probe.port.description), usb, number) if part)
+    return f"{probe.port.device}  {about}".rstrip()
 
 
 def _safe(text: str | None) -> str:
-    """Text that a device has chosen, without what would change a terminal."""
+    """Return a text that a device has chosen, without control characters."""
     return "".join(each for each in text or "" if each.isprintable())
 
 
-def _words(ear: LinkProbe) -> str:
-    """What a link is, for a person."""
-    match ear.verdict:
+def _words(probe: LinkProbe) -> str:
+    """Return the verdict on a link for a person."""
+    match probe.verdict:
         case LinkVerdict.CAR:
-            after = "; it answered the probe in mode 0" if ear.probed and ear.answered else ""
-            gone = f"; then: {ear.trouble}" if ear.trouble else ""
-            return f"a car: {ear.tally.words()}{after}{gone}"
+            after = "; it answered the probe in mode 0" if probe.probed and probe.answered else ""
+            gone = f"; then: {probe.trouble}" if probe.trouble else ""
+            return f"a car: {probe.statistics.words()}{after}{gone}"
         case LinkVerdict.OTHER:
-            return f"no car: {ear.tally.words()}"
-        case LinkVerdict.SILENT if ear.probed:
+            return f"no car: {probe.statistics.words()}"
+        case LinkVerdict.SILENT if probe.probed:
             return "silent, also when probed: no car, one that is off or wedged, or its fan runs"
         case LinkVerdict.SILENT:
             return "silent: no car, one that is off, in a silent mode, or with its fan on (--probe asks it)"
         case LinkVerdict.BUSY:
             return "in use by another program (its gateway?): not listened to"
         case LinkVerdict.FAILED:
-            return str(ear.trouble)
+            return str(probe.trouble)

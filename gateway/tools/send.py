@@ -1,6 +1,6 @@
-"""`gateway send`: one frame to a car on the desk, checked against the table, and what the car may be doing then.
+"""`gateway send`: checks one frame against the table, sends it, and prints what the car may do then.
 
-For trying things: it paces, repeats and stops nothing. `gateway run` is what drives a car safely.
+For experiments with a car on the desk: it paces, repeats and stops nothing. `gateway run` drives a car safely.
 """
 
 import argparse
@@ -10,7 +10,6 @@ import shlex
 from typing import Final
 
 from gateway.link import LinkUrl, open_link, parse_url
-from gateway.link.url import TcpUrl
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import (
     ArmSet,
@@ -25,8 +24,9 @@ from gateway.protocol.frames import (
     parse_sent,
 )
 from gateway.protocol.platforms import Profile, StopStyle
-from gateway.protocol.timing import BYTES_PER_S, FRAME_S
+from gateway.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
 from gateway.tools import cli_support
+from schemas.links import TcpUrl
 
 DESCRIPTION: Final = "Send one frame to a car on the desk, checked against the table, and say what the car may do then."
 EPILOG: Final = """\
@@ -40,7 +40,7 @@ A car keeps its last motion for ever: put it on blocks. `gateway run` is what dr
 Opening a serial port can reset an Arduino that is on a USB cable; it misses what comes in the two seconds of its start:
 --wait 3."""
 
-LONGEST_WAIT_S: Final = 60.0
+MAX_WAIT_S: Final = 60.0
 _STOP: Final = encode(General(Motion.STOP)).decode()
 _MANUAL: Final = encode(ModeClose()).decode()
 _FORMS: Final = (
@@ -48,7 +48,7 @@ _FORMS: Final = (
     "'$4WD,MODE<0..6><0 or 1>#', or '$4WD,ServoJ1<0..180>,J2...,J6<0..180>#'"
 )
 _PLACES: Final = ("motion", "rotate", "whistle", "speed", "servo", "sing", "light", "fan", "servo reset")
-# What is left of a frame whose `$0` or `$4` a shell has replaced: by its own name, or by nothing.
+# The rest of a frame after a shell has replaced its `$0` or `$4` by the shell's name or by nothing.
 _EXPANDED: Final = re.compile(r"(?P<name>[^,$]*)(?P<rest>(?:,\d){8}#?)|(?P<named>WD,[A-Za-z0-9,]+#?)")
 
 
@@ -64,19 +64,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the frame; the exit code."""
-    return cli_support.explained("gateway send", lambda: _run(arguments))
+    """Send the frame; return the exit code."""
+    return cli_support.run_command("gateway send", lambda: _run(arguments))
 
 
 def _run(arguments: argparse.Namespace) -> None:
     url, profile = parse_url(arguments.link), cli_support.profile_of(arguments.platform)
-    if not 0 <= arguments.wait <= LONGEST_WAIT_S:
-        raise cli_support.WrongUse(f"--wait {arguments.wait:g}: a number of seconds from 0 to {LONGEST_WAIT_S:g}")
-    data = raw_bytes(arguments.frame) if arguments.raw else checked(arguments.frame, profile, url)
-    cli_support.warn_of(url)
+    if not 0 <= arguments.wait <= MAX_WAIT_S:
+        raise cli_support.WrongUse(f"--wait {arguments.wait:g}: a number of seconds from 0 to {MAX_WAIT_S:g}")
+    data = raw_bytes(arguments.frame) if arguments.raw else check_frame(arguments.frame, profile, url)
+    cli_support.warn_before_opening(url)
     cli_support.run_until_interrupted(_send(url, data, arguments.wait))
     sent = f"sent {cli_support.printable(data)} to {url}"
-    cli_support.say([sent, *aftermath(parse_sent(data), profile, arguments.link)])
+    cli_support.print_lines([sent, *aftermath(parse_sent(data), profile, arguments.link)])
 
 
 async def _send(url: LinkUrl, data: bytes, wait_s: float) -> None:
@@ -84,14 +84,14 @@ async def _send(url: LinkUrl, data: bytes, wait_s: float) -> None:
     try:
         await asyncio.sleep(wait_s)
         await link.write(data)
-        # A port that is closed before its bytes are out may cut them.
+        # A port that closes before its bytes are sent may truncate them.
         await asyncio.sleep(len(data) / BYTES_PER_S + FRAME_S)
     finally:
         await link.close()
 
 
 def raw_bytes(text: str) -> bytes:
-    """The text as bytes, one each; raises WrongUse."""
+    """Return the text as bytes, one per character; raise WrongUse."""
     try:
         data = text.encode("latin-1")
     except UnicodeEncodeError as error:
@@ -101,8 +101,8 @@ def raw_bytes(text: str) -> bytes:
     return data
 
 
-def checked(text: str, profile: Profile, url: LinkUrl) -> bytes:
-    """The bytes of a frame that is in the table and that this car knows; raises WrongUse, which says what is wrong."""
+def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
+    """Return the bytes of a frame that is in the table and that this car knows; raise WrongUse with the reason."""
     frame = parse_sent(raw_bytes(text))
     if frame is None:
         raise cli_support.WrongUse(f"frame {text!r}: {why_not(text)} (--raw sends it anyway)")
@@ -120,7 +120,7 @@ def checked(text: str, profile: Profile, url: LinkUrl) -> bytes:
 
 
 def why_not(text: str) -> str:
-    """Why a text is no frame of the table, in words for a person."""
+    """Return for a person why a text is no frame of the table."""
     if expanded := _EXPANDED.fullmatch(text):
         rest = expanded["rest"]
         # `$1`..`$4` are empty in a shell, `$0` is its name.
@@ -152,7 +152,7 @@ def _is_frame(index: int, digit: str) -> bool:
 
 
 def moves(frame: Frame) -> bool:
-    """Whether the car may drive after this frame."""
+    """Return True if the car may drive after this frame."""
     match frame:
         case General(motion):
             return motion is not Motion.STOP
@@ -163,7 +163,7 @@ def moves(frame: Frame) -> bool:
 
 
 def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
-    """What the car may be doing now, and how it is stopped, in lines for a person."""
+    """Return for a person what the car may do now and how to stop it."""
     again = f"gateway send --link {shlex.quote(link)}"
     lines = ["cars do not answer; `gateway monitor` shows what it says"]
     match frame:
@@ -176,7 +176,8 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
                 lines.append("its fan was toggled; while it runs, an arduino car sends no readings")
         case ModeOpen(mode):
             lines.append(
-                f"it is opening mode {mode}, which takes up to 3.5 s, and keeps its motors as they were for that"
+                f"it is opening mode {mode}, which takes up to {LONGEST_BLOCK_S:g} s, and keeps its motors as they "
+                "were for that"
             )
             then = "obeys" if mode in (Mode.REMOTE_CONTROL, Mode.COLOR_LED) else "drives by itself, and obeys"
             lines.append(f"then it {then} only a mode frame; stop it, and back to mode 0: {again} '{_MANUAL}'")

@@ -44,7 +44,7 @@ def run(seed: int, pieces: int) -> int:
                 assert 0 < len(event.raw) <= 256
                 assert event.at <= now
             made += len(events)
-            assert len(decoder._held) <= 256
+            assert len(decoder._buffer) <= 256
             assert len(decoder._sent) <= 256
             if number % FRESH == FRESH - 1:
                 # Whatever was held: the next but one good frame after a silence decodes.

@@ -402,7 +402,7 @@ class Episode:
         world = ALL_WORLDS[plan.world]()
         self.car = build(plan.platform, world, 0, random.Random(plan.seed), transport=Transport.SERIAL, name="red")
         if isinstance(self.car, ArduinoCar):
-            self.car.report_every_s = plan.report_every_s
+            self.car.report_interval_s = plan.report_every_s
         self.control = Controller("red", parse_platform(plan.told))
         self.decoder = Decoder()
         self.now = 0.0

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.capture import FORMAT, LINE_LIMIT, BadCapture, CapturedBytes, CaptureWriter, read
+from gateway.capture import FORMAT, MAX_LINE_BYTES, BadCapture, CapturedBytes, CaptureWriter, read
 
 MICROSECONDS = st.integers(0, 10**13)
 PIECES = st.lists(st.tuples(MICROSECONDS, st.binary(max_size=300)), max_size=12).map(
@@ -129,7 +129,7 @@ def test_a_line_without_end_is_not_read_to_its_end(tmp_path: Path) -> None:
     with path.open("w") as file:
         file.write(HEAD)
         file.write('{"t": 0, "rx": "')
-        file.seek(LINE_LIMIT * 2)
+        file.seek(MAX_LINE_BYTES * 2)
         file.write('"}')
     with pytest.raises(BadCapture, match="kept:2: not a JSON object"):
         list(read(path))

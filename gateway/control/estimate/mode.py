@@ -12,8 +12,9 @@ from typing import Final
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Sensors
+from gateway.protocol.modes import SILENT_MODES
 from gateway.protocol.platforms import Profile
-from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S, RATE_HZ
+from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
 
 CONTRADICTING_FRAMES: Final = 3
 """Number of consecutive readings of another mode that contradict the commanded one
@@ -183,7 +184,7 @@ class ModeEstimator:
 
     @property
     def _silent_modes(self) -> tuple[Mode, ...]:
-        return tuple(mode for mode in Mode if mode in self.profile.possible_modes and mode not in RATE_HZ)
+        return tuple(mode for mode in Mode if mode in self.profile.possible_modes and mode in SILENT_MODES)
 
     def _on_expected_silence(self, asked: Mode, now: float) -> None:
         """Let older evidence expire: silence is normal in this mode or with the fan on, so it proves nothing."""

@@ -4,15 +4,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.enums import Motion
 from gateway.protocol.frames import Frame, General, ModeClose, Reset
-from gateway.protocol.timing import mode_open_s
+from gateway.protocol.timing import RECOVERY_SILENCE_S
 
 REPEAT_INTERVAL_S: Final = 1.1
 """Minimum interval that leaves a frame alone in the car's buffer: an unknown block lasts up to 1.0 s."""
-# The car must have read all earlier frames by then, also one that opens the mode with the longest block.
-RECOVERY_SILENCE_S: Final = max(mode_open_s(mode) for mode in Mode) + 0.2
-"""Silence before the frame of recovery that the car certainly reads: longer than any block outside avoidance."""
 STOP_REPORT_TIMEOUT_S: Final = 4.5
 """Timeout for a report of mode 0 after a stop: avoidance blocks for 4.3 s."""
 

@@ -11,12 +11,13 @@ from gateway.control.stops.evidence import StopCase
 from gateway.control.stops.sequences import Gate, StopSequence
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import Frame, ModeClose
+from gateway.protocol.modes import MODES
 from gateway.protocol.platforms import Profile, StopStyle
-from gateway.protocol.timing import FRAME_S, MODE_TURN_S
+from gateway.protocol.timing import FRAME_S, RECOVERY_SILENCE_S
 
 WIRE_S: Final = 0.02  # docs/reference/protocol.md#stops: 20 ms of wire for a frame of 19 bytes at 960 B/s
 RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory never longer outside avoidance
-_AVOIDING_S: Final = MODE_TURN_S[Mode.OBSTACLE_AVOIDANCE]
+_AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 """A car in an unknown state may be avoiding obstacles; assume the worst."""
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After it the command fails."""
@@ -26,7 +27,7 @@ USUAL_EVIDENCE_S: Final = 2.0
 """Usual time from the last frame of a stop to the evidence."""
 # The silence is longer than any block outside avoidance, so the car reads the next frame alone. With growth to 6.5 s
 # the car reads one of two tries within 15 s of the end of a fault.
-RETRY_S: Final = (sequences.RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
+RETRY_S: Final = (RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
 """Intervals from `MODE00` to the next try, by the number of tries."""
 # Without an echo the car ranges for 1.0 s before it reads the frame, is blocked for 1.0 s, ranges for another 1.0 s,
 # and reports after 0.9 s.
@@ -237,7 +238,7 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
     if sequence is sequences.UNKNOWN:
         # Even if the first frames merge with a partial frame and open a mode, the second half of the sequence closes
         # it.
-        return sequences.RECOVERY_SILENCE_S + _AVOIDING_S + WIRE_S
+        return RECOVERY_SILENCE_S + _AVOIDING_S + WIRE_S
     one = sequence in (sequences.SOFT, sequences.FULL_BEHIND) or (context.clear and context.known)
     twice_s = 0.0 if one else FRAME_S  # the car may read only the second
     if context.clear:

@@ -1,1 +1,5 @@
-"""The simulated cars' pure core: firmware on virtual time, and the world. No I/O, no clock, no randomness."""
+"""The simulated cars' pure core: programs on virtual time, and the world. No I/O, no clock, no randomness.
+
+`firmware` is the base of the programs `arduino` and `raspberry_pi`. `car_body` puts a car into the `world` with its
+`objects`. `faulty_link` carries the bytes, `capture_car` plays a capture, `scheduler` orders the programs.
+"""

@@ -1,7 +1,7 @@
-"""The Arduino car's program (the STM32 car's is the same): one loop, one string, modes.
+"""The program of the Arduino car and of the STM32 car: one loop, one string, modes.
 
-It reads its string by position as the real program does and knows nothing of our codec. "Row" in a comment means the
-row of that name in docs/reference/protocol.md.
+It reads its string by position, as the real program does, and does not use our codec. "Row" in a comment means the row
+of that name in docs/reference/protocol.md.
 """
 
 import re
@@ -10,9 +10,9 @@ from math import inf
 from typing import Final
 
 from gateway.sim.model.firmware import (
-    COLOUR_S,
+    COLOR_S,
     NO_ECHO_S,
-    REPORT_EVERY_S,
+    REPORT_INTERVAL_S,
     WHISTLE_S,
     CarBodyState,
     Firmware,
@@ -25,9 +25,10 @@ from gateway.sim.model.firmware import (
 from gateway.sim.model.ir_remote import SIGNS, Button
 
 TX_BUFFER: Final = 64
+# A wedged car never clears its string, which grows until the RAM is full.
 STRING_LIMIT: Final = 512
-"""A string that is never cleared (a wedged car) grows until the RAM is full; what comes then is dropped."""
-BOOT_S: Final = 0.5
+"""Maximum length of the string. Further bytes are dropped."""
+ARDUINO_BOOT_S: Final = 0.5
 START_SPEED: Final = 150
 CLOSE_S: Final = 1.0
 OPEN_S: Final = 2.0
@@ -35,9 +36,9 @@ BEEP_S: Final = 0.1
 AVOIDANCE_RANGINGS: Final = 5
 SHARP_S: Final = 0.08
 FAR_CM: Final = 500.0
-"""In avoidance a distance from here on is thrown away like a missing echo."""
+"""In avoidance, the program discards a distance from here on like a missing echo."""
 
-LIGHTS: Final = {
+ARDUINO_LIGHTS: Final = {
     "1": (255, 255, 255),
     "2": (255, 0, 0),
     "3": (0, 255, 0),
@@ -58,29 +59,29 @@ class ArduinoCar(Firmware):
     ) -> None:
         super().__init__(body, rng, options=options, now=now)
         self._joints = [90] * 6
-        self.report_every_s = REPORT_EVERY_S
-        """Loop time from one report to the next, without its ranging. About a second: cars differ."""
-        self._forget()
+        self.report_interval_s = REPORT_INTERVAL_S
+        """Loop time from one report to the next, without the ranging. About a second: cars differ."""
+        self._reset_variables()
 
-    def _forget(self) -> None:
-        """What the program's variables are after a start."""
+    def _reset_variables(self) -> None:
+        """Set the program's variables to their values after a start."""
         self._string = ""
         self._started = False
         self._complete = False
         self._pressed = None
         self._speed = START_SPEED
-        self._colour_position = 0
-        # Loop time until each thing that mode 0 sends; the options' frames lie between the reports so that none blocks.
-        self._due = {"report": self.report_every_s}
+        self._color_position = 0
+        # Loop time until each frame of mode 0. The frames of the options come between the reports, so that none blocks.
+        self._due = {"report": self.report_interval_s}
         for offset, option in ((0.3, "arm"), (0.6, "imu")):
             if option in self._options:
                 self._due[option] = offset
 
     def _reboot(self) -> Program:
-        # Lost: mode, motion, speed (150 again), light, fan, half frames, whatever was in either buffer.
-        # The servo and the arm stay where they are.
-        self._forget()
-        yield Wait(self._now + BOOT_S)
+        # A reboot loses the mode, the motion, the speed (150 again), the light, the fan and both buffers.
+        # The servo and the arm keep their positions.
+        self._reset_variables()
+        yield Wait(self._now + ARDUINO_BOOT_S)
         self._buffer.clear()  # the UART is off while it boots
         yield from self._main()
 
@@ -88,7 +89,7 @@ class ArduinoCar(Firmware):
         while True:
             self._serial_event()
             if self._complete and (yield from self._parse()):
-                continue  # what came during an opening is obeyed when its block is over, not a turn later
+                continue  # the car obeys bytes from the time of an opening right after it, not a turn later
             match self._mode:
                 case 0:
                     yield from self._manual()
@@ -97,7 +98,7 @@ class ArduinoCar(Firmware):
                 case 3:
                     yield from self._avoidance()
                 case 4:
-                    yield from self._colour_led()
+                    yield from self._color_led()
                 case 5:
                     yield from self._light_seeking()
                 case 6:
@@ -108,7 +109,7 @@ class ArduinoCar(Firmware):
     # From the host.
 
     def _serial_event(self) -> None:
-        """All that waits becomes part of ONE string. `#` completes it even if no frame has begun (row "a lone #")."""
+        """Append all buffered bytes to ONE string. `#` completes it even outside a frame (row "a lone #")."""
         for byte in self._buffer:
             char = chr(byte)
             if char == "$":
@@ -121,7 +122,7 @@ class ArduinoCar(Firmware):
         self._buffer.clear()
 
     def _parse(self) -> Generator[Wait, None, bool]:
-        """Whether the string was cleared."""
+        """Obey the string; return True if it was cleared."""
         text = self._string
         if text.find("MODE") > 0 and text.find("4WD") > 0:
             yield from self._mode_frame(text)
@@ -136,7 +137,7 @@ class ArduinoCar(Firmware):
         return True
 
     def _mode_frame(self, text: str) -> Program:
-        """The digits are read at places 9 and 10 of the string, whatever stands there."""
+        """Read the digits at places 9 and 10 of the string, whatever they are."""
         self._pressed = None
         if text[10:11] == "0":
             self._drive(0, 0)
@@ -151,7 +152,7 @@ class ArduinoCar(Firmware):
         yield from self._busy(beeps + OPEN_S)
 
     def _general_frame(self, text: str) -> Program:
-        """Motion last, after whatever in the frame blocks, as in the real program."""
+        """Set the motion last, after everything that blocks, as in the real program."""
         left, right = motion(text)
         if text[5:6] == "1":
             yield from self._busy(WHISTLE_S)
@@ -163,7 +164,7 @@ class ArduinoCar(Firmware):
             yield from self._turn_servo(180)
         elif text[9:10] == "2":
             yield from self._turn_servo(0)
-        self._rgb = LIGHTS.get(text[13:14], self._rgb)
+        self._rgb = ARDUINO_LIGHTS.get(text[13:14], self._rgb)
         if text[15:16] == "1":
             self._fan = not self._fan
         if text[17:18] == "1":
@@ -178,7 +179,7 @@ class ArduinoCar(Firmware):
         self._speed = 100 if slower < 50 else slower
 
     def _named_frame(self, text: str) -> Generator[Wait, None, bool]:
-        """Whether the frame was known."""
+        """Obey a named frame; return True if it is known."""
         if (at := text.find("PTZ")) > 0:
             end = text.find("#", at)
             if end > at:
@@ -193,7 +194,7 @@ class ArduinoCar(Firmware):
                     old[1] if green is None else green,
                     blue,
                 )
-                yield from self._busy(COLOUR_S)
+                yield from self._busy(COLOR_S)
                 return True
         elif "arm" in self._options and (joints := _JOINTS.search(text)):
             self._joints = [min(180, int(value)) for value in joints.groups()]
@@ -203,7 +204,7 @@ class ArduinoCar(Firmware):
     # Mode 0.
 
     def _manual(self) -> Program:
-        """Wait for a byte or the next thing to send. While the fan runs loop turns do not count: it sends nothing."""
+        """Wait for a byte or the next frame to send. While the fan runs, loop turns do not count."""
         since = self._now
         due = inf if self._fan else since + min(self._due.values())
         yield Wait(due, wakes=True)
@@ -213,7 +214,7 @@ class ArduinoCar(Firmware):
             self._due[what] -= self._now - since
         if self._now >= due:
             what = min(self._due, key=lambda name: self._due[name])
-            self._due[what] = self.report_every_s
+            self._due[what] = self.report_interval_s
             yield from self._report(what)
 
     def _report(self, what: str) -> Program:
@@ -231,7 +232,7 @@ class ArduinoCar(Firmware):
             )
 
     def _print(self, text: str) -> Program:
-        """Send; blocks while the 64-byte transmit buffer has no room."""
+        """Send a frame; block while the 64-byte transmit buffer is full."""
         data = text.encode()
         room_at = self._tx_free - (TX_BUFFER - len(data)) / self._rate
         if room_at > self._now:
@@ -239,7 +240,7 @@ class ArduinoCar(Firmware):
         self._send(data)
 
     def _turn(self, frame: str) -> Program:
-        """The part of a loop turn in modes 2, 5 and 6 that sends: as many frames as the UART carries."""
+        """Send the frame of one loop turn in modes 2, 5 and 6, at the rate of the UART."""
         if self._fan:
             yield Wait(self._now + len(frame) / self._rate)
         else:
@@ -248,7 +249,7 @@ class ArduinoCar(Firmware):
     # Mode 1.
 
     def press(self, button: Button, now: float) -> bool:
-        """Only mode 1 looks at the receiver, which keeps one button while the program is busy."""
+        """Press a button. Only mode 1 reads the receiver, which stores one button while the program is busy."""
         self._run(now)
         if self._mode != 1 or self._pressed is not None:
             return False
@@ -257,7 +258,7 @@ class ArduinoCar(Firmware):
         return True
 
     def _remote(self) -> Program:
-        """Row "remote control": the infrared remote drives, nobody else."""
+        """Obey only the infrared remote (row "remote control")."""
         yield Wait(inf, wakes=True)
         button, self._pressed = self._pressed, None
         match button:
@@ -273,7 +274,7 @@ class ArduinoCar(Firmware):
                 left, right = SIGNS[button]
                 self._drive(left * self._speed, right * self._speed)
 
-    # The other modes. They set the speed for themselves and leave it so: what mode 0 has afterwards is theirs.
+    # The other modes. Each sets the speed, which mode 0 keeps afterwards.
 
     def _go(self, left: int, right: int, speed: int) -> None:
         self._speed = speed
@@ -308,24 +309,24 @@ class ArduinoCar(Firmware):
         self._go(*((1, 1) if left and right else (0, 1) if left else (1, 0) if right else (0, 0)), 200)
 
     def _following(self) -> Program:
-        """Row "6 following": its frame has no `#`, and its bits are inverted: 0 = object seen."""
+        """Follow an object (row "6 following"): no `#`, inverted bits, 0 = object seen."""
         seen = self._body.obstacle(self._now)
         yield from self._turn(f"$4WD,CSB120,PV8.3,GS000,LF0000,HW{bits((not seen[0], not seen[1]))},GM00")
         left, right = seen
         self._go(*((1, 1) if left and right else (-1, 1) if left else (1, -1) if right else (0, 0)), 200)
 
-    def _colour_led(self) -> Program:
-        yield from self._turn_servo(self._colour_position)
+    def _color_led(self) -> Program:
+        yield from self._turn_servo(self._color_position)
         red, green, blue = (int(self._rng.random() * 255) for _ in range(3))
         self._rgb = (red, green, blue)
-        yield from self._busy(COLOUR_S)
-        self._colour_position = (self._colour_position + 10) % 190
+        yield from self._busy(COLOR_S)
+        self._color_position = (self._color_position + 10) % 190
 
     def _avoidance(self) -> Program:
         cm = yield from self._distance()
         if cm < 20:
             self._blocked = True
-            yield from self._manoeuvre()
+            yield from self._maneuver()
             self._blocked = False
             return
         left, right = self._body.obstacle(self._now)
@@ -336,13 +337,13 @@ class ArduinoCar(Firmware):
             self._go(1, -1, 200)
             yield from self._busy(0.2)
         if cm > 30:
-            self._rgb = LIGHTS["3"]
+            self._rgb = ARDUINO_LIGHTS["3"]
             self._go(1, 1, 200)
         else:
             self._go(1, 1, 100)
 
     def _distance(self) -> Generator[Wait, None, float]:
-        """Five rangings, 0.1 s. Without echo: braked, for ever, and deaf."""
+        """Return the distance of five rangings, 0.1 s. Without echo, brake and block for ever."""
         found = []
         for _ in range(AVOIDANCE_RANGINGS):
             while (cm := self._range()) is None or cm >= FAR_CM:
@@ -352,9 +353,9 @@ class ArduinoCar(Firmware):
             yield Wait(self._now + 0.1 / AVOIDANCE_RANGINGS)
         return sum(sorted(found)[1:4]) / 3
 
-    def _manoeuvre(self) -> Program:
-        """Back off, look right, left and ahead, turn: with the ranging before it 4.2 s, 4.3 s when hemmed in."""
-        self._rgb = LIGHTS["2"]
+    def _maneuver(self) -> Program:
+        """Back off, range right, left and ahead, turn: 4.2 s with the ranging before it, 4.3 s if hemmed in."""
+        self._rgb = ARDUINO_LIGHTS["2"]
         self._go(-1, -1, 80)
         yield from self._busy(0.08)
         self._drive(0, 0)
@@ -365,28 +366,28 @@ class ArduinoCar(Firmware):
             seen.append((yield from self._distance()))
         right, left, _ = seen
         if max(seen) < 10:
-            self._rgb = LIGHTS["6"]
+            self._rgb = ARDUINO_LIGHTS["6"]
             self._go(1, -1, 200)
             yield from self._busy(0.37)
         elif left >= right:
-            self._rgb = LIGHTS["4"]
+            self._rgb = ARDUINO_LIGHTS["4"]
             self._go(-1, 1, 200)
             yield from self._busy(0.28)
         else:
-            self._rgb = LIGHTS["6"]
+            self._rgb = ARDUINO_LIGHTS["6"]
             self._go(1, -1, 200)
             yield from self._busy(0.28)
         self._drive(0, 0)
 
 
 def _to_int(text: str) -> int:
-    """Arduino's String.toInt(): leading digits, 0 without any."""
+    """Return the leading digits as a number, 0 without any, as Arduino's String.toInt()."""
     digits = re.match(r"\s*[+-]?\d{1,9}", text)
     return int(digits[0]) if digits else 0
 
 
 def _field(text: str, word: str) -> int | None:
-    """The number behind a word of a colour frame, 0..255; None if it or what ends it is missing."""
+    """Return the number after a word of a color frame, 0..255. None if the number or its end is missing."""
     at = text.find(word)
     end = text.find("#" if word == "CLB" else ",", at) if at >= 0 else -1
     return min(255, max(0, _to_int(text[at + 3 : end]))) if end > at else None

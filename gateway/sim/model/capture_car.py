@@ -1,11 +1,11 @@
-"""A capture that plays as a car: its pieces at their times. It hears nothing; only its bytes are known."""
+"""Plays a capture as a car: its pieces at their times. It ignores all bytes from the host."""
 
 from collections.abc import Sequence
 from math import inf
 from typing import Final
 
-PAUSE_S: Final = 1.0
-"""Between two rounds of a loop: about what lies between two reports of a car."""
+LOOP_PAUSE_S: Final = 1.0
+"""Pause between two rounds of a loop, about that between two reports of a car."""
 
 
 class CaptureCar:
@@ -19,31 +19,31 @@ class CaptureCar:
         self._loop = loop
         self._index = 0
         self._start = now
-        """When the round began; None: a host is waited for."""
+        """Start time of the round. None: waits for a host."""
         self.rounds = 0
-        """How often it was played to its end."""
+        """Number of complete rounds."""
         self.sent_bytes = 0
         self.ignored_bytes = 0
-        """What the host has sent to it."""
+        """Number of bytes from the host."""
         self.truth: Final = None
         self.alive: Final = True
 
     def begin(self, now: float) -> None:
-        """A host is there; of a capture that plays already nothing changes."""
+        """Start to play, unless the capture plays already."""
         if self._start is None:
             self._start = now
 
     @property
     def done(self) -> bool:
-        """Whether nothing more will come."""
+        """True at the end of the capture."""
         return self._index >= len(self._pieces)
 
     def feed(self, data: bytes, now: float) -> None:  # noqa: ARG002 - as Firmware.feed
-        """Nobody hears it; it is counted."""
+        """Count the bytes and ignore them."""
         self.ignored_bytes += len(data)
 
     def advance(self, now: float) -> list[tuple[float, bytes]]:
-        """What has come since, with its time."""
+        """Return the pieces since the last call, each with its time."""
         sent = []
         while (due := self.next_event()) <= now:
             data = self._pieces[self._index][1]
@@ -53,22 +53,22 @@ class CaptureCar:
             if self.done:
                 self.rounds += 1
                 if self._loop:
-                    self._index, self._start = 0, due + PAUSE_S / self._rate
+                    self._index, self._start = 0, due + LOOP_PAUSE_S / self._rate
         return sent
 
     def next_event(self) -> float:
-        """When its next piece is due; inf when there is none, or nobody has come."""
+        """Return the time of the next piece; inf if there is none, or no host."""
         if self._start is None or self.done:
             return inf
         return self._start + self._pieces[self._index][0] / self._rate
 
     def backlog(self, now: float) -> int:  # noqa: ARG002 - as Firmware.backlog
-        """Nothing waits: whatever comes is taken at once."""
+        """Return 0: the capture accepts bytes at once."""
         return 0
 
     def pose(self, now: float) -> None:  # noqa: ARG002 - as Firmware.pose
-        """Nobody knows."""
+        """Return None: the pose is unknown."""
         return
 
     def drop_link(self, now: float) -> None:
-        """The capture goes on while its link is gone, as a car does."""
+        """Do nothing: the capture goes on without its link, as a car does."""

@@ -1,4 +1,4 @@
-"""One car's body in the world: how its motors move it and what its sensors report. The world itself: world.py."""
+"""One car's body in the `world`: moves by its motors and reads its sensors."""
 
 from math import atan2, ceil, cos, degrees, hypot, pi, radians, sin
 from typing import Final
@@ -8,22 +8,22 @@ from gateway.sim.model.geometry import Point
 from gateway.sim.model.world import STEP_S, World
 
 TOP_SPEED_M_S: Final = 0.5
-"""Of a wheel at PWM 255."""
+"""Speed of a wheel at PWM 255."""
 TRACK_M: Final = 0.20
-"""Effective distance of the wheels; wider than the car's, since four wheels skid when they turn."""
+"""Effective distance of the wheels; larger than the real one, as four wheels skid in a turn."""
 
 SONAR_AT_M: Final = 0.10
 SONAR_REACH_CM: Final = 499.0
-"""Just below the 500 cm from which the car's own program throws a reading away."""
+"""Just below the 500 cm from which the car's own program discards a reading."""
 SONAR_CONE: Final = tuple(radians(degree) for degree in (-15.0, -7.5, 0.0, 7.5, 15.0))
 SONAR_STEEPEST: Final = cos(radians(76))
-"""A surface hit at a flatter angle than this reflects the sound away."""
+"""Cosine of the steepest angle: a surface hit at a flatter angle reflects the sound away."""
 INFRARED_REACH_M: Final = 0.20
 INFRARED_SIDE: Final = radians(20)
+# For cars and things. Walls are only detected in the middle of the cone, so that recorded avoidance runs stay the same.
 INFRARED_CONE: Final = tuple(radians(degree) for degree in (-30.0, -15.0, 0.0, 15.0, 30.0))
-"""For cars and things. A wall is looked for in the cone's middle alone, as ever: an avoiding car keeps its ways."""
 LINE_SENSORS: Final = ((0.08, 0.040), (0.08, 0.010), (0.08, -0.010), (0.08, -0.040))
-"""Ahead and left of the axle's middle, m: left-outer .. right-outer."""
+"""Positions ahead and left of the axle's middle, m: left-outer .. right-outer."""
 LAMP_SIDE: Final = radians(30)
 LAMP_CONE: Final = radians(50)
 
@@ -46,26 +46,26 @@ class CarBody:
 
     @property
     def name(self) -> str:
-        """Of the car; empty in a world in which nobody asks."""
+        """The name of the car; empty if the world needs none."""
         return self._name
 
     @property
     def place(self) -> Pose:
-        """Where it was when it was last moved."""
+        """The pose after the last move."""
         return Pose(self._x, self._y, self._heading)
 
     @property
     def driving(self) -> bool:
-        """Whether a motor is on."""
+        """True if a motor is on."""
         return self._left != 0 or self._right != 0
 
     def drive(self, now: float, left: int, right: int) -> None:
-        """From `now` on the motors have these PWM values."""
+        """Set the PWM values of the motors from `now` on."""
         self._move(now)
         self._left, self._right = left, right
 
     def pose(self, now: float) -> Pose:
-        """The true pose; heading in -pi..pi."""
+        """Return the true pose; heading in -pi..pi."""
         self._move(now)
         return Pose(self._x, self._y, (self._heading + pi) % (2 * pi) - pi)
 
@@ -73,7 +73,7 @@ class CarBody:
         return TOP_SPEED_M_S * self._left / 255, TOP_SPEED_M_S * self._right / 255
 
     def glide(self, now: float) -> None:
-        """In a lively world: go on to `now`, at most a tick away, as far as there is room."""
+        """Move on to `now`, at most one tick, as far as there is room. Only in a lively world."""
         span = now - self._now
         if span <= 0:
             return
@@ -107,7 +107,7 @@ class CarBody:
             self._x, self._y = self._world.push_out(x, y)
 
     def _driven(self, span: float) -> tuple[float, float, float]:
-        """Where its wheels take it if nothing is in the way: x, y, heading."""
+        """Return x, y, heading after this time if nothing is in the way."""
         left, right = self._wheels()
         speed, turn = (left + right) / 2, (right - left) / TRACK_M
         heading = self._heading + turn * span
@@ -119,7 +119,7 @@ class CarBody:
         return x, y, heading
 
     def _look(self, now: float) -> None:
-        """Everything that can be seen is brought to `now`."""
+        """Bring every visible car to `now`."""
         self._move(now)
         if self._world.lively:
             for other in self._world.bodies:
@@ -130,7 +130,7 @@ class CarBody:
         return self._x + ahead * c - left * s, self._y + ahead * s + left * c
 
     def range_cm(self, now: float, bearing_deg: float) -> float | None:
-        """The nearest echo within the cone, from the sensor at the car's front."""
+        """Return the distance of the nearest echo within the cone, from the sensor at the car's front."""
         self._look(now)
         x, y = self._at(SONAR_AT_M, 0.0)
         middle = self._heading + radians(bearing_deg)
@@ -139,11 +139,11 @@ class CarBody:
         return None if nearest is None or nearest * 100 > SONAR_REACH_CM else nearest * 100
 
     def _echo(self, x: float, y: float, angle: float, now: float) -> float | None:
-        """How far away it is that a beam of sound comes back from."""
+        """Return the distance from which a beam of sound returns. None without echo."""
         wall = self._world.ray(x, y, angle, SONAR_STEEPEST)
         if not self._world.lively:
             return wall
-        # A wall that reflects the sound away is still in its way.
+        # A wall that reflects the sound away still hides everything behind it.
         first = self._world.ray(x, y, angle)
         hit = self._world.met(self, x, y, angle, SONAR_REACH_CM / 100 if first is None else first, now)
         if hit is None:
@@ -151,7 +151,7 @@ class CarBody:
         return hit[0] if hit[1] >= SONAR_STEEPEST else None
 
     def line(self, now: float) -> tuple[bool, bool, bool, bool]:
-        """What the four line sensors see."""
+        """Return for each of the four line sensors whether it sees the line."""
         self._move(now)
         if not self._world.line:
             return (False, False, False, False)
@@ -159,7 +159,7 @@ class CarBody:
         return (seen[0], seen[1], seen[2], seen[3])
 
     def obstacle(self, now: float) -> tuple[bool, bool]:
-        """Infrared, looking ahead and 20 degrees outwards."""
+        """Return for each infrared sensor, turned 20 degrees outward, whether it sees an obstacle."""
         self._look(now)
         seen = []
         for side in (1, -1):
@@ -173,7 +173,7 @@ class CarBody:
         return (seen[0], seen[1])
 
     def _glimpse(self, x: float, y: float, angle: float, now: float) -> bool:
-        """Whether a car or a thing sends infrared light back, with no wall before it."""
+        """Return True if a car or a thing reflects infrared light, with no wall in front of it."""
         hit = self._world.met(self, x, y, angle, INFRARED_REACH_M, now)
         if hit is None:
             return False
@@ -181,7 +181,7 @@ class CarBody:
         return wall is None or hit[0] <= wall
 
     def light(self, now: float) -> tuple[bool, bool]:
-        """Whether a lamp stands before the left and the right light sensor."""
+        """Return for the left and the right light sensor whether it sees a lamp."""
         self._look(now)
         seen = [False, False]
         for lamp in self._world.lamps:
@@ -202,17 +202,18 @@ class CarBody:
         return (seen[0], seen[1])
 
     def grayscale(self, now: float) -> int:
-        """The floor under the car's middle: high on the tape."""
+        """Return the grayscale of the floor under the car's middle: high on the tape."""
         self._move(now)
         return TAPE_GRAY if self._world.line and self._world.on_line(self._x, self._y) else FLOOR_GRAY
 
     def battery_v(self, now: float) -> float:
-        """Falls by 0.3 V an hour and sags by up to 0.25 V under load; not below 6.4, where its electronics cut off."""
+        """Return the battery voltage, at least 6.4 V, where the electronics cut off."""
+        # It falls by 0.3 V per hour, and by up to 0.25 V under load.
         load = 0.25 * (abs(self._left) + abs(self._right)) / 510
         return max(6.4, self._battery - 0.3 * (now - self._started) / 3600 - load)
 
     def yaw_rate_deg_s(self, now: float) -> float:
-        """How fast the car turns."""
+        """Return the yaw rate."""
         self._move(now)
         left, right = self._wheels()
         return degrees((right - left) / TRACK_M)

@@ -1,4 +1,4 @@
-"""From the words of a car's description to a car in the world. Checking the words is spec.py's part."""
+"""Builds a car in the world from the checked words of `car_spec`."""
 
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.car_body import CarBody
@@ -21,10 +21,10 @@ def build(
     now: float = 0.0,
     name: str = "",
 ) -> Firmware:
-    """Car number `index` of the world, at rest on its start pose, its program just started.
+    """Return car number `index` of the world, at rest on its start pose, with its program just started.
 
-    `name`: what the world knows it by, if it has a place for it there or lets it carry something. `transport` matters
-    to a Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART.
+    `name`: its name in the world file, for its place and the things that it carries. `transport` matters only to a
+    Raspberry Pi: an Arduino behind a Wi-Fi bridge still has its UART.
     """
     body = CarBody(world, world.start_pose(index, name), rng, now, name)
     car: Firmware
@@ -33,6 +33,6 @@ def build(
     else:
         car = ArduinoCar(body, rng, options=options, now=now)
     if world.lively:
-        car.company = world.company
-        world.company.join(car)
+        car.scheduler = world.scheduler
+        world.scheduler.join(car)
     return car

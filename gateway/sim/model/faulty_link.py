@@ -1,7 +1,6 @@
-"""A link with its faults, on virtual time: bytes go in at either end, and come out late, fewer, other, or not at all.
+"""A link with faults on virtual time: it delays, drops, changes or blocks bytes in either direction.
 
-A link without faults hands on what it gets as it gets it. Being there or not is links.py's part, the UART's pace the
-firmware's.
+Without faults it passes bytes on unchanged. `endpoints` opens and closes links; `firmware` has the rate of the UART.
 """
 
 from collections import deque
@@ -12,21 +11,21 @@ from typing import Final, Protocol
 from gateway.sim.model.firmware import BYTES_PER_S
 
 TO_HOST_LIMIT: Final = 1024
-"""Bytes that wait in a slow link on their way to the host; what comes on top is lost, as in a Bluetooth module."""
-FLOOD_EVERY_S: Final = 0.005
+"""Maximum bytes in a slow link to the host. Further bytes are lost, as in a Bluetooth module."""
+FLOOD_INTERVAL_S: Final = 0.005
 NEVER_ENDING: Final = b"$4WD,CSB"
-"""How the frame begins that has no end; zeros follow."""
+"""The beginning of a frame without an end; zeros follow."""
 
 
 class Direction(StrEnum):
-    """Either way of a link."""
+    """A direction of a link."""
 
     TO_CAR = "car"
     TO_HOST = "host"
 
 
 class Flood(StrEnum):
-    """What a firehose sends."""
+    """The bytes of a firehose."""
 
     NOISE = "noise"
     FRAME = "frame"
@@ -36,16 +35,16 @@ class Noise(Protocol):
     """A seeded source of random numbers and bytes; `random.Random` is one."""
 
     def random(self) -> float:
-        """The next number in 0..1."""
+        """Return the next number in 0..1."""
         ...
 
     def randbytes(self, n: int) -> bytes:
-        """The next `n` bytes."""
+        """Return the next `n` bytes."""
         ...
 
 
-class _Lane:
-    """One way: a queue, each piece with the time at which it comes out."""
+class _ByteQueue:
+    """One direction: a queue of pieces, each with the time of its delivery."""
 
     def __init__(self, rng: Noise, limit: float) -> None:
         self._rng = rng
@@ -60,26 +59,26 @@ class _Lane:
         self.lost_bytes = 0
 
     def put(self, data: bytes, now: float) -> None:
-        """Bytes go in."""
-        kept = data
+        """Queue bytes."""
+        accepted = data
         if now < self.closed_until:
-            kept = b""
+            accepted = b""
         elif now < self.lossy_until:
-            kept = bytes(byte for byte in data if self._rng.random() >= self.share)
+            accepted = bytes(byte for byte in data if self._rng.random() >= self.share)
         if now < self.slow_until or self.waiting:
-            kept = kept[: int(min(len(kept), self._limit - self.waiting))]
-        self.lost_bytes += len(data) - len(kept)
+            accepted = accepted[: int(min(len(accepted), self._limit - self.waiting))]
+        self.lost_bytes += len(data) - len(accepted)
         at = max(now, self.pieces[-1][0] if self.pieces else now)
         if now < self.slow_until:
-            for index in range(len(kept)):
+            for index in range(len(accepted)):
                 at += 1 / self.rate
-                self.pieces.append((at, kept[index : index + 1]))
-        elif kept:
-            self.pieces.append((at, kept))
-        self.waiting += len(kept)
+                self.pieces.append((at, accepted[index : index + 1]))
+        elif accepted:
+            self.pieces.append((at, accepted))
+        self.waiting += len(accepted)
 
     def take(self, now: float) -> list[bytes]:
-        """What has come out by now, piece by piece."""
+        """Return the pieces that are due."""
         out = []
         while self.pieces and self.pieces[0][0] <= now:
             out.append(self.pieces.popleft()[1])
@@ -87,18 +86,18 @@ class _Lane:
         return out
 
     def clear(self) -> None:
-        """What is under way is lost."""
+        """Lose all queued bytes."""
         self.pieces.clear()
         self.lost_bytes += self.waiting
         self.waiting = 0
 
 
 class FaultyLink:
-    """Both ways of a car's link. Times: seconds from any origin, must not run backwards; `until` inf: for ever."""
+    """Both directions of a car's link. Times: seconds from any origin, never backwards; `until` inf: for ever."""
 
     def __init__(self, to_car: Noise, to_host: Noise) -> None:
         self._noise = to_host
-        self._lanes = {Direction.TO_CAR: _Lane(to_car, inf), Direction.TO_HOST: _Lane(to_host, TO_HOST_LIMIT)}
+        self._lanes = {Direction.TO_CAR: _ByteQueue(to_car, inf), Direction.TO_HOST: _ByteQueue(to_host, TO_HOST_LIMIT)}
         self._echo_until = 0.0
         self._flood_until = 0.0
         self._flood_at = 0.0
@@ -111,45 +110,45 @@ class FaultyLink:
     # The faults.
 
     def slow(self, factor: float, until: float) -> None:
-        """Bytes come out one at a time, at this part of 960 bytes/s, both ways."""
+        """Deliver single bytes at this fraction of 960 bytes/s, in both directions."""
         for lane in self._lanes.values():
             lane.rate, lane.slow_until = factor * BYTES_PER_S, until
 
     def lossy(self, share: float, ways: tuple[Direction, ...], until: float) -> None:
-        """This part of the bytes is lost, each by itself."""
+        """Lose this fraction of the bytes, each independently."""
         for way in ways:
             self._lanes[way].share, self._lanes[way].lossy_until = share, until
 
     def close(self, way: Direction, until: float) -> None:
-        """All is taken and nothing comes out."""
+        """Accept all bytes and deliver none."""
         self._lanes[way].closed_until = until
 
     def echo(self, until: float) -> None:
-        """What the host sends also comes back to it."""
+        """Send the host's bytes back to it as well."""
         self._echo_until = until
 
     def flood(self, what: Flood, rate: float, now: float, until: float) -> None:
-        """So many bytes a second to the host, besides what the car sends."""
+        """Send `rate` bytes per second to the host, besides the car's own."""
         self._flood, self._flood_rate, self._flood_at, self._flood_until = what, rate, now, until
         self._flooded = 0
 
     def cut_next(self, count: int) -> None:
-        """Of the next frame, from its `$` on, so many bytes come out, and nothing after them until `mend`."""
+        """Deliver only `count` bytes of the next frame, from its `$` on, and nothing after them until `mend`."""
         self._cut, self._cut_began = count, False
 
     @property
     def cut(self) -> bool:
-        """Whether the cut has come, and what came before it is out."""
+        """True if the frame was cut and the bytes before the cut are delivered."""
         return self._cut == 0 and self._cut_began and not self._lanes[Direction.TO_CAR].pieces
 
     def mend(self) -> None:
-        """The cut is over."""
+        """End the cut."""
         self._cut = None
 
     # The bytes.
 
     def from_host(self, data: bytes, now: float) -> None:
-        """The host has sent this."""
+        """Accept bytes from the host."""
         if now < self._echo_until:
             self._lanes[Direction.TO_HOST].put(data, now)
         if self._cut is not None:
@@ -169,19 +168,19 @@ class FaultyLink:
         return data[:end]
 
     def from_car(self, data: bytes, now: float) -> None:
-        """The car has sent this."""
+        """Accept bytes from the car."""
         self._lanes[Direction.TO_HOST].put(data, now)
 
     def to_car(self, now: float) -> list[bytes]:
-        """What reaches the car's UART."""
+        """Return the pieces that reach the car's UART."""
         return self._lanes[Direction.TO_CAR].take(now)
 
     def to_host(self, now: float) -> list[bytes]:
-        """What reaches the host."""
+        """Return the pieces that reach the host."""
         out = self._lanes[Direction.TO_HOST].take(now)
         if self._flood_at < self._flood_until:
             end = min(now, self._flood_until)
-            # A host that was busy finds at most a second's worth: nobody has kept the rest.
+            # A busy host gets at most the bytes of one second: no buffer holds more.
             since = max(self._flood_at, end - 1.0)
             count = int((end - since) * self._flood_rate + 1e-6)
             self._flood_at = end if end == self._flood_until else since + count / self._flood_rate
@@ -196,22 +195,22 @@ class FaultyLink:
         return NEVER_ENDING[begun : begun + count].ljust(count, b"0")
 
     def waiting(self) -> int:
-        """Bytes on their way to the car: whoever feeds should hold back while this is large."""
+        """Return the number of bytes queued to the car; feed no more while it is large."""
         return self._lanes[Direction.TO_CAR].waiting
 
     @property
     def lost_bytes(self) -> dict[Direction, int]:
-        """What was lost so far, each way."""
+        """The number of lost bytes in each direction."""
         return {way: lane.lost_bytes for way, lane in self._lanes.items()}
 
     def next_event(self) -> float:
-        """When something next comes out by itself; inf if nothing will."""
+        """Return the time of the next delivery; inf if there is none."""
         due = min((lane.pieces[0][0] for lane in self._lanes.values() if lane.pieces), default=inf)
         if self._flood_at < self._flood_until:
-            due = min(due, self._flood_at + max(FLOOD_EVERY_S, 1 / self._flood_rate))
+            due = min(due, self._flood_at + max(FLOOD_INTERVAL_S, 1 / self._flood_rate))
         return due
 
     def clear(self) -> None:
-        """The link is cut: what is under way is lost."""
+        """Cut the link: lose all queued bytes."""
         for lane in self._lanes.values():
             lane.clear()

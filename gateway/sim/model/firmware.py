@@ -1,8 +1,7 @@
-"""What every car's program stands on: one blocking loop on virtual time, a UART each way, motors.
+"""The base of every car's program: one blocking loop on virtual time, a UART each way, motors.
 
-A program is a generator that yields a `Wait` wherever the real one blocks, so its code reads like the real one.
-What the programs do with their bytes lives in arduino.py and raspberry_pi.py; where the car is and what it sees, in
-world.py.
+A program is a generator that yields a `Wait` wherever the real program blocks, so that both read alike. `arduino` and
+`raspberry_pi` have the programs, `car_body` the motion and the sensors.
 """
 
 from collections import deque
@@ -15,34 +14,46 @@ from gateway.protocol.enums import Mode
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.model.scheduler import EventScheduler
 
+# The numbers below repeat those of gateway.protocol on purpose: the simulator is the oracle of the tests, and an oracle
+# that shares its numbers with the tested code finds no wrong number.
+
 BYTES_PER_S: Final = 960.0
 """9600 baud, 8N1: ten bits a byte (docs/reference/protocol.md#framing)."""
 CHUNK: Final = 20
-"""Bytes are handed on in pieces of at most this many, as a Bluetooth 4.0 module does."""
+"""Maximum bytes of a piece, as from a Bluetooth 4.0 module."""
 
 WHISTLE_S: Final = 0.30
 SERVO_S: Final = 0.65
-COLOUR_S: Final = 0.10
+COLOR_S: Final = 0.10
 NO_ECHO_S: Final = 1.0
 ECHO_S_PER_CM: Final = 58e-6
-"""There and back at the speed of sound."""
+"""Time for both ways at the speed of sound."""
 REPORT_BASE_S: Final = 0.004
-REPORT_EVERY_S: Final = 0.9
-"""Loop time between two mode-0 reports; counted in turns of the loop, so it stands still while the program blocks."""
+# The program counts turns of its loop, so this time stands still while the program blocks.
+REPORT_INTERVAL_S: Final = 0.9
+"""Loop time between two mode-0 reports."""
 
-MODES: Final = tuple(Mode)
+MODE_OF_DIGIT: Final = {
+    0: Mode.MANUAL,
+    1: Mode.REMOTE_CONTROL,
+    2: Mode.TRACKING,
+    3: Mode.OBSTACLE_AVOIDANCE,
+    4: Mode.COLOR_LED,
+    5: Mode.LIGHT_SEEKING,
+    6: Mode.FOLLOWING,
+}
 
 
 class Rng(Protocol):
     """A seeded source of random numbers; `random.Random` is one."""
 
     def random(self) -> float:
-        """The next number in 0..1."""
+        """Return the next number in 0..1."""
         ...
 
 
 class Pose(NamedTuple):
-    """Where a car is (REP-103: x forward, y left, counter-clockwise)."""
+    """The pose of a car (REP-103: x forward, y left, counter-clockwise)."""
 
     x_m: float
     y_m: float
@@ -50,73 +61,73 @@ class Pose(NamedTuple):
 
 
 class CarBodyState(Protocol):
-    """The car in its world, as its program meets it."""
+    """The motors and sensors of a car, for its program."""
 
     def drive(self, now: float, left: int, right: int) -> None:
-        """From `now` on the motors have these PWM values, -255..255."""
+        """Set the PWM values of the motors from `now` on, -255..255."""
         ...
 
     def pose(self, now: float) -> Pose:
-        """The true pose."""
+        """Return the true pose."""
         ...
 
     def range_cm(self, now: float, bearing_deg: float) -> float | None:
-        """Ultrasonic distance at a bearing from straight ahead, left positive; None without echo."""
+        """Return the ultrasonic distance at a bearing from straight ahead, left positive. None without echo."""
         ...
 
     def line(self, now: float) -> tuple[bool, bool, bool, bool]:
-        """Left-outer, left-inner, right-inner, right-outer: whether each sees the line."""
+        """Return for left-outer, left-inner, right-inner, right-outer whether the sensor sees the line."""
         ...
 
     def obstacle(self, now: float) -> tuple[bool, bool]:
-        """Infrared left, right: whether each sees an obstacle."""
+        """Return for left and right whether the infrared sensor sees an obstacle."""
         ...
 
     def light(self, now: float) -> tuple[bool, bool]:
-        """Left, right: whether each sees light."""
+        """Return for left and right whether the sensor sees light."""
         ...
 
     def grayscale(self, now: float) -> int:
-        """Raw ADC 0..1023 of the floor."""
+        """Return the raw ADC value of the floor, 0..1023."""
         ...
 
     def battery_v(self, now: float) -> float:
-        """Battery voltage."""
+        """Return the battery voltage."""
         ...
 
     def yaw_rate_deg_s(self, now: float) -> float:
-        """How fast the car turns, left positive."""
+        """Return the yaw rate, left positive."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is so, whatever anyone believes."""
+    """The true state of a simulated car."""
 
     mode: Mode
     motor_left: int
     motor_right: int
     blocked: bool
-    """Inside a blocking stretch of 0.1 s or more: bytes pile up."""
+    """True during a block of 0.1 s or more, while bytes pile up."""
     fan: bool
     led: str
     """`off`, or `#rrggbb`."""
     servo: int
-    """Where the front servo points, 0..180 degrees; 90 is straight ahead, 180 left."""
+    """Direction of the front servo, 0..180 degrees; 90 is straight ahead, 180 left."""
     speed: int
-    """The PWM (0..255) that the next motion will have."""
+    """The PWM (0..255) of the next motion."""
     alive: bool
     """False once a Raspberry Pi program has died."""
 
     @property
     def driving(self) -> bool:
-        """Whether a motor is on."""
+        """True if a motor is on."""
         return self.motor_left != 0 or self.motor_right != 0
 
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """The program does not run again before `until`, or before the next byte if that `wakes` it."""
+    """A block of the program until `until`, or until the next byte if a byte `wakes` it."""
 
     until: float
     wakes: bool = False
@@ -126,7 +137,7 @@ Program: TypeAlias = Generator[Wait, None, None]
 
 
 class Firmware:
-    """One car's program and its wires on virtual time: `feed` bytes, `advance`, look at `truth`.
+    """One car's program and its wires on virtual time: `feed` bytes, `advance`, read `truth`.
 
     Times are seconds from any origin and must not run backwards.
     """
@@ -162,21 +173,21 @@ class Firmware:
         self.motor_log: deque[tuple[float, int, int]] = deque([(now, 0, 0)], maxlen=4096)
         """(time, left, right) of every change of the motors, oldest first."""
         self.lost_bytes = 0
-        """Bytes that found the receive buffer full."""
+        """Number of bytes dropped because the receive buffer was full."""
         self._pressed: Button | None = None
-        """A button of the remote that the program has not looked at."""
-        self.company: EventScheduler | None = None
-        """Whose programs run in one order with this one."""
+        """A button of the remote that the program has not read yet."""
+        self.scheduler: EventScheduler | None = None
+        """Runs this program in order with those of the other cars. None if cars do not meet."""
         self._program = self._main()
         self._wait = Wait(now)
 
     def _main(self) -> Program:
         raise NotImplementedError
 
-    # The three verbs of a shell.
+    # The calls of the simulation.
 
     def feed(self, data: bytes, now: float) -> None:
-        """Put bytes on the link at `now`; they reach the car at the pace of its UART."""
+        """Put bytes on the link at `now`; they reach the car at the rate of its UART."""
         self._run(now)
         at = max(now, self._arrivals[-1][0] if self._arrivals else now)
         for byte in data:
@@ -184,7 +195,7 @@ class Firmware:
             self._arrivals.append((at, byte))
 
     def advance(self, now: float) -> list[tuple[float, bytes]]:
-        """Run the program up to `now`; what the car has sent since, with the time of each piece's last byte."""
+        """Run the program up to `now`; return the pieces sent since then, each with the time of its last byte."""
         self._run(now)
         sent = []
         while self._outgoing and self._outgoing[0][0] <= now:
@@ -192,18 +203,18 @@ class Firmware:
         return sent
 
     def next_event(self) -> float:
-        """When something next happens by itself; inf if nothing will."""
+        """Return the time of the next event; inf if there is none."""
         due = self.due()
         return min(due, self._outgoing[0][0]) if self._outgoing else due
 
     def backlog(self, now: float) -> int:
-        """Bytes fed that are still on the wire: whoever feeds should hold back while this is large."""
+        """Return the number of bytes still on the wire; feed no more while it is large."""
         self._run(now)
         return len(self._arrivals)
 
     @property
     def now(self) -> float:
-        """How far the program has been run."""
+        """The time up to which the program has run."""
         return self._now
 
     @property
@@ -215,7 +226,7 @@ class Firmware:
     def truth(self) -> Truth:
         """The state at `now`, as of the last call."""
         return Truth(
-            mode=MODES[self._mode],
+            mode=MODE_OF_DIGIT[self._mode],
             motor_left=self._left,
             motor_right=self._right,
             blocked=self._blocked,
@@ -227,24 +238,24 @@ class Firmware:
         )
 
     def pose(self, now: float) -> Pose:
-        """Where the car truly is."""
+        """Return the true pose of the car."""
         self._run(now)
         return self._body.pose(now)
 
-    def press(self, button: Button, now: float) -> bool:  # noqa: ARG002 - for cars that have a receiver
-        """A button of the infrared remote is pressed; whether the car obeys it."""
+    def press(self, button: Button, now: float) -> bool:  # noqa: ARG002 - for cars with a receiver
+        """Press a button of the infrared remote; return True if the car obeys it."""
         self._run(now)
         return False
 
     # Faults.
 
     def drop_link(self, now: float) -> None:
-        """The link is cut: bytes on the wire are lost; the car notices nothing, and keeps half a frame that it has."""
+        """Cut the link: bytes on the wire are lost. The car notices nothing and keeps a truncated frame."""
         self._run(now)
         self._arrivals.clear()
 
     def brown_out(self, now: float) -> None:
-        """The battery sags: motors off, the frame being sent is cut, all RAM is lost, the program boots again."""
+        """Let the battery sag: motors off, the frame being sent is truncated, the RAM is lost, the program reboots."""
         self._run(now)
         self._cut_outgoing(now)
         self._arrivals.clear()
@@ -263,18 +274,18 @@ class Firmware:
         raise NotImplementedError
 
     def _cut_outgoing(self, now: float) -> None:
-        kept = deque(piece for piece in self._outgoing if piece[0] <= now)
-        if len(kept) < len(self._outgoing):
-            end, data = self._outgoing[len(kept)]
+        sent = deque(piece for piece in self._outgoing if piece[0] <= now)
+        if len(sent) < len(self._outgoing):
+            end, data = self._outgoing[len(sent)]
             done = len(data) - ceil((end - now) * self._rate)
             if done > 0:
-                kept.append((now, data[:done]))
-        self._outgoing = kept
+                sent.append((now, data[:done]))
+        self._outgoing = sent
 
     # The engine.
 
     def due(self) -> float:
-        """When the program next runs by itself; inf if it will not."""
+        """Return the time at which the program next runs; inf if it never does."""
         if not self._alive:
             return inf
         if self._wait.wakes:
@@ -285,13 +296,13 @@ class Firmware:
         return self._wait.until
 
     def _run(self, now: float) -> None:
-        if self.company is None:
+        if self.scheduler is None:
             self.run_alone(now)
         else:
-            self.company.run(now)
+            self.scheduler.run(now)
 
     def run_alone(self, now: float) -> None:
-        """Run this program up to `now`, whatever others have done by then."""
+        """Run only this program up to `now`."""
         while (due := self.due()) <= now:
             self._now = max(self._now, due)
             self._receive()
@@ -310,7 +321,7 @@ class Firmware:
             else:
                 self.lost_bytes += 1
 
-    # What programs are made of.
+    # The building blocks of programs.
 
     def _pwm(self) -> int:
         return self._speed
@@ -322,9 +333,9 @@ class Firmware:
             self.motor_log.append((self._now, left, right))
 
     def _busy(self, seconds: float) -> Program:
-        """Block, deaf, and say so in `truth` if it is long."""
+        """Block the program; show a long block in `truth`."""
         outer = self._blocked
-        self._blocked = outer or seconds >= COLOUR_S
+        self._blocked = outer or seconds >= COLOR_S
         yield Wait(self._now + seconds)
         self._blocked = outer
 
@@ -342,7 +353,7 @@ class Firmware:
         self._tx_free = at
 
     def _ranging(self) -> Generator[Wait, None, float | None]:
-        """One ultrasonic ranging, cm; without echo it blocks until its time-out and gives None."""
+        """Range once with ultrasound and return cm. Without echo, block until the timeout and return None."""
         cm = self._range()
         if cm is None:
             yield from self._busy(NO_ECHO_S)
@@ -355,7 +366,7 @@ class Firmware:
         return None if cm is None else max(2.0, cm + 0.6 * (self._rng.random() - 0.5))
 
     def _imu_frame(self) -> bytes:
-        """Raw counts of an MPU6050 at its default scales (131 per deg/s, 16384 per g), level, with a little noise."""
+        """Return raw counts of a level MPU6050 with noise, at its default scales (131 per deg/s, 16384 per g)."""
         noise = [round(40 * (self._rng.random() - 0.5)) for _ in range(6)]
         turning = round(131 * self._body.yaw_rate_deg_s(self._now))
         values = [0, 0, turning, 0, 0, 16384]
@@ -365,7 +376,7 @@ class Firmware:
 
 
 def bits(values: tuple[bool, ...]) -> str:
-    """Digits as the car prints them."""
+    """Return bits as the car prints them."""
     return "".join("1" if value else "0" for value in values)
 
 
@@ -376,5 +387,5 @@ SPINS: Final = {"1": (-1, 1), "2": (1, -1)}
 
 
 def motion(text: str) -> tuple[int, int]:
-    """Signs of the two motors from places 1 and 2 of whatever string is there, read by position."""
+    """Return the signs of the two motors from places 1 and 2 of a string, read by position."""
     return SPINS.get(text[3:4]) or MOTIONS.get(text[1:2], (0, 0))

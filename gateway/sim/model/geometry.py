@@ -1,6 +1,6 @@
-"""Plane geometry of the simulated world: points, segments, circles, rays. Knows no cars. Pure.
+"""Plane geometry of the simulated world: points, segments, circles, rays. Pure.
 
-REP-103: metres, x forward, y left, angles counter-clockwise.
+REP-103: meters, x forward, y left, angles counter-clockwise.
 """
 
 from collections.abc import Iterable
@@ -10,19 +10,19 @@ from typing import Final, TypeAlias
 Point: TypeAlias = tuple[float, float]
 Segment: TypeAlias = tuple[float, float, float, float]
 Hit: TypeAlias = tuple[float, float]
-"""How far along a ray something is, and the cosine of the angle to its surface's normal."""
+"""The distance along a ray, and the cosine of the angle to the normal of the surface."""
 
 _PARALLEL: Final = 1e-12
 
 
 def box(x: float, y: float, width: float, depth: float) -> tuple[Segment, ...]:
-    """The four sides of a rectangle around a point, `width` along x."""
+    """Return the four sides of a rectangle around a point, `width` along x."""
     w, d = width / 2, depth / 2
     return _sides([(x - w, y - d), (x + w, y - d), (x + w, y + d), (x - w, y + d)])
 
 
 def turned_box(x: float, y: float, heading: float, width: float, depth: float) -> tuple[Segment, ...]:
-    """The four sides of a rectangle that is turned by `heading` rad."""
+    """Return the four sides of a rectangle turned by `heading` rad."""
     c, s, w, d = cos(heading), sin(heading), width / 2, depth / 2
     corners = ((-w, -d), (w, -d), (w, d), (-w, d))
     return _sides([(x + ahead * c - left * s, y + ahead * s + left * c) for ahead, left in corners])
@@ -33,7 +33,7 @@ def _sides(corners: list[Point]) -> tuple[Segment, ...]:
 
 
 def loop(half_x: float, half_y: float, radius: float) -> list[Point]:
-    """A rectangle with round corners, counter-clockwise, from the middle of its lower side."""
+    """Return a rectangle with round corners, counter-clockwise, from the middle of its lower side."""
     points: list[Point] = [(0.0, -half_y)]
     corners = ((1, -1, -90), (1, 1, 0), (-1, 1, 90), (-1, -1, 180))
     for sx, sy, start in corners:
@@ -45,30 +45,30 @@ def loop(half_x: float, half_y: float, radius: float) -> list[Point]:
 
 
 def reach(segment: Segment, away: float) -> Segment:
-    """The rectangle outside which nothing is within `away` of a segment: low x, low y, high x, high y."""
+    """Return the bounds of all points within `away` of a segment: low x, low y, high x, high y."""
     x1, y1, x2, y2 = segment
     return min(x1, x2) - away, min(y1, y2) - away, max(x1, x2) + away, max(y1, y2) + away
 
 
 def foot(x: float, y: float, segment: Segment) -> Point:
-    """The point of a segment that is nearest."""
+    """Return the nearest point of a segment."""
     x1, y1, x2, y2 = segment
     wx, wy = x2 - x1, y2 - y1
     square = wx * wx + wy * wy
-    if square == 0:  # also that of a length of 1e-200
+    if square == 0:  # also for a length of 1e-200
         return x1, y1
     share = min(1.0, max(0.0, ((x - x1) * wx + (y - y1) * wy) / square))
     return x1 + share * wx, y1 + share * wy
 
 
 def distance(x: float, y: float, segment: Segment) -> float:
-    """From a point to a segment."""
+    """Return the distance from a point to a segment."""
     fx, fy = foot(x, y, segment)
     return hypot(x - fx, y - fy)
 
 
 def apart(a: Segment, b: Segment) -> float:
-    """From one segment to another; 0 if they cross."""
+    """Return the distance between two segments; 0 if they cross."""
     if _cross(a, b):
         return 0.0
     ends = (distance(*a[:2], b), distance(*a[2:], b), distance(*b[:2], a), distance(*b[2:], a))
@@ -79,12 +79,12 @@ def _cross(a: Segment, b: Segment) -> bool:
     def side(line: Segment, x: float, y: float) -> float:
         return (line[2] - line[0]) * (y - line[1]) - (line[3] - line[1]) * (x - line[0])
 
-    # Ends that only touch have a distance of 0 anyway.
+    # Touching ends have a distance of 0 anyway.
     return side(a, *b[:2]) * side(a, *b[2:]) < 0 and side(b, *a[:2]) * side(b, *a[2:]) < 0
 
 
 def ray_to_segment(x: float, y: float, dx: float, dy: float, segment: Segment) -> Hit | None:
-    """Where a ray (of a direction of length 1) meets a segment."""
+    """Return the hit of a ray on a segment. The direction of the ray has length 1."""
     x1, y1, x2, y2 = segment
     wx, wy = x2 - x1, y2 - y1
     cross = dx * wy - dy * wx
@@ -96,7 +96,7 @@ def ray_to_segment(x: float, y: float, dx: float, dy: float, segment: Segment) -
 
 
 def ray_to_circle(x: float, y: float, dx: float, dy: float, middle: Point, radius: float) -> Hit | None:
-    """Where a ray (of a direction of length 1) meets a circle; at once if it begins inside."""
+    """Return the hit of a ray on a circle; distance 0 from inside. The direction of the ray has length 1."""
     mx, my = middle[0] - x, middle[1] - y
     outside = mx * mx + my * my - radius * radius
     if outside <= 0:
@@ -109,5 +109,5 @@ def ray_to_circle(x: float, y: float, dx: float, dy: float, middle: Point, radiu
 
 
 def nearest(hits: Iterable[Hit | None]) -> Hit | None:
-    """The first of several."""
+    """Return the first of several hits."""
     return min((hit for hit in hits if hit is not None), default=None)

@@ -1,7 +1,8 @@
-"""The infrared remote's buttons, and what each does to a car that is in remote control mode.
+"""The buttons of the infrared remote and their motions.
 
-docs/reference/protocol.md#modes says who obeys (nobody but a car in mode 1) and not which buttons there are: these
-are what the other ways of driving have in common.
+docs/reference/protocol.md#modes says that only a car in mode 1 obeys, but does not list the buttons: these are the
+motions and steps of the
+general frame.
 """
 
 from enum import StrEnum
@@ -9,7 +10,7 @@ from typing import Final
 
 
 class Button(StrEnum):
-    """A button; a motion holds until another one is pressed."""
+    """A button. A motion lasts until the next button."""
 
     FORWARD = "forward"
     BACK = "back"

@@ -1,7 +1,6 @@
-"""What stands or moves in the world besides cars: lamps, and things to see, to bump into and to follow. Pure values.
+"""The lamps and things in the world, which cars see, bump into and follow. Pure values.
 
-A change makes another value; what a lamp or a thing does to a car is world.py's part. Times are seconds since the
-world began.
+Times are seconds since the start of the world.
 """
 
 from bisect import bisect_right
@@ -14,9 +13,10 @@ from gateway.sim.model.firmware import Pose
 from gateway.sim.model.geometry import Hit, Point, Segment, foot, nearest, ray_to_circle, ray_to_segment, turned_box
 
 FAR_M: Final = 100.0
-"""No place in a world is farther from its middle, in x or in y."""
+"""Maximum of x and y in a world."""
+# A car's own top speed. A much faster thing would jump over a car between two ticks.
 FASTEST_M_S: Final = 0.5
-"""Of a thing: a car's own top speed. A much faster one would step over a car between two ticks."""
+"""Maximum speed of a thing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,18 +26,18 @@ class Lamp:
     x_m: float
     y_m: float
     reach_m: float = 1.5
-    """With a brightness of 1; four times as bright is seen from twice as far."""
+    """Range at a brightness of 1. Four times the brightness doubles the range."""
     brightness: float = 1.0
     on: bool = True
     overhead: bool = False
-    """Hangs higher than everything: nothing throws a shadow."""
+    """True if the lamp hangs above everything, so that nothing hides it."""
     name: str = ""
     carried_by: str = ""
     """A thing or a car, in whose frame x (ahead) and y (left) then are."""
 
     @property
     def seen_from_m(self) -> float:
-        """From how far away it is seen now; 0 if it is off."""
+        """The current range; 0 if the lamp is off."""
         return self.reach_m * sqrt(self.brightness) if self.on else 0.0
 
 
@@ -50,25 +50,25 @@ class MovingObject:
     y_m: float = 0.0
     radius_m: float = 0.0
     width_m: float = 0.0
-    """Of a box: along x, when its heading is 0."""
+    """Width of a box: along x, if its heading is 0."""
     depth_m: float = 0.0
     heading_rad: float = 0.0
     path: tuple[Point, ...] = ()
-    """A closed polyline; a thing with one has no place of its own. There and back: the points back, too."""
+    """A closed polyline, instead of a place. A path there and back includes the points back."""
     speed_m_s: float = 0.0
     carried_by: str = ""
     """A car, in whose frame x (ahead) and y (left) then are."""
     waits_for_m: float = 0.0
-    """It goes on only while a car is within so far from its middle; 0: it waits for nobody."""
+    """The thing moves only while a car is within this distance of its middle; 0: always."""
     from_m: float = 0.0
-    """Where on its path it was at `since_s`."""
+    """Position along its path at `since_s`."""
     since_s: float = 0.0
     going: bool = True
-    """False while it waits."""
+    """False while the thing waits."""
 
     @property
     def moves(self) -> bool:
-        """Whether it goes along its path by itself."""
+        """True if the thing moves along a path."""
         return bool(self.path) and self.speed_m_s > 0
 
     @property
@@ -89,7 +89,7 @@ class MovingObject:
         return Pose(x1 + share * (x2 - x1), y1 + share * (y2 - y1), self.heading_rad)
 
     def along_m(self, at_s: float) -> float:
-        """How far along its path it is; 0 without one."""
+        """Return the position along the path; 0 without a path."""
         if not self.path:
             return 0.0
         length = _ends(self.path)[-1]
@@ -97,21 +97,21 @@ class MovingObject:
         return (self.from_m + gone) % length if length > 0 else 0.0
 
     def faster(self, speed_m_s: float, at_s: float) -> "MovingObject":
-        """The same with another speed from now on."""
+        """Return the thing with another speed from now on."""
         return replace(self, from_m=self.along_m(at_s), since_s=at_s, speed_m_s=speed_m_s)
 
     def waiting(self, at_s: float, *, near: bool) -> "MovingObject":
-        """The same when the nearest car is, or is not, as near as it waits for."""
+        """Return the thing, moving if a car is near and waiting otherwise."""
         if not self.waits_for_m or near == self.going:
             return self
         return replace(self, from_m=self.along_m(at_s), since_s=at_s, going=near)
 
     def put(self, x_m: float, y_m: float) -> "MovingObject":
-        """The same elsewhere, where it stays: it has left its path."""
+        """Return the thing at another place, off its path."""
         return replace(self, x_m=x_m, y_m=y_m, path=(), speed_m_s=0.0)
 
     def met(self, pose: Pose, x: float, y: float, dx: float, dy: float) -> Hit | None:
-        """Where a ray meets it when it is at `pose`."""
+        """Return the hit of a ray on the thing at `pose`."""
         if self.radius_m:
             return ray_to_circle(x, y, dx, dy, (pose.x_m, pose.y_m), self.radius_m)
         if self._inside(pose, x, y):
@@ -119,11 +119,11 @@ class MovingObject:
         return nearest(ray_to_segment(x, y, dx, dy, side) for side in self.sides(pose))
 
     def sides(self, pose: Pose) -> tuple[Segment, ...]:
-        """Of a box."""
+        """Return the sides of a box."""
         return turned_box(pose.x_m, pose.y_m, pose.heading_rad, self.width_m, self.depth_m)
 
     def depth(self, pose: Pose, x: float, y: float, radius: float) -> float:
-        """How deep a disc at x, y is in it; negative: how far away it is."""
+        """Return how deep a disc at x, y overlaps the thing; negative: the distance between them."""
         if self.radius_m:
             return radius + self.radius_m - hypot(x - pose.x_m, y - pose.y_m)
         fx, fy = self._nearest(pose, x, y)
@@ -131,7 +131,7 @@ class MovingObject:
         return radius + away if self._inside(pose, x, y) else radius - away
 
     def pushed(self, pose: Pose, x: float, y: float, radius: float) -> Point:
-        """Where a disc that overlaps it has to be so that it does not."""
+        """Return the nearest place of a disc at which it does not overlap the thing."""
         depth = self.depth(pose, x, y, radius)
         if depth <= 0:
             return x, y
@@ -157,11 +157,11 @@ class MovingObject:
 
 
 def _ends(path: tuple[Point, ...]) -> list[float]:
-    """How far along a closed path each of its parts ends."""
+    """Return the position along a closed path at which each part ends."""
     return list(accumulate(hypot(x2 - x1, y2 - y1) for (x1, y1), (x2, y2) in pairwise((*path, path[0]))))
 
 
 def carried(carrier: Pose, ahead: float, left: float, turn: float = 0.0) -> Pose:
-    """Where something is that is carried at a place in its carrier's frame."""
+    """Return the pose of something at a place in its carrier's frame."""
     c, s = cos(carrier.heading_rad), sin(carrier.heading_rad)
     return Pose(carrier.x_m + ahead * c - left * s, carrier.y_m + ahead * s + left * c, carrier.heading_rad + turn)

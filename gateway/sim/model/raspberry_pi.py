@@ -1,4 +1,4 @@
-"""The Raspberry Pi car's two programs: the TCP server and the one behind a Bluetooth module. Neither knows modes.
+"""The two programs of the Raspberry Pi car: a TCP server, and one behind a Bluetooth module. Neither has modes.
 
 "Row" in a comment means the row of that name in docs/reference/protocol.md.
 """
@@ -10,8 +10,8 @@ from typing import Final
 
 from gateway.sim.model.firmware import (
     BYTES_PER_S,
-    COLOUR_S,
-    REPORT_EVERY_S,
+    COLOR_S,
+    REPORT_INTERVAL_S,
     WHISTLE_S,
     CarBodyState,
     Firmware,
@@ -23,17 +23,17 @@ from gateway.sim.model.firmware import (
 )
 
 TCP_RECEIVE: Final = 128
-"""The program receives at most so many bytes at once."""
+"""Maximum bytes of one receive."""
 SOCKET_BUFFER: Final = 65536
 TTY_BUFFER: Final = 4096
 START_PERCENT: Final = 80
 FAN_S: Final = 1.0
 LIGHT_S: Final = 0.02
-BOOT_S: Final = 2.0
+PI_BOOT_S: Final = 2.0
 GREETING: Final = b"serial is on!"
 PAN_TILT_DEG_S: Final = 35.0
 
-LIGHTS: Final = {"2": (255, 0, 0), "3": (0, 255, 0), "4": (0, 0, 255)}
+PI_LIGHTS: Final = {"2": (255, 0, 0), "3": (0, 255, 0), "4": (0, 0, 255)}
 CYCLE: Final = (
     (255, 255, 255),
     (255, 0, 0),
@@ -50,7 +50,7 @@ _LIMITS: Final = {"vertical": (45.0, 180.0), "horizontal": (0.0, 180.0)}
 
 
 class Transport(StrEnum):
-    """What carries the bytes to the program; the two programs read differently."""
+    """The connection of the program to its host. The two programs read differently."""
 
     TCP = "tcp"
     SERIAL = "serial"
@@ -78,9 +78,9 @@ class RaspberryPiCar(Firmware):
         self._tcp = tcp
         self._camera = {"vertical": 90.0, "horizontal": 90.0}
         self._joints = [90] * 6
-        self._forget()
+        self._reset_variables()
 
-    def _forget(self) -> None:
+    def _reset_variables(self) -> None:
         self._cache = ""
         self._started = False
         self._speed = START_PERCENT
@@ -88,37 +88,37 @@ class RaspberryPiCar(Firmware):
         self._turning: tuple[str, int, float] | None = None
         self._client = False
         self._client_gone = False
-        self._due = {"report": REPORT_EVERY_S}
+        self._due = {"report": REPORT_INTERVAL_S}
         for offset, option in ((0.3, "arm"), (0.6, "imu")):
             if option in self._options:
                 self._due[option] = offset
 
     def connected(self, now: float) -> None:
-        """A TCP client has connected."""
+        """Note that a TCP client has connected."""
         self._run(now)
         self._client = True
 
     def disconnected(self, now: float) -> None:
-        """The TCP client has gone away: the next report kills the program, also if someone has connected again."""
+        """Note that the TCP client is gone: the next report kills the program, even after a reconnect."""
         self._run(now)
         self._client_gone = True
 
     @property
     def camera(self) -> dict[str, float]:
-        """Where the camera's vertical and horizontal servos point, degrees."""
+        """The angles of the camera's vertical and horizontal servos, degrees."""
         self._settle()
         return dict(self._camera)
 
     def drop_link(self, now: float) -> None:
-        """The link is cut. Over TCP what the program's machine already has stays readable."""
+        """Cut the link. Over TCP, bytes that have reached the machine stay readable."""
         super().drop_link(now)
         if self._tcp and self._client:
             self.disconnected(now)
 
     def _reboot(self) -> Program:
-        # Someone has to start the program by hand on a real car unless it was made a service; here it starts by itself.
-        self._forget()
-        yield Wait(self._now + BOOT_S)
+        # On a real car somebody must start the program, unless it runs as a service. Here it starts by itself.
+        self._reset_variables()
+        yield Wait(self._now + PI_BOOT_S)
         self._buffer.clear()
         yield from self._main()
 
@@ -141,13 +141,13 @@ class RaspberryPiCar(Firmware):
     # From the host.
 
     def _receive_tcp(self) -> str | None:
-        """One receive: taken whole if it begins with `$` and has a `#` anywhere, else ignored whole."""
+        """Receive once. Return all of it if it begins with `$` and contains a `#`; otherwise ignore all of it."""
         data = self._buffer[:TCP_RECEIVE].decode("latin-1")
         del self._buffer[:TCP_RECEIVE]
         return data if data.startswith("$") and "#" in data else None
 
     def _receive_serial(self) -> str | None:
-        """All that waits; of several frames the last. Half a frame waits for the rest, whatever that is."""
+        """Read all buffered bytes and return the last whole frame. A truncated frame waits for its rest."""
         last = None
         for byte in self._buffer:
             char = chr(byte)
@@ -166,7 +166,7 @@ class RaspberryPiCar(Firmware):
             servo = 180 - _number(text, "PTZ", "#")
         if "CLR" in text:
             self._rgb = (_number(text, "CLR", ",CLG"), _number(text, "CLG", ",CLB"), _number(text, "CLB", "#"))
-            yield from self._busy(COLOUR_S)
+            yield from self._busy(COLOR_S)
         if "arm" in self._options and "ServoJ1" in text:
             ends = [*(f",J{n}" for n in range(2, 7)), "#"]
             self._joints = [min(180, _number(text, f"J{n}", end)) for n, end in enumerate(ends, 1)]
@@ -176,7 +176,7 @@ class RaspberryPiCar(Firmware):
             yield from self._turn_servo(servo)
 
     def _general_frame(self, text: str) -> Generator[Wait, None, int | None]:
-        """Motion after whistle and fan, before the front servo; gives the servo's target."""
+        """Set the motion after whistle and fan; return the target of the front servo, which moves last."""
         if len(text) < 18:
             raise _Died  # the program reads place 9 whether it is there or not
         left, right = motion(text)
@@ -190,8 +190,8 @@ class RaspberryPiCar(Firmware):
             self._rgb = CYCLE[self._cycle]
             self._cycle = (self._cycle + 1) % len(CYCLE)
             yield from self._busy(LIGHT_S)
-        elif text[13] in LIGHTS:
-            self._rgb = LIGHTS[text[13]]
+        elif text[13] in PI_LIGHTS:
+            self._rgb = PI_LIGHTS[text[13]]
             yield from self._busy(LIGHT_S)
         if text[15] == "1":
             self._fan = not self._fan
@@ -202,7 +202,7 @@ class RaspberryPiCar(Firmware):
         return 90 if text[17] == "1" else {"1": 180, "2": 0}.get(text[9])
 
     def _turn_camera(self, digit: str) -> None:
-        """The camera keeps turning until another general frame says something else."""
+        """Turn the camera until another general frame changes it."""
         self._settle()
         axis, sign = _TURNS.get(digit, ("", 0))
         self._turning = (axis, sign, self._now) if axis else None
@@ -227,7 +227,7 @@ class RaspberryPiCar(Firmware):
             self._due[what] -= self._now - since
         if self._now >= due:
             what = min(self._due, key=lambda name: self._due[name])
-            self._due[what] = REPORT_EVERY_S
+            self._due[what] = REPORT_INTERVAL_S
             yield from self._report(what)
 
     def _report(self, what: str) -> Program:
@@ -251,7 +251,7 @@ class RaspberryPiCar(Firmware):
 
 
 def _number(text: str, word: str, end: str) -> int:
-    """The number between two words of the FIRST such place; the program dies of one that is none."""
+    """Return the number between the FIRST occurrences of two words; the program dies if it is no number."""
     start, stop = text.find(word) + len(word), text.find(end)
     if stop < start or not text[start:stop].strip().lstrip("+-").isdecimal():
         raise _Died

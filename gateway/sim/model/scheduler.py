@@ -1,32 +1,32 @@
-"""Programs of cars that meet run in the order of their events, so that none sees another as it was or will be. Pure."""
+"""Runs the programs of cars that meet in the order of their events, so that all see the same moment. Pure."""
 
 from typing import Protocol
 
 
 class Member(Protocol):
-    """A car's program as its company drives it."""
+    """A car's program."""
 
     def due(self) -> float:
-        """When it next runs by itself; inf if it will not."""
+        """Return the time at which the program next runs; inf if it never does."""
         ...
 
     def run_alone(self, now: float) -> None:
-        """Run it up to `now`."""
+        """Run this program up to `now`."""
         ...
 
 
 class EventScheduler:
-    """All the programs of one world in which cars meet."""
+    """All programs of one world in which cars meet."""
 
     def __init__(self) -> None:
         self._members: list[Member] = []
 
     def join(self, member: Member) -> None:
-        """From now on this one runs with the others."""
+        """Add a program."""
         self._members.append(member)
 
     def run(self, now: float) -> None:
-        """Run all up to `now`; of two events at one time that of the car that joined first."""
+        """Run all programs up to `now`. Of two simultaneous events, that of the earlier member runs first."""
         if not self._members:
             return
         while (due := (first := min(self._members, key=_due)).due()) <= now:

@@ -1,8 +1,8 @@
 """The ONE flat world that all cars of a simulator share: walls, a taped line, lamps, things, and the cars as bodies.
 
-What a car's own sensors make of it is body.py's part. In the worlds of before (no things, cars that do not meet) each
-car is integrated by itself whenever someone looks; in a lively one all are brought to each tick of STEP_S together.
-REP-103: metres, x forward, y left, angles counter-clockwise.
+`car_body` has the sensors. In a plain world (no things, cars do not meet), each car moves by itself when needed.
+In a lively world, all cars move together, tick by tick of STEP_S. REP-103: meters, x forward, y left, angles
+counter-clockwise.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,45 +28,45 @@ from gateway.sim.model.objects import Lamp, MovingObject, carried
 from gateway.sim.model.scheduler import EventScheduler
 
 RADIUS_M: Final = 0.13
-"""Of a car: it is a disc to walls, things and other cars, and to their sensors."""
+"""Radius of a car, which is a disc for walls, things, other cars and their sensors."""
 STEP_S: Final = 0.04
-"""Longest stretch of driving between two looks for a wall, and the tick of a lively world."""
+"""Maximum time between two collision checks, and the tick of a lively world."""
 TAPE_M: Final = 0.025
 _BUCKET_M: Final = 0.25
-_ROUNDS: Final = 3
-"""So often a car that is pushed out of one thing is pushed out of the next."""
-_HAIR_M: Final = 1e-9
-_APART_M: Final = 0.4
-"""Between two places where cars begin that have none of their own."""
-_SPREAD_M: Final = 4.0
-"""How far out they are if there are no walls."""
+_PUSH_ROUNDS: Final = 3
+"""Maximum rounds of pushing a car out of one obstacle after the other."""
+_TOLERANCE_M: Final = 1e-9
+_START_GRID_M: Final = 0.4
+"""Distance of the start places of cars that have none in the world file."""
+_START_REACH_M: Final = 4.0
+"""Maximum distance of these start places from the middle if there are no walls."""
 
 
 class WorldBody(Protocol):
-    """A car as the world moves it."""
+    """A car in the world."""
 
     @property
     def name(self) -> str:
-        """The car's."""
+        """The name of the car."""
         ...
 
     @property
     def place(self) -> Pose:
-        """Where it was when it was last moved."""
+        """The pose after the last move."""
         ...
 
     @property
     def driving(self) -> bool:
-        """Whether a motor is on."""
+        """True if a motor is on."""
         ...
 
     def glide(self, now: float) -> None:
-        """Go on to `now`, at most a tick away."""
+        """Move on to `now`, at most one tick."""
         ...
 
 
 class World:
-    """Walls and a line, which never change; lamps, things and cars, which do."""
+    """The walls and the line, which never change, and the lamps, things and cars, which do."""
 
     def __init__(
         self,
@@ -84,15 +84,15 @@ class World:
         self.lamps = tuple(lamps)
         self.things = tuple(things)
         self.cars_meet = cars_meet
-        """Whether cars see each other and are in each other's way."""
+        """True if cars see each other and block each other's way."""
         self.lively = cars_meet or bool(self.things) or any(lamp.carried_by for lamp in self.lamps)
-        """Whether what one car does may matter to another, or something moves by itself."""
-        self.company = EventScheduler()
+        """True if cars may affect each other, or if something moves by itself."""
+        self.scheduler = EventScheduler()
         self.bodies: list[WorldBody] = []
         self._starts = dict(starts or {})
         self._began = 0.0
         self._tick = 0
-        # What is asked for a thousand times a second of simulated time is worked out once.
+        # Computed once: the sensors need these a thousand times per second of simulated time.
         self._rays = tuple((x1, y1, x2 - x1, y2 - y1, hypot(x2 - x1, y2 - y1)) for x1, y1, x2, y2 in self.walls)
         self._touching = tuple((wall, reach(wall, RADIUS_M)) for wall in self.walls)
         self._near: dict[tuple[int, int], list[Segment]] = {}
@@ -107,19 +107,19 @@ class World:
 
     @classmethod
     def room(cls) -> "World":
-        """A room of 5.0 x 3.6 m, a box in its middle, a loop of line: small enough that every ranging has an echo."""
+        """Return a room of 5.0 x 3.6 m with a box and a line loop, so small that every ranging has an echo."""
         walls = (*box(0.0, 0.0, 5.0, 3.6), *box(0.0, 0.0, 0.5, 0.5))
         return cls(walls, loop(1.7, 1.05, 0.6))
 
     @classmethod
     def open_field(cls) -> "World":
-        """Nothing at all: no ranging ever has an echo."""
+        """Return an empty world, in which no ranging ever has an echo."""
         return cls()
 
     def start_pose(self, index: int, name: str = "") -> Pose:
-        """Where a car begins: at its own place, or as number `index` on the line; the cars spread over its length.
+        """Return the start pose of a car: its own place, or that of number `index` along the line.
 
-        In a lively world one without a place of its own that would begin in something begins where there is room.
+        In a lively world, a car without a place of its own starts where there is room.
         """
         if name in self._starts:
             return self._starts[name]
@@ -129,18 +129,18 @@ class World:
         return next((each for each in (pose, *self._grid()) if self._free(each)), pose)
 
     def _grid(self) -> list[Pose]:
-        """Places to begin, the innermost first."""
-        xs = [x for wall in self.walls for x in wall[::2]] or [-_SPREAD_M, _SPREAD_M]
-        ys = [y for wall in self.walls for y in wall[1::2]] or [-_SPREAD_M, _SPREAD_M]
+        """Return start places, the innermost first."""
+        xs = [x for wall in self.walls for x in wall[::2]] or [-_START_REACH_M, _START_REACH_M]
+        ys = [y for wall in self.walls for y in wall[1::2]] or [-_START_REACH_M, _START_REACH_M]
         spots = [
-            Pose(_APART_M * column, _APART_M * row, 0.0)
-            for column in range(ceil(min(xs) / _APART_M), floor(max(xs) / _APART_M) + 1)
-            for row in range(ceil(min(ys) / _APART_M), floor(max(ys) / _APART_M) + 1)
+            Pose(_START_GRID_M * column, _START_GRID_M * row, 0.0)
+            for column in range(ceil(min(xs) / _START_GRID_M), floor(max(xs) / _START_GRID_M) + 1)
+            for row in range(ceil(min(ys) / _START_GRID_M), floor(max(ys) / _START_GRID_M) + 1)
         ]
         return sorted(spots, key=lambda pose: hypot(pose.x_m, pose.y_m))
 
     def _free(self, pose: Pose) -> bool:
-        """Whether a car can begin there: in nothing, and not shut off from all cars that have a place of their own."""
+        """Return True if a car can start there: the place is empty, and in sight of a car with its own place."""
         x, y, _ = pose
         cars = (*self._starts.values(), *(body.place for body in self.bodies)) if self.cars_meet else ()
         return (
@@ -152,7 +152,7 @@ class World:
 
     def _reachable(self, pose: Pose, other: Pose) -> bool:
         sight: Segment = (*pose[:2], *other[:2])
-        return all(apart(sight, wall) > _HAIR_M for wall in self.walls)
+        return all(apart(sight, wall) > _TOLERANCE_M for wall in self.walls)
 
     def _spread(self, index: int) -> Pose:
         if not self.line:
@@ -170,12 +170,12 @@ class World:
     # Walls and line.
 
     def on_line(self, x: float, y: float) -> bool:
-        """Whether a point lies on the tape."""
+        """Return True if a point lies on the tape."""
         near = self._near.get((floor(x / _BUCKET_M), floor(y / _BUCKET_M)), ())
         return any(distance(x, y, segment) <= TAPE_M / 2 for segment in near)
 
     def ray(self, x: float, y: float, angle: float, steepest: float = 0.0) -> float | None:
-        """Distance to the first wall; `steepest`: least cosine to its normal that sends something back."""
+        """Return the distance to the first wall. `steepest`: the minimum cosine to its normal that reflects."""
         best = self._wall(x, y, cos(angle), sin(angle))
         return None if best is None or best[1] < steepest else best[0]
 
@@ -192,7 +192,7 @@ class World:
         return best
 
     def push_out(self, x: float, y: float) -> Point:
-        """The nearest place at which a car does not overlap a wall."""
+        """Return the nearest place at which a car does not overlap a wall."""
         for wall, (low_x, low_y, high_x, high_y) in self._touching:
             if not (low_x < x < high_x and low_y < y < high_y):
                 continue
@@ -202,17 +202,17 @@ class World:
                 x, y = fx + (x - fx) * RADIUS_M / away, fy + (y - fy) * RADIUS_M / away
         return x, y
 
-    # What moves.
+    # Moving things and cars.
 
     def join(self, body: WorldBody, now: float) -> None:
-        """A car has been put into the world."""
+        """Add a car to the world."""
         if self.lively:
             if not self.bodies:
                 self._began, self._tick = now, 0
             self.bodies.append(body)
 
     def settle(self, now: float) -> None:
-        """Bring all cars to the last tick up to `now`, each tick for all before the next."""
+        """Bring all cars to the last tick up to `now`, all of them tick by tick."""
         last = floor((now - self._began) / STEP_S)
         if last <= self._tick:
             return
@@ -233,15 +233,15 @@ class World:
         return thing.waiting(now - self._began, near=near)
 
     def others(self, me: WorldBody | None) -> Iterator[WorldBody]:
-        """The cars that a car meets."""
+        """Yield the cars that a car can meet."""
         return (body for body in self.bodies if body is not me) if self.cars_meet else iter(())
 
     def carrier(self, name: str) -> WorldBody | None:
-        """A car by its name, if it is there."""
+        """Return a car by its name. None if it does not exist."""
         return next((body for body in self.bodies if body.name == name), None)
 
     def where(self, thing: MovingObject, now: float) -> Pose | None:
-        """Where a thing is; None if the car that carries it is not there."""
+        """Return the pose of a thing. None if the car that carries it does not exist."""
         pose = thing.pose(now - self._began)
         if not thing.carried_by:
             return pose
@@ -249,7 +249,7 @@ class World:
         return None if car is None else carried(car.place, pose.x_m, pose.y_m, pose.heading_rad)
 
     def shines(self, lamp: Lamp, now: float) -> Point | None:
-        """Where a lamp is; None if what carries it is not there."""
+        """Return the place of a lamp. None if its carrier does not exist."""
         if not lamp.carried_by:
             return lamp.x_m, lamp.y_m
         thing = next((each for each in self.things if each.name == lamp.carried_by), None)
@@ -258,7 +258,7 @@ class World:
         return None if base is None else carried(base, lamp.x_m, lamp.y_m)[:2]
 
     def solids(self, me: WorldBody | None, now: float) -> Iterator[tuple[MovingObject, Pose]]:
-        """The things that a car meets, which is not what it carries itself."""
+        """Yield the things that a car can meet, without those that it carries."""
         for thing in self.things:
             if me is None or thing.carried_by != me.name:
                 pose = self.where(thing, now)
@@ -266,7 +266,7 @@ class World:
                     yield thing, pose
 
     def make_room(self, me: WorldBody, x: float, y: float, now: float) -> Point:
-        """Where a car that wants to be at x, y can be. One that is jammed stays where it is."""
+        """Return the nearest free place for a car that moves to x, y. A jammed car stays in place."""
         things = [
             (thing, pose)
             for thing, pose in self.solids(me, now)
@@ -277,8 +277,8 @@ class World:
             for other in self.others(me)
             if hypot(x - other.place.x_m, y - other.place.y_m) < 4 * RADIUS_M
         ]
-        wanted = x, y
-        for _ in range(_ROUNDS):
+        target = x, y
+        for _ in range(_PUSH_ROUNDS):
             before = x, y
             for ox, oy in cars:
                 away = hypot(x - ox, y - oy)
@@ -290,30 +290,30 @@ class World:
             if (x, y) == before:
                 break
         old = me.place
-        if (x, y) == wanted and not cars:
-            return x, y  # nothing was in its way
+        if (x, y) == target and not cars:
+            return x, y  # nothing in the way
         if self._passes(old.x_m, old.y_m, x, y, cars):
             return x, y
         return old.x_m, old.y_m
 
     def _passes(self, old_x: float, old_y: float, x: float, y: float, cars: list[Point]) -> bool:
-        """Whether a car may go there: through no wall, and no deeper into one or into a car than it is."""
+        """Return True if a car may move there: through no wall, and no deeper into a wall or a car."""
         for wall, (low_x, low_y, high_x, high_y) in self._touching:
             if max(old_x, x) < low_x or min(old_x, x) > high_x or max(old_y, y) < low_y or min(old_y, y) > high_y:
                 continue
             after = distance(x, y, wall)
-            if after < min(RADIUS_M, distance(old_x, old_y, wall)) - _HAIR_M:
+            if after < min(RADIUS_M, distance(old_x, old_y, wall)) - _TOLERANCE_M:
                 return False
-            if (old_x, old_y) != (x, y) and apart((old_x, old_y, x, y), wall) <= _HAIR_M:
+            if (old_x, old_y) != (x, y) and apart((old_x, old_y, x, y), wall) <= _TOLERANCE_M:
                 return False
         return all(
-            hypot(x - ox, y - oy) >= min(2 * RADIUS_M, hypot(old_x - ox, old_y - oy)) - _HAIR_M for ox, oy in cars
+            hypot(x - ox, y - oy) >= min(2 * RADIUS_M, hypot(old_x - ox, old_y - oy)) - _TOLERANCE_M for ox, oy in cars
         )
 
-    # What is seen.
+    # Sight.
 
     def met(self, me: WorldBody | None, x: float, y: float, angle: float, reach_m: float, now: float) -> Hit | None:
-        """The first thing or car, no wall, that a ray meets within `reach_m`. All cars have to be at `now`."""
+        """Return the first hit of a ray on a thing or car within `reach_m`. All cars must be at `now`."""
         dx, dy = cos(angle), sin(angle)
         hits: list[Hit | None] = []
         for other in self.others(me):
@@ -327,15 +327,15 @@ class World:
         return hit if hit is not None and hit[0] <= reach_m else None
 
     def clear(self, a: Point, b: Point, without: Iterable[str] = (), *, now: float = 0.0) -> bool:
-        """Whether nothing stands between two points; `without`: cars and things that do not count, by name.
+        """Return True if nothing stands between two points, in either direction.
 
-        The same both ways.
+        `without`: names of cars and things to ignore.
         """
         a, b = sorted((a, b))
         sight: Segment = (*a, *b)
         if a == b:
             return True
-        if any(apart(sight, wall) <= _HAIR_M for wall in self.walls):
+        if any(apart(sight, wall) <= _TOLERANCE_M for wall in self.walls):
             return False
         ignored = set(without)
         for other in self.others(None):
@@ -347,34 +347,34 @@ class World:
             if thing.radius_m:
                 if distance(pose.x_m, pose.y_m, sight) < thing.radius_m:
                     return False
-            elif any(apart(sight, side) <= _HAIR_M for side in thing.sides(pose)):
+            elif any(apart(sight, side) <= _TOLERANCE_M for side in thing.sides(pose)):
                 return False
         return True
 
-    # What is changed while it runs.
+    # Changes at run time.
 
     def advance(self, now: float) -> None:
-        """Bring every program and every car to `now`, before something is changed or asked."""
-        self.company.run(now)
+        """Bring every program and every car to `now`, before a change or a query."""
+        self.scheduler.run(now)
         self.settle(now)
         for body in self.bodies:
             body.glide(now)
 
     def change_lamp(self, name: str, **fields: float | bool) -> None:
-        """Change fields of a lamp that is there."""
+        """Change fields of a lamp."""
         self.lamps = tuple(
-            # Their names and types are what changes.py lets through.
+            # `world_commands` has checked the names and types.
             replace(lamp, **fields) if lamp.name == name else lamp  # type: ignore[arg-type]
             for lamp in self.lamps
         )
 
     def speed_thing(self, name: str, speed_m_s: float, now: float) -> None:
-        """Give a thing that has a path another speed."""
+        """Set the speed of a thing on a path."""
         at_s = now - self._began
         self.things = tuple(each.faster(speed_m_s, at_s) if each.name == name else each for each in self.things)
 
     def put_thing(self, name: str, x_m: float | None, y_m: float | None, now: float) -> None:
-        """Put a thing elsewhere (None: as it is), where it stays; one that is carried: elsewhere on its car."""
+        """Move a thing to a place, where it stays (None: unchanged). The place of a carried thing is on its car."""
 
         def put(thing: MovingObject) -> MovingObject:
             pose = thing.pose(now - self._began)

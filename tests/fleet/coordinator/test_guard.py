@@ -88,7 +88,7 @@ def test_what_nobody_foresaw_is_answered_logged_and_survived(started: Started) -
     words = started.ask(b"cars: {purple: manual}")  # its warning meets what is broken
     started.broken = False
     assert isinstance(words, str)
-    assert words.startswith(f"{INTERNAL_ERROR} while answering {KEY}: RuntimeError at test_coordinator_guard.py:")
+    assert words.startswith(f"{INTERNAL_ERROR} while answering {KEY}: RuntimeError at test_guard.py:")
     (event,) = wait_for(lambda: [each.message() for each in logged], "the event")
     assert (event.name, event.message, event.level) == (f"@coordinator {INTERNAL_ERROR}", words, 4)
     assert words in started.said

@@ -1,5 +1,6 @@
 """Fleet files: layers resolved, faults across cars told, and links understood as gateways understand them."""
 
+import contextlib
 import json
 import time
 from itertools import combinations
@@ -11,10 +12,11 @@ from hypothesis import strategies as st
 
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
 from fleet.fleetfile.models import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V, BatteryAction, schema
-from fleet.links import BadLink, LinkKind, LinkUrl, parse_link, shared_ports
+from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link, shared_ports
 from gateway.bus import requests
 from gateway.control.estimate import battery
 from gateway.link import BadUrl, parse_url
+from schemas.links import BadLink, parse_link
 from schemas.yaml_document.document import BadFile
 
 LAYERS = """\
@@ -149,7 +151,7 @@ def test_a_port_behind_two_names(tmp_path: Path) -> None:
     assert "may be the port of a" in line
 
 
-_PORTS = [parse_link(each) for each in ("/dev/a", "/dev/b", "tcp://a:1", "tcp://a:2", "ble://name=a", "sim")] + [
+_PORTS = [parse_fleet_link(each) for each in ("/dev/a", "/dev/b", "tcp://a:1", "tcp://a:2", "ble://name=a", "sim")] + [
     parse_link(f"serial://?{ids}")
     for ids in (
         "vid=1a86",
@@ -164,11 +166,11 @@ _PORTS = [parse_link(each) for each in ("/dev/a", "/dev/b", "tcp://a:1", "tcp://
 
 
 @given(st.lists(st.sampled_from(_PORTS), max_size=12))
-def test_shared_ports_are_those_that_a_comparison_of_each_pair_finds(links: list[LinkUrl]) -> None:
+def test_shared_ports_are_those_that_a_comparison_of_each_pair_finds(links: list[FleetLink]) -> None:
     named = {f"car{number}": link for number, link in enumerate(links)}
     first: dict[str, str] = {}
     for (one, before), (other, after) in combinations(named.items(), 2):
-        if before.may_be(after):
+        if may_be_same(before, after):
             first.setdefault(other, one)
     assert set(shared_ports(named)) == {(one, other) for other, one in first.items()}
 
@@ -224,19 +226,15 @@ LINKS = [
 ]
 
 
-def _agree(text: str) -> None:
+@pytest.mark.parametrize("text", LINKS)
+def test_gateways_and_fleet_files_take_the_same_links(text: str) -> None:
     try:
-        parse_url(text)
+        link = parse_url(text)
     except BadUrl:
         with pytest.raises(BadLink):
-            parse_link(text)
+            parse_fleet_link(text)
     else:
-        parse_link(text)
-
-
-@pytest.mark.parametrize("text", LINKS)
-def test_links_are_as_gateways_take_them(text: str) -> None:
-    _agree(text)
+        assert parse_fleet_link(text) == parse_link(str(link)) == link
 
 
 _PIECES = [
@@ -261,12 +259,13 @@ _PIECES = [
 
 
 @given(st.lists(st.sampled_from(_PIECES), max_size=9).map("".join))
-def test_links_of_any_pieces_are_as_gateways_take_them(text: str) -> None:
-    _agree(text)
+def test_any_pieces_are_a_link_or_a_bad_link(text: str) -> None:
+    with contextlib.suppress(BadLink):
+        parse_link(text)
 
 
 def test_only_fleet_files_know_simulated_links() -> None:
-    assert parse_link("sim").kind is LinkKind.SIMULATED
+    assert parse_fleet_link("sim") == SimLink()
     with pytest.raises(BadUrl):
         parse_url("sim")
 

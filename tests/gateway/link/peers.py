@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 
 from gateway.link import LinkUrl, ble
-from gateway.link.url import BleUrl, SerialUrl, TcpUrl
+from schemas.links import BleUrl, SerialUrl, TcpUrl
 
 SYSTEM_BUS = "DBUS_SYSTEM_BUS_ADDRESS"
 PATIENCE_S = 20.0
@@ -150,8 +150,9 @@ class BlePeer(Peer):
         self.url = BleUrl(self.module.address)
         self._before = os.environ.get(SYSTEM_BUS)
         os.environ[SYSTEM_BUS] = self.bluez.address
-        self._write_s = ble.WRITE_S
-        ble.WRITE_S = PATIENCE_S  # type: ignore[misc]  # a busy machine keeps both ends from running for longer than a command may take
+        self._write_s = ble.BLE_WRITE_TIMEOUT_S
+        # a busy machine keeps both ends from running for longer than a command may take
+        ble.BLE_WRITE_TIMEOUT_S = PATIENCE_S  # type: ignore[misc]
 
     def send(self, data: bytes) -> None:
         self.bluez.notify(self.module, data)
@@ -171,11 +172,11 @@ class BlePeer(Peer):
     def stall_after(self, pieces: int) -> None:
         """Take so many more."""
         self.module.takes = pieces
-        ble.WRITE_S = self._write_s  # type: ignore[misc]
+        ble.BLE_WRITE_TIMEOUT_S = self._write_s  # type: ignore[misc]
 
     def close(self) -> None:
         self.bluez.close()
-        ble.WRITE_S = self._write_s  # type: ignore[misc]
+        ble.BLE_WRITE_TIMEOUT_S = self._write_s  # type: ignore[misc]
         if self._before is None:
             del os.environ[SYSTEM_BUS]
         else:

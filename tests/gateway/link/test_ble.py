@@ -10,7 +10,8 @@ from collections.abc import AsyncIterator
 import pytest
 
 from gateway.link import Busy, CannotOpen, Link, LinkLost, ble, open_link
-from gateway.link.url import BleUrl
+from gateway.link.base import MAX_BUFFERED_BYTES
+from schemas.links import BleUrl
 from tests.gateway.link.peers import BlePeer, open_descriptors, settled
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="BlueZ is Linux's; elsewhere bleak asks the system")
@@ -153,7 +154,7 @@ async def test_a_module_that_does_not_connect(peer: BlePeer) -> None:
 
 async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
     """BlueZ answers neither Connect nor Disconnect, for which bleak would wait for ever."""
-    monkeypatch.setattr(ble, "DISCONNECT_S", 0.2)
+    monkeypatch.setattr(ble, "DISCONNECT_TIMEOUT_S", 0.2)
     peer.module.connects = peer.module.leaves = False
     await refused(peer, timeout_s=0.5)
     assert not [task for task in asyncio.all_tasks() if "BleLink" in repr(task)], "nothing goes on in secret"
@@ -250,7 +251,7 @@ async def test_a_service_that_died_unnoticed(peer: BlePeer) -> None:
 
 async def test_more_than_is_read_ends_the_link_and_is_bounded(link: Link, peer: BlePeer) -> None:
     """Radio cannot be held back. What had come is still read, then the cause is told."""
-    size = ble.HELD_BYTES + 20_000
+    size = MAX_BUFFERED_BYTES + 20_000
     peer.module.mtu = 515
     await asyncio.to_thread(peer.send, b"x" * size)
 
@@ -261,7 +262,7 @@ async def test_more_than_is_read_ends_the_link_and_is_bounded(link: Link, peer: 
     async with asyncio.timeout(PATIENCE_S):
         with pytest.raises(LinkLost, match="sends more than is read: 65536 bytes wait"):
             await write_on()
-        assert ble.HELD_BYTES < len(await link.read()) <= ble.HELD_BYTES + 512
+        assert MAX_BUFFERED_BYTES < len(await link.read()) <= MAX_BUFFERED_BYTES + 512
         with pytest.raises(LinkLost, match="sends more than is read"):
             await link.read()
 

@@ -21,9 +21,9 @@ import serial
 
 from gateway.link import Busy, CannotOpen, Link, LinkLost, open_link
 from gateway.link.tcp import TcpLink
-from gateway.link.url import TcpUrl
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.events import Sensors
+from schemas.links import TcpUrl
 from tests.gateway.link.peers import (
     BlePeer,
     Peer,

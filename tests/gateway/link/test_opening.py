@@ -15,7 +15,7 @@ import serial
 
 from gateway.link import BadUrl, CannotOpen, open_link, parse_url
 from gateway.link.tcp import connect_first
-from gateway.link.url import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
+from schemas.links import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
 from tests.gateway.link.peers import PtyPeer, no_threads
 
 
@@ -109,9 +109,9 @@ def test_what_is_no_url_is_refused_with_what_is(text: str, why: str) -> None:
     words = str(caught.value)
     assert why in words
     assert words.endswith(
-        "give serial:///dev/ttyUSB0 (?baud=9600), a bare device path such as /dev/ttyUSB0 or COM3, "
-        "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://host:8888, "
-        "ble://AA:BB:CC:DD:EE:FF (on macOS the UUID that `gateway scan` shows), or ble://name=BT04"
+        "give /dev/ttyUSB0 or COM3 (also as serial:///dev/ttyUSB0?baud=9600), "
+        "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://HOST:PORT, "
+        "ble://AA:BB:CC:DD:EE:FF (macOS: a UUID), ble://name=BT04 (`gateway scan` shows them)"
     )
     assert "\n" not in words
 
@@ -151,7 +151,7 @@ WITHOUT_PERMISSION = """
 import asyncio, grp, os, sys  # all of it now: nobody may not even read the library
 from gateway.link import CannotOpen, open_link
 from gateway.link.tcp import connect_first
-from gateway.link.url import SerialUrl
+from schemas.links import SerialUrl
 import gateway.link.serial, serial.tools.list_ports
 os.setgroups([]); os.setgid(65534); os.setuid(65534)
 try:
@@ -255,7 +255,7 @@ def test_bluetooth_that_is_not_installed_is_one_line_and_nothing_is_started() ->
 WITH_A_SILENT_NAME_SERVER = """
 import asyncio, socket, sys, threading
 from gateway.link import CannotOpen, open_link
-from gateway.link.url import TcpUrl
+from schemas.links import TcpUrl
 socket.getaddrinfo = lambda *_, **__: threading.Event().wait()  # nothing can end it
 async def main():
     for _ in range(3):

@@ -9,8 +9,8 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from gateway.link import CannotOpen, LinkLost, open_link, parse_url
-from gateway.link.url import SerialUrl, UsbUrl
 from gateway.link.usb import UsbSerialPort, choose
+from schemas.links import SerialUrl, UsbUrl
 from tests.gateway.link.peers import PtyPeer
 
 CH340 = UsbSerialPort("/dev/ttyUSB0", 0x1A86, 0x7523)

@@ -177,9 +177,9 @@ class TestOverlong:
     def test_a_frame_that_never_ends_is_held_in_bounds(self) -> None:
         decoder = Decoder()
         events = [event for _ in range(5000) for event in decoder.feed(b"$4WD,CSB" + b"1" * 20 + b"." * 200, 1.0)]
-        assert len(decoder._held) <= 256
+        assert len(decoder._buffer) <= 256
         events = decoder.feed(b"1" * 1_000_000, 1.0)
-        assert len(decoder._held) <= 256
+        assert len(decoder._buffer) <= 256
         assert all(len(event.raw) <= 256 for event in events)
         assert len(events) <= 1_000_000 // 256 + 1
         assert isinstance(decoder.feed(GOOD, 1.0)[-1], Sensors)

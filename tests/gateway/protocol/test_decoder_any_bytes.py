@@ -47,7 +47,7 @@ def events_of(bursts: list[tuple[bytes, float]], size: int | None, *, ticks: boo
         step = size or max(len(burst), 1)
         for start in range(0, len(burst), step):
             events += decoder.feed(burst[start : start + step], now)
-            assert len(decoder._held) <= 256
+            assert len(decoder._buffer) <= 256
     return timeless(events + decoder.end())
 
 

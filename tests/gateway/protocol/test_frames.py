@@ -18,6 +18,7 @@ from gateway.protocol.frames import (
     encode,
     parse_sent,
 )
+from gateway.protocol.modes import MODES
 from tests.support.vectors import ids, rows, wire
 
 GENERAL, NAMED, REFUSED = rows("general"), rows("named"), rows("refused")
@@ -87,7 +88,15 @@ def test_words_instead_of_members_are_refused_by_name() -> None:
 def test_every_word_of_the_enums_is_in_the_table() -> None:
     seen = {row[column] for row in GENERAL for column in ("motion", "speed", "servo", "light")}
     assert {*Motion, *SpeedStep, *ServoAction, *Light} <= seen
-    assert [mode.digit for mode in Mode] == [0, 1, 2, 3, 4, 5, 6]
+    assert {mode: MODES[mode].digit for mode in Mode} == {
+        Mode.MANUAL: 0,
+        Mode.REMOTE_CONTROL: 1,
+        Mode.TRACKING: 2,
+        Mode.OBSTACLE_AVOIDANCE: 3,
+        Mode.COLOR_LED: 4,
+        Mode.LIGHT_SEEKING: 5,
+        Mode.FOLLOWING: 6,
+    }
 
 
 FRAMES = st.one_of(

@@ -5,8 +5,9 @@ import pytest
 from gateway.protocol.decoder import Decoder, Sensors
 from gateway.protocol.enums import Mode, SpeedStep
 from gateway.protocol.frames import ArmSet, parse_sent
+from gateway.protocol.modes import MODES
 from gateway.protocol.platforms import Platform, StopStyle, parse_platform
-from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, mode_open_s
+from gateway.protocol.timing import FRAME_S, LONGEST_BLOCK_S, RECOVERY_SILENCE_S
 from tests.support.vectors import ids, rows, wire
 
 PLATFORMS, PLACEHOLDERS, BLOCKS, TURNS = rows("platforms"), rows("placeholders"), rows("blocks"), rows("turns")
@@ -45,7 +46,7 @@ def test_the_longest_block_outside_avoidance() -> None:
     profile = parse_platform("unknown+arm")
     frames = [parse_sent(wire(row["bytes"])) for row in PLATFORMS]
     assert max(profile.block_s(frame) for frame in frames if frame) == pytest.approx(LONGEST_BLOCK_S)
-    assert mode_open_s(Mode.FOLLOWING) == pytest.approx(LONGEST_BLOCK_S)
+    assert MODES[Mode.FOLLOWING].open_s == LONGEST_BLOCK_S == 3.5
     assert profile.block_s(ArmSet((0,) * 6)) > FRAME_S
 
 
@@ -53,12 +54,18 @@ def test_the_longest_block_outside_avoidance() -> None:
 def test_the_turn_and_rate_of_each_mode(row: dict[str, str]) -> None:
     profile, mode = parse_platform("arduino"), Mode(row["mode"])
     assert profile.mode_turn_s(mode) == float(row["seconds"])
-    assert profile.rate_hz(mode) == float(row["hz"])
+    assert MODES[mode].rate_hz == float(row["hz"])
     assert (mode in profile.silent_modes) is (float(row["hz"]) == 0)
 
 
-def test_every_mode_has_a_turn() -> None:
-    assert {row["mode"] for row in TURNS} == set(Mode)
+def test_every_mode_has_a_row_and_a_turn() -> None:
+    assert {row["mode"] for row in TURNS} == set(MODES) == set(Mode)
+    assert len({row.digit for row in MODES.values()}) == len(MODES)
+
+
+def test_recovery_waits_longer_than_any_mode_opens() -> None:
+    assert RECOVERY_SILENCE_S == 3.7
+    assert all(row.open_s + FRAME_S < RECOVERY_SILENCE_S for row in MODES.values())
 
 
 @pytest.mark.parametrize("platform", Platform)

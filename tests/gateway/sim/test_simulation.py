@@ -23,7 +23,7 @@ from gateway.sim.endpoints import EndpointError, Taken
 from gateway.sim.faults import Fault, FaultKind
 from gateway.sim.model.faulty_link import Direction
 from gateway.sim.simulation import Simulation
-from gateway.sim.truth_publisher import LOOK_AGAIN_S, TruthPublisher
+from gateway.sim.truth_publisher import HUB_RETRY_DELAY_S, TruthPublisher
 from schemas.bus import Bus, Sample
 from tests.gateway.sim.strangers import FAN, MODE00, RUN, STOP, opening
 from tests.support.ports import free_endpoint
@@ -119,7 +119,7 @@ async def test_a_plain_pty_says_its_new_name() -> None:
     await simulation.start()
     car = simulation.cars["red"]
     named: list[str] = []
-    car.moved = lambda moved: named.append(moved.url)
+    car.on_renamed = lambda moved: named.append(moved.url)
     first = car.url
     with serial.Serial(first.removeprefix("serial://")):  # held open, the old name cannot be given again
         await simulation.inflict(Fault(FaultKind.LINK_DROP, for_s=0.05))
@@ -561,13 +561,13 @@ def test_lamps_and_things_are_on_the_bus_too(started: list[SimProcess]) -> None:
 
 
 async def test_truth_that_nobody_can_see_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gateway.sim.truth_publisher.PATIENCE_S", 0.0)
+    monkeypatch.setattr("gateway.sim.truth_publisher.HUB_WARNING_DELAY_S", 0.0)
     said: asyncio.Queue[str] = asyncio.Queue()
     simulation = Simulation(parse_cars(["red:arduino:tcp://127.0.0.1:0"]), seed=1)
     publishing = asyncio.create_task(TruthPublisher(simulation, free_endpoint(), "fleet", said.put_nowait).run())
     words = await asyncio.wait_for(said.get(), 20)
     assert words.startswith("there is no hub at tcp/127.0.0.1:")
-    await asyncio.sleep(3 * LOOK_AGAIN_S)
+    await asyncio.sleep(3 * HUB_RETRY_DELAY_S)
     publishing.cancel()
     await asyncio.gather(publishing, return_exceptions=True)
     assert said.empty()

@@ -16,7 +16,7 @@ from gateway.sim.model.firmware import Pose
 from gateway.sim.model.objects import Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
 from gateway.sim.world_file import WorldSpec, read_world
-from gateway.sim.yaml_reader import LARGEST_BYTES, BadWorld
+from gateway.sim.yaml_reader import MAX_WORLD_BYTES, BadWorld
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 EVERYTHING = """\
@@ -176,7 +176,7 @@ FAULTS = [
     ("\x00", ["1:1: a character that is not allowed"]),
     ("%YAML " + "9" * 5000 + ".1\n---\na: 1", ["is no YAML"]),
     ("room: {width_m: " + "9" * 5000 + ", depth_m: 1}", ["1:17: room.width_m: '9999"]),
-    ("#" * (LARGEST_BYTES + 1), ["1:1: has more than 64 KiB"]),
+    ("#" * (MAX_WORLD_BYTES + 1), ["1:1: has more than 64 KiB"]),
     ("walls: [" + "[0, 0, 1, 1], " * 250 + "]", ["walls: has 250 of them: at most 200"]),
     ("- 1", ["1:1: a list is not allowed: write fields"]),
 ]
@@ -276,7 +276,7 @@ def test_a_good_file_with_something_changed_is_a_world_or_a_list_of_faults(chanc
     [
         ("nothing.yaml", None, "No such file or directory: write room, open or the path of a file"),
         ("bytes.yaml", b"room: \xff", "is no UTF-8"),
-        pytest.param("large.yaml", b"\xff" * 2 * LARGEST_BYTES, "has more than 64 KiB", id="large.yaml"),
+        pytest.param("large.yaml", b"\xff" * 2 * MAX_WORLD_BYTES, "has more than 64 KiB", id="large.yaml"),
         ("faulty.yaml", b"foo: 1\nbar: 2\n", "faulty.yaml:2:1: bar: is not known here"),
         ("carried.yaml", b"lamps: {a: {carried_by: blue}}", "no car or thing 'blue' is simulated here: use red"),
     ],

@@ -3,7 +3,7 @@
 import pytest
 
 from gateway.control.estimate.mode import CONTRADICTING_FRAMES, ModeEstimator, Verdict
-from gateway.protocol.decoder import SILENCE_S, Decoder, Sensors
+from gateway.protocol.decoder import MISSING_END_SILENCE_S, Decoder, Sensors
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import parse_platform
 
@@ -24,7 +24,7 @@ SETTLED_S = {mode: BLOCK_S + (0.1 if mode is Mode.MANUAL else 1.0) for mode in M
 
 def reading(shape: bytes, at: float) -> Sensors:
     decoder = Decoder()
-    event = (decoder.feed(shape, at) + decoder.tick(at + SILENCE_S))[0]
+    event = (decoder.feed(shape, at) + decoder.tick(at + MISSING_END_SILENCE_S))[0]
     assert isinstance(event, Sensors)
     return event
 

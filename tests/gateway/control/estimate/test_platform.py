@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.estimate.platform import EVIDENCE_FRAMES, PlatformDetector
-from gateway.protocol.decoder import SILENCE_S, Decoder
+from gateway.protocol.decoder import MISSING_END_SILENCE_S, Decoder
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Event
 from gateway.protocol.platforms import parse_platform
@@ -24,7 +24,7 @@ ARM = "$4WD,J190,J290,J390,J490,J590,J690#"
 
 def event_of(text: str) -> Event:
     decoder = Decoder()
-    return (decoder.feed(wire(text), 1.0) + decoder.tick(1.0 + SILENCE_S))[0]
+    return (decoder.feed(wire(text), 1.0) + decoder.tick(1.0 + MISSING_END_SILENCE_S))[0]
 
 
 def hear(truth: PlatformDetector, *frames: str) -> list[str]:

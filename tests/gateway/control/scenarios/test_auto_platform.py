@@ -5,7 +5,7 @@ import pytest
 from gateway.control.commands import Drive, SetMode, Stop
 from gateway.control.controller import Controller
 from gateway.protocol.enums import Mode, Motion
-from gateway.protocol.platforms import parse_platform, parse_told
+from gateway.protocol.platforms import parse_platform, parse_platform_option
 from gateway.sim.model.raspberry_pi import Transport
 from tests.support.virtual import Pair
 
@@ -13,7 +13,7 @@ from tests.support.virtual import Pair
 def paired(platform: str) -> Pair:
     transport = Transport.TCP if platform == "raspberry_pi" else Transport.SERIAL
     pair = Pair(platform, transport=transport)
-    profile, auto = parse_told("auto")
+    profile, auto = parse_platform_option("auto")
     pair.control = Controller("red", profile, auto=auto)
     pair.connect()
     return pair
@@ -66,13 +66,13 @@ def test_a_link_that_comes_back_may_have_another_car_behind_it() -> None:
 
 @pytest.mark.parametrize(("told", "name"), [("auto", "unknown"), ("auto+arm", "unknown+arm"), ("stm32", "stm32")])
 def test_auto_is_the_unknown_platform_until_then(told: str, name: str) -> None:
-    profile, auto = parse_told(told)
+    profile, auto = parse_platform_option(told)
     assert (profile.name, auto) == (name, told.startswith("auto"))
 
 
 def test_a_platform_that_is_none_says_which_there_are() -> None:
     with pytest.raises(ValueError, match=r"'uno' is not known, allowed are arduino.*; or auto, to find out"):
-        parse_told("uno")
+        parse_platform_option("uno")
 
 
 def test_a_contradicted_profile_is_told_of_once() -> None:

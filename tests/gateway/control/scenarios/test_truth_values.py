@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gateway.control.commands import Drive, Fan, SetMode, Stop
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.events import Event, Sensors
-from gateway.protocol.parser import fullmatch_sensors, sensors
+from gateway.protocol.parser import fullmatch_sensors, read_sensors
 from gateway.protocol.platforms import parse_platform
 from tests.support.truth import WORLDS, car_in, frame_of
 from tests.support.virtual import Pair
@@ -166,6 +166,6 @@ def test_a_damaged_frame_publishes_no_filler_while_its_mode_is_confirmed(mode: M
     found = fullmatch_sensors(text[:place] + other + text[place + 1 :])
     if found:
         for terminated in (True, False):
-            event = sensors(found, 1.0, terminated=terminated)
+            event = read_sensors(found, 1.0, terminated=terminated)
             for platform in ("arduino", "stm32", "unknown"):
                 assert parse_platform(platform).measured(event, mode) <= MEASURED[mode], event.raw

@@ -4,7 +4,7 @@ from math import inf
 
 import pytest
 
-from gateway.sim.model.capture_car import PAUSE_S, CaptureCar
+from gateway.sim.model.capture_car import LOOP_PAUSE_S, CaptureCar
 
 PIECES = [(0.5, b"a"), (0.5, b"b"), (2.5, b"c")]
 
@@ -35,9 +35,9 @@ def test_one_late_look_gives_all_that_was_due() -> None:
 def test_a_loop_begins_again_after_a_pause(pieces: list[tuple[float, bytes]]) -> None:
     played = CaptureCar(pieces, rate=2.0, loop=True, now=0.0)
     times = [at for at, _ in heard(played, 20.0)]
-    length = (pieces[-1][0] + PAUSE_S) / 2
+    length = (pieces[-1][0] + LOOP_PAUSE_S) / 2
     assert times[: len(pieces) * 2] == pytest.approx([start + at / 2 for start in (0.0, length) for at, _ in pieces])
-    assert played.rounds == int((20.0 + PAUSE_S / 2 + 1e-9) / length)
+    assert played.rounds == int((20.0 + LOOP_PAUSE_S / 2 + 1e-9) / length)
     assert not played.done
 
 

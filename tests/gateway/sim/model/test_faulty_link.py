@@ -7,7 +7,7 @@ from math import inf
 import pytest
 
 from gateway.protocol.decoder import Decoder
-from gateway.sim.model.faulty_link import FLOOD_EVERY_S, TO_HOST_LIMIT, Direction, FaultyLink, Flood
+from gateway.sim.model.faulty_link import FLOOD_INTERVAL_S, TO_HOST_LIMIT, Direction, FaultyLink, Flood
 
 FRAME = b"$1,0,0,0,0,0,0,0,0#"
 
@@ -169,7 +169,7 @@ def test_a_firehose_that_nobody_looked_at_is_no_mountain() -> None:
     link = line()
     link.flood(Flood.NOISE, 1e6, 0.0, until=inf)
     assert sum(map(len, link.to_host(3600.0))) == 1_000_000
-    assert link.next_event() == pytest.approx(3600.0 + FLOOD_EVERY_S)
+    assert link.next_event() == pytest.approx(3600.0 + FLOOD_INTERVAL_S)
 
 
 def test_a_frame_that_never_ends_is_one_frame() -> None:

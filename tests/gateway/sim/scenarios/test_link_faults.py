@@ -234,7 +234,7 @@ async def test_a_path_stays_and_the_device_behind_it_is_another(cars: Simulation
 
 async def test_a_path_goes_and_another_comes(cars: Simulation, tmp_path: Path) -> None:
     named: list[str] = []
-    cars.cars["red"].moved = lambda car: named.append(car.url)
+    cars.cars["red"].on_renamed = lambda car: named.append(car.url)
     await cars.inflict(Fault(FaultKind.RENAME, "red", for_s=0.05, path=str(tmp_path / "other")))
     await until(lambda: named, "back")
     assert named == [f"serial://{tmp_path / 'other'}"]
@@ -250,7 +250,7 @@ async def test_a_renamed_plain_pty_and_tcp_car_say_where_they_are(cars: Simulati
     before = {name: cars.cars[name].url for name in ("plain", "green")}
     named: dict[str, str] = {}
     for name in before:
-        cars.cars[name].moved = lambda car: named.__setitem__(car.spec.name, car.url)
+        cars.cars[name].on_renamed = lambda car: named.__setitem__(car.spec.name, car.url)
         await cars.inflict(Fault(FaultKind.RENAME, name, for_s=0.0))
     await until(lambda: len(named) == 2, "back")
     assert all(named[name] == cars.cars[name].url != before[name] for name in before)
@@ -270,7 +270,7 @@ async def test_a_path_that_is_taken_or_nowhere_is_refused_and_the_car_stays(cars
 
 async def test_a_path_that_is_taken_while_a_link_is_gone_is_told(cars: Simulation, tmp_path: Path) -> None:
     told: list[str] = []
-    cars.cars["red"].failed = lambda _, error: told.append(str(error))
+    cars.cars["red"].on_failed = lambda _, error: told.append(str(error))
     await cars.inflict(Fault(FaultKind.LINK_DROP, "red", for_s=0.2))
     (tmp_path / "red").write_text("precious")
     await until(lambda: told, "told")

@@ -1,0 +1,164 @@
+"""Link URLs: the kinds of links and the only parser of their text. Pure; nothing is opened."""
+
+import re
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import parse_qs, quote, unquote, urlsplit
+
+BAUD: Final = 9600  # docs/reference/protocol.md#framing: UART 9600 8N1
+LINK_FORMS: Final = (
+    "/dev/ttyUSB0 or COM3 (also as serial:///dev/ttyUSB0?baud=9600), "
+    "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://HOST:PORT, "
+    "ble://AA:BB:CC:DD:EE:FF (macOS: a UUID), ble://name=BT04 (`gateway scan` shows them)"
+)
+"""All forms of a link, for a message or help text."""
+_BAUDS: Final = range(300, 4_000_001)
+WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
+_USB_ID: Final = re.compile(r"(?:0[xX])?([0-9a-fA-F]{4})")
+_USB_FIELDS: Final = ("vid", "pid", "serial")
+_BLE_ADDRESS: Final = re.compile(r"[0-9A-F]{2}(:[0-9A-F]{2}){5}|[0-9A-F]{8}(-[0-9A-F]{4}){3}-[0-9A-F]{12}")
+# Core Specification, vol. 3, part C, 3.2.2
+_BLE_NAME_BYTES: Final = 248
+"""Maximum length of the name of a Bluetooth device."""
+
+
+class BadLink(ValueError):
+    """Text that is no link. The message is the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class SerialUrl:
+    """A serial port by its device path."""
+
+    path: str
+    baud: int = BAUD
+
+    def __str__(self) -> str:
+        return f"serial://{self.path}" + ("" if self.baud == BAUD else f"?baud={self.baud}")
+
+
+@dataclass(frozen=True, slots=True)
+class UsbUrl:
+    """A serial port by the ids of its USB device, wherever it is plugged in. At least one id is set.
+
+    vid, pid: 0 to 0xFFFF. serial: the whole serial number of the device.
+    """
+
+    vid: int | None = None
+    pid: int | None = None
+    serial: str | None = None
+    baud: int = BAUD
+
+    def fits(self, vid: int | None, pid: int | None, serial: str | None) -> bool:
+        """Return True if a device with these ids may be the one."""
+        return self.vid in (None, vid) and self.pid in (None, pid) and self.serial in (None, serial)
+
+    def __str__(self) -> str:
+        ids = [f"{name}={value:04x}" for name, value in (("vid", self.vid), ("pid", self.pid)) if value is not None]
+        number = [] if self.serial is None else [f"serial={quote(self.serial, safe='')}"]
+        baud = [] if self.baud == BAUD else [f"baud={self.baud}"]
+        return "serial://?" + "&".join(ids + number + baud)
+
+
+@dataclass(frozen=True, slots=True)
+class TcpUrl:
+    """A car or a bridge that listens on TCP."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"tcp://{host}:{self.port}"
+
+
+@dataclass(frozen=True, slots=True)
+class BleUrl:
+    """A car's Bluetooth LE module, by its address in capitals (on macOS: its UUID there) or by its name."""
+
+    address: str | None = None
+    name: str | None = None
+
+    def __str__(self) -> str:
+        return f"ble://{self.address}" if self.name is None else f"ble://name={quote(self.name, safe='')}"
+
+
+LinkUrl = SerialUrl | UsbUrl | TcpUrl | BleUrl
+
+
+def parse_link(text: str) -> LinkUrl:
+    """Return the link with this URL or bare device path; raise BadLink."""
+    if not text.isprintable():  # urlsplit drops a line feed without an error
+        raise BadLink("it has characters that cannot be printed")
+    if text.startswith("/") or WINDOWS_PORT.fullmatch(text):
+        return SerialUrl(text)
+    if text[:6].lower() == "ble://":  # urlsplit would take the colons of an address for a port
+        return _ble(text[6:])
+    try:
+        parts = urlsplit(text)
+        port = parts.port if parts.scheme == "tcp" else None
+    except ValueError as error:
+        raise BadLink(str(error)) from None
+    if parts.scheme == "serial":
+        if parts.fragment:
+            raise BadLink("a # is written %23, and that only in a serial number")
+        return _serial(parts.netloc, parts.path, parts.query)
+    if parts.scheme == "tcp":
+        if not parts.hostname or not port:
+            raise BadLink("a host and a port from 1 to 65535 are needed")
+        if parts.path or parts.query or parts.fragment or parts.username is not None:
+            raise BadLink("nothing may follow the port")
+        return TcpUrl(parts.hostname, port)
+    raise BadLink(f"{parts.scheme}:// is no kind of link" if parts.scheme else "it is neither a URL nor a device path")
+
+
+def _serial(netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:
+    fields = parse_qs(query.replace("+", "%2B"), keep_blank_values=True)  # a + is a +, not a blank
+    if unknown := sorted(fields.keys() - {"baud", *_USB_FIELDS}):
+        raise BadLink(f"{', '.join(unknown)} is no option of a serial link")
+    if twice := sorted(name for name, values in fields.items() if len(values) > 1):
+        raise BadLink(f"{', '.join(twice)} is given twice")
+    options = {name: values[0] for name, values in fields.items()}
+    baud = _baud(options.pop("baud", str(BAUD)))
+    if path.strip("/") or netloc:
+        if netloc and path.strip("/"):
+            raise BadLink("three slashes come before a device path")
+        if netloc and not WINDOWS_PORT.fullmatch(netloc):
+            raise BadLink("it names no device")
+        if options:
+            ids = ", ".join(name for name in _USB_FIELDS if name in options)
+            raise BadLink(f"it names a device path, and {ids} too: one of the two")
+        return SerialUrl(path or netloc, baud)
+    if not options:
+        raise BadLink("it names no device")
+    if options.get("serial") == "":
+        raise BadLink("serial= is empty")
+    return UsbUrl(_usb_id("vid", options), _usb_id("pid", options), options.get("serial"), baud)
+
+
+def _baud(text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and len(text) < 10) or int(text) not in _BAUDS:
+        raise BadLink(f"baud={text} is not from {_BAUDS.start} to {_BAUDS.stop - 1}")
+    return int(text)
+
+
+# Four hexadecimal digits, with or without 0x, as lsusb and every list of devices writes them. Decimal is not accepted:
+# 2341 is the vendor of an Arduino in hexadecimal, and looks like a decimal number.
+def _usb_id(name: str, options: dict[str, str]) -> int | None:
+    if name not in options:
+        return None
+    found = _USB_ID.fullmatch(options[name])
+    if found is None:
+        raise BadLink(f"{name}={options[name]} is not four hexadecimal digits")
+    return int(found[1], 16)
+
+
+def _ble(rest: str) -> BleUrl:
+    if rest.startswith("name="):
+        name = unquote(rest[5:])
+        if not name or not name.isprintable() or len(name.encode()) > _BLE_NAME_BYTES:
+            raise BadLink(f"a name has 1 to {_BLE_NAME_BYTES} bytes, and can be printed")
+        return BleUrl(name=name)
+    if _BLE_ADDRESS.fullmatch(rest.upper()) is None:
+        raise BadLink("it names no Bluetooth address, and no name=")
+    return BleUrl(address=rest.upper())
