@@ -80,7 +80,7 @@ def to_bus(
     from fleet.recording import time_spec
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.summary import of_session
-    from fleet.replay.player.player import PAUSE_NS, NameTaken, Player
+    from fleet.replay.player.player import LOOP_PAUSE_NS, NameTaken, Player
     from fleet.replay.player.schedule import Schedule
     from schemas.bus import Bus
 
@@ -137,7 +137,7 @@ def to_bus(
                     raise click.ClickException(f"{path} holds nothing there that is published again")
                 if not loop or stop.is_set():
                     break
-                schedule.again(PAUSE_NS)
+                schedule.again(LOOP_PAUSE_NS)
                 from_ns = part.start_ns
             told.end()
     took_s = time.monotonic() - origin_s

@@ -129,11 +129,11 @@ def record(
             option = "--json" if asked[0] == "as_json" else f"--{asked[0].replace('_', '-')}"
             raise click.UsageError(f"{option} goes behind {ctx.invoked_subcommand!r}, if it has it", ctx)
         return
-    from fleet.recording.session_dir import FLEET_FILE, PLAN
+    from fleet.recording.session_dir import FLEET_FILE, PLAN_FILE
     from fleet.recording.writing.recorder import AnotherRecorder, Recorder, RecordingFailed
     from fleet.recording.writing.session_writer import Options, Sync
 
-    copied = {FLEET_FILE: fleet_file, PLAN: plan}
+    copied = {FLEET_FILE: fleet_file, PLAN_FILE: plan}
     if session_size and quota and session_size > quota // 2:
         raise click.BadParameter(
             f"{session_size / 10**6:g} MB is more than half of --quota, which is kept by removing whole sessions: "
@@ -155,7 +155,7 @@ def record(
     signals.calls(stop.set)
     try:
         with Bus.open(connect, start_hub=True) as bus:
-            recorder = Recorder(bus, fleet, out, options, tell=_warn)
+            recorder = Recorder(bus, fleet, out, options, notify=_warn)
             session = recorder.start()
             if full := recorder.full:
                 _say(as_json, {"session": str(session), "state": "full"}, f"fleet {fleet} waits for room: {full}")

@@ -8,7 +8,7 @@ from google.protobuf.json_format import MessageToDict
 
 from fleet.client.client import default_sender
 from fleet.commands.options import bus_options, json_option
-from fleet.recording.writing.recorder import LONGEST_MARK
+from fleet.recording.writing.recorder import MAX_MARK_CHARACTERS
 from schemas import keys, messages
 from schemas.bus import Bus, Failure
 
@@ -80,7 +80,7 @@ def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @bus_options
 def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
     """Write TEXT into the recording, at this moment; a marked session is spared by the quota."""
-    if not text.strip() or len(text) > LONGEST_MARK:
-        raise click.UsageError(f"TEXT must have 1 to {LONGEST_MARK} characters, and not only blanks")
+    if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
+        raise click.UsageError(f"TEXT must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
     found = _ask("mark", connect, fleet, text=text, by=by or default_sender())
     click.echo(f"marked in {found.session}")

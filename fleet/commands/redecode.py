@@ -65,14 +65,14 @@ class _RedecodeReport:
     """One run: where the frames come from, and what came of it."""
 
     def __init__(self, path: Path, cars: tuple[str, ...], platform: str | None) -> None:
-        from fleet.replay.analysis.recorded_frames import Unread
+        from fleet.replay.analysis.recorded_frames import SkippedMessages
 
         self._path = path
         self._cars = cars
         self._platform = platform
         self._items: Iterable[tuple[str, Item]] = ()
         self._session: Session | None = None
-        self._unread: Unread = Unread()
+        self._unread: SkippedMessages = SkippedMessages()
         self.counts: dict[str, Counts] = {}
         self.start_ns = 0
 
@@ -88,12 +88,12 @@ class _RedecodeReport:
         from fleet.commands.sessions import part_of, watched
         from fleet.recording.reading.session import Session
         from fleet.recording.tools.summary import of_session as overview
-        from fleet.replay.analysis.recorded_frames import KEYS, of_session
+        from fleet.replay.analysis.recorded_frames import FRAME_KEYS, of_session
 
         self._session = session = Session.open(self._path)
         part_of(session, None, None, self._cars)  # says what is not there
         self.start_ns = overview(session).start_ns
-        wanted = [f"*/{car}/{key.split('/', 2)[2]}" for car in self._cars or ("*",) for key in KEYS]
+        wanted = [f"*/{car}/{key.split('/', 2)[2]}" for car in self._cars or ("*",) for key in FRAME_KEYS]
         self._items = of_session(watched("redecode", None)(session.messages(keys=wanted)), self._unread)
 
     def differences(self) -> Iterator["ReadingDifference"]:
@@ -196,7 +196,7 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.summary import of_session as overview
     from fleet.replay.analysis import test_vector as vectors
-    from fleet.replay.analysis.recorded_frames import KEYS, Rx, Unread, of_session
+    from fleet.replay.analysis.recorded_frames import FRAME_KEYS, Rx, SkippedMessages, of_session
 
     if out.suffix != vectors.ENDING:
         raise click.UsageError(f"--out {out}: a vector's name ends in {vectors.ENDING}")
@@ -206,10 +206,10 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
         about = overview(found)
     except NoSession as error:
         raise click.ClickException(str(error)) from None
-    wanted = [f"*/{car}/{key.split('/', 2)[2]}" for key in KEYS]
+    wanted = [f"*/{car}/{key.split('/', 2)[2]}" for key in FRAME_KEYS]
     before_ns = None if part.start_ns is None else part.start_ns - vectors.BEFORE_NS
     after_ns = None if part.end_ns is None else part.end_ns + vectors.BEFORE_NS
-    recorded = of_session(found.messages(wanted, before_ns, after_ns), Unread())
+    recorded = of_session(found.messages(wanted, before_ns, after_ns), SkippedMessages())
     items = [*vectors.stretch((item for _, item in recorded), part.start_ns or 0, part.end_ns)]
     frames = sum(isinstance(item, Rx) for item in items)
     if not frames:

@@ -113,7 +113,9 @@ class _ReplanReport:
         about = of_session(self._session)
         self.origin_ns = about.start_ns
         self._runs = [
-            run for run in recorded_decisions.runs(self._session.messages(recorded_decisions.KEYS)) if run.said
+            run
+            for run in recorded_decisions.runs(self._session.messages(recorded_decisions.DECISION_KEYS))
+            if run.decisions
         ]
         if not self._runs:
             damage = f" ({self._session.damage_words})" if self._session.damage else ""
@@ -122,7 +124,7 @@ class _ReplanReport:
                 f"there is nothing to compare a plan with{damage}"
             )
         self._refuse_without_cars()
-        tokens = recorded_decisions.presence(self._session.messages(recorded_decisions.STATES), about.end_ns)
+        tokens = recorded_decisions.presence(self._session.messages(recorded_decisions.STATE_KEYS), about.end_ns)
         kept = PersistedPolicy()
         for run in self._runs:
             if not run.plans and (self._session.path / "plan.yaml").is_file():
@@ -145,7 +147,9 @@ class _ReplanReport:
         left = origin_of(self._session).get("cars")
         if not left:
             return
-        decided = {car for run in self._runs for car in (*run.roles, *(each for each in run.said if " " not in each))}
+        decided = {
+            car for run in self._runs for car in (*run.roles, *(each for each in run.decisions if " " not in each))
+        }
         if others := sorted(decided - {*left, "phase"}):
             raise click.ClickException(
                 f"{self._session.path} was cut to {', '.join(left)}: what was decided then was decided with "
@@ -154,13 +158,13 @@ class _ReplanReport:
 
     def _one(self, run: "CoordinatorRun", again: "Replanning", tokens: "list[PresenceToken]") -> Any:
         from fleet.replay.analysis.recorded_decisions import differences
-        from fleet.replay.analysis.replan import BEFORE_NS, wanted_keys
+        from fleet.replay.analysis.replan import COORDINATOR_HISTORY_NS, keys_for
 
-        wanted = wanted_keys(run.fleet, (plan for _, plan in again.plans))
-        messages = self._session.messages(wanted, run.start_ns - BEFORE_NS, run.end_ns + 1)
+        wanted = keys_for(run.fleet, (plan for _, plan in again.plans))
+        messages = self._session.messages(wanted, run.start_ns - COORDINATOR_HISTORY_NS, run.end_ns + 1)
         kept = again.go(messages, tokens)
-        self._decisions += sum(map(len, run.said.values()))
-        for each in differences(run.said, again.said, run.start_ns, run.end_ns):
+        self._decisions += sum(map(len, run.decisions.values()))
+        for each in differences(run.decisions, again.decisions, run.start_ns, run.end_ns):
             if not run.whole and (each.then is None or (each.now is None and self._plan is None)):
                 continue  # said before the recording began
             if each.to_ns - each.from_ns > self._tolerance_ns:

@@ -100,10 +100,10 @@ def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
 
 def _part(session: "Session", cars: tuple[str, ...], start: str | None, end: str | None) -> "Part":
     quiet_rerun()
-    from fleet.replay.rerun.export import EVERYTHING, Part
+    from fleet.replay.rerun.export import WHOLE_SESSION, Part
 
     if not cars and start is None and end is None:
-        return EVERYTHING
+        return WHOLE_SESSION
     from fleet.commands.sessions import part_of
 
     selection = part_of(session, start, end, cars)
@@ -174,5 +174,5 @@ def _view(rrd: Path) -> int:
         except KeyboardInterrupt:
             return startup.INTERRUPTED
         if code:
-            click.echo(f"fleet: Rerun's viewer ended with {code}: {viewer.last_words}", err=True)
+            click.echo(f"fleet: Rerun's viewer ended with {code}: {viewer.last_error}", err=True)
         return 1 if code else 0

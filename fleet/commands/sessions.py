@@ -337,13 +337,13 @@ def export(session: Path, csv: Path | None, parquet: Path | None) -> None:
     from fleet.recording.tools.export import export as write
     from fleet.recording.tools.summary import total
     from fleet.recording.tools.table_formats import FORMATS
-    from fleet.recording.tools.transform import made_whole
+    from fleet.recording.tools.transform import atomic_directory
 
     wanted = {name: out for name, out in (("csv", csv), ("parquet", parquet)) if out is not None}
     if not wanted or csv == parquet:
         raise click.UsageError("say where to, and as what: --csv DIR, --parquet DIR, or both (two directories)")
     for name, out in wanted.items():
-        with _explained(out), made_whole(out) as new:
+        with _explained(out), atomic_directory(out) as new:
             found = _open(session)
             done = write(watched(f"export {name}", total(found))(found.rows()), new, FORMATS[name])
         click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")

@@ -79,13 +79,13 @@ def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, co
 def _follow(
     connect: str | None, fleet: str, save: Path | None, memory: str, seconds: float | None, *, web: bool
 ) -> None:
-    from fleet.replay.rerun.live import BATCH_S, SHOWN_S, Live
+    from fleet.replay.rerun.live import DEFAULT_VIEW_S, VIEW_INTERVAL_S, Live
     from schemas.bus import Bus
 
     stop = threading.Event()
     until = time.monotonic() + seconds if seconds is not None else None
     with _signals(stop), Bus.open(connect) as bus, _sink(save, memory, web=web) as (viewer, sink):
-        live = Live(bus, fleet, sink, last_s=None if save is not None else SHOWN_S)
+        live = Live(bus, fleet, sink, last_s=None if save is not None else DEFAULT_VIEW_S)
         try:
             live.start()
             pause = SETTLE_S
@@ -93,12 +93,12 @@ def _follow(
                 live.step()
                 if until is not None and time.monotonic() > until:
                     break
-                pause = BATCH_S
+                pause = VIEW_INTERVAL_S
         finally:
             live.close(send=viewer is None or viewer.ended is None)
         lost = f"; {live.dropped} were left out, the viewer was too slow" if live.dropped else ""
         words = f"{save}: " if save is not None else ""
-        click.echo(f"{words}{live.held} messages of {len(live.cars)} cars{lost}", err=save is None)
+        click.echo(f"{words}{live.sent} messages of {len(live.cars)} cars{lost}", err=save is None)
 
 
 @contextmanager
@@ -119,7 +119,7 @@ def _signals(stop: threading.Event) -> Iterator[None]:
 @contextmanager
 def _sink(save: Path | None, memory: str, *, web: bool) -> "Iterator[tuple[Viewer | None, Callable[[Any], None]]]":
     """Where it goes: a file, or a viewer that is up."""
-    from fleet.replay.rerun.viewer import LOOPBACK, Viewer, free_port
+    from fleet.replay.rerun.viewer import VIEWER_HOST, Viewer, free_port
 
     if save is not None:
         yield None, lambda recording: recording.save(save)
@@ -132,7 +132,7 @@ def _sink(save: Path | None, memory: str, *, web: bool) -> "Iterator[tuple[Viewe
         arguments = ["--expect-data-soon", "--hide-welcome-screen"]
     with Viewer("--port", str(port), *bounded, *arguments) as viewer:
         viewer.wait_until_it_listens(page if web else port)
-        url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+        url = f"rerun+http://{VIEWER_HOST}:{port}/proxy"
         if web:
-            click.echo(f"http://{LOOPBACK}:{page}/?url={url.replace('+', '%2B')}")
+            click.echo(f"http://{VIEWER_HOST}:{page}/?url={url.replace('+', '%2B')}")
         yield viewer, lambda recording: recording.connect_grpc(url)

@@ -1,4 +1,7 @@
-"""Sessions on disk: MCAP segments and what belongs to them. `open_session` is for scripts."""
+"""Records, reads and converts sessions: directories with MCAP segments. Scripts use `open_session`.
+
+Read `session_dir` first, then the packages `writing`, `reading` and `tools`.
+"""
 
 from os import PathLike
 from pathlib import Path
@@ -11,10 +14,10 @@ __all__ = ["open_session"]
 
 
 def open_session(path: str | PathLike[str]) -> "Session":
-    """Open a recorded session, a directory or an .mcap, to read it; raises fleet.recording.reading.session.NoSession.
+    """Open a session directory or .mcap file for reading; raises fleet.recording.reading.session.NoSession.
 
-    `session.messages(keys=..., start_ns=..., end_ns=...)` yields its messages, `session.damage_words` says afterwards
-    what could not be read.
+    `session.messages(keys=..., start_ns=..., end_ns=...)` yields its messages. Afterwards `session.damage_words`
+    describes what could not be read.
     """
     from fleet.recording.reading.session import Session
 

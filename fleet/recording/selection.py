@@ -1,4 +1,4 @@
-"""Which messages of a session are meant: by key expression and by the recorder's time. Pure; no files here."""
+"""Selects messages of a session by key expression and by time of the recorder's clock. Pure; reads no files."""
 
 import re
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from typing import Final, Self
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Messages of some keys, from `start_ns` until before `end_ns` of the recorder's clock; None: no bound."""
+    """Selection by keys and by time from `start_ns` (included) to `end_ns` (excluded). None: no limit."""
 
     keys: tuple[str, ...] | None = None
     start_ns: int | None = None
@@ -17,21 +17,21 @@ class Selection:
 
     @classmethod
     def of(cls, keys: Iterable[str] | None, start_ns: int | None, end_ns: int | None) -> Self:
-        """As `Session.messages` takes it; one key may be given as it is."""
+        """Build a selection from the arguments of `Session.messages`. `keys` may be a single key."""
         if isinstance(keys, str):
             keys = (keys,)
         return cls(None if keys is None else tuple(keys), start_ns, end_ns)
 
     def has_key(self, key: str) -> bool:
-        """Whether messages of this key are meant."""
+        """Return True if messages of this key are selected."""
         return self.keys is None or any(matches(expression, key) for expression in self.keys)
 
     def overlaps(self, first_ns: int, last_ns: int) -> bool:
-        """Whether some of what lies between two times, both included, can be meant."""
+        """Return True if a time between these two, both included, is selected."""
         return (self.start_ns is None or last_ns >= self.start_ns) and (self.end_ns is None or first_ns < self.end_ns)
 
     def has_time(self, at_ns: int) -> bool:
-        """Whether messages of this time are meant."""
+        """Return True if messages of this time are selected."""
         return self.overlaps(at_ns, at_ns)
 
 
@@ -39,9 +39,9 @@ EVERYTHING: Final = Selection()
 
 
 def matches(expression: str, key: str) -> bool:
-    """Whether a key is the one that is written, or matches a key expression of the bus.
+    """Return True if a key equals or matches a key expression of the bus.
 
-    `*` is one chunk, `**` any number of them, `$*` any part of one; none of them matches a chunk that begins with @.
+    `*` matches one chunk, `**` any number of chunks, `$*` any part of a chunk. None matches a chunk that begins with @.
     """
     return expression == key or ("*" in expression and _pattern(expression).fullmatch(f"{key}/") is not None)
 

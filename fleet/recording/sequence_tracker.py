@@ -1,120 +1,205 @@
-"""Which publications of a key there are, by their publishers' numbers: what is missing, what comes twice. Pure.
+"""Tracks the sequence numbers of publishers: gaps, duplicates, late messages. Pure.
 
-Publishers count from 1, modulo 2^32. What was missed may be had again (`schemas.bus.Bus.recall`); it comes late then,
-and perhaps along with what was not missed.
+The recorder uses `SequenceTracker` to request backfills, `sessions verify` uses `PublisherSequence` to report losses.
 """
 
 from collections.abc import Hashable
+from dataclasses import dataclass, field
 from typing import Final
 
-SENDERS: Final = 16
-"""Whose numbers are remembered per key: every `fleet drive` is a sender of its own."""
-HOLES: Final = 256
-LATE: Final = 512
-"""Publications had again before they came: those may still be under way. What a publisher holds, twice."""
-_WRAP: Final = 1 << 32
-_BACKWARDS: Final = 1 << 31
+MAX_SENDERS: Final = 16
+"""Maximum senders to remember per key: each `fleet drive` is a new one."""
+MAX_OPEN_GAPS: Final = 256
+"""Maximum gaps of one sender that a backfill may close. Older ones are only counted."""
+MAX_LISTED_GAPS: Final = 1000
+"""Maximum gaps of one publisher to list. Later ones are only counted."""
+MAX_EARLY_BACKFILLS: Final = 512
+"""Maximum backfilled messages to remember whose originals may still arrive: twice the cache of a publisher."""
+_MODULO: Final = 1 << 32
+_BACKWARD: Final = 1 << 31
+
+
+@dataclass(slots=True)
+class Gap:
+    """Missing messages `first` to `last`, and the receive times between which they should have come."""
+
+    first: int
+    last: int
+    after_ns: int = 0
+    before_ns: int = 0
+
+    @property
+    def count(self) -> int:
+        """Return the number of missing messages."""
+        return self.last - self.first + 1
+
+
+def _fill(gaps: list[Gap], number: int) -> bool:
+    """Remove a number from the gap that contains it. Return False if no gap does."""
+    for place in range(len(gaps) - 1, -1, -1):
+        gap = gaps[place]
+        if gap.first <= number <= gap.last:
+            parts = (
+                Gap(gap.first, number - 1, gap.after_ns, gap.before_ns),
+                Gap(number + 1, gap.last, gap.after_ns, gap.before_ns),
+            )
+            gaps[place : place + 1] = [part for part in parts if part.count > 0]
+            return True
+    return False
 
 
 class SequenceTracker:
-    """One key's. Who writes each message looks at `last` first: a number that follows the last one needs no more."""
+    """Tracks the live and backfilled messages of one key. Numbers count from 1, modulo 2^32.
 
-    __slots__ = ("_first", "_holes", "_late", "_lost", "last")
+    The caller of each message first compares with `last`: a consecutive number needs no call.
+    """
+
+    __slots__ = ("_early", "_first", "_gaps", "_lost", "last")
 
     def __init__(self) -> None:
         self.last: dict[Hashable, int] = {}
         self._first: dict[Hashable, int] = {}
-        self._holes: dict[Hashable, list[tuple[int, int]]] = {}
-        self._late: dict[tuple[Hashable, int], int] = {}
+        self._gaps: dict[Hashable, list[Gap]] = {}
+        self._early: dict[tuple[Hashable, int], int] = {}
         self._lost = 0
 
     @property
     def missing(self) -> int:
-        """How many numbers are missing."""
-        return self._lost + sum(high - low + 1 for holes in self._holes.values() for low, high in holes)
+        """Return the number of missing messages."""
+        return self._lost + sum(gap.count for gaps in self._gaps.values() for gap in gaps)
 
     @property
-    def open(self) -> bool:
-        """Whether some may still be had again."""
-        return bool(self._holes)
+    def has_gaps(self) -> bool:
+        """True if a backfill may still close a gap."""
+        return bool(self._gaps)
 
-    def live(self, sender: Hashable, number: int, published_ns: int) -> bool:
-        """Take a number that does not follow its sender's last one; False if this publication was had already."""
+    def add_live(self, sender: Hashable, number: int, published_ns: int) -> bool:
+        """Add a message that is not consecutive. Return False if it was backfilled before."""
         last = self.last.get(sender)
         if last is None:
             self._begin(sender, number)
             return True
-        ahead = (number - last) % _WRAP
-        if 0 < ahead < _BACKWARDS:
+        ahead = (number - last) % _MODULO
+        if 0 < ahead < _BACKWARD:
             self._skip(sender, last, ahead)
             self.last[sender] = number
             return True
-        if self._late.get((sender, number)) == published_ns:
-            del self._late[sender, number]
+        if self._early.get((sender, number)) == published_ns:
+            del self._early[sender, number]
             return False
-        if self._fill(sender, number):  # overtaken by what was had again
+        if self._close(sender, number):  # a newer backfilled message came first
             return True
-        self._forget(sender)  # a new stream of the same sender, not a gap of four thousand million
+        self._forget(sender)  # the sender restarted its count: no gap of four billion messages
         self._begin(sender, number)
         return True
 
-    def recalled(self, sender: Hashable, number: int, published_ns: int) -> bool:
-        """Take a number that was asked for again; False if this publication was had already."""
+    def add_backfilled(self, sender: Hashable, number: int, published_ns: int) -> bool:
+        """Add a backfilled message. Return False if it is a duplicate."""
         last = self.last.get(sender)
         if last is None:
             self._begin(sender, number)
             self._expect(sender, number, published_ns)
-        elif 0 < (ahead := (number - last) % _WRAP) < _BACKWARDS:
+        elif 0 < (ahead := (number - last) % _MODULO) < _BACKWARD:
             self._skip(sender, last, ahead)
             self.last[sender] = number
             self._expect(sender, number, published_ns)
-        elif 0 < (before := (self._first[sender] - number) % _WRAP) < _BACKWARDS:
+        elif 0 < (before := (self._first[sender] - number) % _MODULO) < _BACKWARD:
             self._skip(sender, number, before)
             self._first[sender] = number
-        elif not self._fill(sender, number):
+        elif not self._close(sender, number):
             return False
         return True
 
     def _expect(self, sender: Hashable, number: int, published_ns: int) -> None:
-        """It may come yet. What newer ones overtook never does: publications of one publisher keep their order."""
-        self._late[sender, number] = published_ns
-        if len(self._late) > LATE:
-            del self._late[next(iter(self._late))]
+        """Remember a backfilled message whose original may still arrive."""
+        # Only the newest can arrive late: publications of one publisher keep their order.
+        self._early[sender, number] = published_ns
+        if len(self._early) > MAX_EARLY_BACKFILLS:
+            del self._early[next(iter(self._early))]
 
     def _begin(self, sender: Hashable, number: int) -> None:
-        """Its first number says nothing about what was missed before it."""
-        if len(self.last) >= SENDERS:
+        """Add a sender. Its first number does not show how many messages came before."""
+        if len(self.last) >= MAX_SENDERS:
             oldest = next(iter(self.last))
             self._forget(oldest)
             del self.last[oldest]
         self.last[sender] = self._first[sender] = number
 
     def _skip(self, sender: Hashable, below: int, distance: int) -> None:
-        """Note what lies between two numbers, both of which are there."""
+        """Add the gap between two received numbers."""
         if distance == 1:
             return
-        holes = self._holes.setdefault(sender, [])
-        low, high = (below + 1) % _WRAP, (below + distance - 1) % _WRAP
-        if low > high:  # over the wrap
-            holes.append((low, _WRAP - 1))
-            low = 0
-        holes.append((low, high))
-        while len(holes) > HOLES:
-            low, high = holes.pop(0)
-            self._lost += high - low + 1
+        gaps = self._gaps.setdefault(sender, [])
+        first, last = (below + 1) % _MODULO, (below + distance - 1) % _MODULO
+        if first > last:  # across the wrap
+            gaps.append(Gap(first, _MODULO - 1))
+            first = 0
+        gaps.append(Gap(first, last))
+        while len(gaps) > MAX_OPEN_GAPS:
+            self._lost += gaps.pop(0).count
 
-    def _fill(self, sender: Hashable, number: int) -> bool:
-        holes = self._holes.get(sender, [])
-        for place, (low, high) in enumerate(holes):
-            if low <= number <= high:
-                holes[place : place + 1] = [
-                    (one, other) for one, other in ((low, number - 1), (number + 1, high)) if one <= other
-                ]
-                if not holes:
-                    del self._holes[sender]
-                return True
-        return False
+    def _close(self, sender: Hashable, number: int) -> bool:
+        gaps = self._gaps.get(sender, [])
+        filled = _fill(gaps, number)
+        if filled and not gaps:
+            del self._gaps[sender]
+        return filled
 
     def _forget(self, sender: Hashable) -> None:
-        self._lost += sum(high - low + 1 for low, high in self._holes.pop(sender, []))
+        self._lost += sum(gap.count for gap in self._gaps.pop(sender, []))
         self._first.pop(sender, None)
+
+
+@dataclass(slots=True)
+class PublisherSequence:
+    """Tracks the recorded messages of one publisher on one key."""
+
+    restarts: bool = False
+    """True if the count may restart. Then a lower number is a new start, else a duplicate.
+
+    The `seq` of a payload never restarts within one `boot_id`. The number of Zenoh restarts with each publisher.
+    """
+    first: int = 0
+    last: int = 0
+    count: int = 0
+    duplicates: int = 0
+    unlisted: int = 0
+    """Missing messages beyond MAX_LISTED_GAPS."""
+    gaps: list[Gap] = field(default_factory=list)
+    _last_ns: int = 0
+
+    @property
+    def missing(self) -> int:
+        """Return the number of missing messages."""
+        return sum(gap.count for gap in self.gaps) + self.unlisted
+
+    def add(self, number: int, received_ns: int) -> bool:
+        """Add the next message in the order of the file. Return True if it is the newest."""
+        self.count += 1
+        if self.count == 1:
+            self.first = self.last = number
+        elif number == self.last + 1:
+            self.last = number
+        elif number > self.last:
+            self._add_gap(Gap(self.last + 1, number - 1, self._last_ns, received_ns))
+            self.last = number
+        elif _fill(self.gaps, number):
+            return False
+        elif self.restarts:
+            self.last = number
+        elif number < self.first:
+            if number < self.first - 1:
+                self._add_gap(Gap(number + 1, self.first - 1, received_ns, received_ns))
+            self.first = number
+            return False
+        else:
+            self.duplicates += 1
+            return False
+        self._last_ns = received_ns
+        return True
+
+    def _add_gap(self, gap: Gap) -> None:
+        if len(self.gaps) < MAX_LISTED_GAPS:
+            self.gaps.append(gap)
+        else:
+            self.unlisted += gap.count

@@ -1,20 +1,20 @@
-"""Times within a session as people write them: an offset from its start or end, or a date. Pure."""
+"""Parses times within a session as users type them: an offset from its start or end, or a date. Pure."""
 
 import re
 from datetime import UTC, datetime
 from typing import Final
 
 RULE: Final = "an offset from the start (90s, 1m30s, 1h, 500ms), from the end with - (-60s), or 2026-03-14T15:16:17Z"
-_PARTS: Final = {"h": 3_600_000_000_000, "m": 60_000_000_000, "s": 1_000_000_000, "ms": 1_000_000}
+_UNIT_NS: Final = {"h": 3_600_000_000_000, "m": 60_000_000_000, "s": 1_000_000_000, "ms": 1_000_000}
 _OFFSET: Final = re.compile(r"-?(?:\d+(?:\.\d+)?(?:ms|h|m|s))+|-?\d+(?:\.\d+)?")
 
 
 def at_ns(text: str, start_ns: int, end_ns: int) -> int:
-    """The time that is meant, ns since the epoch; a date without a zone is UTC. Raises ValueError, naming the rule."""
+    """Return the time in ns since the epoch. A date without a zone is UTC. Raises ValueError with the syntax."""
     if _OFFSET.fullmatch(text):
         size = 0.0
         for number, unit in re.findall(r"(\d+(?:\.\d+)?)(ms|h|m|s|)", text):
-            size += float(number) * _PARTS[unit or "s"]
+            size += float(number) * _UNIT_NS[unit or "s"]
         return end_ns - round(size) if text.startswith("-") else start_ns + round(size)
     try:
         when = datetime.fromisoformat(text)
@@ -27,16 +27,16 @@ def at_ns(text: str, start_ns: int, end_ns: int) -> int:
 
 
 def iso(ns: int) -> str:
-    """A time in ISO 8601, UTC, with milliseconds."""
+    """Return a time in ISO 8601, UTC, with milliseconds."""
     try:
         when = datetime.fromtimestamp(ns // 1_000_000_000, UTC)
     except (OverflowError, ValueError, OSError):
-        return f"{ns} ns"  # somebody else's clock
+        return f"{ns} ns"  # not a date: the clock of another writer was wrong
     return f"{when:%Y-%m-%dT%H:%M:%S}.{ns // 1_000_000 % 1000:03d}Z"
 
 
 def words(seconds: float) -> str:
-    """A length as people write it: 59.2s, 1m30s, 2h05m."""
+    """Return a duration as users write it: 59.2s, 1m30s, 2h05m."""
     if seconds < 60:
         return f"{seconds:.1f}s"
     minutes, rest = divmod(round(seconds), 60)

@@ -1,4 +1,4 @@
-"""One meaning has one colour, in every view. Pure."""
+"""Colors of cars, states and LEDs: one meaning has one color in every view. Pure."""
 
 from collections.abc import Iterable, Mapping
 from typing import Final
@@ -8,17 +8,17 @@ from schemas.topics import COMMANDS
 Rgb = tuple[int, int, int]
 
 OFF: Final[Rgb] = (70, 74, 82)
-"""A lamp or an LED that is off."""
+"""Color of a lamp or LED that is off."""
 
-_CARS: Final[Mapping[str, Rgb]] = {
+_CAR_COLORS: Final[Mapping[str, Rgb]] = {
     "red": (235, 80, 80), "green": (90, 200, 110), "blue": (90, 150, 250), "yellow": (235, 205, 70),
     "orange": (245, 150, 60), "white": (230, 230, 230), "black": (130, 130, 130), "pink": (245, 130, 190),
 }  # fmt: skip
-_OTHERS: Final[tuple[Rgb, ...]] = (
+_OTHER_COLORS: Final[tuple[Rgb, ...]] = (
     (80, 200, 200), (190, 130, 240), (245, 150, 60), (160, 200, 80), (230, 120, 160), (120, 160, 200),
 )  # fmt: skip
 
-STATES: Final[Mapping[str, int]] = {
+STATE_COLORS: Final[Mapping[str, int]] = {
     "true": 0x4FB477FF, "false": 0x30343BFF,
     "online": 0x4FB477FF, "quiet": 0x5C7FA3FF, "stale": 0xE0A030FF, "lost": 0xD9534FFF,
     "confirmed": 0x4FB477FF, "assumed": 0x8A8F98FF, "contradicted": 0xD9534FFF, "unknown": 0x555A63FF,
@@ -31,24 +31,26 @@ STATES: Final[Mapping[str, int]] = {
     "recording": 0x4FB477FF, "running": 0x4FB477FF, "starting": 0x5C7FA3FF, "ending": 0x8A8F98FF,
     "closed": 0x8A8F98FF, "ended": 0x8A8F98FF, "full": 0xD9534FFF, "failed": 0xD9534FFF,
 }  # fmt: skip
-"""By state, 0xRRGGBBAA; what is not here gets one of the viewer's own."""
+"""Colors of states, 0xRRGGBBAA. The viewer picks the color of other states."""
 
-_PHASES: Final[Mapping[str, int]] = {
+_PHASE_COLORS: Final[Mapping[str, int]] = {
     "asked": 0x8A8F98FF, "queued": 0xC9B037FF, "sent": 0x5C7FA3FF, "effect_seen": 0x3C9D9BFF, "complete": 0x4FB477FF,
     "superseded": 0x8E6BBFFF, "expired": 0xE0A030FF, "failed": 0xD9534FFF, "rejected": 0xD9534FFF,
 }  # fmt: skip
 
-MARKS: Final[Mapping[str, int]] = {f"{verb} {phase}": tint for verb in COMMANDS for phase, tint in _PHASES.items()}
-"""Of the marks of commands: the phase is the colour."""
+MARK_COLORS: Final[Mapping[str, int]] = {
+    f"{verb} {phase}": tint for verb in COMMANDS for phase, tint in _PHASE_COLORS.items()
+}
+"""Colors of the marks of commands, by phase."""
 
 
-def colour(car: str, index: int) -> Rgb:
-    """A car's colour: the one it is named after, else one of its own."""
-    return _CARS.get(car, _OTHERS[index % len(_OTHERS)])
+def color(car: str, index: int) -> Rgb:
+    """Return the color of a car: the one it is named after, else one by its index."""
+    return _CAR_COLORS.get(car, _OTHER_COLORS[index % len(_OTHER_COLORS)])
 
 
 def rgb(led: str) -> Rgb:
-    """The colour of an LED as `sim/truth` has it: `#rrggbb`; anything else is off."""
+    """Return the color of an LED in `sim/truth`: `#rrggbb`; anything else is off."""
     try:
         red, green, blue = bytes.fromhex(led.removeprefix("#"))
     except ValueError:
@@ -57,5 +59,5 @@ def rgb(led: str) -> Rgb:
 
 
 def leds(seen: Iterable[str]) -> Mapping[str, int]:
-    """Lanes of LEDs are in the LEDs' own colours."""
+    """Return the colors for tracks of LEDs: each state has the color of the LED."""
     return {led: int.from_bytes((*rgb(led), 255), "big") for led in sorted(seen)}

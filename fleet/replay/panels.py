@@ -1,7 +1,7 @@
-"""What each message looks like in Rerun: which fields are curves, lanes and lines of text. Pure tables, no Rerun here.
+"""Tables of the views: which field is drawn as a curve, as a state track or as a line of text. Pure; no Rerun here.
 
-A curve is a number over time; a lane a state over time; words a line in a log. What is in no table is still in the file
-(every message is, as it was), for Rerun's dataframe view. Entities are the keys themselves: `/fleet/red/sensor/range`.
+A curve is a number over time, a track a state over time, a text line an entry of a log. Every message is in the .rrd,
+also without a row here, for Rerun's dataframe view. The entity of a key is the key: `/fleet/red/sensor/range`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,66 +21,66 @@ class Curve:
 
     topic: str
     field: str
-    """Selector inside the message. One that ends in ! leaves out what was not measured, instead of drawing a zero."""
+    """Selector inside the message. With ! at the end, values that were not measured are left out, not drawn as zero."""
     name: str
-    how: "How | None" = None
-    """None: the field as it is, which the viewer reads from the message itself."""
+    derivation: "Derivation | None" = None
+    """None: the viewer reads the field from the message itself."""
 
 
-class How(StrEnum):
-    """What a lens makes of a field that is not shown as it is."""
+class Derivation(StrEnum):
+    """What a lens derives from a field."""
 
     TEXT_OR_NOTHING = "text_or_nothing"
-    """A text; an empty one is nothing."""
+    """A text, or no state if it is empty."""
     WHO_AND_WHY = "who_and_why"
-    """A list of e-stops: who gave them, and why; nothing if there is none."""
+    """The senders and reasons of a list of e-stops, or no state if it is empty."""
     TOTAL = "total"
-    """The sum of a map's values."""
+    """The sum of the values of a map."""
     LOW = "low"
     CRITICAL = "critical"
-    """A line at the battery's threshold."""
+    """A line at a battery threshold."""
 
 
 @dataclass(frozen=True, slots=True)
 class StateTrack:
-    """One state of a topic; `name` is its component in the .rrd, and what the lane is called."""
+    """One state of a topic over time. `name` is its component in the .rrd and its label."""
 
     topic: str
     field: str
     name: str
-    how: How | None = None
+    derivation: Derivation | None = None
     drawn: bool = False
-    """Made by drawing.py of several fields or messages; `field` is the first of them."""
+    """True if drawings.py derives it from several fields or messages; `field` is the first of them."""
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
-    """A line of text made of fields, in order, without those that are empty."""
+class TextLine:
+    """A line of text joined from fields in this order, without empty ones."""
 
     topic: str
     fields: tuple[str, ...]
     alarm_field: str = ""
     before: Mapping[str, str] = field(default_factory=dict)
-    """What stands in front of a field, if it is not empty."""
+    """Prefix of a field that is not empty."""
     calm: frozenset[str] = frozenset()
-    """Values of `alarm_field` that are as it should be; with any other the line is a warning."""
+    """Normal values of `alarm_field`. With any other value the line is a warning."""
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One view: curves, or lanes, or lines of text."""
+    """One view of curves, tracks or lines of text."""
 
     name: str
     curves: tuple[Curve, ...] = ()
-    lanes: tuple[StateTrack, ...] = ()
+    tracks: tuple[StateTrack, ...] = ()
     texts: tuple[str, ...] = ()
-    """Topics whose lines of text are shown together."""
+    """Topics whose lines of text share the view."""
 
     @property
     def topics(self) -> frozenset[str]:
-        """Topics it shows."""
+        """Return the topics of the view."""
         return frozenset(
-            [curve.topic for curve in self.curves] + [lane.topic for lane in self.lanes] + list(self.texts)
+            [curve.topic for curve in self.curves] + [track.topic for track in self.tracks] + list(self.texts)
         )
 
 
@@ -88,63 +88,63 @@ def _unit(topic: str, field: str) -> str:
     return TOPICS[topic].units[field.rstrip("!")]
 
 
-def _lanes(topic: str, what: str, *fields: str) -> tuple[StateTrack, ...]:
+def _tracks(topic: str, what: str, *fields: str) -> tuple[StateTrack, ...]:
     return tuple(StateTrack(topic, field, f"{what} {field.replace('_', ' ')}".strip()) for field in fields)
 
 
 TRUTH: Final = "sim/truth"
 WORLD: Final = "@sim/world"
-COMMANDS: Final = "event/command"
+COMMAND_TOPIC: Final = "event/command"
 ASSIGNMENT: Final = "@coordinator/assignment"
-PLAN: Final = "@coordinator/plan"
+PLAN_TOPIC: Final = "@coordinator/plan"
 
 DISTANCE: Final = Curve("sensor/range", "range_m!", f"distance ({_unit('sensor/range', 'range_m')})")
 BATTERY: Final = Curve("sensor/battery", "voltage_v", f"battery ({_unit('sensor/battery', 'voltage_v')})")
-LOW: Final = Curve("sensor/battery", "voltage_v", f"low, by default {LOW_V:g} V", How.LOW)
-CRITICAL: Final = Curve("sensor/battery", "voltage_v", f"critical, by default {CRITICAL_V:g} V", How.CRITICAL)
-MODE_ASKED: Final = StateTrack("state/mode", "asked", "mode asked")
+LOW: Final = Curve("sensor/battery", "voltage_v", f"low, by default {LOW_V:g} V", Derivation.LOW)
+CRITICAL: Final = Curve("sensor/battery", "voltage_v", f"critical, by default {CRITICAL_V:g} V", Derivation.CRITICAL)
+MODE_REQUESTED: Final = StateTrack("state/mode", "asked", "mode asked")
 MODE_INFERRED: Final = StateTrack("state/mode", "inferred", "mode inferred")
 MODE_TRUE: Final = StateTrack(TRUTH, "mode", "mode true")
-VERDICT: Final = StateTrack("state/mode", "verdict", "verdict")
+VERDICT_TRACK: Final = StateTrack("state/mode", "verdict", "verdict")
 MOTION: Final = StateTrack("state/motion", "motion", "motion")
-LINK: Final = StateTrack("state/link", "state", "link")
-ESTOPS: Final = StateTrack("state/safety", "estops", "e-stop", How.WHO_AND_WHY)
-HOLD: Final = StateTrack("state/safety", "hold.by", "hold", How.TEXT_OR_NOTHING)
-LEASE: Final = StateTrack("state/safety", "lease.holder", "driven by", How.TEXT_OR_NOTHING)
-MARKS: Final = StateTrack(COMMANDS, "verb", "commands", drawn=True)
-LED_ASKED: Final = StateTrack(COMMANDS, "request", "LED asked", drawn=True)
+LINK_TRACK: Final = StateTrack("state/link", "state", "link")
+ESTOPS: Final = StateTrack("state/safety", "estops", "e-stop", Derivation.WHO_AND_WHY)
+HOLD: Final = StateTrack("state/safety", "hold.by", "hold", Derivation.TEXT_OR_NOTHING)
+LEASE: Final = StateTrack("state/safety", "lease.holder", "driven by", Derivation.TEXT_OR_NOTHING)
+COMMAND_TRACK: Final = StateTrack(COMMAND_TOPIC, "verb", "commands", drawn=True)
+LED_REQUESTED: Final = StateTrack(COMMAND_TOPIC, "request", "LED asked", drawn=True)
 LED_TRUE: Final = StateTrack(TRUTH, "led", "LED true")
 ROLE: Final = StateTrack(ASSIGNMENT, "roles", "role", drawn=True)
-"""On the assignment's entity, one lane per car: `role red`."""
-PHASE: Final = StateTrack(ASSIGNMENT, "phase", "phase of the plan", How.TEXT_OR_NOTHING)
+"""One track per car, on the entity of the assignment: `role red`."""
+PHASE: Final = StateTrack(ASSIGNMENT, "phase", "phase of the plan", Derivation.TEXT_OR_NOTHING)
 
 MAIN_PANELS: Final = (
     Panel(
         "Mode, motion, link",
-        lanes=(
-            MODE_ASKED,
+        tracks=(
+            MODE_REQUESTED,
             MODE_INFERRED,
             MODE_TRUE,
-            VERDICT,
+            VERDICT_TRACK,
             MOTION,
             StateTrack("state/safety", "motors", "motors"),
-            LINK,
+            LINK_TRACK,
         ),
     ),
     Panel("Distance", curves=(DISTANCE,)),
     Panel(
         "Line, obstacle, light",
-        lanes=(
-            *_lanes("sensor/line", "line", "left_outer", "left_inner", "right_inner", "right_outer"),
-            *_lanes("sensor/obstacle", "obstacle", "left", "right"),
-            *_lanes("sensor/light", "light", "left", "right"),
+        tracks=(
+            *_tracks("sensor/line", "line", "left_outer", "left_inner", "right_inner", "right_outer"),
+            *_tracks("sensor/obstacle", "obstacle", "left", "right"),
+            *_tracks("sensor/light", "light", "left", "right"),
         ),
     ),
     Panel("Battery", curves=(BATTERY, LOW, CRITICAL)),
-    Panel("Commands, holds, e-stops", lanes=(MARKS, LEASE, HOLD, ESTOPS, ROLE, LED_ASKED, LED_TRUE)),
-    Panel("What happened", texts=(COMMANDS, "event/log")),
+    Panel("Commands, holds, e-stops", tracks=(COMMAND_TRACK, LEASE, HOLD, ESTOPS, ROLE, LED_REQUESTED, LED_TRUE)),
+    Panel("What happened", texts=(COMMAND_TOPIC, "event/log")),
 )
-"""The page of a car's tab that is seen first, two beside each other."""
+"""First page of a car's tab, in two columns."""
 
 MORE_PANELS: Final = (
     Panel("Gyroscope", curves=tuple(Curve("sensor/imu", f"gyro_{a}_raw", f"{a} (raw)") for a in "xyz")),
@@ -161,7 +161,7 @@ MORE_PANELS: Final = (
         "Link",
         curves=(
             Curve("state/link", "tx_airtime", "airtime (share)"),
-            Curve("state/link", "rejects", "frames rejected", How.TOTAL),
+            Curve("state/link", "rejects", "frames rejected", Derivation.TOTAL),
             Curve("state/link", "reconnects", "reconnects"),
         ),
     ),
@@ -175,7 +175,7 @@ MORE_PANELS: Final = (
     ),
     Panel(
         "Battery, fan, bumps, platform",
-        lanes=(
+        tracks=(
             StateTrack("sensor/battery", "level", "battery level"),
             StateTrack("state/motion", "fan", "fan"),
             StateTrack(TRUTH, "blocked", "blocked in truth"),
@@ -184,29 +184,29 @@ MORE_PANELS: Final = (
     ),
     Panel("Raw frames", texts=("frame/rx", "frame/tx")),
 )
-"""The other page of a car's tab."""
+"""Second page of a car's tab."""
 
 CAR_PANELS: Final = MAIN_PANELS + MORE_PANELS
 
-FLEET_LANES: Final = (
-    ("Mode and link", (MODE_ASKED, MODE_INFERRED, MODE_TRUE, LINK)),
-    ("Commands, holds, e-stops", (MARKS, LEASE, HOLD, ESTOPS, ROLE)),
+FLEET_TRACKS: Final = (
+    ("Mode and link", (MODE_REQUESTED, MODE_INFERRED, MODE_TRUE, LINK_TRACK)),
+    ("Commands, holds, e-stops", (COMMAND_TRACK, LEASE, HOLD, ESTOPS, ROLE)),
 )
-"""(name, of every car), on the fleet's tab."""
+"""(name, tracks of every car) on the fleet's tab."""
 FLEET_CURVES: Final = (("Distance (m)", DISTANCE), ("Battery (V)", BATTERY))
 FLEET_TEXTS: Final = (
     ("Decisions and why", (), ("@coordinator/decision", ASSIGNMENT, "@recorder/mark")),
-    ("Commands and log", (COMMANDS, "event/log"), ("@coordinator/log",)),
+    ("Commands and log", (COMMAND_TOPIC, "event/log"), ("@coordinator/log",)),
 )
-"""(name, topics of every car, topics of services)."""
+"""(name, topics of every car, topics of services) on the fleet's tab."""
 
 SERVICE_PANELS: Final = (
     Panel(
         "Plan, recorder, supervisor",
-        lanes=(
+        tracks=(
             PHASE,
             StateTrack("@recorder/status", "state", "recorder"),
-            StateTrack("@recorder/status", "error", "recorder's error", How.TEXT_OR_NOTHING),
+            StateTrack("@recorder/status", "error", "recorder's error", Derivation.TEXT_OR_NOTHING),
             StateTrack("@supervisor/status", "state", "fleet up"),
         ),
     ),
@@ -214,37 +214,37 @@ SERVICE_PANELS: Final = (
     Panel(
         "Lost",
         curves=(
-            Curve("@recorder/status", "drops", "dropped by the recorder", How.TOTAL),
-            Curve("@recorder/status", "missed", "missed on the bus", How.TOTAL),
+            Curve("@recorder/status", "drops", "dropped by the recorder", Derivation.TOTAL),
+            Curve("@recorder/status", "missed", "missed on the bus", Derivation.TOTAL),
         ),
     ),
     Panel("Free on the disk", curves=(Curve("@recorder/status", "free_bytes", "free (B)"),)),
 )
-"""The page of the fleet's own services."""
+"""Page of the fleet's services."""
 
-WORDS: Final = (
-    Words(
-        COMMANDS,
+TEXT_LINES: Final = (
+    TextLine(
+        COMMAND_TOPIC,
         ("car", "verb", "phase", "reason", "words", "sender"),
         "phase",
         {"sender": "by "},
         frozenset({"asked", "queued", "sent", "effect_seen", "complete"}),
     ),
-    Words(
+    TextLine(
         "@coordinator/decision",
         ("subject", "decided", "why", "would_change"),
         before={"would_change": "- changes with: "},
     ),
-    Words(ASSIGNMENT, ("roles", "phase")),
-    Words("frame/rx", ("data", "verdict"), "verdict", calm=frozenset({"sensors", "arm", "imu", "echo"})),
-    Words("frame/tx", ("data", "why", "command_id")),
+    TextLine(ASSIGNMENT, ("roles", "phase")),
+    TextLine("frame/rx", ("data", "verdict"), "verdict", calm=frozenset({"sensors", "arm", "imu", "echo"})),
+    TextLine("frame/tx", ("data", "why", "command_id")),
 )
-"""`event/log` needs none: Rerun reads foxglove.Log as text by itself."""
+"""`event/log` needs no row: Rerun reads foxglove.Log as text."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What a session has: topics by car, and of the fleet's services."""
+    """Topics of a session by car, and of the fleet's services."""
 
     fleet: str
     cars: Mapping[str, frozenset[str]]
@@ -252,7 +252,7 @@ class Contents:
 
 
 def contents(recorded: frozenset[str]) -> Contents:
-    """Sort a session's keys; what is not one of the table's topics has no place in the layout."""
+    """Sort the keys of a session by car and service. Ignore keys without a topic in schemas/topics.py."""
     cars: dict[str, set[str]] = {}
     services: set[str] = set()
     fleets: list[str] = []
@@ -275,17 +275,17 @@ def contents(recorded: frozenset[str]) -> Contents:
 
 
 def parts() -> Iterator[Curve | StateTrack]:
-    """Every curve and lane of the tables, each once."""
+    """Yield every curve and track of the tables once."""
     every: list[Curve | StateTrack] = [curve for _, curve in FLEET_CURVES]
-    for _, lanes in FLEET_LANES:
-        every += lanes
+    for _, tracks in FLEET_TRACKS:
+        every += tracks
     for panel in (*CAR_PANELS, *SERVICE_PANELS):
-        every += (*panel.curves, *panel.lanes)
+        every += (*panel.curves, *panel.tracks)
     yield from dict.fromkeys(every)
 
 
 def topic_of(key: str) -> str:
-    """The topic of a key in the table, of a car or of a service; of another key what may stand there."""
+    """Return the topic name of a key of a car or service; empty if the key belongs to no fleet."""
     found = keys.parse(key)
     if found is None:
         return ""
@@ -293,12 +293,12 @@ def topic_of(key: str) -> str:
 
 
 def entity(key: str) -> str:
-    """The Rerun entity of a key, as Rerun's MCAP reader names it: what is no word character is escaped."""
+    """Return the entity that Rerun's MCAP reader gives a key: it escapes all but word characters."""
     return "/" + "/".join(
         "".join(c if c.isalnum() or c in "-_." else f"\\{c}" for c in part) for part in key.split("/")
     )
 
 
 def key_of(path: str) -> str:
-    """The key of an entity; the inverse of `entity`."""
+    """Return the key of an entity, the inverse of `entity`."""
     return path.replace("\\", "").lstrip("/")

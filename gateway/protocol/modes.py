@@ -37,7 +37,7 @@ class ModeRow:
 
 
 def _open_s(digit: int) -> float:
-    # docs/reference/protocol.md#blocking-times, mode opened (`x1`), 2.1 s + 0.2 s x (x + 1), so 2.5 to 3.5 s
+    # An opening takes 2.1 s and 0.2 s for each digit up to its own (docs/reference/protocol.md#blocking-times).
     return round(2.1 + 0.2 * (digit + 1), 3)
 
 
@@ -45,7 +45,7 @@ def _signature(filler: Mapping[str, bytes]) -> re.Pattern[bytes]:
     return re.compile(sensors_pattern(filler) + b"#?")
 
 
-# docs/reference/protocol.md#placeholders: the spelling of the filler counts
+# The spelling of a placeholder tells the modes apart (docs/reference/protocol.md#placeholders).
 _TRACKING: Final = {"range": b"0", "battery": b"8", "grayscale": b"0", "obstacle": b"00", "light": b"00"}
 _SEEKING: Final = {"range": b"120", "battery": b"8.3", "grayscale": b"000", "line": b"0000", "obstacle": b"00"}
 _FOLLOWING: Final = {"range": b"120", "battery": b"8.3", "grayscale": b"000", "line": b"0000", "light": b"00"}

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import click
 
-from fleet.replay.rerun.viewer import LOOK_S, Viewer, free_port
+from fleet.replay.rerun.viewer import VIEWER_POLL_INTERVAL_S, Viewer, free_port
 
 SIZE: Final = "1920x1080"
 AT: Final = 0.75
@@ -60,7 +60,7 @@ def take(rrd: Path, out: Path, view: str = "") -> Shown:
             viewer.wait(SETTLE_S)
             raise NoPicture(
                 "Rerun's viewer cannot draw here: it needs a graphics driver, or one in software "
-                f"(Debian: apt install mesa-vulkan-drivers). It said: {viewer.last_words}"
+                f"(Debian: apt install mesa-vulkan-drivers). It said: {viewer.last_error}"
             ) from None
     _write(png, out)
     return shown
@@ -168,7 +168,7 @@ def _connect(viewer: Viewer, port: int) -> Any:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
         except (RuntimeError, OSError, ValueError):  # how it says that nothing answers yet
-            if viewer.wait(LOOK_S) is not None or time.monotonic() > deadline:
+            if viewer.wait(VIEWER_POLL_INTERVAL_S) is not None or time.monotonic() > deadline:
                 raise
         else:
             return client

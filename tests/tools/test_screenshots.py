@@ -50,7 +50,7 @@ def test_the_pictures_show_the_fleet_a_car_and_the_world(tmp_path: Path) -> None
 
 
 def _is_the_fleet(image: np.ndarray, shown: Shown) -> None:
-    expected = [name for name, _ in panels.FLEET_LANES] + [name for name, _ in panels.FLEET_CURVES]
+    expected = [name for name, _ in panels.FLEET_TRACKS] + [name for name, _ in panels.FLEET_CURVES]
     expected += [name for name, _, _ in panels.FLEET_TEXTS] + ["Plan"]
     expected += [panel.name for panel in panels.SERVICE_PANELS]
     assert set(expected) <= set(shown.views)
@@ -59,10 +59,10 @@ def _is_the_fleet(image: np.ndarray, shown: Shown) -> None:
         assert shown.views.count(panel.name) >= 3, panel.name
     middle = image.shape[1] // 2
     for state in ("tracking", "obstacle_avoidance", "manual", "online"):
-        assert share(image[:, middle:], lane(colors.STATES[state])) > 0.002, state
+        assert share(image[:, middle:], lane(colors.STATE_COLORS[state])) > 0.002, state
     for car in ("red", "green", "blue"):
         for half in (image[:, :middle], image[:, middle:]):
-            assert share(half, colors.colour(car, 0)) > 0.0001, car
+            assert share(half, colors.color(car, 0)) > 0.0001, car
 
 
 def _is_a_car(image: np.ndarray, shown: Shown) -> None:
@@ -70,10 +70,10 @@ def _is_a_car(image: np.ndarray, shown: Shown) -> None:
     middle = image.shape[1] // 2
     left, right = image[:, :middle], image[:, middle:]
     for state in ("tracking", "confirmed", "true"):
-        assert share(left, lane(colors.STATES[state])) > 0.002, state
+        assert share(left, lane(colors.STATE_COLORS[state])) > 0.002, state
     assert share(left, lane(0xFF0010FF)) > 0.002, "the LED's lanes are in its colour"
     # 0.00065 seen, less as lines are smoothed.
-    assert share(right, colors.colour("blue", 0)) > 0.0002, "distance and battery"
+    assert share(right, colors.color("blue", 0)) > 0.0002, "distance and battery"
     assert share(right, (217, 83, 79)) > 0.00005, "the critical threshold"
 
 
@@ -85,7 +85,7 @@ def _is_the_world(image: np.ndarray) -> None:
     ):
         assert share(image, colour) > least, what
     for car in ("red", "green", "blue"):
-        assert share(image, colors.colour(car, 0)) > 0.0005, car
+        assert share(image, colors.color(car, 0)) > 0.0005, car
 
 
 def test_without_a_driver_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

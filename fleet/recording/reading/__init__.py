@@ -1,1 +1,1 @@
-"""Reading sessions and MCAP files, also damaged ones. Read `session` first."""
+"""Reads sessions and MCAP files, also damaged ones. Read `session` first, then `mcap_reader`."""

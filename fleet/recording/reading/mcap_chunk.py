@@ -1,6 +1,6 @@
-"""One chunk of an MCAP file as bytes: taken out, held against its checksum, taken apart. Where chunks are is walk.py's.
+"""Decodes one chunk of an MCAP file: decompresses it, checks its CRC and splits it into records.
 
-The mcap library would allocate what a damaged length says, and takes eight times as long for each message.
+Not the mcap library: it allocates what a damaged length says, and takes eight times as long for each message.
 """
 
 import struct
@@ -16,22 +16,22 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 
-from fleet.recording.reading.mcap_index import HEAD, LIMIT
+from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES
 
-_MESSAGE: Final = struct.Struct("<BQHIQQ")  # the head, channel, sequence, log time, publish time
-# The ways in which the library, and what it decompresses with, say that bytes are not what they should be.
+_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+# Errors that the mcap library and the decompressors raise for corrupted bytes.
 BROKEN: Final = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
 
 Record = tuple[int, int, int, int, bytes]
-"""Channel, sequence, log time, publish time, payload; what describes channels: minus its opcode, 0, 0, 0, body."""
+"""Message: channel, sequence, log time, publish time, payload. Channel or schema: minus its opcode, 0, 0, 0, body."""
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """One thing that is wrong with a file."""
+    """One corrupted or missing part of a file."""
 
     at: int
-    """Offset in bytes of what could not be read."""
+    """Byte offset."""
     words: str
 
     def __str__(self) -> str:
@@ -40,30 +40,30 @@ class Damage:
 
 @dataclass(frozen=True, slots=True)
 class ChunkPart:
-    """A chunk, or in a file without chunks one record, as bytes."""
+    """The bytes of a chunk, or of one record in a file without chunks."""
 
     at: int
     opcode: int
     body: bytes
     span: str = ""
-    """From when to when it has messages; empty where the index does not say so."""
+    """Time span of its messages as text; empty without an index."""
 
     def check(self) -> None:
-        """Hold it against its checksum; raises one of BROKEN."""
+        """Check its CRC; raises one of BROKEN."""
         get_chunk_data_stream(self._plain(), validate_crc=True)
 
     def records(self) -> list[Record]:
-        """Its messages, and what describes channels, in order; raises one of BROKEN."""
+        """Return its messages, channels and schemas in order; raises one of BROKEN."""
         chunk = self._plain()
         stream, end = get_chunk_data_stream(chunk, validate_crc=True)
         data = chunk.data if not chunk.compression else stream.read(end)
         found: list[Record] = []
-        unpack = _MESSAGE.unpack_from
+        unpack = _MESSAGE_HEAD.unpack_from
         at = 0
         while at < end:
             if data[at] == Opcode.MESSAGE:
                 _, length, channel, sequence, log_ns, publish_ns = unpack(data, at)
-                begin, at = at + _MESSAGE.size, at + HEAD.size + length
+                begin, at = at + _MESSAGE_HEAD.size, at + HEAD.size + length
                 if at < begin or at > end:
                     raise EndOfFile
                 found.append((channel, sequence, log_ns, publish_ns, data[begin:at]))
@@ -74,14 +74,14 @@ class ChunkPart:
                     raise EndOfFile
                 if opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
                     body = data[begin:at]
-                    # Taken apart here too: a chunk of which one record is broken gives none.
+                    # Parse it here too: a chunk with one corrupted record yields no message.
                     (Channel if opcode == Opcode.CHANNEL else Schema).read(ReadDataStream(BytesIO(body)))
                     found.append((-opcode, 0, 0, 0, body))
         return found
 
     @property
-    def whole(self) -> bool:
-        """Whether every record of it can be had."""
+    def is_intact(self) -> bool:
+        """True if all its records can be read."""
         try:
             self.records()
         except BROKEN:
@@ -89,7 +89,7 @@ class ChunkPart:
         return True
 
     def lost(self, error: Exception) -> Damage:
-        """Why this was not read."""
+        """Return the damage that an error of `records` means."""
         match error:
             case CRCValidationError():
                 words = "fails its checksum"
@@ -100,20 +100,31 @@ class ChunkPart:
         return Damage(self.at, f"the {named(self.opcode)} there {words}{self.span}")
 
     def _plain(self) -> Chunk:
-        """Its records, uncompressed, not yet checked."""
+        """Return the decompressed chunk, with its CRC unchecked."""
         if self.opcode != Opcode.CHUNK:
-            return Chunk("", HEAD.pack(self.opcode, len(self.body)) + self.body, 0, 0, 0, HEAD.size + len(self.body))
+            return Chunk(
+                "",
+                HEAD.pack(self.opcode, len(self.body)) + self.body,
+                0,
+                0,
+                0,
+                HEAD.size + len(self.body),
+            )
         chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(self.body)))
         size = chunk.uncompressed_size
-        if size > LIMIT:
-            raise ValueError(f"says that it has {size} bytes: no more than {LIMIT} are read")
-        # One byte more than it should have: to see one that has more, without making room for all of it.
+        if size > MAX_RECORD_BYTES:
+            raise ValueError(f"says that it has {size} bytes: no more than {MAX_RECORD_BYTES} are read")
+        # Ask for one byte more: detects a larger chunk without decompressing all of it.
         data: bytes
         match chunk.compression:
             case "":
                 return chunk
             case "zstd":
-                data = zstandard.ZstdDecompressor(max_window_size=LIMIT).stream_reader(chunk.data).read(size + 1)
+                data = (
+                    zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES)
+                    .stream_reader(chunk.data)
+                    .read(size + 1)
+                )
             case "lz4":
                 data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
             case other:
@@ -125,13 +136,13 @@ class ChunkPart:
 
 
 def read(file: IO[bytes], at: int, length: int) -> bytes:
-    """Bytes from an offset on; fewer at the end."""
+    """Return the bytes from an offset on; fewer at the end of the file."""
     file.seek(at)
     return file.read(length)
 
 
 def named(opcode: int) -> str:
-    """What a record is called."""
+    """Return the name of a record type."""
     try:
         return Opcode(opcode).name.lower().replace("_", " ")
     except ValueError:

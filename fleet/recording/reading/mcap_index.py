@@ -1,7 +1,7 @@
-"""What stands at the end of a whole MCAP file: where its chunks are, and its channels. No message is read here.
+"""Reads the index at the end of an MCAP file: its chunks, channels and schemas. Reads no message.
 
-The mcap library reads it too, but takes each chunk's table of channels apart: with 1,000 channels and an hour of chunks
-that are millions of entries. Here that table stays bytes until somebody asks whether a channel is in it.
+Not the mcap library: it parses the channel table of each chunk. For 1,000 channels and an hour of chunks these are
+millions of entries. Here a table stays bytes until `may_contain` searches it.
 """
 
 import struct
@@ -15,18 +15,20 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
-LIMIT: Final = 80 * 2**20
-"""No record, and no chunk when uncompressed, is read if it is larger. The recorder takes up to 64 MiB at once, and
-ends a chunk with the message that brings it over 1 MiB."""
+MAX_RECORD_BYTES: Final = 80 * 2**20
+"""Maximum size of a record and of a decompressed chunk to read.
+
+The recorder accepts messages of up to 64 MiB, and ends a chunk with the message that brings it over 1 MiB.
+"""
 HEAD: Final = struct.Struct("<BQ")  # opcode, length
 
-_CHUNK: Final = struct.Struct("<QQQQI")  # first and last log time, offset, length, bytes of the table of channels
-_ENTRY: Final = struct.Struct("<HQ")  # of that table: channel, offset of its message index
+_CHUNK_INDEX: Final = struct.Struct("<QQQQI")  # first and last log time, offset, length, bytes of the table of channels
+_CHANNEL_ENTRY: Final = struct.Struct("<HQ")  # of that table: channel, offset of its message index
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """One chunk: where it is, and from when to when its messages are."""
+class ChunkPlace:
+    """Position and time span of one chunk."""
 
     at: int
     length: int
@@ -34,29 +36,33 @@ class Place:
     last_ns: int
     table: bytes
 
-    def holds(self, channels: frozenset[int]) -> bool:
-        """Whether it may have messages of one of these; a writer that made no table leaves it open."""
-        return not self.table or any(channel in channels for channel, _ in _ENTRY.iter_unpack(self.table))
+    def may_contain(self, channels: frozenset[int]) -> bool:
+        """Return True if it may contain messages of these channels. Without a table it may contain any."""
+        return not self.table or any(channel in channels for channel, _ in _CHANNEL_ENTRY.iter_unpack(self.table))
 
 
 @dataclass(slots=True)
 class Index:
-    """A file's chunks, in the order of the file, its schemas and channels by id, and its statistics."""
+    """Chunks in the order of the file, schemas and channels by id, and statistics."""
 
-    places: list[Place] = field(default_factory=list)
+    chunks: list[ChunkPlace] = field(default_factory=list)
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     statistics: Statistics | None = None
 
     @property
-    def complete(self) -> bool:
-        """Whether it names every chunk, and no message is outside of them."""
-        said = self.statistics
-        return said is not None and said.chunk_count == len(self.places) and bool(self.places or not said.message_count)
+    def has_all_chunks(self) -> bool:
+        """True if it lists every chunk, and no message is outside of chunks."""
+        statistics = self.statistics
+        return (
+            statistics is not None
+            and statistics.chunk_count == len(self.chunks)
+            and bool(self.chunks or not statistics.message_count)
+        )
 
     @property
-    def describes(self) -> bool:
-        """Whether it has every channel: if not, chunks that are passed over may have the description of one."""
+    def has_all_channels(self) -> bool:
+        """True if it describes every channel. If not, a skipped chunk might describe one."""
         return (
             self.statistics is not None
             and self.statistics.channel_count == len(self.channels)
@@ -65,7 +71,7 @@ class Index:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Messages by key."""
+        """Return the number of messages by key."""
         counts: dict[str, int] = {}
         if self.statistics is not None:
             for channel, count in self.statistics.channel_message_counts.items():
@@ -76,15 +82,17 @@ class Index:
 
 
 def read(file: IO[bytes], start: int, end: int) -> Index:
-    """Take the records between two offsets apart; raises what the mcap library and struct raise for broken ones."""
+    """Parse the index between two offsets; raises errors of the mcap library and struct if it is corrupted."""
     index = Index()
     for opcode, body in _records(file, start, end):
         match opcode:
             case Opcode.CHUNK_INDEX:
-                first, last, at, length, table = _CHUNK.unpack_from(body)
-                if table % _ENTRY.size or _CHUNK.size + table > len(body):
+                first, last, at, length, table = _CHUNK_INDEX.unpack_from(body)
+                if table % _CHANNEL_ENTRY.size or _CHUNK_INDEX.size + table > len(body):
                     raise EndOfFile
-                index.places.append(Place(at, length, first, last, body[_CHUNK.size : _CHUNK.size + table]))
+                index.chunks.append(
+                    ChunkPlace(at, length, first, last, body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + table])
+                )
             case Opcode.SCHEMA:
                 schema = Schema.read(ReadDataStream(BytesIO(body)))
                 index.schemas[schema.id] = schema
@@ -95,7 +103,7 @@ def read(file: IO[bytes], start: int, end: int) -> Index:
                 index.statistics = Statistics.read(ReadDataStream(BytesIO(body)))
             case _:
                 pass
-    index.places.sort(key=lambda place: place.at)
+    index.chunks.sort(key=lambda chunk: chunk.at)
     return index
 
 
@@ -105,6 +113,6 @@ def _records(file: IO[bytes], start: int, end: int) -> Iterator[tuple[int, bytes
     while at < end:
         opcode, length = HEAD.unpack(file.read(HEAD.size))
         at += HEAD.size + length
-        if length > LIMIT or at > end:
+        if length > MAX_RECORD_BYTES or at > end:
             raise EndOfFile
         yield opcode, file.read(length)

@@ -1,10 +1,8 @@
-"""What is whole of one MCAP file, and where and why the rest is not. No sessions here, and nothing is repaired.
+"""Reads the intact messages of an MCAP file, and reports where and why others are lost. Repairs nothing.
 
-The mcap library reads every record but the messages. The way from record to record (walk.py) and within a chunk
-(chunk.py) is our own, because the library's is made for whole files: it allocates what a damaged length says, reads to
-the end for a negative one, gives up at the first damage without saying where, and takes eight times as long (1.0
-instead of 0.12 us a message) as it reads each message's index. A file with an end is not walked at all: its index
-(index.py) says where chunks are, so that a damaged one hides no other, and only those that are asked for are read.
+The mcap library parses every record except messages. Chunks (mcap_chunk.py) and the scan of files without an index
+(mcap_scan.py) are our own: the library gives up at the first damage, and needs 1.0 instead of 0.12 us a message.
+If the file has an index (mcap_index.py), the reader opens only the selected chunks, and a damaged one hides no other.
 """
 
 import os
@@ -21,7 +19,7 @@ from mcap.records import Channel, DataEnd, Footer, Header, Schema
 
 from fleet.recording.reading import mcap_index
 from fleet.recording.reading.mcap_chunk import BROKEN, ChunkPart, Damage, Record, read
-from fleet.recording.reading.mcap_index import HEAD, LIMIT, Index, Place
+from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES, ChunkPlace, Index
 from fleet.recording.reading.mcap_scan import MAGIC, RecordScanner
 from fleet.recording.selection import EVERYTHING, Selection
 
@@ -32,28 +30,28 @@ _HEADER_LIMIT: Final = 2**16
 
 
 class NotMcap(Exception):
-    """A file of another kind, or none; its text says why."""
+    """The file is missing or no MCAP file. The message gives the reason."""
 
 
 class ChannelInfo(NamedTuple):
-    """A channel and its schema, if it has one."""
+    """A channel, and its schema if it has one."""
 
     channel: Channel
     schema: Schema | None
 
 
 Row = tuple[ChannelInfo, int, int, int, bytes]
-"""One message: lane, sequence, log time and publish time in ns, payload. A plain tuple: there are millions."""
+"""One message: channel, sequence, log time and publish time in ns, payload. A plain tuple: there are millions."""
 
 
 class McapReader:
-    """One file; raises NotMcap. What is wrong is in `damage`, as far as `check` or `messages` have looked."""
+    """Reader of one file; raises NotMcap. `damage` lists what `check` or `messages` have found so far."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: list[Damage] = []
         self.cut = False
-        """Whether it has no end: whoever wrote it was killed, or is still writing."""
+        """True if the file is truncated: its writer was killed, or is still writing."""
         self._bad_magic = False
         if not path.is_file():
             raise NotMcap("is not a regular file" if path.exists() else "is missing")
@@ -75,7 +73,7 @@ class McapReader:
 
     @property
     def words(self) -> str:
-        """What is wrong, on one line; empty if nothing is."""
+        """Return the damage on one line; empty if there is none."""
         if not self.damage:
             return ""
         kind = "is damaged"
@@ -86,45 +84,45 @@ class McapReader:
 
     @property
     def only_cut(self) -> bool:
-        """Whether all that is wrong is that it stops somewhere."""
+        """True if the only damage is that the file is truncated."""
         return self.cut and len(self.damage) == 1
 
     def check(self) -> None:
-        """Hold every checksum against what it is for; no message is taken apart."""
+        """Check every CRC. Parses no message."""
         self._begin()
         try:
             with self.path.open("rb") as file:
                 footer, summary = self._index(file)
-                for piece in self._pieces(file, summary):
+                for part in self._parts(file, summary):
                     try:
-                        piece.check()
+                        part.check()
                     except BROKEN as error:
-                        self.damage.append(piece.lost(error))
+                        self.damage.append(part.lost(error))
                 if footer is not None and not self.damage:
                     self._check_data(file, footer)
         except OSError as error:
             self._unreadable(error)
 
     def messages(self, selection: Selection = EVERYTHING) -> Iterator[Row]:
-        """Every whole message that is selected, in the order of writing. Never holds more than one chunk.
+        """Yield every intact selected message in the order of the file. At most one chunk is in memory.
 
-        With a whole index only the chunks are read that can have one; without, all are.
+        With an intact index only chunks that may contain a selected message are read, without one all chunks.
         """
         self._begin()
         try:
             with self.path.open("rb") as file:
                 _, index = self._index(file)
-                channels = {} if index is None else dict(index.channels)
+                known = {} if index is None else dict(index.channels)
                 schemas: dict[int, Schema | None] = {0: None} if index is None else {0: None, **index.schemas}
-                lanes = _Channels(channels, schemas, selection)
+                channels = _Channels(known, schemas, selection)
                 strays: list[int] = []
-                for piece in self._pieces(file, index, selection):
+                for part in self._parts(file, index, selection):
                     try:
-                        records = piece.records()
+                        records = part.records()
                     except BROKEN as error:
-                        self.damage.append(piece.lost(error))
+                        self.damage.append(part.lost(error))
                         continue
-                    yield from lanes.rows(records, piece.at, strays)
+                    yield from channels.rows(records, part.at, strays)
                 if strays:
                     words = f"{len(strays)} messages from there on are of channels that were described in what is lost"
                     self.damage.append(Damage(strays[0], words))
@@ -132,11 +130,11 @@ class McapReader:
             self._unreadable(error)
 
     def index(self) -> Index | None:
-        """What stands at its end, if it is whole and names every chunk; raises OSError."""
+        """Return the index if it is intact and lists every chunk, else None; raises OSError."""
         self._begin()
         with self.path.open("rb") as file:
             _, index = self._index(file)
-        return index if index is not None and index.complete else None
+        return index if index is not None and index.has_all_chunks else None
 
     def _begin(self) -> None:
         self.damage, self.cut = [], False
@@ -147,7 +145,7 @@ class McapReader:
         self.damage.append(Damage(0, f"it cannot be read: {error.strerror}"))
 
     def _index(self, file: IO[bytes]) -> tuple[Footer | None, Index | None]:
-        """What stands at the end of a file, if its checksum says that it is whole."""
+        """Return the footer and index of a file; None if they are missing or fail the CRC."""
         size = file.seek(0, os.SEEK_END)
         at = size - _FOOTER_SIZE - len(MAGIC)
         tail = read(file, max(at, 0), _FOOTER_SIZE + len(MAGIC))
@@ -159,7 +157,7 @@ class McapReader:
             return None, None
         footer = Footer.read(ReadDataStream(BytesIO(tail[HEAD.size :])))
         if not footer.summary_start or not footer.summary_crc:
-            return None, None  # somebody else's file: without an index, or with one that cannot be checked
+            return None, None  # a file of another writer, without an index or without its CRC
         if not len(MAGIC) + _DATA_END_SIZE <= footer.summary_start <= at:
             self.damage.append(Damage(at, "the footer says that the index is where it cannot be"))
             return None, None
@@ -172,57 +170,59 @@ class McapReader:
             self.damage.append(Damage(footer.summary_start, "the index there cannot be taken apart"))
             return None, None
 
-    def _pieces(self, file: IO[bytes], index: Index | None, selection: Selection = EVERYTHING) -> Iterator[ChunkPart]:
-        """What holds messages, by the index or, without one, from record to record."""
-        if index is None or not index.complete:
-            walk = RecordScanner(file)
-            for piece in walk.pieces():
-                self.damage += walk.damage
-                walk.damage.clear()
-                yield piece
-            self.damage += walk.damage
-            self.cut = self.cut or walk.cut
+    def _parts(self, file: IO[bytes], index: Index | None, selection: Selection = EVERYTHING) -> Iterator[ChunkPart]:
+        """Yield the parts with messages, from the index or, without one, by a scan."""
+        if index is None or not index.has_all_chunks:
+            scanner = RecordScanner(file)
+            for part in scanner.parts():
+                self.damage += scanner.damage
+                scanner.damage.clear()
+                yield part
+            self.damage += scanner.damage
+            self.cut = self.cut or scanner.cut
             return
-        places = index.places
-        if index.describes:
-            wanted = frozenset(number for number, one in index.channels.items() if selection.has_key(one.topic))
-            every = len(wanted) == len(index.channels)
-            places = [
-                place
-                for place in places
-                if selection.overlaps(place.first_ns, place.last_ns) and (every or place.holds(wanted))
+        chunks = index.chunks
+        if index.has_all_channels:
+            selected = frozenset(number for number, one in index.channels.items() if selection.has_key(one.topic))
+            every = len(selected) == len(index.channels)
+            chunks = [
+                chunk
+                for chunk in chunks
+                if selection.overlaps(chunk.first_ns, chunk.last_ns) and (every or chunk.may_contain(selected))
             ]
-        for place in places:
-            yield from self._indexed(file, place)
+        for chunk in chunks:
+            yield from self._indexed(file, chunk)
 
-    def _indexed(self, file: IO[bytes], place: Place) -> Iterator[ChunkPart]:
-        at, length = place.at, place.length - HEAD.size
-        if length > LIMIT:
-            self.damage.append(Damage(at, f"the chunk there has {length} bytes: no more than {LIMIT} are read"))
+    def _indexed(self, file: IO[bytes], chunk: ChunkPlace) -> Iterator[ChunkPart]:
+        at, length = chunk.at, chunk.length - HEAD.size
+        if length > MAX_RECORD_BYTES:
+            self.damage.append(
+                Damage(at, f"the chunk there has {length} bytes: no more than {MAX_RECORD_BYTES} are read")
+            )
             return
-        if length < 0 or at + place.length > file.seek(0, os.SEEK_END):
+        if length < 0 or at + chunk.length > file.seek(0, os.SEEK_END):
             self.damage.append(Damage(at, "the index says that a chunk is there, where none can be"))
             return
-        record = read(file, at, place.length)
+        record = read(file, at, chunk.length)
         if record[: HEAD.size] != HEAD.pack(Opcode.CHUNK, length):
             self.damage.append(Damage(at, "the head of the chunk there is damaged, its messages are shown if whole"))
-        yield ChunkPart(at, Opcode.CHUNK, record[HEAD.size :], _span(place))
+        yield ChunkPart(at, Opcode.CHUNK, record[HEAD.size :], _span(chunk))
 
     def _check_data(self, file: IO[bytes], footer: Footer) -> None:
-        """What lies between the chunks has one checksum, if its writer made one: ours does."""
+        """Check the CRC of the whole data section, which covers the bytes between chunks. Some writers omit it."""
         at = footer.summary_start - _DATA_END_SIZE
         record = read(file, at, _DATA_END_SIZE)
         if HEAD.unpack_from(record) != (Opcode.DATA_END, _DATA_END_SIZE - HEAD.size):
             self.damage.append(Damage(at, "the end of the messages is damaged, no message is"))
             return
-        said = DataEnd.read(ReadDataStream(BytesIO(record[HEAD.size :]))).data_section_crc
-        if said and said != _checksum(file, 0, at):
+        expected = DataEnd.read(ReadDataStream(BytesIO(record[HEAD.size :]))).data_section_crc
+        if expected and expected != _checksum(file, 0, at):
             words = "the checksum there fails: something before it is damaged, but no message"
             self.damage.append(Damage(at, words))
 
 
 class _Channels:
-    """The channels of a file as they become known, and whether each is selected."""
+    """Channels of a file found so far, and whether each is selected."""
 
     def __init__(self, channels: dict[int, Channel], schemas: dict[int, Schema | None], selection: Selection) -> None:
         self._channels = channels
@@ -231,7 +231,7 @@ class _Channels:
         self._found: dict[int, ChannelInfo | None] = {}
 
     def rows(self, records: list[Record], at: int, strays: list[int]) -> Iterator[Row]:
-        """The selected messages of one chunk; each of an unknown channel adds `at` to `strays`."""
+        """Yield the selected messages of one chunk. For each message of an unknown channel add `at` to `strays`."""
         found, selection = self._found, self._selection
         timed = selection.start_ns is not None or selection.end_ns is not None
         for number, sequence, log_ns, publish_ns, data in records:
@@ -239,16 +239,16 @@ class _Channels:
                 self._describe(-number, data)
                 continue
             try:
-                lane = found[number]
+                info = found[number]
             except KeyError:
                 channel = self._channels.get(number)
                 if channel is None or channel.schema_id not in self._schemas:
                     strays.append(at)
                     continue
-                wanted = selection.has_key(channel.topic)
-                lane = found[number] = ChannelInfo(channel, self._schemas[channel.schema_id]) if wanted else None
-            if lane is not None and (not timed or selection.has_time(log_ns)):
-                yield lane, sequence, log_ns, publish_ns, data
+                selected = selection.has_key(channel.topic)
+                info = found[number] = ChannelInfo(channel, self._schemas[channel.schema_id]) if selected else None
+            if info is not None and (not timed or selection.has_time(log_ns)):
+                yield info, sequence, log_ns, publish_ns, data
 
     def _describe(self, opcode: int, body: bytes) -> None:
         stream = ReadDataStream(BytesIO(body))
@@ -265,7 +265,7 @@ class _Channels:
 
 
 def _is_mcap(file: IO[bytes]) -> bool:
-    """Whether a file that does not begin as one has the end, the header or a whole chunk of one."""
+    """Return True if a file without the magic bytes has the end, the header or an intact chunk of an MCAP file."""
     end = file.seek(0, os.SEEK_END) - len(MAGIC)
     if end > len(MAGIC) and read(file, end, len(MAGIC)) == MAGIC:
         return True
@@ -290,11 +290,11 @@ def _checksum(file: IO[bytes], start: int, end: int) -> int:
     return crc
 
 
-def _span(place: Place) -> str:
+def _span(chunk: ChunkPlace) -> str:
     try:
         first, last = (
-            datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3] for ns in (place.first_ns, place.last_ns)
+            datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3] for ns in (chunk.first_ns, chunk.last_ns)
         )
     except (OverflowError, ValueError, OSError):
-        return ""  # somebody else's clock
+        return ""  # the clock of another writer was wrong
     return f" (its messages, {first} to {last} UTC, are lost)"

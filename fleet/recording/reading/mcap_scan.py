@@ -1,189 +1,174 @@
-"""The way from record to record of an MCAP file without a whole index, past what is damaged. No message is read here.
+"""Scans an MCAP file without a valid index record by record, past damage. Reads no message.
 
-A length that is damaged would lead anywhere. So a record is believed if what is in it agrees with its length, or if
-another one begins where it ends; else the next chunk that is whole is searched, and what lies between is said.
+A damaged length would lead anywhere. So the scan trusts a record only if a record follows it and no intact chunk lies
+inside it. Otherwise the scan reports the damage and resumes at the next intact chunk.
 """
 
 import os
 import re
 import struct
 from collections.abc import Iterator
-from io import BytesIO
-from typing import IO, Any, Final
+from typing import IO, Final
 
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Metadata, Schema, Statistics
 
-from fleet.recording.reading.mcap_chunk import BROKEN, ChunkPart, Damage, named, read
-from fleet.recording.reading.mcap_index import HEAD, LIMIT
+from fleet.recording.reading.mcap_chunk import ChunkPart, Damage, named, read
+from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _HOLDS_MESSAGES: Final = (Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-_CHUNK: Final = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
-_LONGEST_NAME: Final = 16
-_LOOK: Final = HEAD.size + _CHUNK.size + _LONGEST_NAME + 8
-_INDEX: Final = struct.Struct("<HI")  # channel, length of the entries
-_INDEX_ENTRY: Final = 16
-_FIXED: Final = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
-_EXACT: Final[dict[int, Any]] = {
-    Opcode.HEADER: Header,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.METADATA: Metadata,
-    Opcode.STATISTICS: Statistics,
-}
+_FIXED_LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _PRIVATE: Final = 0x80
-# The head of a chunk that is no longer than LIMIT.
-_MAY_BE_CHUNK: Final = re.compile(rb"(?=\x06[\s\S]{3}[\x00-\x05]\x00{4})")
-_MAY_BE_SIZE: Final = 9
+"""First opcode for records of other programs."""
+_CHUNK_HEAD: Final = struct.Struct(
+    "<QQQII"
+)  # first and last log time, size, checksum, length of the compression's name
+_MAX_COMPRESSION_NAME: Final = 16
+_MESSAGE_INDEX_HEAD: Final = struct.Struct("<HI")  # channel, length of the entries
+# The head of a chunk of at most MAX_RECORD_BYTES bytes.
+_CANDIDATE: Final = re.compile(rb"(?=\x06[\s\S]{3}[\x00-\x05]\x00{4})")
 _BLOCK: Final = 2**20
-_PATIENCE: Final = 4
-"""What looks like a chunk and is none costs its length: so many times the file's size are spent on it."""
+_MAX_REREADS: Final = 4
+"""Maximum bytes to read for false candidates, as a multiple of the file size."""
 
 
 class RecordScanner:
-    """One file that is open; what is wrong with it is in `damage`."""
+    """Scanner of one open file. `damage` lists the damage found so far."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
         self._size = file.seek(0, os.SEEK_END)
-        self._spent = 0
-        self._known: tuple[int, int | None] | None = None
-        """From an offset on the next whole chunk is there, or nowhere."""
+        self._reread = 0
+        self._next_chunk: tuple[int, int | None] | None = None
+        """Result of the last search: its start, and the next intact chunk from there."""
         self.damage: list[Damage] = []
         self.cut = False
-        """Whether it stops before its end."""
+        """True if the end of the file is missing."""
 
-    def pieces(self) -> Iterator[ChunkPart]:
-        """What holds messages, in order."""
+    def parts(self) -> Iterator[ChunkPart]:
+        """Yield the records that contain messages or describe channels, in order."""
         size, at = self._size, len(MAGIC)
         in_data, chunks = True, False
         while at < size:
             head = read(self._file, at, HEAD.size)
             if len(head) < HEAD.size:
-                self._say(at, "the record there is cut")
+                self._report(at, "the record there is cut")
                 return
             opcode, length = HEAD.unpack(head)
-            if not self._believed(at, opcode, length, chunks=chunks):
+            end = at + HEAD.size + length
+            if not self._is_trusted(at, opcode, length, chunks=chunks):
                 found = self.chunk_from(at + 1)
                 if found is not None:
-                    self._say(at, f"no whole record begins there, {found - at} bytes are passed over")
+                    self._report(at, f"no whole record begins there, {found - at} bytes are passed over")
                     at = found
                     continue
-                if words := self._hopeless(at, opcode, length):
-                    self._say(at, words)
+                if opcode and end > size and length <= MAX_RECORD_BYTES:
+                    left = size - at - HEAD.size
+                    self._report(at, f"the {named(opcode)} there should have {length} bytes, {left} are there")
+                    return
+                if not opcode or end > size:
+                    self._report(at, f"no record begins there, and the last {size - at} bytes are not read")
                     return
             if opcode == Opcode.FOOTER:
-                self._end(at + HEAD.size + length)
+                self._check_end(end)
                 return
             in_data = in_data and opcode != Opcode.DATA_END
             if opcode == Opcode.CHUNK or (in_data and opcode in _HOLDS_MESSAGES):
                 chunks = chunks or opcode == Opcode.CHUNK
-                if length > LIMIT:
-                    self._say(at, f"the {named(opcode)} there has {length} bytes: no more than {LIMIT} are read")
+                if length > MAX_RECORD_BYTES:
+                    self._report(
+                        at, f"the {named(opcode)} there has {length} bytes: no more than {MAX_RECORD_BYTES} are read"
+                    )
                 else:
                     yield ChunkPart(at, opcode, read(self._file, at + HEAD.size, length))
-            at += HEAD.size + length
-        self._say(at, "it stops there")
+            at = end
+        self._report(at, "it stops there")
 
     def chunk_from(self, start: int) -> int | None:
-        """Where the next chunk begins that is whole, not before `start`; None: there is none."""
-        if self._known is not None and self._known[0] <= start and (self._known[1] is None or self._known[1] >= start):
-            return self._known[1]
-        found = next((at for at in self._candidates(start) if self._whole(at)), None)
-        self._known = start, found
+        """Return the offset of the first intact chunk at or after `start`; None if not found."""
+        if self._next_chunk is not None:
+            searched, found = self._next_chunk
+            if searched <= start and (found is None or found >= start):
+                return found
+        found = next((at for at in self._candidates(start) if self._is_intact(at)), None)
+        self._next_chunk = start, found
         return found
 
     def _candidates(self, start: int) -> Iterator[int]:
         while start < self._size:
-            block = read(self._file, start, _BLOCK + _MAY_BE_SIZE - 1)
-            for match in _MAY_BE_CHUNK.finditer(block):
-                at = start + match.start()
-                if self._agrees(at, *HEAD.unpack_from(block, match.start())):
-                    yield at
-                if self._spent > _PATIENCE * self._size:
+            block = read(self._file, start, _BLOCK + HEAD.size - 1)
+            for match in _CANDIDATE.finditer(block):
+                if self._is_chunk_head(start + match.start(), HEAD.unpack_from(block, match.start())[1]):
+                    yield start + match.start()
+                # A file full of false heads would cost its size for each of them.
+                if self._reread > _MAX_REREADS * self._size:
                     return
             start += _BLOCK
 
-    def _whole(self, at: int) -> bool:
+    def _is_intact(self, at: int) -> bool:
+        """Return True if every record of this chunk can be read."""
         _, length = HEAD.unpack(read(self._file, at, HEAD.size))
-        if length > LIMIT or at + HEAD.size + length > self._size:
+        if length > MAX_RECORD_BYTES or at + HEAD.size + length > self._size:
             return False
-        if ChunkPart(at, Opcode.CHUNK, read(self._file, at + HEAD.size, length)).whole:
+        if ChunkPart(at, Opcode.CHUNK, read(self._file, at + HEAD.size, length)).is_intact:
             return True
-        self._spent += length
+        self._reread += length
         return False
 
-    def _believed(self, at: int, opcode: int, length: int, *, chunks: bool) -> bool:
-        """Whether a record's length leads to the next."""
+    def _is_trusted(self, at: int, opcode: int, length: int, *, chunks: bool) -> bool:
+        """Return True if the length of a record leads to the next record."""
         end = at + HEAD.size + length
-        if not opcode or end > self._size:
+        if not self._is_head(at, opcode, length):
             return False
-        if self._agrees(at, opcode, length):
-            return opcode != Opcode.CHUNK or length > LIMIT or self._begins(end) or self._whole(at)
-        # Nobody writes messages both into chunks and between them: it was something else once.
-        if opcode in (Opcode.CHUNK, *_FIXED) or (opcode == Opcode.MESSAGE and chunks) or not self._begins(end):
-            return False
-        passed = self.chunk_from(at + 1)
-        return passed is None or passed >= end
-
-    def _agrees(self, at: int, opcode: int, length: int) -> bool:
-        """Whether what a record says in itself is what its head says; False also where it says nothing."""
-        if opcode in _FIXED:
-            return length == _FIXED[Opcode(opcode)]
         if opcode == Opcode.CHUNK:
-            body = read(self._file, at + HEAD.size, _LOOK - HEAD.size)
-            if len(body) < _CHUNK.size:
-                return False
-            name = _CHUNK.unpack_from(body)[4]
-            if name > _LONGEST_NAME or len(body) < _CHUNK.size + name + 8:
-                return False
-            (data,) = struct.unpack_from("<Q", body, _CHUNK.size + name)
-            return bool(length == _CHUNK.size + name + 8 + data)
-        if opcode == Opcode.MESSAGE_INDEX:
-            body = read(self._file, at + HEAD.size, _INDEX.size)
-            entries = _INDEX.unpack(body)[1] if len(body) == _INDEX.size else 1
-            return bool(length == _INDEX.size + entries and not entries % _INDEX_ENTRY)
-        if opcode not in _EXACT or length > min(LIMIT, self._size - at):
+            return length > MAX_RECORD_BYTES or self._begins(end) or self._is_intact(at)
+        if opcode == Opcode.MESSAGE_INDEX:  # its own length agrees: trust it also before a damaged record
+            body = read(self._file, at + HEAD.size, _MESSAGE_INDEX_HEAD.size)
+            return (
+                len(body) == _MESSAGE_INDEX_HEAD.size
+                and length == _MESSAGE_INDEX_HEAD.size + _MESSAGE_INDEX_HEAD.unpack(body)[1]
+            )
+        # No writer puts messages both into chunks and between them: this opcode is damaged.
+        if (opcode == Opcode.MESSAGE and chunks) or not self._begins(end):
             return False
-        stream = BytesIO(read(self._file, at + HEAD.size, length))
-        try:
-            _EXACT[opcode].read(ReadDataStream(stream))
-        except BROKEN:
-            return False
-        return bool(stream.tell() == length)
+        inside = self.chunk_from(at + 1)
+        return inside is None or inside >= end
 
     def _begins(self, at: int) -> bool:
-        """Whether a record may begin there, or the file ends."""
+        """Return True if a record may begin there, or the file ends."""
         head = read(self._file, at, HEAD.size)
         if len(head) < HEAD.size:
             return not head or 0 < head[0] <= Opcode.DATA_END
-        opcode, length = HEAD.unpack(head)
-        if opcode in _FIXED or opcode in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
-            return self._agrees(at, opcode, length)
+        return self._is_head(at, *HEAD.unpack(head))
+
+    def _is_head(self, at: int, opcode: int, length: int) -> bool:
+        """Return True if a record may have this opcode and length."""
+        if opcode == Opcode.CHUNK and not self._is_chunk_head(at, length):
+            return False
         known = 0 < opcode <= Opcode.DATA_END or opcode >= _PRIVATE
-        return bool(known and at + HEAD.size + length <= self._size)
+        return known and _FIXED_LENGTHS.get(opcode, length) == length and at + HEAD.size + length <= self._size
 
-    def _hopeless(self, at: int, opcode: int, length: int) -> str:
-        """Why nothing from there on is read; empty: what the head says is all there is to go by."""
-        left = self._size - at - HEAD.size
-        if length > left and self._agrees(at, opcode, length):
-            return f"the {named(opcode)} there should have {length} bytes, {left} are there"
-        if not opcode or length > left:
-            return f"no record begins there, and the last {self._size - at} bytes are not read"
-        return ""
+    def _is_chunk_head(self, at: int, length: int) -> bool:
+        """Return True if the lengths inside a chunk add up to the length of its record."""
+        body = read(self._file, at + HEAD.size, _CHUNK_HEAD.size + _MAX_COMPRESSION_NAME + 8)
+        if len(body) < _CHUNK_HEAD.size:
+            return False
+        name = _CHUNK_HEAD.unpack_from(body)[4]
+        if name > _MAX_COMPRESSION_NAME or len(body) < _CHUNK_HEAD.size + name + 8:
+            return False
+        (data,) = struct.unpack_from("<Q", body, _CHUNK_HEAD.size + name)
+        return bool(length == _CHUNK_HEAD.size + name + 8 + data)
 
-    def _end(self, at: int) -> None:
-        """What follows the footer."""
+    def _check_end(self, at: int) -> None:
+        """Check the bytes after the footer."""
         after = self._size - at - len(MAGIC)
         self.cut = after < 0
         if self.cut:
-            self._say(at, "it stops there")
+            self._report(at, "it stops there")
         elif after:
-            self._say(self._size - after, f"{after} bytes follow the end")
+            self._report(self._size - after, f"{after} bytes follow the end")
         elif read(self._file, at, len(MAGIC)) != MAGIC:
-            self._say(at, "the magic bytes of the end are damaged")
+            self._report(at, "the magic bytes of the end are damaged")
 
-    def _say(self, at: int, words: str) -> None:
+    def _report(self, at: int, words: str) -> None:
         self.damage.append(Damage(at, words))

@@ -1,4 +1,4 @@
-"""Payloads of a recording as messages, by the schemas that are in the file: it may be older or newer than we are."""
+"""Decodes recorded payloads with the schemas embedded in the file, which may be older or newer than ours."""
 
 from typing import Any, Final
 
@@ -11,32 +11,32 @@ from google.protobuf.message_factory import GetMessageClass
 from fleet.recording.reading.mcap_reader import ChannelInfo
 from schemas import messages
 
-SAME: Final = "same"
-"""The state of a schema that has the fields of today's."""
+SAME_SCHEMA: Final = "same"
+"""Result for a schema with the same fields as ours."""
 
 
 class MessageDecoder:
-    """Message classes of a session's lanes."""
+    """Decoder of the messages of a session, with a cache of message classes."""
 
     def __init__(self) -> None:
         self._classes: dict[tuple[str, bytes], type[Message] | None] = {}
 
-    def class_of(self, lane: ChannelInfo) -> type[Message] | None:
-        """The class of a lane's messages; None if it is not protobuf, or its schema cannot be understood."""
-        schema = lane.schema
-        if schema is None or schema.encoding != "protobuf" or lane.channel.message_encoding != "protobuf":
+    def class_of(self, info: ChannelInfo) -> type[Message] | None:
+        """Return the class of the messages of a channel; None if it is not protobuf, or its schema is invalid."""
+        schema = info.schema
+        if schema is None or schema.encoding != "protobuf" or info.channel.message_encoding != "protobuf":
             return None
         kind = (schema.name, schema.data)
         if kind not in self._classes:
-            self._classes[kind] = _made(*kind)
+            self._classes[kind] = _build_class(*kind)
         return self._classes[kind]
 
-    def message(self, lane: ChannelInfo, payload: bytes) -> Message | None:
-        """A payload as a message; None if it is none."""
-        made = self.class_of(lane)
-        if made is None:
+    def message(self, info: ChannelInfo, payload: bytes) -> Message | None:
+        """Return the decoded payload; None if it does not match its schema."""
+        message_class = self.class_of(info)
+        if message_class is None:
             return None
-        message = made()
+        message = message_class()
         try:
             message.ParseFromString(payload)
         except DecodeError:
@@ -44,25 +44,25 @@ class MessageDecoder:
         return message
 
 
-def _made(name: str, data: bytes) -> type[Message] | None:
+def _build_class(name: str, data: bytes) -> type[Message] | None:
     pool = DescriptorPool()
     try:
         for file in FileDescriptorSet.FromString(data).file:
             pool.Add(file)
         return GetMessageClass(pool.FindMessageTypeByName(name))
-    # What protobuf raises for a schema that makes no sense depends on where it does not.
+    # For an invalid schema protobuf raises one of these, depending on the place.
     except (DecodeError, KeyError, TypeError, ValueError):
         return None
 
 
-def compared(made: type[Message]) -> str:
-    """How a schema in a file differs from today's of the same name: `same`, or in words."""
-    name = made.DESCRIPTOR.full_name
+def compare_schema(message_class: type[Message]) -> str:
+    """Return the difference of a recorded schema from ours of the same name in words, or SAME_SCHEMA."""
+    name = message_class.DESCRIPTOR.full_name
     try:
-        today = _shape(messages.message_class(name).DESCRIPTOR)
+        today = _field_shapes(messages.message_class(name).DESCRIPTOR)
     except KeyError:
         return "not one of ours"
-    then = _shape(made.DESCRIPTOR)
+    then = _field_shapes(message_class.DESCRIPTOR)
     parts = [
         f"{words} {', '.join(sorted(fields))}"
         for words, fields in (
@@ -72,19 +72,17 @@ def compared(made: type[Message]) -> str:
         )
         if fields
     ]
-    return "; ".join(parts) or SAME
+    return "; ".join(parts) or SAME_SCHEMA
 
 
-def _shape(descriptor: Any, prefix: str = "", above: frozenset[str] = frozenset()) -> dict[str, tuple[int, ...]]:
-    """Every field by its path: number and type. A message within itself is not followed.
-
-    The stubs know two types of descriptors, upb's and pure Python's.
-    """
+def _field_shapes(descriptor: Any, prefix: str = "", above: frozenset[str] = frozenset()) -> dict[str, tuple[int, ...]]:
+    """Return number, type and label of every field by its path. Skip messages nested in themselves."""
+    # Any: the stubs know two types of descriptors, those of upb and of pure Python.
     found: dict[str, tuple[int, ...]] = {}
     for field in descriptor.fields:
         path = prefix + field.name
         found[path] = (field.number, field.type, field.is_repeated)
         inner = field.message_type
         if field.type == FieldDescriptor.TYPE_MESSAGE and inner is not None and inner.full_name not in above:
-            found |= _shape(inner, f"{path}.", above | {descriptor.full_name})
+            found |= _field_shapes(inner, f"{path}.", above | {descriptor.full_name})
     return found

@@ -1,6 +1,6 @@
-"""Reading a session back: its segments, its description, every message that is whole. Nothing is repaired here.
+"""Reads a session: its segments, its description and every intact message. Repairs nothing.
 
-A session is a directory (directory.py) or a bare .mcap, also somebody else's. What is whole of a file is salvage.py's.
+A session is a directory (session_dir.py) or a single .mcap file of any writer. mcap_reader.py reads the files.
 """
 
 import json
@@ -18,47 +18,47 @@ from fleet.recording.writing.mcap_copy import Copy
 
 
 class NoSession(Exception):
-    """What was named is not a session; its text names it and says why."""
+    """The path is no session. The message names the path and the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """One message of a session: payload bytes as they came over the bus."""
+    """One message of a session, with its payload as on the bus."""
 
     key: str
     payload: bytes
     message: str
-    """Full protobuf name; empty where the file has no schema for it."""
+    """Full protobuf name; empty if the file has no schema for it."""
     encoding: str
-    """MCAP message encoding: `protobuf`, `json`, or what the publisher said."""
+    """MCAP message encoding: `protobuf`, `json`, or the encoding of the publisher."""
     published_ns: int
     """Zenoh timestamp of the publisher's session, ns since the epoch."""
     recorded_ns: int
-    """The recorder's clock, ns since the epoch."""
+    """Time of the recorder's clock, ns since the epoch."""
     sequence: int
-    """The publisher's number for the key, modulo 2^32; 0 if it gave none."""
+    """Sequence number of the publisher for the key, modulo 2^32; 0 if it sent none."""
 
 
 @dataclass(slots=True)
 class Session:
-    """Segments in order. `damage` says what is wrong with which, as far as opening, checking or reading has seen it."""
+    """Segments in order, and their `damage` found so far by opening, checking or reading."""
 
     path: Path
     segments: tuple[Path, ...]
-    """Those that can be read."""
+    """Readable segments."""
     description: session_dir.SessionInfo | None
     damage: dict[Path, str] = field(default_factory=dict)
     unended: set[Path] = field(default_factory=set)
-    """Those of which nothing is known to be wrong but that they stop somewhere, as one does that is being written."""
+    """Segments that are only truncated, as a file still being written is."""
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Find a session's segments; raises NoSession."""
+        """Find the segments of a session; raises NoSession."""
         try:
             whole = path.is_dir()
             there = sorted(path.glob(session_dir.SEGMENTS)) if whole else [path]
             if whole and not there:
-                # Is it empty, or must we not look? Only listing it tells.
+                # Glob hides a missing permission. Listing the directory raises it.
                 next(path.iterdir(), None)
                 raise NoSession(f"{path} is not a session: no {session_dir.segment(Path(), 1)} in it")
             if not whole and not path.exists():
@@ -77,12 +77,12 @@ class Session:
             raise NoSession("; ".join(f"{segment} {words}" for segment, words in damage.items()))
         if whole:
             numbered = {session_dir.segment(path, number + 1) for number in range(int(there[-1].stem))}
-            if missing := sorted((numbered | _closed(path)) - set(there)):
+            if missing := sorted((numbered | _closed_segments(path)) - set(there)):
                 damage[path] = f"lacks {len(missing)} of its files, the first is {missing[0].name}"
-            given = _json(path / session_dir.DESCRIPTION).get("format")
-            if isinstance(given, int) and given > session_dir.FORMAT:
+            given = _json(path / session_dir.SESSION_FILE).get("format")
+            if isinstance(given, int) and given > session_dir.FORMAT_VERSION:
                 raise NoSession(
-                    f"{path} has format {given}, this version reads up to {session_dir.FORMAT}: "
+                    f"{path} has format {given}, this version reads up to {session_dir.FORMAT_VERSION}: "
                     "update zenoh-car-fleet; "
                     f"its files can be looked into one by one, as {there[0]}"
                 )
@@ -91,34 +91,34 @@ class Session:
 
     @property
     def name(self) -> str:
-        """What to call it: the directory's name, or the file's without its ending."""
+        """Return the name of the directory, or of the file without its suffix."""
         return self.path.resolve().name if self.path.is_dir() else self.path.stem
 
     def lacking(self, messages: int) -> str:
-        """What its description says that there should be besides; empty if these are all, or nothing tells."""
-        said = self.description.messages if self.description is not None and self.description.closed else 0
-        return f"says that there were {said} messages: {said - messages} are not here" if messages < said else ""
+        """Return which messages session.json counts beyond these, in words; empty if none or unknown."""
+        total = self.description.messages if self.description is not None and self.description.closed else 0
+        return f"says that there were {total} messages: {total - messages} are not here" if messages < total else ""
 
     @property
     def damage_words(self) -> str:
-        """One line on what is missing and why; empty if the session is whole."""
+        """Return the damage on one line; empty if there is none."""
         return "; ".join(f"{path} {words}" for path, words in sorted(self.damage.items()))
 
     def check(self) -> None:
-        """Look at every checksum, which reading by way of the index does not; adds what is wrong to `damage`."""
+        """Check every CRC, also those that reading skips, and add failures to `damage`."""
         for segment in self.segments:
             try:
-                salvage = McapReader(segment)
-                salvage.check()
-            except NotMcap as error:  # it was one when it was opened
+                reader = McapReader(segment)
+                reader.check()
+            except NotMcap as error:  # replaced since it was opened
                 self.damage[segment] = str(error)
             else:
-                self._note(salvage)
+                self._add_damage(reader)
 
     def rescue(self, out: Path) -> "Session":
-        """Write every whole message into a new, whole file; it as a session. Raises OSError, and NoSession if none is.
+        """Copy every intact message into a new file, and return it as a session. Raises OSError, NoSession if empty.
 
-        For what is cut or damaged: other readers stop early there, or show what fails its checksum.
+        For truncated or damaged files: other readers stop at the damage, or show corrupted messages.
         """
         with Copy(out) as copy:
             for row in self.rows():
@@ -130,41 +130,41 @@ class Session:
     def messages(
         self, keys: Iterable[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Recorded]:
-        """Every whole message, in the order of writing; see `damage` afterwards.
+        """Yield every intact message in the order of the file; see `damage` afterwards.
 
-        `keys`: only of these keys or key expressions (`fleet/red/**`, `fleet/*/sensor/range`). `start_ns`, `end_ns`:
-        only from then until before then, by the recorder's clock. Of a whole file only the chunks are read that can
-        have some, so that the last minute of a long session takes no longer than a minute's messages.
+        `keys` selects keys or key expressions (`fleet/red/**`, `fleet/*/sensor/range`). `start_ns` (included) and
+        `end_ns` (excluded) select times of the recorder's clock. With an index only chunks in question are read: the
+        last minute of a long session takes no longer than a minute's messages.
         """
-        for lane, sequence, log_ns, publish_ns, data in self.rows(Selection.of(keys, start_ns, end_ns)):
+        for info, sequence, log_ns, publish_ns, data in self.rows(Selection.of(keys, start_ns, end_ns)):
             yield Recorded(
-                key=lane.channel.topic,
+                key=info.channel.topic,
                 payload=data,
-                message=message_of(lane),
-                encoding=lane.channel.message_encoding,
+                message=message_of(info),
+                encoding=info.channel.message_encoding,
                 published_ns=publish_ns,
                 recorded_ns=log_ns,
                 sequence=sequence,
             )
 
     def rows(self, selection: Selection = EVERYTHING) -> Iterator[Row]:
-        """As `messages`, as plain tuples with channel and schema as they are in the file: a third of the time."""
+        """Yield messages as plain tuples with their channel and schema: a third of the time of `messages`."""
         for segment in self.segments:
-            yield from self._whole(segment, selection)
+            yield from self._read_segment(segment, selection)
 
     def expected(self) -> dict[Path, int | None]:
-        """How many messages each segment should have, by its own end or what the recorder noted; None: not known."""
-        counts = ((each["file"], each.get("messages")) for each in _noted(self.path))
-        noted = {name: count for name, count in counts if isinstance(count, int)}
+        """Return the expected messages of each segment, from its index or index.json; None if unknown."""
+        counts = ((each["file"], each.get("messages")) for each in _indexed_segments(self.path))
+        indexed = {name: count for name, count in counts if isinstance(count, int)}
         found: dict[Path, int | None] = {}
         for segment, index in self.indexes().items():
             statistics = None if index is None else index.statistics
-            found[segment] = noted.get(segment.name) if statistics is None else statistics.message_count
+            found[segment] = indexed.get(segment.name) if statistics is None else statistics.message_count
         gone = (path for path in self.damage if path.suffix == ".mcap" and path not in found)
-        return found | {path: noted.get(path.name) for path in gone}
+        return found | {path: indexed.get(path.name) for path in gone}
 
     def indexes(self) -> dict[Path, Index | None]:
-        """What stands at the end of each segment; None where it is not whole, or cannot be read."""
+        """Return the index of each segment; None if it is damaged or cannot be read."""
         found: dict[Path, Index | None] = {}
         for segment in self.segments:
             try:
@@ -173,34 +173,34 @@ class Session:
                 found[segment] = None
         return found
 
-    def _whole(self, segment: Path, selection: Selection) -> Iterator[Row]:
+    def _read_segment(self, segment: Path, selection: Selection) -> Iterator[Row]:
         try:
-            salvage = McapReader(segment)
+            reader = McapReader(segment)
         except NotMcap as error:
             self.damage[segment] = str(error)
             return
-        yield from salvage.messages(selection)
-        self._note(salvage)
+        yield from reader.messages(selection)
+        self._add_damage(reader)
 
-    def _note(self, salvage: McapReader) -> None:
-        if salvage.damage:
-            self.damage[salvage.path] = salvage.words
-            (self.unended.add if salvage.only_cut else self.unended.discard)(salvage.path)
-
-
-def _closed(path: Path) -> set[Path]:
-    """The segments that the recorder noted when it closed them: of one that was last, nothing else tells."""
-    return {path / one["file"] for one in _noted(path)}
+    def _add_damage(self, reader: McapReader) -> None:
+        if reader.damage:
+            self.damage[reader.path] = reader.words
+            (self.unended.add if reader.only_cut else self.unended.discard)(reader.path)
 
 
-def _noted(path: Path) -> list[dict[str, Any]]:
-    noted = _json(path / session_dir.INDEX).get("segments") if path.is_dir() else None
-    named = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
+def _closed_segments(path: Path) -> set[Path]:
+    """Return the segments listed in index.json, which alone shows that the last one is missing."""
+    return {path / one["file"] for one in _indexed_segments(path)}
+
+
+def _indexed_segments(path: Path) -> list[dict[str, Any]]:
+    indexed = _json(path / session_dir.INDEX_FILE).get("segments") if path.is_dir() else None
+    named = [one for one in indexed if isinstance(one, dict)] if isinstance(indexed, list) else []
     return [one for one in named if isinstance(one.get("file"), str) and fnmatch(one["file"], session_dir.SEGMENTS)]
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """What a file says; nothing if that is no object."""
+    """Return the JSON object in a file; empty if there is none."""
     try:
         values = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
     except (OSError, ValueError, RecursionError):
@@ -208,6 +208,6 @@ def _json(path: Path) -> dict[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
-def message_of(lane: ChannelInfo) -> str:
-    """Full protobuf name of a lane's messages; empty where the file has no schema for it."""
-    return lane.schema.name if lane.schema is not None and lane.schema.encoding == "protobuf" else ""
+def message_of(info: ChannelInfo) -> str:
+    """Return the full protobuf name of the messages of a channel; empty if the file has no schema for it."""
+    return info.schema.name if info.schema is not None and info.schema.encoding == "protobuf" else ""

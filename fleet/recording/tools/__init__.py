@@ -1,1 +1,1 @@
-"""What can be done with a recorded session: summarize, verify, cut, recover, and export to tables."""
+"""Tools for recorded sessions: summarize, verify, cut, recover, and export to tables."""

@@ -1,7 +1,7 @@
-"""Readings of one type of message as one CSV table (RFC 4180): which columns, and each reading's row. Pure.
+"""Formats readings of one message type as a CSV table (RFC 4180) for `fleet get --csv`. Pure.
 
-Columns are the key, the time, and every field of the message with its unit in the name: always the same for a type,
-empty where nothing was measured. Numbers, times and truths are written as in JSON, whatever the locale.
+The columns are the time, the key, and every field of the message with its unit in the name. They are always the same
+for a type, and empty where nothing was measured. Numbers, times and booleans are written as in JSON.
 """
 
 import csv
@@ -14,12 +14,12 @@ from typing import Any, Final
 from fleet.client.reading import Reading
 from schemas import topics
 
-_COMMON: Final = frozenset({"stamp", "timestamp", "boot_id"})
-_UNITS: Final = {"1": "", "B": "bytes"}
+_OMITTED_FIELDS: Final = frozenset({"stamp", "timestamp", "boot_id"})
+_UNIT_NAMES: Final = {"1": "", "B": "bytes"}
 
 
 def table(readings: Sequence[Reading], topic: topics.Topic) -> str:
-    """The whole table, header first; the readings must be of this topic."""
+    """Return the table with its header. All readings must be of this topic."""
     fields = list(_fields(readings))
     lines = io.StringIO(newline="")
     writer = csv.writer(lines)
@@ -30,14 +30,14 @@ def table(readings: Sequence[Reading], topic: topics.Topic) -> str:
 
 
 def iso(time: datetime) -> str:
-    """A time in ISO 8601, UTC, with microseconds."""
+    """Return a time in ISO 8601, UTC, with microseconds."""
     return time.astimezone(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
 def _fields(readings: Sequence[Reading]) -> Iterable[tuple[str, int | None]]:
-    """The fields with a column each; a list of numbers has as many as its longest."""
+    """Yield each column as field and index. A list of numbers has one column per item of its longest value."""
     for field in readings[0].value.DESCRIPTOR.fields:
-        if field.name in _COMMON:
+        if field.name in _OMITTED_FIELDS:
             continue
         if field.is_repeated and field.cpp_type == field.CPPTYPE_DOUBLE:
             longest = max(len(getattr(reading.value, field.name)) for reading in readings)
@@ -47,8 +47,8 @@ def _fields(readings: Sequence[Reading]) -> Iterable[tuple[str, int | None]]:
 
 
 def column_name(name: str, unit: str, index: int | None = None) -> str:
-    """The name of a field's column: with its unit if it does not end in that; an item of a list has its number."""
-    unit = _UNITS.get(unit, unit).lower()
+    """Return the column name of a field: with the number of a list item, and with its unit unless the name has it."""
+    unit = _UNIT_NAMES.get(unit, unit).lower()
     numbered = name if index is None else f"{name}_{index + 1}"
     return numbered if not unit or name.endswith(f"_{unit}") or name == unit else f"{numbered}_{unit}"
 

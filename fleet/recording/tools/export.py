@@ -1,4 +1,4 @@
-"""A session as tables in a directory, one file for each type of message. How tables look is tables.py's."""
+"""Exports a session to tables in a directory, one file per message type. tables.py defines their columns."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,56 +15,56 @@ from fleet.recording.tools import tables
 from fleet.recording.tools.table_formats import Sink
 
 BATCH_BYTES: Final = 4 << 20
-"""What waits of one table until it is written: payloads, and ROW_BYTES for each row."""
+"""Maximum buffered size of one table: its payloads, and ROW_BYTES per row."""
 ROW_BYTES: Final = 256
-OTHER: Final = "other"
+OTHER_TABLE: Final = "other"
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What was written."""
+    """Result of an export."""
 
     rows: Mapping[str, int]
-    """By file name."""
+    """Rows by file name."""
     undecoded: int
-    """Messages with a protobuf schema that they do not fit: among the others, as bytes."""
+    """Messages that do not match their protobuf schema. Their bytes are in the table of other messages."""
 
 
 @dataclass(slots=True)
-class _Waiting:
-    """Messages that wait for their table, by column: of a row each, the garbage collector would take a third longer."""
+class _Batch:
+    """Buffered messages of a table, by column: one object per row would cost a third more time in the collector."""
 
-    lanes: list[ChannelInfo] = field(default_factory=list)
+    infos: list[ChannelInfo] = field(default_factory=list)
     log_ns: list[int] = field(default_factory=list)
     publish_ns: list[int] = field(default_factory=list)
     sequences: list[int] = field(default_factory=list)
     payloads: list[bytes] = field(default_factory=list)
 
-    def part(self, numbers: Sequence[int]) -> "_Waiting":
-        """Some of them."""
-        columns = (self.lanes, self.log_ns, self.publish_ns, self.sequences, self.payloads)
-        return _Waiting(*([column[number] for number in numbers] for column in columns))  # type: ignore[arg-type]  # in turn
+    def part(self, numbers: Sequence[int]) -> "_Batch":
+        """Return the messages with these row numbers."""
+        columns = (self.infos, self.log_ns, self.publish_ns, self.sequences, self.payloads)
+        return _Batch(*([column[number] for number in numbers] for column in columns))  # type: ignore[arg-type]  # in turn
 
-    def extend(self, others: "_Waiting") -> None:
-        """Add them all."""
-        self.lanes += others.lanes
+    def extend(self, others: "_Batch") -> None:
+        """Add all messages of another batch."""
+        self.infos += others.infos
         self.log_ns += others.log_ns
         self.publish_ns += others.publish_ns
         self.sequences += others.sequences
         self.payloads += others.payloads
 
     def common(self) -> list[tables.Values]:
-        """The values of the columns that every table has."""
-        topics = [lane.channel.topic for lane in self.lanes]
+        """Return the values of the columns that every table has."""
+        topics = [info.channel.topic for info in self.infos]
         cars = {key: tables.car_of(key) for key in set(topics)}
         return [topics, [cars[key] for key in topics], self.log_ns, self.publish_ns, self.sequences]
 
     def others(self) -> list[tables.Values]:
-        """The values of the columns of what is no protobuf message."""
+        """Return the values of the columns for messages that are not protobuf."""
         texts = [_text(payload) for payload in self.payloads]
         return [
-            [message_of(lane) or None for lane in self.lanes],
-            [lane.channel.message_encoding for lane in self.lanes],
+            [message_of(info) or None for info in self.infos],
+            [info.channel.message_encoding for info in self.infos],
             texts,
             [None if text is not None else data for data, text in zip(self.payloads, texts, strict=True)],
         ]
@@ -72,40 +72,40 @@ class _Waiting:
 
 @dataclass(slots=True)
 class _Table:
-    """One file, and what waits for it."""
+    """One file, and its buffered messages."""
 
     sink: Sink
     layout: tables.Layout | None
-    made: type[Message] | None
+    message_class: type[Message] | None
     name: str
-    waiting: _Waiting = field(default_factory=_Waiting)
+    batch: _Batch = field(default_factory=_Batch)
     size: int = 0
     rows: int = 0
 
-    def write(self) -> _Waiting:
-        """Write what waits; what of it is not the message that it should be is left out and returned."""
-        batch, self.waiting, self.size = self.waiting, _Waiting(), 0
-        bad = _Waiting()
+    def write(self) -> _Batch:
+        """Write the buffered rows. Return those that do not match their schema."""
+        batch, self.batch, self.size = self.batch, _Batch(), 0
+        bad = _Batch()
         messages: list[Message] = []
-        if self.made is not None:
+        if self.message_class is not None:
             try:
-                messages = list(map(self.made.FromString, batch.payloads))
+                messages = list(map(self.message_class.FromString, batch.payloads))
             except DecodeError:
-                batch, bad, messages = _sorted_out(batch, self.made)
-        if batch.lanes:
+                batch, bad, messages = _split_undecodable(batch, self.message_class)
+        if batch.infos:
             own = self.layout.fill(messages) if self.layout is not None else batch.others()
             self.sink.add([*batch.common(), *own])
-            self.rows += len(batch.lanes)
+            self.rows += len(batch.infos)
         return bad
 
 
-def _sorted_out(batch: _Waiting, made: type[Message]) -> tuple[_Waiting, _Waiting, list[Message]]:
+def _split_undecodable(batch: _Batch, message_class: type[Message]) -> tuple[_Batch, _Batch, list[Message]]:
     good: list[int] = []
     bad: list[int] = []
     messages: list[Message] = []
     for number, payload in enumerate(batch.payloads):
         try:
-            messages.append(made.FromString(payload))
+            messages.append(message_class.FromString(payload))
         except DecodeError:
             bad.append(number)
         else:
@@ -114,31 +114,31 @@ def _sorted_out(batch: _Waiting, made: type[Message]) -> tuple[_Waiting, _Waitin
 
 
 class _Export:
-    """The tables of a session, as far as they have been met."""
+    """Tables of a session found so far."""
 
     def __init__(self, out: Path, sink: type[Sink]) -> None:
         self._out = out
         self._sink = sink
         self._decoder = MessageDecoder()
-        self._by_lane: dict[int, tuple[ChannelInfo, _Table]] = {}
+        self._by_channel: dict[int, tuple[ChannelInfo, _Table]] = {}
         self.tables: dict[type[Message] | None, _Table] = {}
         self.undecoded = 0
 
     def run(self, rows: Iterable[Row]) -> None:
         """Write every message."""
-        by_lane = self._by_lane
-        for lane, sequence, log_ns, publish_ns, payload in rows:
-            # By identity, which is quick; the lane is kept with it, so that no other can have the same.
-            known = by_lane.get(id(lane))
+        by_channel = self._by_channel
+        for info, sequence, log_ns, publish_ns, payload in rows:
+            # Look it up by identity, which is fast. Storing the object too keeps its id from being reused.
+            known = by_channel.get(id(info))
             if known is None:
-                known = by_lane[id(lane)] = (lane, self._of(self._decoder.class_of(lane)))
+                known = by_channel[id(info)] = (info, self._table_for(self._decoder.class_of(info)))
             table = known[1]
-            waiting = table.waiting
-            waiting.lanes.append(lane)
-            waiting.log_ns.append(log_ns)
-            waiting.publish_ns.append(publish_ns)
-            waiting.sequences.append(sequence)
-            waiting.payloads.append(payload)
+            batch = table.batch
+            batch.infos.append(info)
+            batch.log_ns.append(log_ns)
+            batch.publish_ns.append(publish_ns)
+            batch.sequences.append(sequence)
+            batch.payloads.append(payload)
             table.size += len(payload) + ROW_BYTES
             if table.size >= BATCH_BYTES:
                 self._write(table)
@@ -149,24 +149,24 @@ class _Export:
 
     def _write(self, table: _Table) -> None:
         bad = table.write()
-        self.undecoded += len(bad.lanes)
-        if bad.lanes:
-            self._of(None).waiting.extend(bad)
+        self.undecoded += len(bad.infos)
+        if bad.infos:
+            self._table_for(None).batch.extend(bad)
 
-    def _of(self, made: type[Message] | None) -> _Table:
-        if made not in self.tables:
-            self.tables[made] = self._opened(made)
-        return self.tables[made]
+    def _table_for(self, message_class: type[Message] | None) -> _Table:
+        if message_class not in self.tables:
+            self.tables[message_class] = self._open_table(message_class)
+        return self.tables[message_class]
 
-    def _opened(self, made: type[Message] | None) -> _Table:
-        """A new file; a second type of the same name, whose fields changed within the session, has a number."""
-        name = made.DESCRIPTOR.full_name if made is not None else OTHER
+    def _open_table(self, message_class: type[Message] | None) -> _Table:
+        """Open a new file. Number it if fields of the type changed within the session."""
+        name = message_class.DESCRIPTOR.full_name if message_class is not None else OTHER_TABLE
         stem = re.sub(r"[^A-Za-z0-9._-]", "_", name)
         taken = {table.name.lower() for table in self.tables.values()}
-        file = next(one for one in _names(stem, self._sink.ending) if one.lower() not in taken)
-        layout = tables.Layout(made.DESCRIPTOR) if made is not None else None
-        sink = self._sink(self._out / file, layout.columns if layout is not None else tables.OTHER)
-        return _Table(sink, layout, made, file)
+        file = next(one for one in _file_names(stem, self._sink.ending) if one.lower() not in taken)
+        layout = tables.Layout(message_class.DESCRIPTOR) if message_class is not None else None
+        sink = self._sink(self._out / file, layout.columns if layout is not None else tables.OTHER_COLUMNS)
+        return _Table(sink, layout, message_class, file)
 
     def close(self) -> None:
         """End every file."""
@@ -175,7 +175,7 @@ class _Export:
 
 
 def export(rows: Iterable[Row], out: Path, sink: type[Sink]) -> Exported:
-    """Write the tables of messages into a directory that is there; raises OSError, FormatMissing."""
+    """Write the tables of messages into an existing directory; raises OSError, FormatMissing."""
     writing = _Export(out, sink)
     try:
         writing.run(rows)
@@ -184,7 +184,7 @@ def export(rows: Iterable[Row], out: Path, sink: type[Sink]) -> Exported:
     return Exported({table.name: table.rows for table in writing.tables.values()}, writing.undecoded)
 
 
-def _names(stem: str, ending: str) -> Iterator[str]:
+def _file_names(stem: str, ending: str) -> Iterator[str]:
     yield f"{stem}{ending}"
     number = 2
     while True:

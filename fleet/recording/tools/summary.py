@@ -1,4 +1,4 @@
-"""What can be said of a session without reading its messages: from session.json and what stands at each file's end."""
+"""Summarizes a session without reading its messages, from session.json and the index of each file."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,67 +14,65 @@ from fleet.recording.selection import Selection
 from fleet.recording.tools.transform import lost_words
 from schemas import keys
 
-MARK: Final = "@recorder/mark"
-WRITING_S: Final = 5.0
-"""A session that is not closed, and whose files changed so lately, is being recorded still: a flush a second."""
-
-
-LOOKED_S: Final = 2.5
-"""A recorder writes each second, its own status at least: a session that does not grow for so long is not recorded."""
-LOOK_EACH_S: Final = 0.1
-STEP_NS: Final = 1_000_000_000
-"""Times that go back further than this are a clock that went back."""
+MARK_TOPIC_NAME: Final = "@recorder/mark"
+RECENT_WRITE_S: Final = 5.0
+"""Maximum age of the last write for an unclosed session to count as being recorded. A recorder flushes every second."""
+MAX_GROWTH_WAIT_S: Final = 2.5
+"""Timeout for an unclosed session to grow. A recorder writes at least its own status every second."""
+GROWTH_POLL_INTERVAL_S: Final = 0.1
+MIN_CLOCK_STEP_NS: Final = 1_000_000_000
+"""Minimum backward step of times that counts as a step of the clock."""
 
 
 class SessionState(StrEnum):
-    """How a session is."""
+    """State of a session."""
 
     WHOLE = "whole"
     RECORDING = "recording"
     CUT = "cut"  # the recorder did not close it
-    DAMAGED = "damaged"  # files are missing, or are none
-    RECOVERED = "recovered"  # whole by itself, made of one that lacked something
-    UNREADABLE = "unreadable"  # nothing of it can be read, or it is of a newer version
+    DAMAGED = "damaged"  # files are missing or no MCAP files
+    RECOVERED = "recovered"  # whole, but made from an incomplete session
+    UNREADABLE = "unreadable"  # no file can be read, or the format is newer than ours
 
 
 @dataclass(slots=True)
 class SessionSummary:
-    """A line of the list."""
+    """One line of `fleet sessions list`."""
 
     name: str
     path: str
     state: SessionState
     words: str = ""
-    """Why it is not whole."""
+    """Why the session is not whole."""
     started: str = ""
     """ISO 8601, UTC."""
     length_s: float = 0.0
-    """What passed on the recorder's clock; what it went back is left out."""
+    """Duration on the recorder's clock, without backward steps."""
     clock_back_s: float = 0.0
-    """The furthest that the recorder's clock went back, at once."""
+    """Largest backward step of the recorder's clock."""
     bytes: int = 0
     messages: int = 0
     lost: int = 0
-    """Messages dropped by the recorder, or missed on the bus, as far as it knew."""
+    """Messages that the recorder dropped, or knew to have missed on the bus."""
     cars: Sequence[str] = ()
     marks: Sequence[Mapping[str, Any]] = ()
     kept: bool = False
-    """Whether it is spared when room is made for others."""
+    """True if the quota spares the session."""
     keys: Mapping[str, int] = field(default_factory=dict)
     """Messages by key."""
     start_ns: int = 0
     end_ns: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the fields for JSON."""
         return asdict(self)
 
 
 def overviews(root: Path) -> Iterator[SessionSummary]:
-    """Every session below a directory, the oldest first; raises OSError if it cannot be listed."""
+    """Yield every session below a directory, oldest first; raises OSError if it cannot be listed."""
     for path in sorted(root.iterdir()):
         if path.is_dir() and not path.name.startswith("."):
-            described = (path / session_dir.DESCRIPTION).exists()
+            described = (path / session_dir.SESSION_FILE).exists()
             if described or next(path.glob(session_dir.SEGMENTS), None) is not None:
                 yield overview(path)
         elif path.suffix == ".mcap" and path.is_file():
@@ -82,7 +80,7 @@ def overviews(root: Path) -> Iterator[SessionSummary]:
 
 
 def overview(path: Path) -> SessionSummary:
-    """One session; nothing that is wrong with it is an error."""
+    """Summarize one session. Damage is part of the summary and no error."""
     try:
         session = Session.open(path)
     except NoSession as error:
@@ -92,7 +90,7 @@ def overview(path: Path) -> SessionSummary:
 
 
 def of_session(session: Session) -> SessionSummary:
-    """As `overview`, of one that is open."""
+    """Summarize an open session."""
     found = SessionSummary(session.name, str(session.path), SessionState.WHOLE)
     counts: dict[str, int] = {}
     cut: list[Path] = []
@@ -101,12 +99,12 @@ def of_session(session: Session) -> SessionSummary:
         if index is not None and index.statistics is not None:
             for key, count in index.counts.items():
                 counts[key] = counts.get(key, 0) + count
-            for place in index.places:
-                span.add(place.first_ns, place.last_ns)
+            for chunk in index.chunks:
+                span.add(chunk.first_ns, chunk.last_ns)
             continue
         cut.append(segment)
-        for lane, _, log_ns, _, _ in Session(segment, (segment,), None).rows():
-            counts[lane.channel.topic] = counts.get(lane.channel.topic, 0) + 1
+        for info, _, log_ns, _, _ in Session(segment, (segment,), None).rows():
+            counts[info.channel.topic] = counts.get(info.channel.topic, 0) + 1
             span.add(log_ns, log_ns)
     found.keys = dict(sorted(counts.items()))
     found.messages = sum(counts.values())
@@ -127,14 +125,14 @@ def of_session(session: Session) -> SessionSummary:
         found.kept = description.kept
     found.state, found.words = _state(session, cut)
     if found.state is SessionState.WHOLE and (words := session.lacking(found.messages)):
-        found.state, found.words = SessionState.DAMAGED, f"{session_dir.DESCRIPTION} {words}"
+        found.state, found.words = SessionState.DAMAGED, f"{session_dir.SESSION_FILE} {words}"
     if found.state is SessionState.WHOLE and (words := lost_words(session)):
         found.state, found.words = SessionState.RECOVERED, words
     return found
 
 
 class _Span:
-    """From when to when messages are, chunk by chunk in the order of writing, on a clock that may go back."""
+    """Time span of chunks in the order of the file, on a clock that may step back."""
 
     def __init__(self) -> None:
         self.first_ns = self.last_ns = self.back_ns = 0
@@ -147,10 +145,10 @@ class _Span:
             return
         self.first_ns, self.last_ns = min(self.first_ns, first_ns), max(self.last_ns, last_ns)
         start_ns, end_ns = self._run
-        if end_ns - first_ns <= STEP_NS:
+        if end_ns - first_ns <= MIN_CLOCK_STEP_NS:
             self._run = start_ns, max(end_ns, last_ns)
             return
-        # The chunk in which the clock went back has times of before and after: its last is then one of before.
+        # The chunk in which the clock stepped back has times from before and after: its last time is from before.
         within = last_ns >= end_ns
         end_ns = max(end_ns, last_ns)
         self.back_ns = max(self.back_ns, end_ns - first_ns)
@@ -159,28 +157,28 @@ class _Span:
 
     @property
     def length_ns(self) -> int:
-        """What passed."""
+        """Return the duration without backward steps."""
         return self._before_ns + (self._run[1] - self._run[0] if self._run is not None else 0)
 
 
 def growing(session: Session) -> Callable[[], bool]:
-    """Tells, asked later, whether a session that nobody closed has grown meanwhile; it looks for up to LOOKED_S."""
+    """Return a function that tells whether an unclosed session has grown since; it waits up to MAX_GROWTH_WAIT_S."""
     began, before = time.monotonic(), _size(session.segments)
 
-    def grew() -> bool:
+    def has_grown() -> bool:
         try:
-            lately = max(segment.stat().st_mtime for segment in session.segments) > time.time() - WRITING_S
+            lately = max(segment.stat().st_mtime for segment in session.segments) > time.time() - RECENT_WRITE_S
         except OSError:
             return False
-        while lately and time.monotonic() - began < LOOKED_S and _size(session.segments) == before:
-            time.sleep(LOOK_EACH_S)
+        while lately and time.monotonic() - began < MAX_GROWTH_WAIT_S and _size(session.segments) == before:
+            time.sleep(GROWTH_POLL_INTERVAL_S)
         return _size(session.segments) != before
 
-    return grew
+    return has_grown
 
 
 def total(session: Session) -> int | None:
-    """How many messages the indexes say that there are; None where one is missing."""
+    """Return the number of messages from the indexes; None if one is missing."""
     count = 0
     for index in session.indexes().values():
         if index is None or index.statistics is None:
@@ -190,14 +188,14 @@ def total(session: Session) -> int | None:
 
 
 def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]:
-    """The marks of a session: as its description has them, else as they were recorded."""
+    """Return the marks of a session from session.json, else from its messages."""
     if about.marks:
         return list(about.marks)
     found: list[Mapping[str, Any]] = []
     decoder = MessageDecoder()
-    marked = [key for key in about.keys if key.endswith(f"/{MARK}")]
-    for lane, _, log_ns, _, data in session.rows(Selection.of(marked, None, None)) if marked else ():
-        message: Any = decoder.message(lane, data)
+    marked = [key for key in about.keys if key.endswith(f"/{MARK_TOPIC_NAME}")]
+    for info, _, log_ns, _, data in session.rows(Selection.of(marked, None, None)) if marked else ():
+        message: Any = decoder.message(info, data)
         if message is not None:
             text, by = getattr(message, "message", ""), getattr(message, "name", "")
             found.append({"time": time_spec.iso(log_ns), "text": text, "by": by})
@@ -209,7 +207,7 @@ def _state(session: Session, cut: Sequence[Path]) -> tuple[SessionState, str]:
     if session.damage:
         return SessionState.DAMAGED, session.damage_words
     if description is not None and not description.closed:
-        lately = max(segment.stat().st_mtime for segment in session.segments) > time.time() - WRITING_S
+        lately = max(segment.stat().st_mtime for segment in session.segments) > time.time() - RECENT_WRITE_S
         if lately and not description.ended:
             return SessionState.RECORDING, ""
         return (
@@ -227,5 +225,5 @@ def _size(paths: Sequence[Path]) -> int:
         try:
             total += path.stat().st_size if path.is_file() else 0
         except OSError:
-            continue  # it went meanwhile
+            continue  # removed meanwhile
     return total

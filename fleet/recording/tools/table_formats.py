@@ -1,7 +1,7 @@
-"""Tables as files: CSV with the standard library, Parquet with pyarrow, which is imported only for that.
+"""Writes tables as CSV with the standard library, or as Parquet with pyarrow, imported only then.
 
-Times are UTC to the nanosecond without a zone, because readers differ in what they do with one: pandas, DuckDB and
-Polars all take `2026-03-14 15:16:17.123456789` for a time as it is.
+Times are UTC with nanoseconds and without a zone, because readers treat zones differently. pandas, DuckDB and Polars
+all parse `2026-03-14 15:16:17.123456789` as a time.
 """
 
 import csv
@@ -13,16 +13,16 @@ from typing import Any, ClassVar, Final, Protocol
 
 from fleet.recording.tools.tables import Column, ColumnKind, Values
 
-SECONDS: Final = 4096
-"""So many seconds are remembered as text."""
+MAX_CACHED_SECONDS: Final = 4096
+"""Maximum seconds cached as text."""
 
 
 class FormatMissing(Exception):
-    """A format whose package is not installed; its text says how to have it."""
+    """The package of a format is not installed. The message says how to install it."""
 
 
 class Sink(Protocol):
-    """One table being written; every method may raise OSError."""
+    """One table to write; every method may raise OSError."""
 
     ending: ClassVar[str]
 
@@ -36,7 +36,7 @@ class Sink(Protocol):
 
 
 class CsvSink:
-    """RFC 4180, header first; nothing where nothing was measured. Lists and maps are JSON, bytes hexadecimal."""
+    """CSV table (RFC 4180) with a header. Missing values are empty, lists and maps JSON, bytes hexadecimal."""
 
     ending: ClassVar[str] = ".csv"
 
@@ -44,7 +44,7 @@ class CsvSink:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._file)
         self._writer.writerow([column.name for column in columns])
-        self._texts = [_TEXTS.get(column.kind) for column in columns]
+        self._texts = [_TO_TEXT.get(column.kind) for column in columns]
 
     def add(self, values: Sequence[Values]) -> None:
         """Write rows: the values of each column."""
@@ -56,40 +56,40 @@ class CsvSink:
         self._file.close()
 
 
-class _Seconds(dict[int, str]):
-    """Seconds since the epoch as text, as they are asked for; those met lately are remembered."""
+class _SecondTexts(dict[int, str]):
+    """Cache of seconds since the epoch as text."""
 
     def __missing__(self, second: int) -> str:
-        if len(self) >= SECONDS:
+        if len(self) >= MAX_CACHED_SECONDS:
             self.clear()
         words = self[second] = datetime.fromtimestamp(second, UTC).strftime("%Y-%m-%d %H:%M:%S")
         return words
 
 
 def _times(column: Values) -> Values:
-    seconds = _Seconds()
+    seconds = _SecondTexts()
     try:
         return [None if ns is None else f"{seconds[ns // 1_000_000_000]}.{ns % 1_000_000_000:09d}" for ns in column]
     except (OverflowError, ValueError, OSError):
-        return column  # somebody else's clock: no date, so numbers
+        return column  # not a date: the clock of another writer was wrong
 
 
-def _by(text: Callable[[Any], str]) -> Callable[[Values], Values]:
+def _each(text: Callable[[Any], str]) -> Callable[[Values], Values]:
     return lambda column: [None if value is None else text(value) for value in column]
 
 
-_TEXTS: Final[dict[ColumnKind, Callable[[Values], Values]]] = {
+_TO_TEXT: Final[dict[ColumnKind, Callable[[Values], Values]]] = {
     ColumnKind.BOOL: lambda column: [None if value is None else "true" if value else "false" for value in column],
-    ColumnKind.BYTES: _by(bytes.hex),
+    ColumnKind.BYTES: _each(bytes.hex),
     ColumnKind.TIME: _times,
-    ColumnKind.LIST: _by(json.dumps),
-    ColumnKind.MAP: _by(json.dumps),
+    ColumnKind.LIST: _each(json.dumps),
+    ColumnKind.MAP: _each(json.dumps),
 }
-"""What makes text of the values of a column; the csv module writes the others as they are to be."""
+"""Converter to text by kind of column. The csv module formats the other kinds itself."""
 
 
 class ParquetSink:
-    """Parquet, zstd; a column's unit is in the metadata of its field, as `unit`."""
+    """Parquet table, compressed with zstd. The metadata of a field contains its `unit`."""
 
     ending: ClassVar[str] = ".parquet"
 

@@ -1,7 +1,7 @@
-"""Messages as tidy tables: one for each type of message, a row for each message. Pure; formats are not here.
+"""Converts messages to tidy tables: one table per message type, one row per message. Pure; knows no file format.
 
-Every table begins with the same columns. `car` is the key's, so it is not repeated. A field with a unit has it in its
-name (`rx_bytes`, `uptime_s`, `raw_count`), as in `fleet get --csv`; what was not measured is None.
+Every table begins with the same columns. `car` comes from the key, so the field of a message is left out. A field with
+a unit has it in its name (`rx_bytes`, `uptime_s`), as in `fleet get --csv`. Values that were not measured are None.
 """
 
 import json
@@ -20,11 +20,11 @@ from schemas import keys
 from schemas.topics import TOPICS
 
 TIMESTAMP: Final = "google.protobuf.Timestamp"
-_UNITS: Final[Mapping[str, Mapping[str, str]]] = {topic.message: topic.units for topic in TOPICS.values()}
+_UNITS_BY_MESSAGE: Final[Mapping[str, Mapping[str, str]]] = {topic.message: topic.units for topic in TOPICS.values()}
 
 
 class ColumnKind(StrEnum):
-    """What is in a column."""
+    """Kind of the values of a column."""
 
     FLOAT = "float"
     INT = "int"
@@ -35,7 +35,7 @@ class ColumnKind(StrEnum):
     TIME = "time"  # ns since the epoch, UTC
     LIST = "list"
     MAP = "map"  # its keys are text
-    JSON = "json"  # what has parts of its own, as text
+    JSON = "json"  # a nested message as text
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,29 +46,29 @@ class Column:
     kind: ColumnKind
     unit: str = ""
     item: ColumnKind = ColumnKind.TEXT
-    """What a LIST or a MAP is of."""
+    """Kind of the items of a LIST or MAP."""
 
 
 Values = list[Any]
 """The values of one column."""
 
-COMMON: Final = (
+COMMON_COLUMNS: Final = (
     Column("key", ColumnKind.TEXT),
     Column("car", ColumnKind.TEXT),
     Column("log_time", ColumnKind.TIME, "UTC"),
     Column("publish_time", ColumnKind.TIME, "UTC"),
     Column("sequence", ColumnKind.UINT),
 )
-OTHER: Final = (
-    *COMMON,
+OTHER_COLUMNS: Final = (
+    *COMMON_COLUMNS,
     Column("message", ColumnKind.TEXT),
     Column("encoding", ColumnKind.TEXT),
     Column("text", ColumnKind.TEXT),
     Column("data", ColumnKind.BYTES),
 )
-"""Columns of what is no protobuf message: JSON and the like as text, anything else as bytes."""
+"""Columns of messages that are not protobuf: UTF-8 as text, anything else as bytes."""
 
-_KINDS: Final = {
+_COLUMN_KINDS: Final = {
     FieldDescriptor.CPPTYPE_DOUBLE: ColumnKind.FLOAT,
     FieldDescriptor.CPPTYPE_FLOAT: ColumnKind.FLOAT,
     FieldDescriptor.CPPTYPE_INT32: ColumnKind.INT,
@@ -83,11 +83,11 @@ _KINDS: Final = {
 
 
 class Layout:
-    """The columns of one type of message, and how they are filled."""
+    """Columns of one message type, and the functions that fill them."""
 
     def __init__(self, descriptor: Any) -> None:  # the stubs know two types, upb's and pure Python's
-        units = _UNITS.get(descriptor.full_name, {})
-        taken = {column.name for column in COMMON}
+        units = _UNITS_BY_MESSAGE.get(descriptor.full_name, {})
+        taken = {column.name for column in COMMON_COLUMNS}
         columns: list[Column] = []
         self._fillers: list[Callable[[Sequence[Any]], Values]] = []
         for field in descriptor.fields:
@@ -97,50 +97,50 @@ class Layout:
             while name in taken:
                 name = f"message_{name}"
             taken.add(name)
-            column, filler = _filled(field, name, units.get(field.name, ""))
+            column, filler = _column(field, name, units.get(field.name, ""))
             columns.append(column)
             self._fillers.append(filler)
-        self.columns = (*COMMON, *columns)
+        self.columns = (*COMMON_COLUMNS, *columns)
 
     def fill(self, messages: Sequence[Message]) -> list[Values]:
-        """The values of the columns after the common ones."""
+        """Return the values of the columns after the common ones."""
         return [filler(messages) for filler in self._fillers]
 
 
 def car_of(key: str) -> str:
-    """The car, or the service, that a key is of; empty for a key that is not a fleet's."""
+    """Return the car or service of a key; empty if the key belongs to no fleet."""
     parsed = keys.parse(key)
     return parsed.car if parsed is not None else ""
 
 
 def kind_of(field: FieldDescriptor) -> ColumnKind:
-    """What one value of a field is."""
+    """Return the kind of one value of a field."""
     if field.type == FieldDescriptor.TYPE_BYTES:
         return ColumnKind.BYTES
     if field.message_type is not None and field.message_type.full_name == TIMESTAMP:
         return ColumnKind.TIME
-    return _KINDS[field.cpp_type]
+    return _COLUMN_KINDS[field.cpp_type]
 
 
-def _filled(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Sequence[Any]], Values]]:
+def _column(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Sequence[Any]], Values]]:
     get = attrgetter(field.name)
     kind = kind_of(field)
-    one = _one(field)
+    convert = _converter(field)
     if _is_map(field):
         of = field.message_type.fields_by_name
         item = kind_of(of["value"])
-        if of["key"].cpp_type == FieldDescriptor.CPPTYPE_STRING and item in _PLAIN:
+        if of["key"].cpp_type == FieldDescriptor.CPPTYPE_STRING and item in _SCALAR_KINDS:
             column = Column(name, ColumnKind.MAP, unit, item)
             return column, lambda messages: [dict(sorted(get(message).items())) for message in messages]
         column = Column(name, ColumnKind.JSON, unit)
         return column, lambda messages: [json.dumps(plain(message)[field.name]) for message in messages]
     if field.is_repeated:
-        if kind in _PLAIN:
+        if kind in _SCALAR_KINDS:
             return Column(name, ColumnKind.LIST, unit, kind), lambda messages: [
-                [one(value) for value in get(message)] for message in messages
+                [convert(value) for value in get(message)] for message in messages
             ]
         return Column(name, ColumnKind.JSON, unit), lambda messages: [
-            json.dumps([plain(value) if kind is ColumnKind.JSON else one(value) for value in get(message)])
+            json.dumps([plain(value) if kind is ColumnKind.JSON else convert(value) for value in get(message)])
             for message in messages
         ]
     column = Column(name, kind, unit or ("UTC" if kind is ColumnKind.TIME else ""))
@@ -150,14 +150,14 @@ def _filled(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Sequenc
         ]
     if field.has_presence:
         return column, lambda messages: [
-            one(get(message)) if message.HasField(field.name) else None for message in messages
+            convert(get(message)) if message.HasField(field.name) else None for message in messages
         ]
     if field.enum_type is not None:
-        return column, lambda messages: [one(get(message)) for message in messages]
+        return column, lambda messages: [convert(get(message)) for message in messages]
     return column, lambda messages: list(map(get, messages))
 
 
-_PLAIN: Final = frozenset(
+_SCALAR_KINDS: Final = frozenset(
     {ColumnKind.FLOAT, ColumnKind.INT, ColumnKind.UINT, ColumnKind.BOOL, ColumnKind.TEXT, ColumnKind.TIME}
 )
 
@@ -166,8 +166,8 @@ def _is_map(field: FieldDescriptor) -> bool:
     return field.message_type is not None and bool(field.message_type.GetOptions().map_entry)
 
 
-def _one(field: FieldDescriptor) -> Callable[[Any], Any]:
-    """What makes a value of a field one of a column."""
+def _converter(field: FieldDescriptor) -> Callable[[Any], Any]:
+    """Return the function that converts a value of a field to a value of its column."""
     if field.enum_type is not None:
         names = {number: value.name for number, value in field.enum_type.values_by_number.items()}
         return lambda number: names.get(number, str(number))
@@ -181,7 +181,7 @@ def _nanoseconds(stamp: Any) -> int:
 
 
 def plain(message: Any) -> dict[str, Any]:
-    """A message as what JSON can hold: times in ns, bytes in hexadecimal; a field that is not given is left out."""
+    """Return a message as a JSON object: times in ns, bytes in hexadecimal, without unset fields."""
     found: dict[str, Any] = {}
     for field in message.DESCRIPTOR.fields:
         if field.has_presence and not message.HasField(field.name):
@@ -189,15 +189,15 @@ def plain(message: Any) -> dict[str, Any]:
         value = getattr(message, field.name)
         if _is_map(field):
             of = field.message_type.fields_by_name["value"]
-            found[field.name] = {str(key): _plain_one(of, value[key]) for key in sorted(value)}
+            found[field.name] = {str(key): _plain_value(of, value[key]) for key in sorted(value)}
         elif field.is_repeated:
-            found[field.name] = [_plain_one(field, each) for each in value]
+            found[field.name] = [_plain_value(field, each) for each in value]
         else:
-            found[field.name] = _plain_one(field, value)
+            found[field.name] = _plain_value(field, value)
     return found
 
 
-def _plain_one(field: FieldDescriptor, value: Any) -> Any:
+def _plain_value(field: FieldDescriptor, value: Any) -> Any:
     match kind_of(field):
         case ColumnKind.JSON:
             return plain(value)
@@ -206,4 +206,4 @@ def _plain_one(field: FieldDescriptor, value: Any) -> Any:
         case ColumnKind.FLOAT if not math.isfinite(value):
             return str(value)  # JSON has no such numbers
         case _:
-            return _one(field)(value)
+            return _converter(field)(value)

@@ -1,6 +1,6 @@
-"""New sessions made of old ones: what is whole of a damaged one, or a part. The old one is never written to.
+"""Makes new sessions from old ones: recovers a damaged session, or cuts out a part. Never writes to the old session.
 
-Everything is written beside its place and put there at the end: who is interrupted leaves nothing that is half there.
+A new session is written to a temporary directory and renamed at the end, so an interruption leaves no partial session.
 """
 
 import json
@@ -20,24 +20,24 @@ from fleet.recording.tools.tables import car_of
 from fleet.recording.writing.mcap_copy import Copy
 
 COPIED: Final = ("fleet.yaml", "plan.yaml")
-SEGMENT_BYTES: Final = 256 << 20
-"""A new segment is begun after so many bytes of payloads."""
+MAX_SEGMENT_PAYLOAD_BYTES: Final = 256 << 20
+"""Maximum size of the payloads in one segment."""
 
 
 class Exists(Exception):
-    """Something is where the new directory is to be; its text says what to do."""
+    """The new directory exists already. The message says what to do."""
 
 
 @contextmanager
-def made_whole(out: Path) -> Iterator[Path]:
-    """A directory to write to, which becomes `out` at the end, and nothing if there is none; raises Exists, OSError."""
+def atomic_directory(out: Path) -> Iterator[Path]:
+    """Yield a temporary directory, and rename it to `out` if no error occurs; raises Exists, OSError."""
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise Exists(f"{out} is there already: name a new directory")
     out.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".new", dir=out.parent))
     try:
         new = scratch / out.name
-        new.mkdir()  # with the rights that any new directory has: the one around it is only ours
+        new.mkdir()  # with default permissions: mkdtemp grants access only to us
         yield new
         if out.exists():
             out.rmdir()
@@ -46,18 +46,18 @@ def made_whole(out: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-Watched = Callable[[Iterable[Row]], Iterable[Row]]
-"""Passes messages on and looks at them: progress."""
+Progress = Callable[[Iterable[Row]], Iterable[Row]]
+"""Passes messages through and shows the progress."""
 
 
-def recover(session: Session, out: Path, watched: Watched = iter) -> tuple[int, str]:
-    """Write every whole message as a whole session that says so; how many, and what could not be saved.
+def recover(session: Session, out: Path, watched: Progress = iter) -> tuple[int, str]:
+    """Write every intact message to a new session. Return their number, and the losses in words.
 
-    Raises Exists, OSError, and NoSession if no message is whole.
+    Raises Exists, OSError, and NoSession if no message is intact.
     """
-    with made_whole(out) as new:
+    with atomic_directory(out) as new:
         count = _copy(watched(session.rows()), new, session)
-        # After reading, which says what is lost with a time; a check of what lies between messages tells no more.
+        # Read the damage after reading: it names the lost times then. A check of all CRCs would add nothing.
         words = session.damage_words
         if not count:
             raise NoSession(f"{session.path} holds no message that is whole: {words or 'it is empty'}")
@@ -68,7 +68,7 @@ def recover(session: Session, out: Path, watched: Watched = iter) -> tuple[int, 
 
 
 def _missing(session: Session, count: int, words: str) -> int | None:
-    """How many messages are known not to be among those that were had; None: not known."""
+    """Return the number of messages that could not be read; None if unknown."""
     description = session.description
     if not words:
         return 0
@@ -81,7 +81,7 @@ def _missing(session: Session, count: int, words: str) -> int | None:
 
 
 def _sum(counts: Iterable[object]) -> int | None:
-    """None if one of them is not known."""
+    """Return the sum; None if one count is unknown."""
     total = 0
     for each in counts:
         if not isinstance(each, int):
@@ -90,8 +90,8 @@ def _sum(counts: Iterable[object]) -> int | None:
     return total
 
 
-def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), watched: Watched = iter) -> int:
-    """Write a part as a session of its own; how many messages. `cars`: only theirs, and the services'.
+def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), watched: Progress = iter) -> int:
+    """Write a part to a new session, and return its number of messages. `cars` selects their messages and all services.
 
     Raises Exists, OSError, and NoSession if the part is empty.
     """
@@ -103,7 +103,7 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
             if not names or car in names or car.startswith("@"):
                 yield row
 
-    with made_whole(out) as new:
+    with atomic_directory(out) as new:
         count = _copy(watched(part()), new, session)
         if not count:
             raise NoSession(f"nothing of {session.path} lies there")
@@ -114,28 +114,28 @@ def cut(session: Session, out: Path, selection: Selection, cars: Iterable[str] =
 
 
 def _copy(rows: Iterable[Row], new: Path, session: Session) -> int:
-    """Write segments; how many messages."""
+    """Write the segments, and return the number of messages."""
     description = session.description
     about = {"made_from": session.name}
     if description is not None:
         about |= {"fleet": description.fleet, "started": description.started, "host": description.host}
-    coming = iter(rows)
+    remaining = iter(rows)
     number, count = 0, 0
-    row = next(coming, None)
+    row = next(remaining, None)
     while row is not None:
         number += 1
         size = 0
-        with Copy(session_dir.segment(new, number), {**about, "format": str(session_dir.FORMAT)}) as copy:
-            while row is not None and size < SEGMENT_BYTES:
+        with Copy(session_dir.segment(new, number), {**about, "format": str(session_dir.FORMAT_VERSION)}) as copy:
+            while row is not None and size < MAX_SEGMENT_PAYLOAD_BYTES:
                 copy.add(row)
                 size += len(row[4])
-                row = next(coming, None)
+                row = next(remaining, None)
         count += copy.messages
     return count
 
 
 def _describe(session: Session, new: Path, count: int, origin: Mapping[str, object]) -> None:
-    """`session.json` and the other files of the session, as the old ones are."""
+    """Write `session.json`, and copy the other files of the old session."""
     first = last = None
     fleet = ""
     for index in Session.open(new).indexes().values():
@@ -147,13 +147,13 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
     assert last is not None
     old = session.description
     before = origin_of(session)
-    if lost := before.get("lost"):  # what was missing before is missing still
+    if lost := before.get("lost"):  # the old session was incomplete already
         origin = {**origin, "lost": "; ".join(str(each) for each in (origin["lost"], lost) if each)}
         origin["missing"] = _sum((origin.get("missing"), before.get("missing")))
     if not origin.get("cars") and before.get("cars"):
         origin = {**origin, "cars": before["cars"]}
     base = old if old is not None else session_dir.SessionInfo(fleet, time_spec.iso(first), "", {})
-    made = {"by": origin["by"], "of": session.name, **origin}
+    origin = {"by": origin["by"], "of": session.name, **origin}
     replace(
         base,
         started=time_spec.iso(first) if origin["by"] == "cut" else base.started,
@@ -161,8 +161,8 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
         closed=True,
         messages=count,
         error="",
-        format=session_dir.FORMAT,
-        origin=made,
+        format=session_dir.FORMAT_VERSION,
+        origin=origin,
     ).write(new)
     if session.path.is_dir():
         for name in COPIED:
@@ -171,12 +171,12 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
 
 
 def origin_of(session: Session) -> Mapping[str, Any]:
-    """Of what a session was made, and what that lacked; empty if it was recorded."""
+    """Return the origin of a session that was made from another; empty if it was recorded."""
     return session.description.origin if session.description is not None else {}
 
 
 def lost_words(session: Session) -> str:
-    """What is missing since before a session was made of another; empty if nothing is."""
+    """Return the losses of the session from which this one was made; empty if there are none."""
     origin = origin_of(session)
     if not origin.get("lost") or origin.get("missing") == 0:
         return ""
@@ -186,7 +186,7 @@ def lost_words(session: Session) -> str:
 
 
 def origin_words(origin: object) -> str:
-    """What a session was made of, in a line; empty if it was recorded."""
+    """Return the origin of a session on one line; empty if it was recorded."""
     if not isinstance(origin, dict) or not origin:
         return ""
     parts = [f"{name} {json.dumps(value)}" for name, value in origin.items() if value and name not in ("by", "of")]

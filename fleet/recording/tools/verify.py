@@ -1,4 +1,4 @@
-"""Is a session whole, and if not, what is missing: files, checksums, numbers, schemas, clocks. Nothing is mended."""
+"""Verifies a session: its files, CRCs, sequence numbers, schemas and clocks. Repairs nothing."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
@@ -8,82 +8,84 @@ from google.protobuf.message import Message
 
 from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
-from fleet.recording.reading.message_decoder import SAME, MessageDecoder, compared
+from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema
 from fleet.recording.reading.session import Session, message_of
-from fleet.recording.tools.sequence_check import Stream
+from fleet.recording.sequence_tracker import PublisherSequence
 from fleet.recording.tools.transform import lost_words
 from schemas import keys
 
-OFFSET_S: Final = 0.5
-"""A publisher's clock that is further from the recorder's is said."""
-MOST_WORDS: Final = 20
-"""Gaps that are told one by one; --json has them all."""
+MAX_CLOCK_OFFSET_S: Final = 0.5
+"""Maximum offset of a publisher's clock from the recorder's that is not reported."""
+MAX_LISTED_LINES: Final = 20
+"""Maximum gaps to print; --json lists all."""
 
 
 @dataclass(slots=True)
 class Clock:
-    """How the clock of a car's gateway (or a service) stood to the recorder's, as far as messages tell."""
+    """Offset of the clock of a gateway or service from the recorder's, estimated from message times."""
 
     least_s: float
-    """The least that a message took, recorder's time minus publisher's: negative if the publisher's is ahead."""
+    """Minimum of receive time minus publish time: negative if the publisher's clock is ahead."""
     most_s: float
+    """Maximum of receive time minus publish time."""
     backwards: int = 0
-    """How often a publisher's time was before that of the message before it."""
+    """Number of backward steps of the publisher's clock."""
     step_s: float = 0.0
-    """The largest of these steps."""
+    """Largest backward step."""
 
 
 @dataclass(slots=True)
 class SessionVerdict:
-    """What was found."""
+    """Result of the verification."""
 
     session: str
     messages: int = 0
     first_ns: int = 0
     last_ns: int = 0
     damage: dict[str, str] = field(default_factory=dict)
-    """By file: what is wrong with it."""
+    """Damage by file."""
     closed: bool = True
     ended: str = ""
-    """What its end says that it should not; empty if the recorder closed it."""
+    """Why the recorder did not close the session; empty if it did."""
     lost: str = ""
-    """What the session that this one was made of lacked already."""
+    """Losses of the session from which this one was made."""
     recording: bool = False
-    """Whether it grew while it was looked at: its end is still to come."""
+    """True if the session grew during the verification: its end is still to come."""
     missing: list[dict[str, Any]] = field(default_factory=list)
-    """Per key and publisher: which numbers are not there, and when they would have come."""
+    """Gaps by key and publisher: sequence numbers, and the times between which they should have come."""
     twice: list[dict[str, Any]] = field(default_factory=list)
+    """Duplicates by key and publisher."""
     dropped: dict[str, int] = field(default_factory=dict)
-    """By key, by the recorder itself: it had no room."""
+    """Messages by key that the recorder dropped for want of space."""
     missed: dict[str, int] = field(default_factory=dict)
-    """By key, by the recorder itself: lost before it had them."""
+    """Messages by key that never reached the recorder, by its own count."""
     undecoded: dict[str, int] = field(default_factory=dict)
-    """By key: messages that their schema does not fit."""
+    """Messages by key that do not match their schema."""
     schemas: dict[str, str] = field(default_factory=dict)
-    """By name: `same` as today's, or how it differs."""
+    """Comparison of each schema with ours: `same`, or the difference."""
     clocks: dict[str, Clock] = field(default_factory=dict)
-    """By car or service."""
+    """Clocks by car or service."""
     backwards: list[dict[str, Any]] = field(default_factory=list)
-    """When the recorder's own clock went back, and how far."""
+    """Backward steps of the recorder's own clock."""
 
     @property
     def whole(self) -> bool:
-        """Whether nothing is missing and nothing is there twice."""
+        """True if no message is missing or duplicated, and no file damaged."""
         return (self.closed or self.recording) and not any(
             (self.damage, self.lost, self.missing, self.twice, self.dropped, self.missed, self.undecoded)
         )
 
     @property
     def missing_count(self) -> int:
-        """How many messages the numbers say are not there."""
+        """Return the number of messages missing by sequence number."""
         return sum(one["count"] for one in self.missing)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the fields for JSON."""
         return {"whole": self.whole, "missing_count": self.missing_count, **asdict(self)}
 
     def words(self) -> Iterable[str]:
-        """What there is to say, a line each; the first is the verdict."""
+        """Yield the lines of the report; the first is the verdict."""
         length = time_spec.words(max(self.last_ns - self.first_ns, 0) / 1e9)
         span = f", {time_spec.iso(self.first_ns)} to {time_spec.iso(self.last_ns)} ({length})" if self.messages else ""
         state = "whole" if self.whole else "NOT whole"
@@ -96,13 +98,13 @@ class SessionVerdict:
             yield f"  lost: {self.lost}"
         if self.ended:
             yield f"  end: {self.ended}"
-        for one in self.missing[:MOST_WORDS]:
+        for one in self.missing[:MAX_LISTED_LINES]:
             yield f"  missing: {_missing_words(one)}"
-        if len(self.missing) > MOST_WORDS:
-            more = len(self.missing) - MOST_WORDS
+        if len(self.missing) > MAX_LISTED_LINES:
+            more = len(self.missing) - MAX_LISTED_LINES
             yield f"  missing: {more} more gaps (--json has all); {self.missing_count} messages altogether"
-        for one in self.twice[:MOST_WORDS]:
-            yield f"  twice: {one['key']} has {one['count']} messages of {_by(one)} more than once"
+        for one in self.twice[:MAX_LISTED_LINES]:
+            yield f"  twice: {one['key']} has {one['count']} messages of {_publisher_words(one)} more than once"
         for what, counts in (
             ("dropped", self.dropped),
             ("missed on the bus", self.missed),
@@ -112,52 +114,52 @@ class SessionVerdict:
                 worst = max(counts, key=lambda key: counts[key])
                 yield f"  {what}: {sum(counts.values())} messages, most of {worst} ({counts[worst]})"
         for name, words in self.schemas.items():
-            if words != SAME:
+            if words != SAME_SCHEMA:
                 yield f"  schema: {name} {words}"
-        for one in self.backwards[:MOST_WORDS]:
+        for one in self.backwards[:MAX_LISTED_LINES]:
             yield f"  clock: the recorder's went back by {one['step_s']:.3f} s at {time_spec.iso(one['at_ns'])}"
         for name, clock in self.clocks.items():
             if clock.backwards:
                 yield f"  clock: {name}'s went back {clock.backwards} times, by {clock.step_s:.3f} s at most"
-            if clock.least_s < -OFFSET_S or clock.least_s > OFFSET_S:
+            if clock.least_s < -MAX_CLOCK_OFFSET_S or clock.least_s > MAX_CLOCK_OFFSET_S:
                 ahead = "ahead of" if clock.least_s < 0 else "behind"
                 yield f"  clock: {name}'s is {abs(clock.least_s):.3f} s {ahead} the recorder's"
 
 
-def _by(one: dict[str, Any]) -> str:
+def _publisher_words(one: dict[str, Any]) -> str:
     return f"publisher {one['publisher']}" if one["publisher"] else "a publisher"
 
 
 def _missing_words(one: dict[str, Any]) -> str:
     numbers = f"number {one['first']}" if one["count"] == 1 else f"numbers {one['first']} to {one['last']}"
     when = f"between {time_spec.iso(one['after_ns'])} and {time_spec.iso(one['before_ns'])}"
-    return f"{one['key']} lacks {one['count']} of {_by(one)}: {numbers}, {when}"
+    return f"{one['key']} lacks {one['count']} of {_publisher_words(one)}: {numbers}, {when}"
 
 
-class _Audit:
-    """Looks at every message once."""
+class _Verifier:
+    """Collects the verdict from every message."""
 
     def __init__(self, verdict: SessionVerdict) -> None:
         self._verdict = verdict
         self._decoder = MessageDecoder()
-        self._streams: dict[tuple[str, str], Stream] = {}
+        self._streams: dict[tuple[str, str], PublisherSequence] = {}
         self._times: dict[tuple[str, str], int] = {}
-        self._lanes: dict[int, tuple[ChannelInfo, type[Message] | None, str]] = {}
+        self._channels: dict[int, tuple[ChannelInfo, type[Message] | None, str]] = {}
         self._last_ns: int | None = None
 
     def add(self, row: Row) -> None:
-        lane, sequence, log_ns, publish_ns, data = row
+        info, sequence, log_ns, publish_ns, data = row
         verdict = self._verdict
-        known = self._lanes.get(id(lane))
+        known = self._channels.get(id(info))
         if known is None:
-            known = self._lanes[id(lane)] = (lane, self._met(lane), _owner(lane.channel.topic))
-        _, made, owner = known
-        key = lane.channel.topic
+            known = self._channels[id(info)] = (info, self._check_schema(info), _owner(info.channel.topic))
+        _, message_class, owner = known
+        key = info.channel.topic
         verdict.messages += 1
         self._recorder_clock(log_ns)
         number, publisher, own = sequence, "", False
-        if made is not None:
-            message: Any = self._decoder.message(lane, data)
+        if message_class is not None:
+            message: Any = self._decoder.message(info, data)
             if message is None:
                 verdict.undecoded[key] = verdict.undecoded.get(key, 0) + 1
             else:
@@ -168,18 +170,18 @@ class _Audit:
         if number:
             stream = self._streams.get((key, publisher))
             if stream is None:
-                stream = self._streams[key, publisher] = Stream(numbered=own)
+                stream = self._streams[key, publisher] = PublisherSequence(restarts=not own)
             newest = stream.add(number, log_ns)
         self._publisher_clock(owner, (key, publisher), log_ns, publish_ns, newest=newest)
 
-    def _met(self, lane: ChannelInfo) -> type[Message] | None:
-        made = self._decoder.class_of(lane)
-        name = message_of(lane)
-        if made is not None:
-            self._verdict.schemas[name] = compared(made)
+    def _check_schema(self, info: ChannelInfo) -> type[Message] | None:
+        message_class = self._decoder.class_of(info)
+        name = message_of(info)
+        if message_class is not None:
+            self._verdict.schemas[name] = compare_schema(message_class)
         elif name:
             self._verdict.schemas[name] = "cannot be understood: its messages are kept as bytes"
-        return made
+        return message_class
 
     def _recorder_clock(self, log_ns: int) -> None:
         verdict = self._verdict
@@ -209,12 +211,12 @@ class _Audit:
         for (key, publisher), stream in sorted(self._streams.items()):
             about = {"key": key, "publisher": publisher}
             self._verdict.missing += [{**about, "count": gap.count, **asdict(gap)} for gap in stream.gaps]
-            if stream.further:
+            if stream.unlisted:
                 at = stream.gaps[-1].before_ns
-                further = {"count": stream.further, "first": stream.gaps[-1].last + 1, "last": stream.last}
+                further = {"count": stream.unlisted, "first": stream.gaps[-1].last + 1, "last": stream.last}
                 self._verdict.missing.append({**about, **further, "after_ns": at, "before_ns": self._verdict.last_ns})
-            if stream.twice:
-                self._verdict.twice.append({**about, "count": stream.twice})
+            if stream.duplicates:
+                self._verdict.twice.append({**about, "count": stream.duplicates})
 
 
 def _owner(key: str) -> str:
@@ -227,23 +229,23 @@ def verify(
     watched: Callable[[Iterable[Row]], Iterable[Row]] = iter,
     recording: Callable[[], bool] = lambda: False,
 ) -> SessionVerdict:
-    """Look at every byte and every message; `watched` may look on as they pass, `recording` is asked at the end."""
+    """Verify every byte and message. `watched` shows the progress; `recording` is called at the end."""
     verdict = SessionVerdict(str(session.path))
-    audit = _Audit(verdict)
+    verifier = _Verifier(verdict)
     for row in watched(session.rows()):
-        audit.add(row)
-    audit.end()
+        verifier.add(row)
+    verifier.end()
     read = dict(session.damage)
     session.check()
-    # What reading says is lost comes before what only a checksum tells.
+    # Damage found by reading names the lost messages, so it overrides damage found by CRC.
     verdict.damage = {path.name: words for path, words in sorted((session.damage | read).items())}
     description = session.description
     if session.path.is_dir() and description is None:
-        verdict.damage[session_dir.DESCRIPTION] = (
+        verdict.damage[session_dir.SESSION_FILE] = (
             "is missing, or cannot be understood: who recorded what, and the marks"
         )
     if words := session.lacking(verdict.messages):
-        verdict.damage[session_dir.DESCRIPTION] = words
+        verdict.damage[session_dir.SESSION_FILE] = words
     verdict.lost = lost_words(session)
     if description is not None:
         verdict.closed = description.closed

@@ -1,1 +1,1 @@
-"""Writing a session: the recorder, its segments, rollover, backfill and retention. Read `recorder` first."""
+"""Writes sessions: the recorder, segments, rollover, backfill and retention. Read `recorder` first."""

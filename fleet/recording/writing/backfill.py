@@ -1,8 +1,8 @@
-"""Asking publishers again for what a recorder missed: when, and for how long back. What is new is tape.py's to say.
+"""Requests messages that a recorder missed from the caches of their publishers. session_writer.py drops duplicates.
 
-Publishers hold ten seconds at their topic's rate, a hundred publications at least (`Topic.held`): of a state minutes,
-of an event hours. They are asked after a hub was away, after a gap in their numbers, and by a recorder that goes on for
-one that was killed.
+Publishers cache ten seconds at the rate of their topic, at least a hundred publications (`Topic.held`): minutes of a
+state, hours of an event. The recorder queries them after a reconnect to the hub, after a gap in their sequence
+numbers, and when it continues an interrupted session.
 """
 
 import threading
@@ -13,105 +13,105 @@ from typing import Final
 
 import zenoh
 
-from fleet.recording.writing.resume import TAIL_S
+from fleet.recording.writing.resume import RESUME_WINDOW_S
 from schemas.bus import Bus
 
-LOOK_S: Final = 0.2
-AFTER_START_S: Final = (1.0,)
-"""A publisher that began in the moment in which we did may not have known of us."""
-AFTER_HUB_S: Final = (0.3, 1.0, 2.0, 4.0)
-"""Others are back later than we are: clients try again after half a second at most, and may be held up."""
-AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
-LOOKS: Final = round(2.0 / LOOK_S)
-"""A link is gone for two seconds before it is noticed (Zenoh's lease): in looks, since who stands still has none."""
-FEW: Final = 16
-"""Of more keys than that everything is asked at once."""
-MOST: Final = 200_000
-"""Answers that wait for the writer; what is over is asked again."""
+BACKFILL_POLL_INTERVAL_S: Final = 0.2
+QUERY_AFTER_START_S: Final = (1.0,)
+"""Delay of the query after the start: a publisher that started with us may have missed our subscription."""
+QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
+"""Delays of the queries after a reconnect: others retry within half a second, and a loaded machine delays them."""
+QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
+LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
+"""Number of polls that cover Zenoh's 2 s lease. Counted in polls because a stalled process does not poll."""
+MAX_SINGLE_KEYS: Final = 16
+"""Maximum keys to query one by one. For more keys, query everything."""
+MAX_ANSWERS: Final = 200_000
+"""Maximum answers in the queue to the writer. The rest is a gap again, and requested again."""
 
 
 class Backfill:
-    """Asks from a thread of its own, from `start` to `close`."""
+    """Requests missed messages on its own thread, from `start` to `close`."""
 
-    def __init__(self, bus: Bus, expressions: Sequence[str], *, follows: bool) -> None:
+    def __init__(self, bus: Bus, expressions: Sequence[str], *, resumes: bool) -> None:
         self._bus = bus
-        # A stream of commands comes from a client that holds nothing.
+        # Clients that send command streams have no cache.
         self._all = tuple(expression for expression in expressions if "@cmd" not in expression)
         self._lock = threading.Lock()
         self._gaps: set[str] = set()
-        self._found: list[zenoh.Sample] = []
+        self._answers: list[zenoh.Sample] = []
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recall")
         now = time.monotonic()
-        self._due = [now + after for after in ((0.0,) if follows else ()) + AFTER_START_S]
-        self._from = now - (TAIL_S if follows else 0.0)
-        self._every = True
+        self._due = [now + after for after in ((0.0,) if resumes else ()) + QUERY_AFTER_START_S]
+        self._missing_since = now - (RESUME_WINDOW_S if resumes else 0.0)
+        self._query_all = True
         self._keys: set[str] = set()
 
     def start(self) -> None:
-        """Begin to ask."""
+        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """Ask a last time if something is missing, and end."""
+        """Request messages that are still missing a last time, and end the thread."""
         self._closing.set()
         self._thread.join()
 
-    def ask(self, keys: Collection[str]) -> None:
-        """Numbers are missing under these keys."""
+    def request(self, keys: Collection[str]) -> None:
+        """Request a backfill of these keys."""
         with self._lock:
             self._gaps.update(keys)
 
-    def taken(self) -> list[zenoh.Sample]:
-        """What has been answered since the last time; some of it is known already."""
+    def take_answers(self) -> list[zenoh.Sample]:
+        """Return the answers since the last call. Some may be recorded already."""
         with self._lock:
-            found, self._found = self._found, []
+            found, self._answers = self._answers, []
         return found
 
     def _run(self) -> None:
         hubs = self._bus.hubs
-        looks = deque([time.monotonic()], LOOKS)
-        whole_at = looks[0]
-        while not self._closing.wait(LOOK_S):
-            now, there = time.monotonic(), self._bus.hubs
+        polls = deque([time.monotonic()], LEASE_POLLS)
+        connected_since = polls[0]
+        while not self._closing.wait(BACKFILL_POLL_INTERVAL_S):
+            now, connected = time.monotonic(), self._bus.hubs
             with self._lock:
                 gaps, self._gaps = self._gaps, set()
             if gaps:
-                self._plan(AFTER_GAP_S, looks[0], gaps)
-            if there and there != hubs:
-                self._plan(AFTER_HUB_S, whole_at, None)
-            hubs = there
-            if there:
-                whole_at = looks[0]
-            looks.append(now)
-            if there and self._due and self._due[0] <= now:
+                self._plan(QUERY_AFTER_GAP_S, polls[0], gaps)
+            if connected and connected != hubs:
+                self._plan(QUERY_AFTER_RECONNECT_S, connected_since, None)
+            hubs = connected
+            if connected:
+                connected_since = polls[0]
+            polls.append(now)
+            if connected and self._due and self._due[0] <= now:
                 self._due = [due for due in self._due if due > now]
-                self._ask_now()
+                self._query()
                 if not self._due:
-                    self._every, self._keys = False, set()
+                    self._query_all, self._keys = False, set()
         with self._lock:
             gaps = self._gaps
         if gaps or self._due:
-            self._plan((), looks[0], gaps or None)
-            self._ask_now()
+            self._plan((), polls[0], gaps or None)
+            self._query()
 
     def _plan(self, after: Sequence[float], since: float, keys: set[str] | None) -> None:
         now = time.monotonic()
-        self._from = min(self._from, since) if self._due else since
+        self._missing_since = min(self._missing_since, since) if self._due else since
         self._due = sorted([*self._due, *(now + each for each in after)])
         if keys is None:
-            self._every = True
+            self._query_all = True
         else:
             self._keys |= keys
 
-    def _ask_now(self) -> None:
-        last_s = time.monotonic() - self._from
-        every = self._every or len(self._keys) > FEW
-        for expression in self._all if every else sorted(self._keys):
+    def _query(self) -> None:
+        last_s = time.monotonic() - self._missing_since
+        query_all = self._query_all or len(self._keys) > MAX_SINGLE_KEYS
+        for expression in self._all if query_all else sorted(self._keys):
             found = []
             for sample in self._bus.recall(expression, last_s):
                 found.append(sample)
-                if len(found) + len(self._found) > MOST:
+                if len(found) + len(self._answers) > MAX_ANSWERS:
                     break
             with self._lock:
-                self._found += found
+                self._answers += found

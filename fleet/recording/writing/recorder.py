@@ -1,8 +1,10 @@
-"""The recorder: everything of one fleet that comes over the bus, into sessions. One more subscriber, no policy.
+"""Records all messages of one fleet into sessions. The recorder is one more subscriber and has no policy.
 
-Three threads. One takes what comes off Zenoh's channels and never touches a disk: a disk that hangs must show as drops
-here, not as a session that stalls its senders. One asks publishers again for what was missed (recall.py). The third
-writes (tape.py), flushes and tells the status each second, and answers.
+It runs three threads:
+- The reader drains the subscriptions and never touches a disk. So a hanging disk shows as drops here and does not
+  stall the publishers.
+- The backfill asks publishers for missed messages (backfill.py).
+- The writer writes (session_writer.py), flushes and publishes the status every second, and answers queries.
 """
 
 import contextlib
@@ -23,47 +25,48 @@ from schemas.bus import Bus, Sample, reply_value
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
 
-LIMIT_MESSAGES: Final = 100_000
-LIMIT_BYTES: Final = 64 << 20
-"""What may wait for the writer: some seconds of a hundred cars, and little beside the memory of a small computer."""
-PERIOD_S: Final = 1.0
-"""Flush and status; what a crash loses at most."""
-TICK_S: Final = 0.01
-"""How long messages gather before they are taken. Their log_time is that moment; their publish_time is exact."""
-WRITE_S: Final = 0.05
-"""How long they gather again before they are written."""
-CHANNEL: Final = 16_384
-"""What a channel holds until it is taken: three seconds of a hundred cars."""
-ROUND: Final = 4_096
-"""Taken from one channel before the others have their turn."""
-LINGER_S: Final = 0.3
-"""What was published before we were told to end is still under way."""
-ANSWER_S: Final = 5.0
-"""Another recorder answers between two looks at its disk, which may take a while."""
-QUESTIONS: Final = 64
-LONGEST_MARK: Final = 1000
+MAX_QUEUED_MESSAGES: Final = 100_000
+MAX_QUEUED_BYTES: Final = 64 << 20
+"""Maximum size of the queue to the writer: some seconds of 100 cars, and little memory for a small computer."""
+FLUSH_INTERVAL_S: Final = 1.0
+"""Interval of flush and status, and the most that a crash loses."""
+READ_INTERVAL_S: Final = 0.01
+"""Interval at which subscriptions are drained. A log_time has this resolution; a publish_time is exact."""
+WRITE_INTERVAL_S: Final = 0.05
+"""Interval at which the queue is written."""
+SUBSCRIBER_QUEUE_SIZE: Final = 16_384
+"""Maximum messages in the queue of one subscription: three seconds of 100 cars."""
+MAX_READ_BATCH: Final = 4_096
+"""Maximum messages read from one subscription before the next one."""
+SHUTDOWN_DRAIN_S: Final = 0.3
+"""Time at shutdown for messages that are still in transit."""
+STATUS_TIMEOUT_S: Final = 5.0
+"""Timeout for the status of another recorder, which answers only between two writes to its disk."""
+MAX_PENDING_QUERIES: Final = 64
+MAX_MARK_CHARACTERS: Final = 1000
+"""Maximum length of the text of a mark, and of its author."""
 
-STATUS: Final = TOPICS["@recorder/status"]
-MARK: Final = TOPICS["@recorder/mark"]
+STATUS_TOPIC: Final = TOPICS["@recorder/status"]
+MARK_TOPIC: Final = TOPICS["@recorder/mark"]
 VERBS: Final = ("start", "stop", "status", "mark")
-"""Under `<fleet>/@recorder/@cmd/`; mark takes JSON: `text`, and `by` whom."""
+"""Commands under `<fleet>/@recorder/@cmd/`. The payload of `mark` is JSON with `text` and `by`."""
 
 
 class AnotherRecorder(Exception):
-    """This fleet is being recorded already; its text says where."""
+    """Another recorder records this fleet. The message names its session."""
 
 
 class RecordingFailed(Exception):
-    """The session could not be written to its end; its text says why, and what is there."""
+    """The session could not be written to its end. The message gives the cause and the recorded part."""
 
 
-class _Refused(Exception):
-    """What was asked over the bus cannot be; its text is the answer."""
+class _CommandRefused(Exception):
+    """A command over the bus was rejected. The message is the answer."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingOutcome:
-    """What a recording holds; numbers by key only where something was lost."""
+    """Result of a recording. The counts by key contain only keys with losses."""
 
     session: Path
     messages: int
@@ -71,7 +74,7 @@ class RecordingOutcome:
     drops: Mapping[str, int]
     missed: Mapping[str, int]
     error: str = ""
-    """What the end cost for want of room."""
+    """Losses at the end of the session because the disk was full."""
 
 
 _Item = tuple[str, bytes, zenoh.Encoding, "zenoh.Timestamp | None", "zenoh.SourceInfo | None", int]
@@ -80,9 +83,9 @@ _Item = tuple[str, bytes, zenoh.Encoding, "zenoh.Timestamp | None", "zenoh.Sourc
 class Recorder:
     """Records from `start` to `close`. If the disk fails, `ended` is set and `close` raises RecordingFailed.
 
-    A disk that is full is waited for, also at the start: `full` says so then.
+    If the disk is full, also at the start, the recorder waits for space, and `full` gives the reason.
 
-    `tell` hears what a person should know: a full disk, an old session that was removed, a session that begins.
+    `notify` is called with news for a person: a full disk, a removed old session, a new session.
     """
 
     def __init__(
@@ -92,59 +95,61 @@ class Recorder:
         root: Path,
         options: Options | None = None,
         *,
-        limit_messages: int = LIMIT_MESSAGES,
-        limit_bytes: int = LIMIT_BYTES,
+        max_messages: int = MAX_QUEUED_MESSAGES,
+        max_bytes: int = MAX_QUEUED_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
-        tell: Callable[[str], object] = lambda _: None,
+        notify: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._bus = bus
         self._fleet = keys.check_name(fleet, "fleet name")
         self._root = root
         self._options = options or Options()
-        self._limit_messages = limit_messages
-        self._limit_bytes = limit_bytes
+        self._max_messages = max_messages
+        self._max_bytes = max_bytes
         self._now = wall_ns
-        self._tell = tell
-        self._told: set[str] = set()
+        self._notify = notify
+        self._reported: set[str] = set()
         self._lock = threading.Lock()
-        self._waiting: list[_Item] = []
+        self._queue: list[_Item] = []
         self._writing: Iterator[_Item] = iter(())
-        self._held_messages = 0
-        self._held_bytes = 0
-        self._questions: list[zenoh.Query] = []
+        self._queued_messages = 0
+        self._queued_bytes = 0
+        self._queries: list[zenoh.Query] = []
         self._closing = threading.Event()
-        self._taken = threading.Event()
+        self._reader_done = threading.Event()
         self._reader_error: Exception | None = None
         self._subscribers: list[zenoh.Subscriber[Any]] = []
         self._error = ""
         self._recording = True
         self.ended = threading.Event()
-        """The writer has ended: closed, or failed."""
+        """Set when the writer has closed the session or failed."""
 
     def start(self) -> Path:
-        """Return the session's directory once every subscription is declared.
+        """Declare all subscriptions, and return the directory of the session.
 
-        Raises AnotherRecorder, and OSError if the session cannot be made for anything but want of room.
+        Raises AnotherRecorder, and OSError if the session cannot be created. A full disk does not raise.
         """
         self._refuse_a_second()
         for expression in keys.recorded(self._fleet):
-            self._subscribers.append(self._bus.subscribe_channel(expression, CHANNEL))
-        self._tape = SessionWriter(self._root, self._fleet, self._options, self._now())
-        self._drops = self._tape.drops
-        session = self._tape.path
-        key = keys.topic_key(self._fleet, keys.RECORDER, STATUS.name.partition("/")[2])
-        self._publisher = self._bus.publisher(key, STATUS, keys.RECORDER)
-        marks = keys.topic_key(self._fleet, keys.RECORDER, MARK.name.partition("/")[2])
-        self._marks = self._bus.publisher(marks, MARK, keys.RECORDER)
+            self._subscribers.append(self._bus.subscribe_channel(expression, SUBSCRIBER_QUEUE_SIZE))
+        self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
+        self._drops = self._session.drops
+        session = self._session.path
+        key = keys.topic_key(self._fleet, keys.RECORDER, STATUS_TOPIC.name.partition("/")[2])
+        self._publisher = self._bus.publisher(key, STATUS_TOPIC, keys.RECORDER)
+        marks = keys.topic_key(self._fleet, keys.RECORDER, MARK_TOPIC.name.partition("/")[2])
+        self._marks = self._bus.publisher(marks, MARK_TOPIC, keys.RECORDER)
         self._last = self._status()
-        self._recall = Backfill(self._bus, keys.recorded(self._fleet), follows=bool(self._tape.description.continues))
+        self._backfill = Backfill(
+            self._bus, keys.recorded(self._fleet), resumes=bool(self._session.description.continues)
+        )
         self._reader = threading.Thread(target=self._read, name="bus-reader")
         self._writer = threading.Thread(target=self._write, name="mcap-writer")
         self._reader.start()
         self._writer.start()
-        self._recall.start()
-        self._bus.queryable(key, self._ask)
-        self._bus.queryable(keys.command_key(self._fleet, keys.RECORDER, "*"), self._ask)
+        self._backfill.start()
+        self._bus.queryable(key, self._on_query)
+        self._bus.queryable(keys.command_key(self._fleet, keys.RECORDER, "*"), self._on_query)
         token = keys.car_token(self._fleet, keys.RECORDER)
         self._bus.token(token)
         # Declaring does not wait for the hub. Its answer comes after it has passed our subscriptions on to all.
@@ -153,14 +158,14 @@ class Recorder:
 
     @property
     def full(self) -> str:
-        """Why nothing is written for now; empty if it is."""
-        return self._tape.full
+        """Return why writing pauses; empty if it does not."""
+        return self._session.full
 
     def close(self) -> RecordingOutcome:
-        """Write what has come until now, and close the session whole; raises RecordingFailed."""
+        """Write all received messages, and close the session; raises RecordingFailed."""
         if not self.ended.is_set():
-            time.sleep(LINGER_S)
-        self._recall.close()
+            time.sleep(SHUTDOWN_DRAIN_S)
+        self._backfill.close()
         self._closing.set()
         self._reader.join()
         for subscriber in self._subscribers:
@@ -169,27 +174,29 @@ class Recorder:
         self._writer.join()
         if self._error:
             raise RecordingFailed(self._error)
-        tape = self._tape
-        return RecordingOutcome(tape.path, tape.messages, tape.bytes, dict(tape.drops), tape.missed, tape.cost)
+        session = self._session
+        return RecordingOutcome(
+            session.path, session.messages, session.bytes, dict(session.drops), session.missed, session.cost
+        )
 
     def _refuse_a_second(self) -> None:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
             return
         where = "it does not say where to"
-        for answer in self._bus.query(f"{self._fleet}/{STATUS.name}", timeout_s=ANSWER_S):
+        for answer in self._bus.query(f"{self._fleet}/{STATUS_TOPIC.name}", timeout_s=STATUS_TIMEOUT_S):
             if isinstance(answer, Sample):
                 message: Any = answer.message()
                 where = f"to {message.session}"
         raise AnotherRecorder(f"fleet {self._fleet!r} is being recorded already, {where}: one recorder is enough")
 
-    def _ask(self, query: zenoh.Query) -> bool:
-        """On a Zenoh thread; False if too many wait."""
+    def _on_query(self, query: zenoh.Query) -> bool:
+        """Queue a query, on a Zenoh thread. Return False if too many are pending."""
         with self._lock:
             if self.ended.is_set():
-                return True  # nobody answers any more
-            if len(self._questions) >= QUESTIONS:
+                return True  # no thread is left to answer
+            if len(self._queries) >= MAX_PENDING_QUERIES:
                 return False
-            self._questions.append(query)
+            self._queries.append(query)
         return True
 
     # ------------------------------------------------------------------ the reader's thread
@@ -197,31 +204,31 @@ class Recorder:
     def _read(self) -> None:
         try:
             while not self._closing.is_set():
-                if not self._take():
-                    time.sleep(TICK_S)  # an Event's wait costs several times as much
-            while self._take():
+                if not self._read_batch():
+                    time.sleep(READ_INTERVAL_S)  # Event.wait costs several times as much CPU
+            while self._read_batch():
                 pass
-        except Exception as error:  # noqa: BLE001 - handed to the writer, which says it: never silently
+        except Exception as error:  # noqa: BLE001 - the writer reports it and ends
             self._reader_error = error
         finally:
-            self._taken.set()
+            self._reader_done.set()
 
-    def _take(self) -> bool:
-        """Take what has come; whether there may be more."""
+    def _read_batch(self) -> bool:
+        """Move received messages to the queue. Return True if there may be more."""
         with self._lock:
-            messages, size = self._held_messages, self._held_bytes
+            messages, size = self._queued_messages, self._queued_bytes
         batch: list[_Item] = []
         more = False
         for subscriber in self._subscribers:
             receive = subscriber.try_recv
-            for _ in range(ROUND):
+            for _ in range(MAX_READ_BATCH):
                 sample = receive()
                 if sample is None:
                     break
-                # Copied here: a payload that is kept keeps the network batch it came in, and the byte limit would lie.
+                # Copy the payload: a ZBytes keeps its whole network batch in memory, beyond the byte limit.
                 payload = sample.payload.to_bytes()
                 key = str(sample.key_expr)
-                if messages >= self._limit_messages or size + len(payload) > self._limit_bytes:
+                if messages >= self._max_messages or size + len(payload) > self._max_bytes:
                     self._drops[key] = self._drops.get(key, 0) + 1
                     continue
                 messages += 1
@@ -232,9 +239,9 @@ class Recorder:
         if batch:
             taken = sum(len(item[1]) for item in batch)
             with self._lock:
-                self._held_messages += len(batch)
-                self._held_bytes += taken
-                self._waiting += batch
+                self._queued_messages += len(batch)
+                self._queued_bytes += taken
+                self._queue += batch
         return more
 
     # ------------------------------------------------------------------ the writer's thread
@@ -242,22 +249,22 @@ class Recorder:
     def _write(self) -> None:
         try:
             due = time.monotonic()
-            while not self._taken.wait(WRITE_S):
+            while not self._reader_done.wait(WRITE_INTERVAL_S):
                 self._drain()
                 if time.monotonic() >= due:
-                    due = max(due + PERIOD_S, time.monotonic())
-                    self._each_second()
+                    due = max(due + FLUSH_INTERVAL_S, time.monotonic())
+                    self._tick()
                 self._answer()
             self._drain()
             if self._reader_error is not None:
                 self._fail(f"{type(self._reader_error).__name__}: {self._reader_error}")
                 return
             if self._recording:
-                self._end(self._tape)
+                self._end_session(self._session)
             self._publish("closed")
         except OSError as error:
-            self._fail(f"{error.filename or self._tape.path}: {error.strerror or error}")
-        except Exception as error:  # noqa: BLE001 - a recorder that stops must never do so silently, whatever the cause
+            self._fail(f"{error.filename or self._session.path}: {error.strerror or error}")
+        except Exception as error:  # noqa: BLE001 - a recorder must never stop silently, whatever the cause
             self._fail(f"{type(error).__name__}: {error}")
         finally:
             self.ended.set()
@@ -265,160 +272,162 @@ class Recorder:
 
     def _drain(self) -> None:
         with self._lock:
-            batch, self._waiting = self._waiting, []
-        recalled = self._recall.taken()
+            batch, self._queue = self._queue, []
+        backfilled = self._backfill.take_answers()
         if self._recording:
-            add = self._tape.add
+            add = self._session.add
             self._writing = iter(batch)
             for item in self._writing:
                 add(*item)
-            for sample in recalled:
-                self._tape.add_recalled(sample, self._now())
-            if self._tape.gaps:
-                # What found no room here would find none again.
-                self._recall.ask(self._tape.gaps.difference(self._drops))
-                self._tape.gaps.clear()
-        # Only now: what is being written is still held.
+            for sample in backfilled:
+                self._session.add_backfilled(sample, self._now())
+            if self._session.gaps:
+                # Do not request keys that the full queue dropped: their backfill would be dropped, too.
+                self._backfill.request(self._session.gaps.difference(self._drops))
+                self._session.gaps.clear()
+        # Only now: messages count against the limit until they are written.
         with self._lock:
-            self._held_messages -= len(batch)
-            self._held_bytes -= sum(len(item[1]) for item in batch)
+            self._queued_messages -= len(batch)
+            self._queued_bytes -= sum(len(item[1]) for item in batch)
 
-    def _each_second(self) -> None:
-        tape = self._tape
+    def _tick(self) -> None:
+        session = self._session
         if self._recording:
-            tape.tick(self._now())
-            if tape.over and not tape.full:
-                self._begin()
-                self._end(tape)
-        self._say_once(self._tape)
+            session.tick(self._now())
+            if session.over and not session.full:
+                self._begin_session()
+                self._end_session(session)
+        self._report_news(self._session)
         self._publish()
 
-    def _begin(self) -> None:
-        """The next session; raises OSError if none can be made."""
-        self._tape = SessionWriter(self._root, self._fleet, self._options, self._now())
-        self._drops = self._tape.drops
-        if not self._tape.full:
-            self._tell(f"recording fleet {self._fleet} to {self._tape.path}")
+    def _begin_session(self) -> None:
+        """Begin the next session; raises OSError if it cannot be created."""
+        self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
+        self._drops = self._session.drops
+        if not self._session.full:
+            self._notify(f"recording fleet {self._fleet} to {self._session.path}")
 
-    def _end(self, tape: SessionWriter) -> None:
-        """Close a session."""
-        tape.close(self._now())
-        self._say_once(tape)
+    def _end_session(self, session: SessionWriter) -> None:
+        """Close a session, and report its last news."""
+        session.close(self._now())
+        self._report_news(session)
 
-    def _say_once(self, tape: SessionWriter) -> None:
-        """Tell what is new of what should be known."""
-        for session in tape.removed:
-            self._tell(f"{session} was removed: the oldest that nobody marked, to keep the quota")
-        for words in tape.uncopied:
-            self._tell(words)
-        tape.removed.clear()
-        tape.uncopied.clear()
-        states = {"full": tape.full, "warning": "" if tape.full else tape.warning.partition(",")[0]}
+    def _report_news(self, session: SessionWriter) -> None:
+        """Notify of each removed session, failed copy and new state once."""
+        for removed in session.removed:
+            self._notify(f"{removed} was removed for the quota: the oldest session without a mark")
+        for words in session.uncopied:
+            self._notify(words)
+        session.removed.clear()
+        session.uncopied.clear()
+        states = {"full": session.full, "warning": "" if session.full else session.warning.partition(",")[0]}
         now = {f"{kind}: {text}" for kind, text in states.items() if text}
-        for text in sorted(now - self._told):
-            self._tell(text)
-        if any(text.startswith("full") for text in self._told) and not tape.full and self._recording:
-            self._tell(f"there is room again: recording goes on to {tape.path}")
-        self._told = now
+        for text in sorted(now - self._reported):
+            self._notify(text)
+        if any(text.startswith("full") for text in self._reported) and not session.full and self._recording:
+            self._notify(f"there is room again: recording goes on to {session.path}")
+        self._reported = now
 
     def _fail(self, words: str) -> None:
         with self._lock:
-            self._limit_messages = 0
-            unwritten, self._waiting = [*self._writing, *self._waiting], []
+            self._max_messages = 0
+            unwritten, self._queue = [*self._writing, *self._queue], []
         for item in unwritten:
-            self._tape.drop(item[0])
-        self._error = self._tape.abandon(f"recording to {self._tape.path} failed: {words}", self._now())
-        # From the last status: asking the disk again may fail again.
-        self._last.state, self._last.error, self._last.messages = "failed", self._error, self._tape.messages
-        self._last.drops.update(self._tape.drops)
-        with contextlib.suppress(zenoh.ZError):  # the bus may be why; `close` says it, and session.json
+            self._session.drop(item[0])
+        self._error = self._session.abandon(f"recording to {self._session.path} failed: {words}", self._now())
+        # Reuse the last status: reading the disk may fail again.
+        self._last.state, self._last.error, self._last.messages = "failed", self._error, self._session.messages
+        self._last.drops.update(self._session.drops)
+        with contextlib.suppress(zenoh.ZError):  # the bus may be the cause; `close` and session.json report it
             self._publisher.put(self._last, self._now())
 
     def _status(self, state: str = "") -> fleet_v1_pb2.Recording:
-        tape = self._tape
+        session = self._session
         return fleet_v1_pb2.Recording(
-            session=str(tape.path),
-            state=state or ("stopped" if not self._recording else "full" if tape.full else "recording"),
-            bytes=tape.bytes,
-            messages=tape.messages,
-            drops=dict(tape.drops),
-            free_bytes=tape.free_bytes,
-            error=self._error or tape.cost or (f"{tape.full}; {tape.waiting} messages wait" if tape.full else ""),
-            missed=tape.missed,
-            recovered=tape.recovered,
-            segments=tape.segments,
-            warning=tape.warning,
+            session=str(session.path),
+            state=state or ("stopped" if not self._recording else "full" if session.full else "recording"),
+            bytes=session.bytes,
+            messages=session.messages,
+            drops=dict(session.drops),
+            free_bytes=session.free_bytes,
+            error=self._error
+            or session.cost
+            or (f"{session.full}; {session.waiting} messages wait" if session.full else ""),
+            missed=session.missed,
+            recovered=session.recovered,
+            segments=session.segments,
+            warning=session.warning,
         )
 
     def _publish(self, state: str = "") -> None:
         self._last = self._status(state)
         self._publisher.put(self._last, self._now())
 
-    # ------------------------------------------------------------------ what is asked
+    # ------------------------------------------------------------------ queries and commands
 
     def _answer(self) -> None:
         with self._lock:
-            questions, self._questions = self._questions, []
-        for query in questions:
+            queries, self._queries = self._queries, []
+        for query in queries:
             with query:
                 key = str(query.key_expr)
                 verb = key.rpartition("/")[2] if "/@cmd/" in key else "status"
                 try:
-                    self._do(verb, query)
-                except _Refused as refused:
+                    self._handle(verb, query)
+                except _CommandRefused as refused:
                     query.reply_err(str(refused), encoding="text/plain")
                 else:
-                    reply_value(query, key, self._last.SerializeToString(), STATUS)
+                    reply_value(query, key, self._last.SerializeToString(), STATUS_TOPIC)
 
-    def _do(self, verb: str, query: zenoh.Query) -> None:
+    def _handle(self, verb: str, query: zenoh.Query) -> None:
         if self.ended.is_set() and verb != "status":
-            raise _Refused("the recorder is ending")
+            raise _CommandRefused("the recorder is ending")
         match verb:
             case "start":
-                self._start_again()
+                self._start_session()
             case "stop":
-                self._stop()
+                self._stop_session()
             case "mark":
                 self._mark(query)
             case "status":
                 if not self.ended.is_set():
                     self._last = self._status()
             case _:
-                raise _Refused(f"{verb!r} is not known: allowed are {', '.join(VERBS)}")
+                raise _CommandRefused(f"{verb!r} is not known: allowed are {', '.join(VERBS)}")
 
-    def _start_again(self) -> None:
+    def _start_session(self) -> None:
         if self._recording:
-            raise _Refused(f"fleet {self._fleet!r} is being recorded already, to {self._tape.path}")
+            raise _CommandRefused(f"fleet {self._fleet!r} is being recorded already, to {self._session.path}")
         try:
-            self._begin()
+            self._begin_session()
         except OSError as error:
-            raise _Refused(f"no session can be made in {self._root}: {error.strerror}") from None
+            raise _CommandRefused(f"no session can be made in {self._root}: {error.strerror}") from None
         self._recording = True
         self._publish()
 
-    def _stop(self) -> None:
+    def _stop_session(self) -> None:
         if not self._recording:
-            raise _Refused(f"nothing is being recorded; the last session is {self._tape.path}")
+            raise _CommandRefused(f"nothing is being recorded; the last session is {self._session.path}")
         self._drain()
-        self._end(self._tape)
+        self._end_session(self._session)
         self._recording = False
-        self._tell(f"{self._tape.path} is closed, as was asked{'; ' * bool(self._tape.cost)}{self._tape.cost}")
+        self._notify(f"{self._session.path} is closed by request{'; ' * bool(self._session.cost)}{self._session.cost}")
         self._publish()
 
     def _mark(self, query: zenoh.Query) -> None:
         if not self._recording:
-            raise _Refused("nothing is being recorded: `fleet record start` begins a session")
+            raise _CommandRefused("nothing is being recorded: `fleet record start` begins a session")
         try:
-            asked = json.loads(query.payload.to_bytes()) if query.payload is not None else {}
-            text, by = asked["text"], asked.get("by", "anonymous")
+            request = json.loads(query.payload.to_bytes()) if query.payload is not None else {}
+            text, by = request["text"], request.get("by", "anonymous")
         except (ValueError, KeyError, TypeError, AttributeError):
-            raise _Refused('a mark is JSON, as {"text": "the cat came", "by": "me"}') from None
-        if not (isinstance(text, str) and isinstance(by, str) and 0 < len(text) <= LONGEST_MARK >= len(by)):
-            raise _Refused(f"text must have 1 to {LONGEST_MARK} characters, and by at most so many")
+            raise _CommandRefused('a mark is JSON, as {"text": "the cat came", "by": "me"}') from None
+        if not (isinstance(text, str) and isinstance(by, str) and 0 < len(text) <= MAX_MARK_CHARACTERS >= len(by)):
+            raise _CommandRefused(f"text must have 1 to {MAX_MARK_CHARACTERS} characters, and by at most so many")
         now = self._now()
         message: Any = messages.message_class("foxglove.Log")()
         message.timestamp.seconds, message.timestamp.nanos = divmod(now, 1_000_000_000)
         message.level, message.name, message.message = 2, by, text
         self._marks.put(message, now)
-        with contextlib.suppress(OSError):  # no room for it now: it is told on the bus, and written at the end
-            self._tape.mark(text, by, now)
+        with contextlib.suppress(OSError):  # the disk is full: the bus has the mark, and `close` writes it
+            self._session.mark(text, by, now)

@@ -1,4 +1,4 @@
-"""The session that a new one goes on with: its recorder ended without closing it, and publishers still hold its end."""
+"""Finds an interrupted session that can be continued, because publishers still cache the lost messages."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -9,40 +9,40 @@ from fleet.recording import session_dir
 from fleet.recording.reading.session import NoSession, Session
 from schemas.topics import HELD_S
 
-TAIL_S: Final = 3 * HELD_S
-"""Of a session that was cut off: what of it publishers may still hold."""
+RESUME_WINDOW_S: Final = 3 * HELD_S
+"""Length of the end of an interrupted session that publishers may still cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class ResumePoint:
-    """What a new session need not write again."""
+    """Where a new session continues, and the messages that it need not write again."""
 
     name: str
-    """Of the session that was cut off; empty if there is none."""
+    """Name of the interrupted session; empty if there is none."""
     since_ns: int
-    """What was published before then is no matter of the new session."""
+    """Publish time from which the new session accepts backfilled messages."""
     known: frozenset[tuple[str, int, int]] = frozenset()
-    """What was written since then: key, number, time of publication."""
+    """Messages recorded since then: key, sequence, publish time."""
 
 
-def cut_off(root: Path, fleet: str, now_ns: int) -> ResumePoint:
-    """Look for it below `root`: what it has is not written again, what it has not is."""
-    session = _last(root, fleet, now_ns)
+def find_interrupted(root: Path, fleet: str, now_ns: int) -> ResumePoint:
+    """Return the resume point of the latest session below `root`; without a name if that session was closed."""
+    session = _find_latest(root, fleet, now_ns)
     if session is None:
         return ResumePoint("", now_ns)
-    start_ns = now_ns - int(TAIL_S * 1e9)
-    # Killed again before it had what the one before it lacked, it lacks that still.
-    chain = [session, *_continued(session, start_ns)]
+    start_ns = now_ns - int(RESUME_WINDOW_S * 1e9)
+    # A recorder that was killed twice may not have backfilled the first gap yet: read its predecessors too.
+    chain = [session, *_predecessors(session, start_ns)]
     known = frozenset(
         (row.key, row.sequence, row.published_ns) for each in chain for row in each.messages(start_ns=start_ns)
     )
-    return ResumePoint(session.path.name, max(start_ns, _begun_ns(chain[-1])), known)
+    return ResumePoint(session.path.name, max(start_ns, _started_ns(chain[-1])), known)
 
 
-def _continued(session: Session, start_ns: int) -> list[Session]:
-    """The sessions that one goes on with, the latest first, back to the one in which `start_ns` lies."""
+def _predecessors(session: Session, start_ns: int) -> list[Session]:
+    """Return the sessions that this one continues, latest first, back to the one that contains `start_ns`."""
     found = [session]
-    while _begun_ns(found[-1]) > start_ns:
+    while _started_ns(found[-1]) > start_ns:
         description = found[-1].description
         assert description is not None
         name = description.continues
@@ -58,15 +58,15 @@ def _continued(session: Session, start_ns: int) -> list[Session]:
     return found[1:]
 
 
-def _begun_ns(session: Session) -> int:
+def _started_ns(session: Session) -> int:
     assert session.description is not None
     return int(datetime.fromisoformat(session.description.started).timestamp() * 1e9)
 
 
-def _last(root: Path, fleet: str, now_ns: int) -> Session | None:
-    """The session of a recorder that ended a moment ago without closing it; None if there is none."""
-    there = sorted(root.glob(f"*/{session_dir.DESCRIPTION}"), key=lambda path: path.parent.name)
-    for path in reversed(there):
+def _find_latest(root: Path, fleet: str, now_ns: int) -> Session | None:
+    """Return the latest session if its recorder ended a moment ago without closing it; else None."""
+    paths = sorted(root.glob(f"*/{session_dir.SESSION_FILE}"), key=lambda path: path.parent.name)
+    for path in reversed(paths):
         description = session_dir.SessionInfo.read(path.parent)
         if description is None or description.fleet != fleet:
             continue

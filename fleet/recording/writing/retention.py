@@ -1,4 +1,4 @@
-"""Room on the disk: how much there is, what a session takes, which old sessions give way to new ones."""
+"""Measures disk space, and removes old sessions to enforce a quota."""
 
 import contextlib
 import shutil
@@ -7,24 +7,24 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from fleet.recording.session_dir import DESCRIPTION, SessionInfo
+from fleet.recording.session_dir import SESSION_FILE, SessionInfo
 
-_IN_USE_S: Final = 60.0
-"""A session that was not closed, and was written to since then, may be another recorder's."""
+_UNCLOSED_IN_USE_S: Final = 60.0
+"""Age below which an unclosed session may still belong to another recorder."""
 
 
 def free_bytes(path: Path) -> int:
-    """What may still be written where `path` is; raises OSError."""
+    """Return the free space on the disk of `path` in bytes; raises OSError."""
     return shutil.disk_usage(path).free
 
 
 def free_bytes_for(path: Path) -> int:
-    """What may be written where `path` is to be made; raises OSError."""
+    """Return the free space on the disk where `path` would be created; raises OSError."""
     return free_bytes(next(each for each in (path, *path.absolute().parents) if each.exists()))
 
 
 def size(session: Path) -> int:
-    """What a session takes, bytes; of one that somebody removes meanwhile, what was left."""
+    """Return the size of a session in bytes. Ignore files that disappear meanwhile."""
     found = 0
     for each in session.rglob("*"):
         with contextlib.suppress(OSError):
@@ -33,9 +33,9 @@ def size(session: Path) -> int:
 
 
 def make_room(root: Path, limit_bytes: int, keep: Path) -> tuple[list[Path], int]:
-    """Remove the oldest sessions below `root` until all take no more than the limit: (removed, what is still over).
+    """Remove the oldest sessions below `root` until all fit the limit: (removed sessions, bytes still over the limit).
 
-    `keep`, marked sessions and what is no session of ours are left alone, and what cannot be removed.
+    Spare `keep`, marked sessions, directories of other programs and sessions that cannot be removed.
     """
     sizes = {session: size(session) for session in _sessions(root)}
     over = sum(sizes.values()) - limit_bytes
@@ -47,14 +47,14 @@ def make_room(root: Path, limit_bytes: int, keep: Path) -> tuple[list[Path], int
             try:
                 shutil.rmtree(session)
             except OSError:
-                continue  # somebody else's, perhaps: what is over is told
+                continue  # perhaps another user's; the caller reports the excess
             removed.append(session)
             over -= sizes[session]
     return removed, max(0, over)
 
 
 def _sessions(root: Path) -> Iterator[Path]:
-    return (path.parent for path in root.glob(f"*/{DESCRIPTION}"))
+    return (path.parent for path in root.glob(f"*/{SESSION_FILE}"))
 
 
 def _may_go(session: Path) -> bool:
@@ -65,4 +65,4 @@ def _may_go(session: Path) -> bool:
         newest = max((each.stat().st_mtime for each in session.iterdir()), default=0.0)
     except OSError:
         return False
-    return description.closed or time.time() - newest > _IN_USE_S
+    return description.closed or time.time() - newest > _UNCLOSED_IN_USE_S

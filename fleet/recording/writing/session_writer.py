@@ -1,6 +1,6 @@
-"""A session being written: which file a message goes to, what is missing, when a file, a session or the disk is full.
+"""Writes one session: assigns messages to segments, tracks gaps, rolls files over and buffers while the disk is full.
 
-Called from one thread. No bus here, and no thread.
+All methods are called from one thread. The module knows no bus and starts no thread.
 """
 
 import contextlib
@@ -22,26 +22,27 @@ from fleet.recording.writing.segment_writer import Segment
 from schemas.bus import sequence_of
 
 MB: Final = 1_000_000
-HELD_MESSAGES: Final = 100_000
-HELD_BYTES: Final = 64 * MB
-"""What waits while the disk is full; what comes then is dropped, and counted."""
-WARN_FREE: Final = 4
-"""With less than so many times `keep_free_bytes` it is told that the disk is nearly full."""
-MOST_SEGMENTS: Final = 9990
-"""Their names have four digits."""
-LEAST_ROOM: Final = 500_000
-MOST_MORE: Final = 50 * MB
-"""With less than that beyond what is to stay free nothing is begun again: it would soon be full again."""
-END_ROOM: Final = 200_000
-"""With less than that on the disk not even the end of a session is written: a file's index is to have room."""
-BATCH: Final = 100_000
-"""Bytes: of what waited so much is written, and certain, before there is another look at the room."""
-SHARE: Final = 10
-"""A quota is kept by removing whole sessions, so one has no more than a tenth of it."""
+MAX_BUFFERED_MESSAGES: Final = 100_000
+MAX_BUFFERED_BYTES: Final = 64 * MB
+"""Maximum size of the buffer while the disk is full. Further messages are dropped and counted."""
+FREE_WARNING_FACTOR: Final = 4
+"""Warn if less than this multiple of `keep_free_bytes` is free."""
+MAX_SEGMENTS: Final = 9990
+"""Maximum segments of a session: their names have four digits."""
+MIN_START_BYTES: Final = 500_000
+"""Minimum free space above the reserve to begin a session."""
+MAX_RESUME_BYTES: Final = 50 * MB
+"""Maximum space above the reserve to wait for before resuming. With less, the disk fills again at once."""
+MIN_CLOSE_BYTES: Final = 200_000
+"""Minimum free space to write the end of a session: the index of its last file needs it."""
+OVERFLOW_BATCH_BYTES: Final = 100_000
+"""Buffered bytes to write and flush before the free space is checked again."""
+SESSIONS_PER_QUOTA: Final = 10
+"""Minimum sessions in a quota. The quota removes whole sessions, so each may use at most a tenth."""
 
 
 class Sync(StrEnum):
-    """When the disk is waited for. What the operating system has outlives us; only its own crash loses it."""
+    """When to wait for the disk. Flushed data survives our crash; only a crash of the operating system loses it."""
 
     NEVER = "never"
     SEGMENT = "segment"
@@ -50,82 +51,85 @@ class Sync(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How sessions are written; 0 is no limit."""
+    """Limits and files of the sessions to write; 0 is no limit."""
 
     segment_bytes: int = 512 * MB
+    """Size at which a segment is rolled over."""
     segment_s: float = 600.0
-    """The index of an open file is in memory: of a hundred cars, 0.1 MB a second."""
+    """Age at which a segment is rolled over. The index of an open file grows in memory: 0.1 MB/s for 100 cars."""
     sync: Sync = Sync.SEGMENT
     session_bytes: int = 0
-    """A session that has so much is closed, and the next one begins; 0: a tenth of `root_bytes`."""
+    """Size at which a session is closed and the next one begins; 0: a tenth of `root_bytes`."""
     root_bytes: int = 0
-    """What all sessions may have together; the oldest that nobody marked go first."""
+    """Quota of all sessions together. The oldest unmarked sessions are removed first."""
     keep_free_bytes: int = 50 * MB
-    """With less than that on the disk recording pauses."""
+    """Reserve on the disk. If less is free, recording pauses."""
     copied: Mapping[str, Path] = field(default_factory=lambda: MappingProxyType({}))
-    """Files that are copied into each session, by the name that they have there."""
+    """Files to copy into each session, by their names there."""
 
     @property
     def session_limit(self) -> int:
-        """What one session may have, bytes; 0 is no limit."""
-        return self.session_bytes or self.root_bytes // SHARE
+        """Return the maximum size of one session in bytes; 0 is no limit."""
+        return self.session_bytes or self.root_bytes // SESSIONS_PER_QUOTA
 
 
 class KeyState:
-    """What came under one key and encoding, in one segment."""
+    """Counters of one key and encoding in one segment."""
 
-    __slots__ = ("channel", "count", "encoding", "final", "first", "key", "numbers")
+    __slots__ = ("channel", "count", "encoding", "final", "first", "key", "tracker")
 
-    def __init__(self, key: str, encoding: zenoh.Encoding, numbers: SequenceTracker, channel: int) -> None:
+    def __init__(self, key: str, encoding: zenoh.Encoding, tracker: SequenceTracker, channel: int) -> None:
         self.key = key
         self.encoding = encoding
-        self.numbers = numbers
+        self.tracker = tracker
         self.channel = channel
         self.count = self.first = self.final = 0
 
 
-_Row = tuple[KeyState, int, bytes, int, int]
-"""Lane, time of receipt, payload, time of publication, number."""
+_BufferedRow = tuple[KeyState, int, bytes, int, int]
+"""State of the key, receive time, payload, publish time, sequence."""
 
 
 class SessionWriter:
-    """Begins with a new session; raises OSError if none can be made, later also if it cannot be written.
+    """Writes one new session. Raises OSError if the session cannot be created or written.
 
-    A full disk is not an error: `full` says so, what comes is held for a while, and it goes on when there is room.
-    If it is full from the start, `path` is where the session will be.
+    A full disk is no error: `full` names it, new messages are buffered, and writing resumes when there is space.
+    If the disk is full from the start, `path` is the future directory of the session.
     """
 
     def __init__(self, root: Path, fleet: str, options: Options, now_ns: int) -> None:
         self._root = root
         self._options = options
-        self.path, self.description = session_dir.plan(root, fleet, _wall(now_ns))
+        self.path, self.description = session_dir.plan(root, fleet, _utc(now_ns))
         self._made = False
-        follows = resume.cut_off(root, fleet, now_ns)
-        self.description.continues = follows.name
-        self._since_ns, self._known = follows.since_ns, follows.known
-        self._about = {"fleet": fleet, "started": self.description.started, "host": self.description.host}
-        self._about |= {**self.description.versions, "format": str(session_dir.FORMAT)}
+        resume_point = resume.find_interrupted(root, fleet, now_ns)
+        self.description.continues = resume_point.name
+        self._resume_since_ns, self._recorded = resume_point.since_ns, resume_point.known
+        self._metadata = {"fleet": fleet, "started": self.description.started, "host": self.description.host}
+        self._metadata |= {**self.description.versions, "format": str(session_dir.FORMAT_VERSION)}
         self.uncopied: list[str] = []
-        """Whoever tells of them clears it."""
-        self._numbers: dict[str, SequenceTracker] = {}
-        self._odd: set[str] = set()
-        """Keys whose numbers did not always follow."""
+        """Files that could not be copied. The recorder reports and clears them."""
+        self._trackers: dict[str, SequenceTracker] = {}
+        self._irregular_keys: set[str] = set()
+        """Keys whose sequence numbers were not always consecutive."""
         self.gaps: set[str] = set()
-        """Keys with new gaps; whoever asks for what is missing clears it."""
+        """Keys with new gaps. The recorder requests a backfill and clears them."""
         self.drops: dict[str, int] = {}
-        """By key: there was no room, here or on the way here. Another thread may count its own."""
+        """Messages by key that a full disk or queue cost. The reader thread of the recorder counts here too."""
         self.recovered: dict[str, int] = {}
+        """Messages by key that a backfill restored."""
         self.full = ""
+        """Why writing pauses; empty if it does not."""
         self.cost = ""
-        """What the end of the session cost for want of room."""
+        """Losses at the end of the session because the disk was full."""
         self.warning = ""
         self.removed: list[Path] = []
-        """Old sessions that gave way; whoever tells of them clears it."""
+        """Old sessions removed for the quota. The recorder reports and clears them."""
         self._index: list[dict[str, Any]] = []
-        self._written = self._closed_bytes = self._held_bytes = 0
-        self._unflushed: list[_Row] = []
-        self._forget_lanes(now_ns)
-        self._open(now_ns, self._options.keep_free_bytes + LEAST_ROOM)
+        self._written = self._closed_bytes = self._buffered_bytes = 0
+        self._unflushed: list[_BufferedRow] = []
+        self._reset_segment(now_ns)
+        self._open(now_ns, self._options.keep_free_bytes + MIN_START_BYTES)
 
     # ------------------------------------------------------------------ messages
 
@@ -138,169 +142,173 @@ class SessionWriter:
         source: zenoh.SourceInfo | None,
         received_ns: int,
     ) -> None:
-        """Write one publication as it came. This is the path of every message: each call in it costs."""
-        lane = self._lanes.get(key)
-        if lane is None or lane.encoding != encoding:
-            lane = self._lane(key, encoding)
+        """Write one publication unchanged."""
+        # Every message takes this path: each call in it costs. So the consecutive number is checked here.
+        state = self._states.get(key)
+        if state is None or state.encoding != encoding:
+            state = self._key_state(key, encoding)
         published_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else received_ns
         sequence = 0
         if source is not None:
-            sequence = (source.source_sn + 1) & 0xFFFFFFFF  # as sequence_of
+            sequence = (source.source_sn + 1) & 0xFFFFFFFF  # as schemas.bus.sequence_of
             entity = source.source_id
             sender = (entity.zid, entity.eid)  # an EntityGlobalId itself compares by identity
-            last = lane.numbers.last
+            last = state.tracker.last
             if last.get(sender) == sequence - 1:
                 last[sender] = sequence
             else:
-                if not lane.numbers.live(sender, sequence, published_ns):
+                if not state.tracker.add_live(sender, sequence, published_ns):
                     return
-                self._odd.add(key)
-                if lane.numbers.open:
+                self._irregular_keys.add(key)
+                if state.tracker.has_gaps:
                     self.gaps.add(key)
-        self._unflushed.append((lane, received_ns, payload, published_ns, sequence))
+        self._unflushed.append((state, received_ns, payload, published_ns, sequence))
         if self._segment is None:
-            self._hold()
+            self._limit_buffer()
             return
         try:
-            self._put(lane.channel, received_ns, payload, published_ns, sequence)
+            self._put(state.channel, received_ns, payload, published_ns, sequence)
         except OSError as error:
-            self._stumble(error)
+            self._on_write_error(error)
 
-    def add_recalled(self, sample: zenoh.Sample, received_ns: int) -> None:
-        """Write a publication that was asked for again, unless it is there already or older than the session."""
+    def add_backfilled(self, sample: zenoh.Sample, received_ns: int) -> None:
+        """Write a backfilled publication, unless it is recorded already or older than the session."""
         source, stamp = sample.source_info, sample.timestamp
         if source is None or stamp is None:
             return
         published_ns = stamp.get_time_as_ntp64().as_nanos()
         key, sequence = str(sample.key_expr), sequence_of(source)
-        if published_ns < self._since_ns:
+        if published_ns < self._resume_since_ns:
             return
-        lane = self._lanes.get(key)
-        if lane is None or lane.encoding != sample.encoding:
-            lane = self._lane(key, sample.encoding)
+        state = self._states.get(key)
+        if state is None or state.encoding != sample.encoding:
+            state = self._key_state(key, sample.encoding)
         sender = (source.source_id.zid, source.source_id.eid)
-        missing = lane.numbers.missing
-        if not lane.numbers.recalled(sender, sequence, published_ns) or (key, sequence, published_ns) in self._known:
+        missing = state.tracker.missing
+        if (
+            not state.tracker.add_backfilled(sender, sequence, published_ns)
+            or (key, sequence, published_ns) in self._recorded
+        ):
             return
-        self._odd.add(key)
-        if lane.numbers.missing < missing:
+        self._irregular_keys.add(key)
+        if state.tracker.missing < missing:
             self.recovered[key] = self.recovered.get(key, 0) + 1
-        self._write((lane, received_ns, sample.payload.to_bytes(), published_ns, sequence))
+        self._write((state, received_ns, sample.payload.to_bytes(), published_ns, sequence))
 
-    def _write(self, row: _Row) -> None:
+    def _write(self, row: _BufferedRow) -> None:
         self._unflushed.append(row)
         if self._segment is None:
-            self._hold()
+            self._limit_buffer()
             return
         try:
             self._put(row[0].channel, *row[1:])
         except OSError as error:
-            self._stumble(error)
+            self._on_write_error(error)
 
-    def _lane(self, key: str, encoding: zenoh.Encoding) -> KeyState:
-        """The lane of a key and an encoding; a key has another one only if its encoding changes."""
+    def _key_state(self, key: str, encoding: zenoh.Encoding) -> KeyState:
+        """Return the state of a key and an encoding. A key has a second state only if its encoding changes."""
         words = str(encoding)
-        lane = self._others.get((key, words))
-        if lane is None:
+        state = self._states_by_encoding.get((key, words))
+        if state is None:
             channel = -1
             if self._segment is not None:
                 try:
                     channel = self._segment.channel(key, words)
                 except OSError as error:
-                    self._stumble(error)
-            lane = KeyState(key, encoding, self._numbers.setdefault(key, SequenceTracker()), channel)
-            self._others[key, words] = lane
-        self._lanes[key] = lane
-        return lane
+                    self._on_write_error(error)
+            state = KeyState(key, encoding, self._trackers.setdefault(key, SequenceTracker()), channel)
+            self._states_by_encoding[key, words] = state
+        self._states[key] = state
+        return state
 
-    # ------------------------------------------------------------------ what there is
+    # ------------------------------------------------------------------ status
 
     @property
     def messages(self) -> int:
-        """How many are written, or wait for room."""
+        """Return the number of messages, written or buffered."""
         return self._written + len(self._unflushed)
 
     @property
     def bytes(self) -> int:
-        """What the segments have, as far as it is certain."""
+        """Return the flushed size of all segments."""
         return self._closed_bytes + (0 if self._segment is None else self._segment.bytes)
 
     @property
     def segments(self) -> int:
-        """How many files there are."""
+        """Return the number of segments."""
         return len(self._index) + (self._segment is not None)
 
     @property
     def waiting(self) -> int:
-        """How many wait for room; 0 while there is some."""
+        """Return the number of messages buffered because the disk is full."""
         return len(self._unflushed) if self.full else 0
 
     @property
     def free_bytes(self) -> int:
-        """What is free on the disk; raises OSError."""
+        """Return the free space on the disk in bytes; raises OSError."""
         return retention.free_bytes(self.path) if self._made else retention.free_bytes_for(self._root)
 
     @property
     def missed(self) -> dict[str, int]:
-        """By key: how many publications are missing, by their publishers' numbers."""
-        return {key: missing for key in sorted(self._odd) if (missing := self._numbers[key].missing)}
+        """Return the missing publications by key, from gaps in their sequence numbers."""
+        return {key: missing for key in sorted(self._irregular_keys) if (missing := self._trackers[key].missing)}
 
     @property
     def over(self) -> bool:
-        """Whether the session has all that it may have."""
-        return 0 < self._options.session_limit <= self.bytes or self.segments >= MOST_SEGMENTS
+        """True if the session has reached its limit of bytes or segments."""
+        return 0 < self._options.session_limit <= self.bytes or self.segments >= MAX_SEGMENTS
 
-    # ------------------------------------------------------------------ each second, and the end
+    # ------------------------------------------------------------------ every second, and the end
 
     def tick(self, now_ns: int) -> None:
-        """Make certain what has come, begin the next segment if it is time, look at the disk."""
+        """Flush, roll over to the next segment if it is due, and check the disk."""
         if self._segment is None:
             self._resume(now_ns)
             return
         try:
             self._flush(sync=self._options.sync is Sync.SECOND)
             segment_s = self._options.segment_s
-            late = bool(segment_s) and now_ns - self._begun_ns >= segment_s * 1e9
+            late = bool(segment_s) and now_ns - self._segment_started_ns >= segment_s * 1e9
             if (late or 0 < self._options.segment_bytes <= self._segment.bytes) and not self.over:
-                self._finish()
-                if not self.over:  # its index counts, too
-                    self._begin(now_ns)
+                self._finish_segment()
+                if not self.over:  # the index of the finished segment counts, too
+                    self._begin_segment(now_ns)
         except OSError as error:
-            self._stumble(error)
-        self._look()
+            self._on_write_error(error)
+        self._check_disk()
 
     def mark(self, text: str, by: str, now_ns: int) -> None:
-        """Note a mark, and that the session is to be kept; raises OSError."""
-        marks = [*self.description.marks, {"time": session_dir.iso(_wall(now_ns)), "text": text, "by": by}]
+        """Add a mark and exempt the session from the quota; raises OSError."""
+        marks = [*self.description.marks, {"time": session_dir.iso(_utc(now_ns)), "text": text, "by": by}]
         self.description.marks, self.description.kept = marks, True
         if self._made:
             self.description.write(self.path)
 
     def close(self, now_ns: int) -> None:
-        """Write what there is, and end the session, also where room was to stay free.
+        """Write the buffer and end the session, also into the reserve of the disk.
 
-        What finds none even now is counted as dropped, and `cost` says it.
+        Count messages that still do not fit as dropped, and describe them in `cost`.
         """
         try:
             self._flush()
         except OSError as error:
-            self._stumble(error)
+            self._on_write_error(error)
         dropped = 0
-        if self._segment is None and self._unflushed and self._open(now_ns, END_ROOM):
-            dropped = self._drop_all(self._write_held(END_ROOM))
+        if self._segment is None and self._unflushed and self._open(now_ns, MIN_CLOSE_BYTES):
+            dropped = self._drop_all(self._write_buffered(MIN_CLOSE_BYTES))
         try:
             if self._segment is not None:
-                self._finish()
+                self._finish_segment()
         except OSError as error:
-            self._stumble(error)
+            self._on_write_error(error)
             self.cost = "there was no room for the end of the last file, whose messages are all there"
-        if dropped := dropped + self._drop_waiting():
+        if dropped := dropped + self._drop_buffered():
             self.cost = f"there was no room to the end: {dropped} messages that waited for it are dropped"
         if self.cost:
             self.description.error = self.cost = f"{self._root}: {self.cost}"
         if self._made:
             try:
-                self._describe(now_ns, closed=True)
+                self._write_info(now_ns, closed=True)
             except OSError as error:
                 if not session_dir.is_full(error):
                     raise
@@ -308,24 +316,24 @@ class SessionWriter:
             session_dir.release(self.path)
 
     def abandon(self, why: str, now_ns: int) -> str:
-        """End a session that cannot be written any more; what was flushed stays as it is. The whole story in words."""
+        """End a session after a write error, and return a description. Flushed data stays unchanged."""
         if self._segment is not None:
             self._segment.cut()
-        self._drop_waiting()
+        self._drop_buffered()
         dropped = sum(self.drops.values())
         words = f"{why}. What was written until then is whole: {self._written} messages; {dropped} are dropped"
         self.description.error = words
-        with contextlib.suppress(OSError):  # the disk that failed; said already
-            self._describe(now_ns, closed=False)
+        with contextlib.suppress(OSError):  # the failed disk, which `words` already names
+            self._write_info(now_ns, closed=False)
             session_dir.release(self.path)
         return words
 
     # ------------------------------------------------------------------ segments
 
     def _open(self, now_ns: int, room_bytes: int) -> bool:
-        """Begin a file, and before the first one the session; False, and paused, if there is no such room."""
+        """Begin a segment, and the session before its first one. If space is short, pause and return False."""
         free = self.free_bytes
-        if self._unflushed:  # or a file would be begun for a large one again and again
+        if self._unflushed:  # else a large first message would begin an empty file at each attempt
             room_bytes += len(self._unflushed[0][2])
         if free < room_bytes:
             if not self.full:
@@ -336,44 +344,44 @@ class SessionWriter:
             if not made:
                 self.path = session_dir.create(self.path, self.description)
                 self._made = True
-            self._begin(now_ns)
+            self._begin_segment(now_ns)
         except OSError as error:
-            if self._made and not made:  # a session without a file is none
+            if self._made and not made:  # no session without a segment
                 shutil.rmtree(self.path, ignore_errors=True)
                 self._made = False
-            self._stumble(error)
+            self._on_write_error(error)
             return False
         if not made:
-            self._copy()
+            self._copy_files()
         with contextlib.suppress(OSError):
             session_dir.reserve(self.path)
         self.full = ""
         return True
 
-    def _forget_lanes(self, now_ns: int) -> None:
-        self._lanes: dict[str, KeyState] = {}
-        self._others: dict[tuple[str, str], KeyState] = {}
-        self._begun_ns, self._first_ns, self._last_ns = now_ns, 0, 0
+    def _reset_segment(self, now_ns: int) -> None:
+        self._states: dict[str, KeyState] = {}
+        self._states_by_encoding: dict[tuple[str, str], KeyState] = {}
+        self._segment_started_ns, self._first_ns, self._last_ns = now_ns, 0, 0
         self._segment: Segment | None = None
 
-    def _begin(self, now_ns: int) -> None:
-        self._forget_lanes(now_ns)
+    def _begin_segment(self, now_ns: int) -> None:
+        self._reset_segment(now_ns)
         path = session_dir.segment(self.path, len(self._index) + 1)
         try:
-            self._segment = Segment(path, self._about)
+            self._segment = Segment(path, self._metadata)
         except OSError:
             path.unlink(missing_ok=True)
             raise
         self._put = self._segment.add
 
     def _flush(self, *, sync: bool = False) -> None:
-        """Make certain what has come."""
+        """Flush the segment, and count its messages."""
         if self._segment is not None:
             self._segment.flush(sync=sync)
-            self._count()
+            self._on_flushed()
 
-    def _count(self) -> None:
-        """What was flushed, for the index."""
+    def _on_flushed(self) -> None:
+        """Add the flushed messages to the counters of the index."""
         rows = self._unflushed
         if not rows:
             return
@@ -382,86 +390,86 @@ class SessionWriter:
             first_ns, last_ns = min(row[1] for row in rows), max(row[1] for row in rows)
         self._first_ns = min(self._first_ns or first_ns, first_ns)
         self._last_ns = max(self._last_ns, last_ns)
-        for lane, _, _, _, sequence in rows:
-            if not lane.count:
-                lane.first = sequence
-            lane.count += 1
-            lane.final = sequence
+        for state, _, _, _, sequence in rows:
+            if not state.count:
+                state.first = sequence
+            state.count += 1
+            state.final = sequence
         self._written += len(rows)
         self._unflushed = []
 
-    def _finish(self) -> None:
+    def _finish_segment(self) -> None:
         assert self._segment is not None
         lost = {"drops": dict(self.drops), "missed": self.missed, "recovered": self.recovered}
         self._segment.finish({"messages": self._written, **lost}, sync=self._options.sync is not Sync.NEVER)
-        self._ended()
+        self._add_to_index()
 
-    def _ended(self) -> None:
-        """Note what the segment has; it takes no more."""
+    def _add_to_index(self) -> None:
+        """Add the closed segment to index.json."""
         assert self._segment is not None
         counts: dict[str, dict[str, int]] = {}
-        for lane in self._others.values():
-            if lane.count:
-                known = counts.setdefault(lane.key, {"count": 0, "first": lane.first, "last": 0})
-                known["count"] += lane.count
-                known["last"] = lane.final
+        for state in self._states_by_encoding.values():
+            if state.count:
+                known = counts.setdefault(state.key, {"count": 0, "first": state.first, "last": 0})
+                known["count"] += state.count
+                known["last"] = state.final
         entry = {"file": self._segment.path.name, "bytes": self._segment.bytes, "keys": counts}
         entry |= {"first_ns": self._first_ns, "last_ns": self._last_ns}
         self._index.append({**entry, "messages": sum(each["count"] for each in counts.values())})
         self._closed_bytes += self._segment.bytes
         self._segment = None
-        with contextlib.suppress(OSError):  # a cache, and a description that is written again at the end
-            session_dir.replace(self.path / session_dir.INDEX, {"segments": self._index})
-            self._describe(None, closed=False)
+        with contextlib.suppress(OSError):  # a cache; session.json is written again at the end
+            session_dir.replace(self.path / session_dir.INDEX_FILE, {"segments": self._index})
+            self._write_info(None, closed=False)
 
-    # ------------------------------------------------------------------ room
+    # ------------------------------------------------------------------ full disk
 
-    def _stumble(self, error: OSError) -> None:
-        """What was not flushed is held; anything but a full disk is raised."""
+    def _on_write_error(self, error: OSError) -> None:
+        """Pause if the disk is full, with the unflushed messages as buffer. Raise any other error."""
         if not session_dir.is_full(error):
             raise error
         if self._segment is not None:
             self._segment.cut()
-            if self._index and not any(lane.count for lane in self._others.values()):
-                self._segment.path.unlink(missing_ok=True)  # nothing is in it
+            if self._index and not any(state.count for state in self._states_by_encoding.values()):
+                self._segment.path.unlink(missing_ok=True)  # an empty one
                 self._segment = None
             else:
-                self._ended()
+                self._add_to_index()
         self._pause(f"{error.strerror or error}")
 
     def _pause(self, words: str) -> None:
         self.full = f"{self._root}: {words}: nothing is written until there is room"
         self.description.error = self.full
-        self._held_bytes = sum(len(row[2]) for row in self._unflushed)
+        self._buffered_bytes = sum(len(row[2]) for row in self._unflushed)
         if self._made:
-            with contextlib.suppress(OSError):  # it is told on the bus, and written at the end
-                self._describe(None, closed=False)
+            with contextlib.suppress(OSError):  # the status names it, and session.json is written at the end
+                self._write_info(None, closed=False)
 
-    def _hold(self) -> None:
-        """Whether what came last can wait for room."""
-        lane, _, payload, _, _ = self._unflushed[-1]
-        if len(self._unflushed) > HELD_MESSAGES or self._held_bytes + len(payload) > HELD_BYTES:
+    def _limit_buffer(self) -> None:
+        """Drop the newest message if the buffer is full."""
+        state, _, payload, _, _ = self._unflushed[-1]
+        if len(self._unflushed) > MAX_BUFFERED_MESSAGES or self._buffered_bytes + len(payload) > MAX_BUFFERED_BYTES:
             self._unflushed.pop()
-            self.drop(lane.key)
+            self.drop(state.key)
         else:
-            self._held_bytes += len(payload)
+            self._buffered_bytes += len(payload)
 
     def drop(self, key: str) -> None:
-        """Count one that cannot be written."""
+        """Count a dropped message."""
         self.drops[key] = self.drops.get(key, 0) + 1
 
-    def _drop_waiting(self) -> int:
-        """Count what is not written as dropped; how many."""
+    def _drop_buffered(self) -> int:
+        """Drop the buffer, and return the number of its messages."""
         rows, self._unflushed = self._unflushed, []
         return self._drop_all(rows)
 
-    def _drop_all(self, rows: Sequence[_Row]) -> int:
-        for lane, *_ in rows:
-            self.drop(lane.key)
+    def _drop_all(self, rows: Sequence[_BufferedRow]) -> int:
+        for state, *_ in rows:
+            self.drop(state.key)
         return len(rows)
 
-    def _look(self) -> None:
-        """See whether there is room, and make some among the old sessions."""
+    def _check_disk(self) -> None:
+        """Enforce the quota, and pause if the disk is nearly full."""
         keep, limit = self._options.keep_free_bytes, self._options.root_bytes
         self.warning = ""
         if limit:
@@ -471,73 +479,73 @@ class SessionWriter:
                 what = f"by {over / MB:.1f} MB that are marked, in use or not to be removed"
                 self.warning = f"{self._root} has more than its quota, {what}"
         free = self.free_bytes
-        if free < keep * WARN_FREE:
+        if free < keep * FREE_WARNING_FACTOR:
             self.warning = f"{self._root}: the disk is nearly full, {free / MB:.0f} MB are left"
         if free < keep and self._segment is not None:
             try:
-                self._finish()
+                self._finish_segment()
             except OSError as error:
-                self._stumble(error)
+                self._on_write_error(error)
                 return
             self._pause(f"{free / MB:.1f} MB are left on the disk, {keep / MB:g} MB are to stay free")
 
     def _resume(self, now_ns: int) -> None:
         keep = self._options.keep_free_bytes
-        if self._open(now_ns, keep + max(min(keep, MOST_MORE), LEAST_ROOM)):
-            rest = self._write_held(keep + END_ROOM)
+        if self._open(now_ns, keep + max(min(keep, MAX_RESUME_BYTES), MIN_START_BYTES)):
+            rest = self._write_buffered(keep + MIN_CLOSE_BYTES)
             try:
                 if rest and self._segment is not None:
-                    self._finish()
+                    self._finish_segment()
             except OSError as error:
-                self._stumble(error)
+                self._on_write_error(error)
             self._unflushed += rest
             if self._segment is None:
                 self._pause(f"{len(self._unflushed)} messages that wait need more than is free")
 
-    def _write_held(self, keep_bytes: int) -> list[_Row]:
-        """Write what waited, as long as so much stays free; what the disk has no room for."""
+    def _write_buffered(self, keep_bytes: int) -> list[_BufferedRow]:
+        """Write the buffer while this much stays free, and return the rest."""
         rows, self._unflushed = self._unflushed, []
         done = size = 0
         most = self.free_bytes - keep_bytes
         try:
             while done < len(rows) and self._segment is not None:
-                lane, received_ns, payload, published_ns, sequence = rows[done]
+                state, received_ns, payload, published_ns, sequence = rows[done]
                 if size + len(payload) > most:
                     break
                 done += 1
-                self._write((self._lane(lane.key, lane.encoding), received_ns, payload, published_ns, sequence))
+                self._write((self._key_state(state.key, state.encoding), received_ns, payload, published_ns, sequence))
                 size += len(payload)
-                if size >= BATCH:
+                if size >= OVERFLOW_BATCH_BYTES:
                     self._flush()
                     size, most = 0, self.free_bytes - keep_bytes
             self._flush()
         except OSError as error:
             if not session_dir.is_full(error):
-                self._unflushed += rows[done:]  # whoever ends this counts them
-            self._stumble(error)
+                self._unflushed += rows[done:]  # `abandon` counts them
+            self._on_write_error(error)
         return rows[done:]
 
     # ------------------------------------------------------------------ the directory
 
-    def _copy(self) -> None:
+    def _copy_files(self) -> None:
         for name, source in self._options.copied.items():
             try:
                 shutil.copyfile(source, self.path / name)
-            except OSError as error:  # no reason to record nothing
+            except OSError as error:  # recording goes on without the copy
                 self.uncopied.append(f"{source} could not be copied into {self.path}: {error.strerror or error}")
         if self.uncopied:
             self.description.error = "; ".join(self.uncopied)
             self.description.write(self.path)
 
-    def _describe(self, now_ns: int | None, *, closed: bool) -> None:
+    def _write_info(self, now_ns: int | None, *, closed: bool) -> None:
         description = self.description
         if now_ns is not None:
-            description.ended, description.closed = session_dir.iso(_wall(now_ns)), closed
+            description.ended, description.closed = session_dir.iso(_utc(now_ns)), closed
         description.messages = self._written
         description.drops, description.missed = dict(self.drops), self.missed
         description.recovered = dict(self.recovered)
         description.write(self.path)
 
 
-def _wall(now_ns: int) -> datetime:
+def _utc(now_ns: int) -> datetime:
     return datetime.fromtimestamp(now_ns / 1e9, UTC)

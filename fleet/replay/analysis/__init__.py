@@ -1,1 +1,1 @@
-"""A recorded session through today's decoder or policy, and where the result differs."""
+"""Compares a recording with today's code: its frames with the decoder, its readings with the policy."""

@@ -1,7 +1,7 @@
-"""What a session recorded of coordinators: when each ran, with which plan, what it decided; and which cars were there.
+"""Extracts the coordinators of a session: when each ran, its plans, its decisions, and the presence of cars.
 
-A coordinator's liveliness tokens are not recorded. That a car was on the bus follows from its states, which come once
-a second: it was gone where they pause, or where its gateway's next one is of another start.
+Liveliness tokens are not recorded. The presence of a car follows from its states, published once a second. The car was
+gone if they pause, or if the next one has another boot_id.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,15 +13,15 @@ from fleet.recording.reading.session import Recorded
 from schemas import keys, messages
 from schemas.topics import TOPICS
 
-KEYS: Final = tuple(f"*/{keys.COORDINATOR}/{name}" for name in ("plan", "assignment", "decision"))
-STATES: Final = ("*/*/state/*",)
-GONE_NS: Final = 2_500_000_000
-"""States pause so long only if the gateway is away."""
+DECISION_KEYS: Final = tuple(f"*/{keys.COORDINATOR}/{name}" for name in ("plan", "assignment", "decision"))
+STATE_KEYS: Final = ("*/*/state/*",)
+MAX_STATE_PAUSE_NS: Final = 2_500_000_000
+"""Minimum pause of states that means a gone gateway."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedDecision:
-    """A decision of one subject, from `at_ns` (the recorder's clock) until its next."""
+    """A decision of item subject, from `at_ns` (the recorder's clock) until its next."""
 
     at_ns: int
     kind: str
@@ -33,7 +33,8 @@ class RecordedDecision:
 
     @property
     def what(self) -> tuple[str, str, str]:
-        """What is compared. Reasons have ages in them; the role of a car left alone ends later without a word."""
+        """Return the parts to compare."""
+        # Not the reasons: they contain ages. A car left alone loses its role later without a decision.
         return self.kind, self.decided, "" if self.kind == DecisionKind.ALONE else self.role
 
     def __str__(self) -> str:
@@ -42,14 +43,14 @@ class RecordedDecision:
 
 
 Timeline = dict[str, list[RecordedDecision]]
-"""By subject, the decisions that differ from the one before, in order."""
+"""Changed decisions in order, by subject."""
 
 
-def add(timeline: Timeline, subject: str, said: RecordedDecision) -> None:
-    """One more decision; one that says what the last one said is none."""
+def add(timeline: Timeline, subject: str, decision: RecordedDecision) -> None:
+    """Add a decision if it differs from the last one of its subject."""
     before = timeline.setdefault(subject, [])
-    if not before or before[-1].what != said.what:
-        before.append(said)
+    if not before or before[-1].what != decision.what:
+        before.append(decision)
 
 
 @dataclass(slots=True)
@@ -60,27 +61,27 @@ class CoordinatorRun:
     start_ns: int
     end_ns: int
     whole: bool
-    """Whether the session has its beginning."""
+    """True if the session contains its start."""
     plans: list[tuple[int, str]] = field(default_factory=list)
-    """From when on which text."""
-    said: Timeline = field(default_factory=dict)
+    """Start time and text of each plan."""
+    decisions: Timeline = field(default_factory=dict)
     roles: Mapping[str, str] = field(default_factory=dict)
-    """Of each car, as first said."""
+    """First role of each car."""
     phase: str = ""
 
 
 def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
-    """The coordinators of a session, in order; `recorded`: the messages of KEYS."""
+    """Return the coordinators of a session in order of their start; `recorded` has the messages of DECISION_KEYS."""
     found: dict[tuple[str, str], CoordinatorRun] = {}
-    for one in recorded:
-        key = keys.parse(one.key)
-        value = message(one)
+    for item in recorded:
+        key = keys.parse(item.key)
+        value = decode_message(item)
         if key is None or value is None:
             continue
-        at_ns = one.recorded_ns
+        at_ns = item.recorded_ns
         run = found.get((key.fleet, value.boot_id))
         if run is None:
-            # The plan is the first thing that a coordinator says; later it says all of it again every ten seconds.
+            # A coordinator publishes its plan first, and repeats everything every ten seconds.
             whole = key.topic == "plan" and value.seq == 1
             run = found[key.fleet, value.boot_id] = CoordinatorRun(key.fleet, at_ns, at_ns, whole)
         run.end_ns = max(run.end_ns, at_ns)
@@ -93,7 +94,7 @@ def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
                     run.roles = {car: role.name for role in value.roles for car in role.cars}
                     run.phase = value.phase
             case _:
-                said = RecordedDecision(
+                decision = RecordedDecision(
                     at_ns,
                     value.kind,
                     value.decided,
@@ -102,13 +103,13 @@ def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
                     tuple(value.readings),
                     value.would_change,
                 )
-                add(run.said, value.subject, said)
+                add(run.decisions, value.subject, decision)
     return sorted(found.values(), key=lambda run: run.start_ns)
 
 
 @dataclass(frozen=True, slots=True)
 class PresenceToken:
-    """A car came to the bus, or went."""
+    """A car appeared on the bus or disappeared."""
 
     at_ns: int
     car: str
@@ -116,46 +117,49 @@ class PresenceToken:
 
 
 def presence(recorded: Iterable[Recorded], end_ns: int) -> list[PresenceToken]:
-    """When cars came and went, by their states (those of STATES), until `end_ns`; the times of going are estimates."""
+    """Return when cars appeared and disappeared until `end_ns`, from the messages of STATE_KEYS.
+
+    The times of disappearing are estimates.
+    """
     last: dict[str, tuple[int, str]] = {}
     found = []
-    for one in recorded:
-        key = keys.parse(one.key)
-        value = message(one)
+    for item in recorded:
+        key = keys.parse(item.key)
+        value = decode_message(item)
         if key is None or value is None:
             continue
-        at_ns, before = one.recorded_ns, last.get(key.car)
+        at_ns, before = item.recorded_ns, last.get(key.car)
         if before is None:
             found.append(PresenceToken(at_ns, key.car, alive=True))
-        elif before[1] != value.boot_id or at_ns - before[0] > GONE_NS:
+        elif before[1] != value.boot_id or at_ns - before[0] > MAX_STATE_PAUSE_NS:
             found.append(PresenceToken(min(before[0] + 500_000_000, (before[0] + at_ns) // 2), key.car, alive=False))
             found.append(PresenceToken(at_ns, key.car, alive=True))
         last[key.car] = at_ns, value.boot_id
     found += [
         PresenceToken(at_ns + 500_000_000, car, alive=False)
         for car, (at_ns, _) in last.items()
-        if end_ns - at_ns > GONE_NS
+        if end_ns - at_ns > MAX_STATE_PAUSE_NS
     ]
     return sorted(found, key=lambda token: token.at_ns)
 
 
-def message(one: Recorded) -> Any:
-    """The message of a key of the table; None for what is none, or does not parse."""
-    key = keys.parse(one.key)
+def decode_message(item: Recorded) -> Any:
+    """Return the decoded message of a known topic; None if the topic is unknown or the payload invalid."""
+    key = keys.parse(item.key)
     if key is None:
         return None
     topic = TOPICS.get(f"{key.car}/{key.topic}" if key.car.startswith("@") else key.topic)
-    if topic is None or topic.message != one.message:
+    if topic is None or topic.message != item.message:
         return None
     try:
-        return messages.parse(one.message, one.payload, topic.encoding)
+        return messages.parse(item.message, item.payload, topic.encoding)
     except messages.BadPayload:
         return None
 
 
 @dataclass(frozen=True, slots=True)
 class DecisionDifference:
-    """From when until when something else was decided then than now; None: nothing."""
+    """Time span with different decisions in the recording and now; None: no decision."""
 
     subject: str
     from_ns: int
@@ -165,30 +169,32 @@ class DecisionDifference:
 
 
 def differences(then: Timeline, now: Timeline, start_ns: int, end_ns: int) -> Iterator[DecisionDifference]:
-    """Every stretch between two times in which the two say otherwise; both sides are stepwise."""
+    """Yield every time span in which the two timelines differ. A decision holds until the next one."""
     for subject in sorted({*then, *now}):
-        one, other = then.get(subject, []), now.get(subject, [])
-        times = sorted({start_ns, *(said.at_ns for said in (*one, *other) if start_ns < said.at_ns < end_ns)})
+        old, new = then.get(subject, []), now.get(subject, [])
+        times = sorted({start_ns, *(decision.at_ns for decision in (*old, *new) if start_ns < decision.at_ns < end_ns)})
         open_from: int | None = None
         pair: tuple[RecordedDecision | None, RecordedDecision | None] = (None, None)
         for at_ns in (*times, end_ns):
-            held = _at(one, at_ns), _at(other, at_ns)
-            same = at_ns == end_ns or _what(held[0]) == _what(held[1])
-            if open_from is not None and (same or (_what(held[0]), _what(held[1])) != (_what(pair[0]), _what(pair[1]))):
+            current = _at(old, at_ns), _at(new, at_ns)
+            same = at_ns == end_ns or _what(current[0]) == _what(current[1])
+            if open_from is not None and (
+                same or (_what(current[0]), _what(current[1])) != (_what(pair[0]), _what(pair[1]))
+            ):
                 yield DecisionDifference(subject, open_from, at_ns, *pair)
                 open_from = None
             if not same and open_from is None:
-                open_from, pair = at_ns, held
+                open_from, pair = at_ns, current
 
 
-def _at(said: list[RecordedDecision], at_ns: int) -> RecordedDecision | None:
+def _at(decisions: list[RecordedDecision], at_ns: int) -> RecordedDecision | None:
     found = None
-    for each in said:
+    for each in decisions:
         if each.at_ns > at_ns:
             break
         found = each
     return found
 
 
-def _what(said: RecordedDecision | None) -> tuple[str, str, str] | None:
-    return None if said is None else said.what
+def _what(decision: RecordedDecision | None) -> tuple[str, str, str] | None:
+    return None if decision is None else decision.what

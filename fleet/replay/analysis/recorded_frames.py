@@ -1,6 +1,6 @@
-"""What a session recorded of cars' wires: frames both ways, what became of them, and what was known of the car then.
+"""Extracts the raw frames of a session in both directions, with their readings and the known mode and platform.
 
-In the order of the gateway's stamps, car by car, and bounded: states overtake readings on the bus. Nothing is decoded.
+Items are in the order of the gateway's stamps: states overtake readings on the bus. Memory is bounded. Decodes nothing.
 """
 
 import heapq
@@ -14,27 +14,27 @@ from gateway.protocol.enums import Mode
 from schemas import keys, messages
 from schemas.topics import TOPICS
 
-SENSORS: Final = tuple(name for name, topic in TOPICS.items() if topic.family == "sensor")
-KEYS: Final = ("*/*/frame/*", "*/*/sensor/*", "*/*/state/mode", "*/*/state/health")
-SLACK_NS: Final = 10_000_000_000
-"""So long, on the recorder's clock, a message may be late: after an outage of the bus what was kept comes at once."""
-_MODES: Final = frozenset(map(str, Mode))
-_HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
+SENSOR_TOPICS: Final = tuple(name for name, topic in TOPICS.items() if topic.family == "sensor")
+FRAME_KEYS: Final = ("*/*/frame/*", "*/*/sensor/*", "*/*/state/mode", "*/*/state/health")
+MAX_MESSAGE_DELAY_NS: Final = 10_000_000_000
+"""Maximum delay of a message on the recorder's clock: after an outage of the bus, cached messages come at once."""
+_MODE_NAMES: Final = frozenset(map(str, Mode))
+_HEADER_FIELDS: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
 Readings = Mapping[str, Mapping[str, Any]]
-"""Fields by topic, as in the messages; what was not measured is left out."""
+"""Fields by topic, without values that were not measured."""
 
 
 @dataclass(slots=True)
 class Rx:
-    """Bytes from a car, and what they were taken for."""
+    """Bytes from a car, and their recorded verdict and readings."""
 
     at_ns: int
     data: bytes
     verdict: str
     published: tuple[str, ...] = ()
     readings: Readings = field(default_factory=dict)
-    """Those of `published` that are there."""
+    """Recorded readings of the topics in `published`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,38 +46,38 @@ class Tx:
 
 
 @dataclass(frozen=True, slots=True)
-class Confirmed:
-    """The mode that the car was known to be in from now on; None: not known."""
+class KnownMode:
+    """Known mode of the car from this time on; None: unknown."""
 
     at_ns: int
     mode: Mode | None
 
 
 @dataclass(frozen=True, slots=True)
-class Treated:
-    """The platform that the car was treated as from now on."""
+class KnownPlatform:
+    """Platform of the car from this time on."""
 
     at_ns: int
     platform: str
 
 
-Item = Rx | Tx | Confirmed | Treated
+Item = Rx | Tx | KnownMode | KnownPlatform
 
 
 @dataclass(slots=True)
-class Unread:
-    """What could not be used, by key."""
+class SkippedMessages:
+    """Counts of messages that could not be used."""
 
     broken: dict[str, int] = field(default_factory=dict)
-    """Messages that do not parse as what they say they are."""
+    """Messages by key that do not match their type."""
     unframed: int = 0
-    """Readings without a raw frame: it was not recorded, or the gateway published no more of them at that moment."""
+    """Readings without a raw frame, which was not recorded or over the gateway's rate limit."""
 
 
-def of_session(recorded: Iterable[Recorded], unread: Unread) -> Iterator[tuple[str, Item]]:
-    """(Car, item), in the order of their stamps."""
+def of_session(recorded: Iterable[Recorded], skipped: SkippedMessages) -> Iterator[tuple[str, Item]]:
+    """Yield (car, item) in the order of their stamps."""
     waiting: dict[tuple[str, str, int], deque[Mapping[str, Any]]] = {}
-    for key, value, at_ns in _in_order(recorded, unread):
+    for key, value, at_ns in _sort_by_stamp(recorded, skipped):
         match key.topic:
             case "frame/tx":
                 yield key.car, Tx(at_ns, value.data)
@@ -91,43 +91,43 @@ def of_session(recorded: Iterable[Recorded], unread: Unread) -> Iterator[tuple[s
                             del waiting[key.car, topic, at_ns]
                 yield key.car, Rx(at_ns, value.data, value.verdict, published, readings)
             case "state/mode":
-                sure = value.verdict == "confirmed" and value.asked in _MODES
-                yield key.car, Confirmed(at_ns, Mode(value.asked) if sure else None)
+                sure = value.verdict == "confirmed" and value.asked in _MODE_NAMES
+                yield key.car, KnownMode(at_ns, Mode(value.asked) if sure else None)
             case "state/health":
-                yield key.car, Treated(at_ns, value.platform)
+                yield key.car, KnownPlatform(at_ns, value.platform)
             case _:
                 waiting.setdefault((key.car, key.topic, at_ns), deque()).append(fields_of(value))
-                if len(waiting) > 1 << 16:  # of gateways whose frames are not here at all
-                    unread.unframed += len(waiting.pop(next(iter(waiting))))
-    unread.unframed += sum(map(len, waiting.values()))
+                if len(waiting) > 1 << 16:  # from gateways without any recorded frame
+                    skipped.unframed += len(waiting.pop(next(iter(waiting))))
+    skipped.unframed += sum(map(len, waiting.values()))
 
 
 def fields_of(message: Any) -> dict[str, Any]:
-    """What a message says, without its header; lists as tuples, and what was not measured left out."""
-    there = {descriptor.name for descriptor, _ in message.ListFields()}
+    """Return the fields of a message without header and unmeasured values; lists as tuples."""
+    present = {descriptor.name for descriptor, _ in message.ListFields()}
     found = {}
     for each in message.DESCRIPTOR.fields:
-        if each.name not in _HEADER and (not each.has_presence or each.name in there):
+        if each.name not in _HEADER_FIELDS and (not each.has_presence or each.name in present):
             value = getattr(message, each.name)
             found[each.name] = tuple(value) if each.is_repeated else value
     return found
 
 
-def _in_order(recorded: Iterable[Recorded], unread: Unread) -> Iterator[tuple[keys.Key, Any, int]]:
-    """Messages by their stamp; of equal stamps readings before their frame, and as they were recorded."""
+def _sort_by_stamp(recorded: Iterable[Recorded], skipped: SkippedMessages) -> Iterator[tuple[keys.Key, Any, int]]:
+    """Yield messages by stamp. At equal stamps readings come before their frame, else in recorded order."""
     heap: list[tuple[int, bool, int, keys.Key, Any]] = []
-    for number, one in enumerate(recorded):
-        key = keys.parse(one.key)
-        if key is None or (topic := TOPICS.get(key.topic)) is None or topic.message != one.message:
+    for number, message in enumerate(recorded):
+        key = keys.parse(message.key)
+        if key is None or (topic := TOPICS.get(key.topic)) is None or topic.message != message.message:
             continue
         try:
-            value: Any = messages.parse(one.message, one.payload, topic.encoding)
+            value: Any = messages.parse(message.message, message.payload, topic.encoding)
         except messages.BadPayload:
-            unread.broken[one.key] = unread.broken.get(one.key, 0) + 1
+            skipped.broken[message.key] = skipped.broken.get(message.key, 0) + 1
             continue
         at_ns = value.stamp.seconds * 1_000_000_000 + value.stamp.nanos
         heapq.heappush(heap, (at_ns, topic.family != "sensor", number, key, value))
-        while heap and heap[0][0] < one.recorded_ns - SLACK_NS:
+        while heap and heap[0][0] < message.recorded_ns - MAX_MESSAGE_DELAY_NS:
             at_ns, _, _, key, value = heapq.heappop(heap)
             yield key, value, at_ns
     while heap:

@@ -1,9 +1,8 @@
-"""A plan on what a session recorded: the coordinator's policy again, on the recorded clock. No bus; nothing is asked.
+"""Runs the coordinator's policy with a plan on the readings of a session, on the recorded clock. Uses no bus.
 
-What cars said is what happened, whatever this plan would have made them do: a car that it would have put into another
-mode says here what it said in its own. Three things a live coordinator knows are not in a recording: its tokens (see
-coordinated.py), when exactly it looked (here: after every message, and ten times a second), and which of two messages
-of nearly the same time it had first.
+Cars behave as recorded, whatever this plan would have commanded. A recording lacks three things that a coordinator
+knows: its liveliness tokens (see recorded_decisions.py), the exact times of its steps (here after every message, and
+ten times a second), and the order of messages that arrived almost at once.
 """
 
 import heapq
@@ -24,19 +23,19 @@ from fleet.replay.analysis.recorded_decisions import (
     RecordedDecision,
     Timeline,
     add,
-    message,
+    decode_message,
 )
 from schemas import keys, messages
 from schemas.bus import Sample
 from schemas.topics import PROTOBUF
 
-TURN_NS: Final = 100_000_000
-TOGETHER_NS: Final = 10_000_000
-"""Messages so close together are taken in one turn."""
-BEFORE_NS: Final = 60_000_000_000
-"""What cars said so long before a coordinator began is what it was told when it asked."""
-_ENDED: Final = frozenset({"sent", "complete", "effect_seen", "rejected", "failed", "expired", "superseded"})
-_DONE: Final = frozenset({"sent", "complete", "effect_seen"})
+STEP_INTERVAL_NS: Final = 100_000_000
+MAX_BATCH_NS: Final = 10_000_000
+"""Maximum time between messages that one step processes together."""
+COORDINATOR_HISTORY_NS: Final = 60_000_000_000
+"""Time before the start of a coordinator whose readings stand for its first queries."""
+_FINAL_PHASES: Final = frozenset({"sent", "complete", "effect_seen", "rejected", "failed", "expired", "superseded"})
+_SUCCESS_PHASES: Final = frozenset({"sent", "complete", "effect_seen"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,40 +44,40 @@ class _NewPlan:
     plan: Plan
 
 
-def wanted_keys(fleet: str, plans: Iterable[Plan]) -> list[str]:
-    """What a coordinator with these plans hears, and what became of what it asked."""
+def keys_for(fleet: str, plans: Iterable[Plan]) -> list[str]:
+    """Return the key expressions that a coordinator with these plans subscribes to, and those of its outcomes."""
     topics = {topic_of(name) for plan in plans for name in plan.names}
     return [f"{fleet}/*/{topic}" for topic in ("state/*", "event/command", *sorted(topics)) if topic]
 
 
 def plans_of(run: CoordinatorRun) -> list[Plan]:
-    """The plans that a coordinator had, one after the other; raises BadPlan for one that this version cannot read."""
+    """Return the plans of a coordinator in order; raises BadPlan if this version cannot read one."""
     return [parse(text, f"the recorded plan of {run.fleet}") for _, text in run.plans]
 
 
 @dataclass(slots=True)
 class Replanning:
-    """One coordinator again, from its beginning to its end: `plans` are (from when on, plan)."""
+    """Runs one recorded coordinator again from its start to its end. `plans` are pairs (start time, plan)."""
 
     run: CoordinatorRun
     plans: list[tuple[int, Plan]]
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
-    kept: PersistedPolicy = field(default_factory=PersistedPolicy)
-    """What the coordinator before it left."""
-    said: Timeline = field(default_factory=dict)
+    persisted: PersistedPolicy = field(default_factory=PersistedPolicy)
+    """State persisted by the previous coordinator."""
+    decisions: Timeline = field(default_factory=dict)
     _observer: FleetObserver = field(init=False)
     _plan: Plan = field(init=False)
-    _memory: PolicyState | None = None
+    _state: PolicyState | None = None
     _busy: dict[str, str] = field(default_factory=dict)
-    """Car: the mode that it was asked for."""
-    _looked_ns: int = 0
+    """Requested mode by car."""
+    _stepped_ns: int = 0
 
     def __post_init__(self) -> None:
         self._observer = FleetObserver(self.listed)
         self._plan = self.plans[0][1]
 
     def go(self, recorded: Iterable[Recorded], tokens: Iterable[PresenceToken]) -> PersistedPolicy:
-        """Take all of it, of the keys that are wanted and in order; what it would leave to the next coordinator."""
+        """Process all messages of `keys_for`, in order, and return the state to persist for the next coordinator."""
         changes = [_NewPlan(at_ns, plan) for at_ns, plan in self.plans[1:]]
         new_ns: int | None = None
         items: Iterable[Any] = heapq.merge(_ordered(recorded), tokens, changes, key=_time)
@@ -86,24 +85,24 @@ class Replanning:
             at_ns = _time(item)
             if at_ns > self.run.end_ns:
                 break
-            if new_ns is not None and at_ns - new_ns > TOGETHER_NS:
-                self._look(new_ns)
+            if new_ns is not None and at_ns - new_ns > MAX_BATCH_NS:
+                self._step(new_ns)
                 new_ns = None
-            self._pass(at_ns)
+            self._advance(at_ns)
             new_ns = at_ns if new_ns is None else new_ns
             match item:
                 case PresenceToken():
                     self._observer.on_token(item.car, item.at_ns / 1e9, alive=item.alive)
                 case _NewPlan():
-                    if self._memory is not None:
-                        self._memory = carry_over(self._memory, self._plan, item.plan)
+                    if self._state is not None:
+                        self._state = carry_over(self._state, self._plan, item.plan)
                     self._plan = item.plan
                 case _:
                     self._take(item)
-        self._pass(self.run.end_ns)
-        self._look(self.run.end_ns)
-        assert self._memory is not None
-        return to_persisted(self._plan, self._memory, self.run.end_ns / 1e9, self.run.end_ns / 1e9)
+        self._advance(self.run.end_ns)
+        self._step(self.run.end_ns)
+        assert self._state is not None
+        return to_persisted(self._plan, self._state, self.run.end_ns / 1e9, self.run.end_ns / 1e9)
 
     def _take(self, item: Recorded) -> None:
         if item.key.endswith("/event/command"):
@@ -115,8 +114,8 @@ class Replanning:
             )
 
     def _outcome(self, item: Recorded) -> None:
-        """What became of a mode that the coordinator asked for then."""
-        event, key = message(item), keys.parse(item.key)
+        """Apply the outcome of a mode command of the recorded coordinator."""
+        event, key = decode_message(item), keys.parse(item.key)
         if event is None or key is None or event.kind != "coordinator" or event.verb != "mode":
             return
         if event.phase == "asked":
@@ -125,61 +124,61 @@ class Replanning:
             except messages.BadPayload:
                 return
             self._busy[key.car] = request.mode
-        elif event.phase in _ENDED and (mode := self._busy.pop(key.car, None)) is not None:
+        elif event.phase in _FINAL_PHASES and (mode := self._busy.pop(key.car, None)) is not None:
             refusal = Refusal(mode, event.reason, event.words, item.recorded_ns / 1e9)
-            self._observer.on_outcome(key.car, None if event.phase in _DONE else refusal)
+            self._observer.on_outcome(key.car, None if event.phase in _SUCCESS_PHASES else refusal)
 
-    def _pass(self, to_ns: int) -> None:
-        """Time in which nothing came."""
+    def _advance(self, to_ns: int) -> None:
+        """Advance the clock, with a step at each interval."""
         if to_ns < self.run.start_ns:
             return
-        if self._memory is None:
-            self._memory = self._begin()
-            self._looked_ns = self.run.start_ns - TURN_NS
-        while self._looked_ns + TURN_NS <= to_ns:
-            self._look(self._looked_ns + TURN_NS)
+        if self._state is None:
+            self._state = self._initial_state()
+            self._stepped_ns = self.run.start_ns - STEP_INTERVAL_NS
+        while self._stepped_ns + STEP_INTERVAL_NS <= to_ns:
+            self._step(self._stepped_ns + STEP_INTERVAL_NS)
 
-    def _begin(self) -> PolicyState:
+    def _initial_state(self) -> PolicyState:
         now = self.run.start_ns / 1e9
         known = {car: role for car, role in self.run.roles.items() if role in self._plan.roles}
-        picture = self._observer.snapshot(())
-        if not self.run.whole or any(not picture.cars.get(car, UNKNOWN_CAR).mode for car in known):
-            # It began, or knew its cars, before the recording: that is where its first roles are from.
+        snapshot = self._observer.snapshot(())
+        if not self.run.whole or any(not snapshot.cars.get(car, UNKNOWN_CAR).mode for car in known):
+            # The coordinator started, or knew its cars, before the recording: its first roles are from then.
             return restore(
-                self._plan, picture, PersistedPolicy(self._plan.version, known, self.run.phase, now), now, now
+                self._plan, snapshot, PersistedPolicy(self._plan.version, known, self.run.phase, now), now, now
             )
-        memory = restore(self._plan, picture, self.kept, now, now)
-        # Roles from before the session: its first words tell of them.
-        told = {
+        state = restore(self._plan, snapshot, self.persisted, now, now)
+        # Roles from before the session: its first decisions name them.
+        initial = {
             car: HeldRole(known[car], TAKEN_OVER)
-            for car, said in self.run.said.items()
-            if car in known and said[0].role == known[car] and TAKEN_OVER in said[0].why
+            for car, past in self.run.decisions.items()
+            if car in known and past[0].role == known[car] and TAKEN_OVER in past[0].why
         }
-        return memory if memory.held_roles or not told else PolicyState(held_roles=told)
+        return state if state.held_roles or not initial else PolicyState(held_roles=initial)
 
-    def _look(self, at_ns: int) -> None:
-        if self._memory is None or at_ns < self._looked_ns:
+    def _step(self, at_ns: int) -> None:
+        if self._state is None or at_ns < self._stepped_ns:
             return
-        self._looked_ns = at_ns
-        self._observer.forget(at_ns / 1e9, {*self._plan.named, *self._memory.held_roles})
-        result = step(self._plan, self._observer.snapshot(self._busy), self._memory, at_ns / 1e9)
-        self._memory = result.memory
+        self._stepped_ns = at_ns
+        self._observer.forget(at_ns / 1e9, {*self._plan.named, *self._state.held_roles})
+        result = step(self._plan, self._observer.snapshot(self._busy), self._state, at_ns / 1e9)
+        self._state = result.memory
         for each in result.changed:
-            said = RecordedDecision(
+            decision = RecordedDecision(
                 at_ns, each.kind, each.decided, each.role or "", each.why, each.readings, each.would_change
             )
-            add(self.said, each.subject, said)
+            add(self.decisions, each.subject, decision)
 
 
 def _ordered(recorded: Iterable[Recorded]) -> Iterable[Recorded]:
-    """By the recorder's clock, which a person may have set back: such a message counts as of the latest time."""
+    """Yield messages with monotonic times: after a backward step of the clock, use the latest time so far."""
     latest_ns = 0
-    for one in recorded:
-        if one.recorded_ns < latest_ns:
-            yield replace(one, recorded_ns=latest_ns)
+    for message in recorded:
+        if message.recorded_ns < latest_ns:
+            yield replace(message, recorded_ns=latest_ns)
         else:
-            latest_ns = one.recorded_ns
-            yield one
+            latest_ns = message.recorded_ns
+            yield message
 
 
 def _time(item: Recorded | PresenceToken | _NewPlan) -> int:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fleet.recording import time_spec
-from fleet.replay.analysis.recorded_frames import Confirmed, Item, Rx, Treated, Tx
+from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from gateway.protocol.decoder import ECHO_S
 from gateway.protocol.enums import Mode
 
@@ -42,7 +42,7 @@ def stretch(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterato
         if item.at_ns < start_ns:
             if isinstance(item, Tx) and item.at_ns >= start_ns - ECHO_S * 1e9:
                 yield item
-            elif isinstance(item, Confirmed | Treated):
+            elif isinstance(item, KnownMode | KnownPlatform):
                 known[type(item)] = item
             continue
         if not begun:
@@ -60,7 +60,7 @@ def lines(items: Iterable[Item], start_ns: int, car: str, source: str) -> Iterat
     before: dict[type, Any] = {}
     for item in sorted(items, key=lambda item: item.at_ns):
         told = _told(item)
-        if isinstance(item, Confirmed | Treated):
+        if isinstance(item, KnownMode | KnownPlatform):
             if before.get(type(item)) == told:
                 continue  # said once a second; only a change matters
             before[type(item)] = told
@@ -69,9 +69,9 @@ def lines(items: Iterable[Item], start_ns: int, car: str, source: str) -> Iterat
 
 def _told(item: Item) -> dict[str, Any]:
     match item:
-        case Treated():
+        case KnownPlatform():
             return {"platform": item.platform}
-        case Confirmed():
+        case KnownMode():
             return {"mode": item.mode}
         case Tx():
             return {"tx": item.data.decode("latin-1")}
@@ -109,9 +109,9 @@ def read(path: Path) -> tuple[str, list[Item]]:
 def _item(told: Mapping[str, Any]) -> Item:
     at_ns = int(told["at_us"]) * 1000
     if "platform" in told:
-        return Treated(at_ns, str(told["platform"]))
+        return KnownPlatform(at_ns, str(told["platform"]))
     if "mode" in told:
-        return Confirmed(at_ns, None if told["mode"] is None else Mode(told["mode"]))
+        return KnownMode(at_ns, None if told["mode"] is None else Mode(told["mode"]))
     if "tx" in told:
         return Tx(at_ns, told["tx"].encode("latin-1"))
     readings = {

@@ -1,1 +1,1 @@
-"""Plays a session on a bus, at its own pace."""
+"""Replays a session on a bus at its own pace. Read `schedule` first, then `player`."""

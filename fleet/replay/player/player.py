@@ -1,8 +1,7 @@
-"""A session on the bus again, as a fleet of another name: payloads, encodings and numbers as they came.
+"""Replays a session on the bus under another fleet name, with its payloads, encodings and sequence numbers unchanged.
 
-It looks like a fleet to whoever reads: cars have tokens, and the latest values are there to be asked for. Nothing
-takes a command: every one is refused, in words. What was recorded under `@cmd` is not published, so that no gateway,
-now or later, can ever obey a recording.
+Readers see a normal fleet: cars have tokens, and queries return the latest values. The player rejects every command,
+and never publishes messages recorded under `@cmd`, so that no gateway can obey a recording.
 """
 
 import contextlib
@@ -21,59 +20,61 @@ from schemas.bus import Bus, BusError, ensure_hub, reply, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos, Topic
 
-PAUSE_NS: Final = 1_000_000_000
-"""Between two rounds of a loop."""
-LATE_S: Final = 0.25
-_LOOK_S: Final = 0.1
-_ALONE_S: Final = 0.5
-_TOLD: Final = 4
-_QUESTIONS: Final = 256
-"""Queries that may wait."""
-_SPARED: Final = frozenset(" /*$#?")
+LOOP_PAUSE_NS: Final = 1_000_000_000
+"""Pause between two rounds of a loop."""
+MAX_DELAY_S: Final = 0.25
+_HUB_POLL_INTERVAL_S: Final = 0.1
+_HUB_RESTART_DELAY_S: Final = 0.5
+_MAX_LISTED_TOKENS: Final = 4
+_MAX_PLAYER_QUERIES: Final = 256
+"""Maximum queries in the queue."""
+_RESERVED_CHARACTERS: Final = frozenset(" /*$#?")
 
 
 class NameTaken(Exception):
-    """The fleet's name is in use; the text says by whom."""
+    """The fleet name is in use. The message says by whom."""
 
 
 @dataclass(slots=True)
 class Player:
-    """Publishes messages under another fleet's name. `refuse`: why a command is not accepted."""
+    """Publishes messages under another fleet name. `refuse` is the reason in the answer to commands."""
 
     bus: Bus
     name: str
     refuse: str
     cars_only: bool = False
-    """Whether the fleet may have a living coordinator and recorder, because those of the recording are silent."""
+    """True if the fleet may have a live coordinator and recorder, because the recorded ones are not replayed."""
     published: int = 0
     late: int = 0
-    """Messages that were published over LATE_S too late: this machine, or the bus, was too slow for the rate."""
+    """Messages published over MAX_DELAY_S late: this machine or the bus was too slow for the rate."""
     _cars: list[str] = field(default_factory=list)
-    _looked_s: float = 0.0
-    _alone_since_s: float | None = None
+    _polled_s: float = 0.0
+    _disconnected_since_s: float | None = None
     _latest: dict[tuple[str, str], tuple[bytes, str]] = field(default_factory=dict)
-    """By key, and of decisions by subject."""
-    _inbox: "queue.Queue[zenoh.Query]" = field(default_factory=lambda: queue.Queue(_QUESTIONS))
+    """Latest values by key; decisions by key and subject."""
+    _inbox: "queue.Queue[zenoh.Query]" = field(default_factory=lambda: queue.Queue(_MAX_PLAYER_QUERIES))
 
     def begin(self, session: str, cars: Iterable[str]) -> None:
-        """Be there, with these cars; raises NameTaken."""
+        """Declare the tokens of these cars, and answer queries; raises NameTaken."""
         another = "give this one another name with --as"
         if playing := self.bus.tokens(f"{self.name}/{keys.REPLAY}/*"):
             raise NameTaken(f"fleet {self.name} is a replay of {playing[0].rpartition('/')[2]} already: {another}")
         if taken := sorted(token.partition("/")[2] for token in self._alive()):
-            more = f" and {len(taken) - _TOLD} more" if len(taken) > _TOLD else ""
-            raise NameTaken(
-                f"fleet {self.name} is alive ({', '.join(taken[:_TOLD])}{more}): {another}{self._or_cars_only(taken)}"
-            )
+            listed = ", ".join(taken[:_MAX_LISTED_TOKENS])
+            more = f" and {len(taken) - _MAX_LISTED_TOKENS} more" if len(taken) > _MAX_LISTED_TOKENS else ""
+            raise NameTaken(f"fleet {self.name} is alive ({listed}{more}): {another}{self._or_cars_only(taken)}")
         for expression in ("*/*/*", "*/@cmd/*", "@coordinator/*", "@recorder/*", "@supervisor/*", "@sim/*"):
-            self.bus.queryable(f"{self.name}/{expression}", self._ask)
-        self.bus.token(f"{self.name}/{keys.REPLAY}/{''.join('_' if each in _SPARED else each for each in session)}")
+            self.bus.queryable(f"{self.name}/{expression}", self._on_query)
+        self.bus.token(
+            f"{self.name}/{keys.REPLAY}/{''.join('_' if each in _RESERVED_CHARACTERS else each for each in session)}"
+        )
         self._cars = sorted(cars)
         for car in self._cars:
             self.bus.token(keys.car_token(self.name, car))
 
     def _alive(self) -> list[str]:
-        """Tokens of who says already what we are to say: `*` means no chunk that begins with @."""
+        """Return the tokens of live processes that publish what we would replay."""
+        # `*` matches no chunk that begins with @, so services are queried one by one.
         services = (keys.SUPERVISOR,) if self.cars_only else (keys.SUPERVISOR, keys.COORDINATOR, keys.RECORDER)
         of_services = (token for each in services for token in self.bus.tokens(f"{self.name}/{each}/**"))
         return [*self.bus.tokens(f"{self.name}/*"), *of_services]
@@ -84,10 +85,10 @@ class Player:
         return ", or only what cars said with --cars-only" if tried else ""
 
     def remember(self, recorded: Iterable[Recorded]) -> None:
-        """What was said before the beginning is there to be asked for, as it was then."""
-        for one in recorded:
-            if (key := self._key_of(one)) is not None:
-                self._keep(key, one, _encoding(one))
+        """Store messages from before the start as latest values for queries."""
+        for message in recorded:
+            if (key := self._key_of(message)) is not None:
+                self._keep(key, message, _encoding(message))
 
     def play(
         self,
@@ -97,69 +98,75 @@ class Player:
         ended: Callable[[], bool],
         progress: Callable[[Recorded], object],
     ) -> None:
-        """Publish each when it is due, counted from `origin_s` of the monotonic clock, until `ended` says so."""
-        for one in recorded:
-            at_s = origin_s + schedule.due_s(one.recorded_ns)
+        """Publish each message when it is due, counted from `origin_s` of the monotonic clock, until `ended()`."""
+        for message in recorded:
+            at_s = origin_s + schedule.due_s(message.recorded_ns)
             self.wait(at_s, ended)
             if ended():
                 return
-            if time.monotonic() - at_s > LATE_S:
+            if time.monotonic() - at_s > MAX_DELAY_S:
                 self.late += 1
-            self._publish(one)
-            progress(one)
+            self._publish(message)
+            progress(message)
 
     def wait(self, until_s: float, ended: Callable[[], bool]) -> None:
-        """Answer queries until then; sees that there is a hub."""
+        """Answer queries until a time of the monotonic clock, and restart a crashed hub."""
         while not ended():
             now_s = time.monotonic()
-            if now_s - self._looked_s > _LOOK_S:
-                self._looked_s = now_s
-                self._see_hub(now_s)
+            if now_s - self._polled_s > _HUB_POLL_INTERVAL_S:
+                self._polled_s = now_s
+                self._restart_hub(now_s)
             left_s = until_s - now_s
             try:
-                query = self._inbox.get(timeout=min(left_s, _LOOK_S)) if left_s > 0 else self._inbox.get_nowait()
+                query = (
+                    self._inbox.get(timeout=min(left_s, _HUB_POLL_INTERVAL_S))
+                    if left_s > 0
+                    else self._inbox.get_nowait()
+                )
             except queue.Empty:
-                if left_s <= _LOOK_S:
+                if left_s <= _HUB_POLL_INTERVAL_S:
                     return
             else:
                 self._answer(query)
 
-    def _see_hub(self, now_s: float) -> None:
-        """Start one in the place of one that went."""
+    def _restart_hub(self, now_s: float) -> None:
+        """Start a hub if the old one is gone."""
         if self.bus.connected:
-            self._alone_since_s = None
-        elif self._alone_since_s is None:
-            self._alone_since_s = now_s
-        elif now_s - self._alone_since_s > _ALONE_S:
-            self._alone_since_s = now_s
-            with contextlib.suppress(BusError):  # of another machine: it comes back by itself, or Ctrl-C
+            self._disconnected_since_s = None
+        elif self._disconnected_since_s is None:
+            self._disconnected_since_s = now_s
+        elif now_s - self._disconnected_since_s > _HUB_RESTART_DELAY_S:
+            self._disconnected_since_s = now_s
+            with contextlib.suppress(BusError):  # a hub on another machine: only wait for it
                 ensure_hub(self.bus.endpoint)
 
-    def _key_of(self, one: Recorded) -> str | None:
-        key = keys.parse(one.key)
+    def _key_of(self, message: Recorded) -> str | None:
+        key = keys.parse(message.key)
         if key is None or key.topic.startswith("@cmd/") or not key.topic:
             return None
         return f"{self.name}/{key.car}/{key.topic}"
 
-    def _publish(self, one: Recorded) -> None:
-        written = self._key_of(one)
+    def _publish(self, message: Recorded) -> None:
+        written = self._key_of(message)
         if written is None:
             return
-        encoding = _encoding(one)
+        encoding = _encoding(message)
         topic = topics.of_key(written)
-        self.bus.put_again(written, one.payload, encoding, one.sequence, Qos.READING if topic is None else topic.qos)
+        self.bus.put_again(
+            written, message.payload, encoding, message.sequence, Qos.READING if topic is None else topic.qos
+        )
         self.published += 1
-        self._keep(written, one, encoding)
+        self._keep(written, message, encoding)
 
-    def _keep(self, key: str, one: Recorded, encoding: str) -> None:
+    def _keep(self, key: str, message: Recorded, encoding: str) -> None:
         topic = topics.of_key(key)
-        if topic is not None and topic.message == one.message and topic.family not in ("frame", "event", "sim"):
-            self._latest[key, _subject(topic, one.payload)] = one.payload, encoding
+        if topic is not None and topic.message == message.message and topic.family not in ("frame", "event", "sim"):
+            self._latest[key, _subject(topic, message.payload)] = message.payload, encoding
 
     # ------------------------------------------------------------------ queries
 
-    def _ask(self, query: zenoh.Query) -> bool:
-        """On a Zenoh thread; False if too many wait."""
+    def _on_query(self, query: zenoh.Query) -> bool:
+        """Queue a query, on a Zenoh thread. Return False if too many are pending."""
         try:
             self._inbox.put_nowait(query)
         except queue.Full:
@@ -191,14 +198,14 @@ class Player:
                 reply(query, key, result.SerializeToString(), messages.encoding_of(topics.RESULT))
 
 
-def _encoding(one: Recorded) -> str:
-    if one.message:
-        return f"{topics.PROTOBUF};{one.message}"
-    return messages.JSON if one.encoding == "json" else one.encoding
+def _encoding(message: Recorded) -> str:
+    if message.message:
+        return f"{topics.PROTOBUF};{message.message}"
+    return messages.JSON if message.encoding == "json" else message.encoding
 
 
 def _subject(topic: Topic, payload: bytes) -> str:
-    """A coordinator has a latest decision of each subject."""
+    """Return the subject of a decision, of which each has its own latest value; empty for other messages."""
     if topic.message != "fleet.v1.Decision":
         return ""
     try:
@@ -209,7 +216,7 @@ def _subject(topic: Topic, payload: bytes) -> str:
 
 
 def _identity(verb: str, query: zenoh.Query, encoding: str) -> str:
-    """The id that a command was given by who asked."""
+    """Return the id that the sender gave a command; empty if unreadable."""
     if verb not in topics.COMMANDS or query.payload is None:
         return ""
     try:

@@ -1,6 +1,6 @@
-"""When each message of a recording is due when it is played again. Pure; times are seconds and nanoseconds given.
+"""Computes when each message of a replayed recording is due. Pure; all times are arguments.
 
-Everything is counted from one origin, in whole nanoseconds of the recording: what is late once makes nothing else late.
+All times count from one origin, in whole nanoseconds of the recording: one late message delays no other.
 """
 
 from dataclasses import dataclass
@@ -8,18 +8,19 @@ from dataclasses import dataclass
 
 @dataclass(slots=True)
 class Schedule:
-    """Takes the recorder's times in order, gives seconds since the origin."""
+    """Converts times of the recorder, in order, to seconds since the origin."""
 
     rate: float = 1.0
     longest_gap_ns: int | None = None
-    """A pause that is longer is made so long; None: none is shortened."""
+    """Maximum pause; longer ones are shortened to it. None: no limit."""
     played_ns: int = 0
-    """How much of the recording has been played, pauses that were shortened as they are played."""
+    """Length of the recording played so far, with shortened pauses."""
     shortened: int = 0
+    """Number of shortened pauses."""
     _last_ns: int | None = None
 
     def due_s(self, at_ns: int) -> float:
-        """When the next message is due. A clock that went backwards stands still meanwhile."""
+        """Return when the next message is due. A backward step of the clock counts as no time."""
         if self._last_ns is not None:
             gap_ns = max(0, at_ns - self._last_ns)
             if self.longest_gap_ns is not None and gap_ns > self.longest_gap_ns:
@@ -30,6 +31,6 @@ class Schedule:
         return self.played_ns / 1e9 / self.rate
 
     def again(self, pause_ns: int) -> None:
-        """The recording begins anew, so long after its last message."""
+        """Restart the recording after a pause."""
         self.played_ns += pause_ns
         self._last_ns = None

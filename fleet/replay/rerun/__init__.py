@@ -1,1 +1,1 @@
-"""Rerun: a session exported or a fleet shown live. Read `export` first; `live` is the same for a running fleet."""
+"""Exports sessions to Rerun and shows a running fleet there. Read `export` first; `live` does the same on the bus."""

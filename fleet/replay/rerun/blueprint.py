@@ -1,4 +1,4 @@
-"""The layout of a session in Rerun's viewer: a tab for the fleet and one per car, only with views that have data."""
+"""Builds the layout of a session in Rerun's viewer: a tab for the fleet and one per car, without empty views."""
 
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
@@ -9,47 +9,49 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from fleet.replay import colors
-from fleet.replay import panels as mapping
-from fleet.replay.colors import Rgb, colour
+from fleet.replay import colors, panels
+from fleet.replay.colors import Rgb, color
 from fleet.replay.panels import Contents, Curve, Panel, StateTrack
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.lenses import component
-from fleet.replay.rerun.staleness import PUBLISHED
+from fleet.replay.rerun.staleness import PUBLISH_TIMELINE
 from schemas import keys
 from schemas.topics import TOPICS
 
-_THRESHOLDS: Final[Mapping[mapping.How, Rgb]] = {mapping.How.LOW: (224, 160, 48), mapping.How.CRITICAL: (217, 83, 79)}
-_LEAST_HEIGHT_M: Final = 1.5
-_WIDE: Final = 1.5
-"""With lines of text below it the world's view is so many times as wide as it is high, at least."""
-_LEDS: Final = frozenset({mapping.LED_ASKED.name, mapping.LED_TRUE.name})
+_THRESHOLDS: Final[Mapping[panels.Derivation, Rgb]] = {
+    panels.Derivation.LOW: (224, 160, 48),
+    panels.Derivation.CRITICAL: (217, 83, 79),
+}
+_MIN_EYE_HEIGHT_M: Final = 1.5
+_MIN_WORLD_ASPECT: Final = 1.5
+"""Minimum ratio of width to height of the view of the world if text views are below it."""
+_LEDS: Final = frozenset({panels.LED_REQUESTED.name, panels.LED_TRUE.name})
 
 _View = rrb.View | rrb.Container
-_Shown = dict[Any, list[Any]]
-"""Visualizers by entity; Any, because Rerun's mapping is invariant in a union of its own."""
+_Overrides = dict[Any, list[Any]]
+"""Visualizers by entity. Any, because Rerun's own mapping type is invariant."""
 
 
 def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.Blueprint:
-    """The layout of what a drawing has seen; `tab`: the car whose tab is in front, none: the fleet's.
+    """Return the layout for the contents of a drawing. `tab` names the car whose tab is in front; empty: the fleet's.
 
-    `last_s`: of curves and lanes the last seconds before the cursor are in view; None: the whole time.
+    `last_s` is the time span in view before the cursor; None: the whole time.
     """
     session = drawing.contents()
-    shown = _RerunLayout(session, colors.leds(drawing.leds), drawing.lanes, _axis(drawing.span_ns, last_s))
-    tabs = [shown.fleet_tab(drawing.ground()), *(shown.car_tab(car) for car in session.cars)]
+    builder = _RerunLayout(session, colors.leds(drawing.leds), drawing.tracks, _axis(drawing.span_ns, last_s))
+    tabs = [builder.fleet_tab(drawing.ground()), *(builder.car_tab(car) for car in session.cars)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=1 + list(session.cars).index(tab) if tab else 0),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=PUBLISHED),
+        rrb.TimePanel(state="collapsed", timeline=PUBLISH_TIMELINE),
         auto_views=False,
         auto_layout=False,
     )
 
 
 class _RerunLayout:
-    """The tabs of one session."""
+    """Builder of the tabs of one session."""
 
     def __init__(
         self, session: Contents, leds: Mapping[str, int], drawn: AbstractSet[tuple[str, str]], axis: rrb.TimeAxis
@@ -60,142 +62,150 @@ class _RerunLayout:
         self._axis = axis
 
     def fleet_tab(self, ground: tuple[tuple[float, float], tuple[float, float]] | None) -> _View:
-        """The fleet at a glance, and beside it its services."""
+        """Return the tab of the fleet: a page of its cars and a page of its services."""
         session = self._session
-        texts = [view for name, ours, theirs in mapping.FLEET_TEXTS if (view := self._fleet_text(name, ours, theirs))]
-        if mapping.PLAN in session.services:
-            plan = mapping.entity(f"{session.fleet}/{mapping.PLAN}")
+        texts = [view for name, ours, theirs in panels.FLEET_TEXTS if (view := self._fleet_text(name, ours, theirs))]
+        if panels.PLAN_TOPIC in session.services:
+            plan = panels.entity(f"{session.fleet}/{panels.PLAN_TOPIC}")
             texts.append(rrb.TextDocumentView(origin=plan, contents=[plan], name="Plan"))
-        wide = _WIDE if texts else 1.0
+        wide = _MIN_WORLD_ASPECT if texts else 1.0
         left: list[_View] = [self._world(*ground, wide)] if ground is not None else []
         if texts:
             left.append(rrb.Tabs(*texts, active_tab=0))
         right: list[_View] = []
-        lanes = [view for name, each in mapping.FLEET_LANES if (view := self._fleet_lanes(name, each))]
-        if lanes:
-            right.append(rrb.Tabs(*lanes, active_tab=0))
-        for name, curve in mapping.FLEET_CURVES:
-            shown = {
-                self._entity(car, curve.topic): [_curve(curve, car, colour(car, index))]
+        tracks = [view for name, each in panels.FLEET_TRACKS if (view := self._fleet_tracks(name, each))]
+        if tracks:
+            right.append(rrb.Tabs(*tracks, active_tab=0))
+        for name, curve in panels.FLEET_CURVES:
+            overrides = {
+                self._entity(car, curve.topic): [_curve(curve, car, color(car, index))]
                 for index, (car, topics) in enumerate(session.cars.items())
                 if curve.topic in topics
             }
-            if shown:
-                right.append(self._curves(name, shown))
-        # The lanes of every car need room; the curves share a view.
+            if overrides:
+                right.append(self._curves(name, overrides))
+        # Tracks of every car need more height than curves, which share one view.
         shares = [3 if isinstance(view, rrb.Tabs) else 1 for view in right]
         columns = [
             rrb.Vertical(*column, row_shares=parts)
             for column, parts in ((left, [1] * len(left)), (right, shares))
             if column
         ]
-        services = [view for panel in mapping.SERVICE_PANELS if (view := self._panel("", panel))]
+        services = [view for panel in panels.SERVICE_PANELS if (view := self._panel("", panel))]
         return _two_pages("Fleet", rrb.Horizontal(*columns, name="Cars"), services, "Services")
 
     def car_tab(self, car: str) -> _View:
-        """One car: what matters most, and beside it the rest."""
-        lanes, others = self._column(car, lanes=True), self._column(car, lanes=False)
-        more = [view for panel in mapping.MORE_PANELS if (view := self._panel(car, panel))]
-        columns = [column for column in (lanes, others) if column is not None]
+        """Return the tab of a car: a page of its main panels and a page of the others."""
+        tracks, others = self._column(car, tracks=True), self._column(car, tracks=False)
+        more = [view for panel in panels.MORE_PANELS if (view := self._panel(car, panel))]
+        columns = [column for column in (tracks, others) if column is not None]
         return _two_pages(car, rrb.Horizontal(*columns, name="Car"), more, "More")
 
-    def _column(self, car: str, *, lanes: bool) -> rrb.Vertical | None:
-        """Half of a car's first page: what is lanes, each panel as high as it has some, or what is none."""
-        panels = [panel for panel in mapping.MAIN_PANELS if bool(panel.lanes) == lanes]
-        shown = [(view, 1 + self._lane_count(car, panel)) for panel in panels if (view := self._panel(car, panel))]
-        return rrb.Vertical(*(view for view, _ in shown), row_shares=[share for _, share in shown]) if shown else None
+    def _column(self, car: str, *, tracks: bool) -> rrb.Vertical | None:
+        """Return one column of a car's first page: panels with tracks, as high as their number, or the other panels."""
+        chosen = [panel for panel in panels.MAIN_PANELS if bool(panel.tracks) == tracks]
+        views = [(view, 1 + self._track_count(car, panel)) for panel in chosen if (view := self._panel(car, panel))]
+        return rrb.Vertical(*(view for view, _ in views), row_shares=[share for _, share in views]) if views else None
 
-    def _lane_count(self, car: str, panel: Panel) -> int:
-        return sum(self._has_lane(car, lane) for lane in panel.lanes)
+    def _track_count(self, car: str, panel: Panel) -> int:
+        return sum(self._has_track(car, track) for track in panel.tracks)
 
     def _entity(self, car: str, topic: str) -> str:
-        """The entity of a topic: a service's has its own name in front, and no car."""
+        """Return the entity of a topic. The topic of a service begins with its name and has no car."""
         if topic.startswith("@"):
-            return mapping.entity(f"{self._session.fleet}/{topic}")
-        return mapping.entity(keys.topic_key(self._session.fleet, car, topic))
+            return panels.entity(f"{self._session.fleet}/{topic}")
+        return panels.entity(keys.topic_key(self._session.fleet, car, topic))
 
     def _has(self, car: str, topic: str) -> bool:
         if topic.startswith("@"):
             return topic in self._session.services
         return topic in self._session.cars.get(car, ())
 
-    def _has_lane(self, car: str, lane: StateTrack) -> bool:
-        if lane.drawn:
-            return (self._entity(car, lane.topic), _name(lane, car)) in self._drawn
-        return self._has(car, lane.topic)
+    def _has_track(self, car: str, track: StateTrack) -> bool:
+        if track.drawn:
+            return (self._entity(car, track.topic), _name(track, car)) in self._drawn
+        return self._has(car, track.topic)
 
     def _fleet_text(self, name: str, ours: Iterable[str], theirs: Iterable[str]) -> rrb.View | None:
-        shown = [self._entity(car, topic) for topic in ours for car in self._session.cars if self._has(car, topic)]
-        shown += [self._entity("", topic) for topic in theirs if self._has("", topic)]
-        return _text(name, shown) if shown else None
+        entities = [self._entity(car, topic) for topic in ours for car in self._session.cars if self._has(car, topic)]
+        entities += [self._entity("", topic) for topic in theirs if self._has("", topic)]
+        return _text(name, entities) if entities else None
 
-    def _fleet_lanes(self, name: str, lanes: Iterable[StateTrack]) -> rrb.View | None:
-        shown: _Shown = {}
+    def _fleet_tracks(self, name: str, tracks: Iterable[StateTrack]) -> rrb.View | None:
+        overrides: _Overrides = {}
         for car in self._session.cars:
-            for lane in lanes:
-                if self._has_lane(car, lane):
-                    shown.setdefault(self._entity(car, lane.topic), []).append(self._lane(lane, car))
-        return self._lanes(name, shown) if shown else None
+            for track in tracks:
+                if self._has_track(car, track):
+                    overrides.setdefault(self._entity(car, track.topic), []).append(self._track(track, car))
+        return self._tracks(name, overrides) if overrides else None
 
     def _panel(self, car: str, panel: Panel) -> rrb.View | None:
-        """One view of a car; of a service with an empty name."""
+        """Return the view of a panel of a car (empty: of a service); None without data."""
         if panel.texts:
             texts = [self._entity(car, topic) for topic in panel.texts if self._has(car, topic)]
             return _text(panel.name, texts) if texts else None
-        shown: _Shown = {}
-        alone = sum(curve.how is None for curve in panel.curves) == 1
+        overrides: _Overrides = {}
+        alone = sum(curve.derivation is None for curve in panel.curves) == 1
         for curve in panel.curves:
             if self._has(car, curve.topic):
-                own = colour(car, sorted(self._session.cars).index(car)) if alone and car else None
-                rgb = _THRESHOLDS.get(curve.how, own) if curve.how is not None else own
-                shown.setdefault(self._entity(car, curve.topic), []).append(_curve(curve, curve.name, rgb))
-        for lane in panel.lanes:
-            if self._has_lane(car, lane):
-                shown.setdefault(self._entity(car, lane.topic), []).append(self._lane(lane, car))
-        if not shown:
+                own = color(car, sorted(self._session.cars).index(car)) if alone and car else None
+                rgb = _THRESHOLDS.get(curve.derivation, own) if curve.derivation is not None else own
+                overrides.setdefault(self._entity(car, curve.topic), []).append(_curve(curve, curve.name, rgb))
+        for track in panel.tracks:
+            if self._has_track(car, track):
+                overrides.setdefault(self._entity(car, track.topic), []).append(self._track(track, car))
+        if not overrides:
             return None
-        return self._lanes(panel.name, shown) if panel.lanes else self._curves(panel.name, shown)
+        return self._tracks(panel.name, overrides) if panel.tracks else self._curves(panel.name, overrides)
 
-    def _lane(self, lane: StateTrack, car: str) -> rrb.Visualizer:
-        tints = self._leds if lane.name in _LEDS else colors.MARKS if lane == mapping.MARKS else colors.STATES
+    def _track(self, track: StateTrack, car: str) -> rrb.Visualizer:
+        tints = (
+            self._leds
+            if track.name in _LEDS
+            else colors.MARK_COLORS
+            if track == panels.COMMAND_TRACK
+            else colors.STATE_COLORS
+        )
         style = rr.StateConfiguration(values=list(tints), colors=np.array(list(tints.values()), dtype=np.uint32))
         source = VisualizerComponentMapping(
-            "StateChange:state", ComponentSourceKind.SourceComponent, source_component=_name(lane, car)
+            "StateChange:state", ComponentSourceKind.SourceComponent, source_component=_name(track, car)
         )
         return style.visualizer(mappings=[source])
 
-    def _curves(self, name: str, shown: _Shown) -> rrb.TimeSeriesView:
+    def _curves(self, name: str, overrides: _Overrides) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             origin="/",
-            contents=list(shown),
+            contents=list(overrides),
             name=name,
-            overrides=shown,
+            overrides=overrides,
             plot_legend=rrb.PlotLegend(visible=True),
             axis_x=self._axis,
         )
 
-    def _lanes(self, name: str, shown: _Shown) -> rrb.StateTimelineView:
-        return rrb.StateTimelineView(origin="/", contents=list(shown), name=name, overrides=shown, time_view=self._axis)
+    def _tracks(self, name: str, overrides: _Overrides) -> rrb.StateTimelineView:
+        return rrb.StateTimelineView(
+            origin="/", contents=list(overrides), name=name, overrides=overrides, time_view=self._axis
+        )
 
     def _world(self, low: tuple[float, float], high: tuple[float, float], wide: float) -> rrb.Spatial3DView:
         session = self._session
         contents = [
-            f"{self._entity(car, mapping.TRUTH)}/**" for car, topics in session.cars.items() if mapping.TRUTH in topics
+            f"{self._entity(car, panels.TRUTH)}/**" for car, topics in session.cars.items() if panels.TRUTH in topics
         ]
-        if mapping.WORLD in session.services:
-            contents.append(f"{self._entity('', mapping.WORLD)}/**")
+        if panels.WORLD in session.services:
+            contents.append(f"{self._entity('', panels.WORLD)}/**")
         x, y = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
         size = max(high[1] - low[1], (high[0] - low[0]) / wide)
-        # Not straight down: Rerun's eye has no sides when it looks along its own up.
+        # Not straight down: Rerun's camera is undefined if it looks along its up vector.
         eye = rrb.EyeControls3D(
-            position=(x, y - 0.01, max(_LEAST_HEIGHT_M, 1.2 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
+            position=(x, y - 0.01, max(_MIN_EYE_HEIGHT_M, 1.2 * size)), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)
         )
         name = "World, from above (simulated cars)"
         return rrb.Spatial3DView(origin="/", contents=contents, name=name, eye_controls=eye)
 
 
 def _axis(span_ns: tuple[int, int] | None, last_s: float | None) -> rrb.TimeAxis:
-    """The time in view; not linked with other views, since linked ones ignore it and show a minute."""
+    """Return the time axis. It is not linked with other views: linked axes ignore the range and show a minute."""
     at = rr.TimeRangeBoundary
     if last_s is not None:
         return rrb.TimeAxis(view_range=rr.TimeRange(at.cursor_relative(seconds=-last_s), at.cursor_relative()))
@@ -204,9 +214,9 @@ def _axis(span_ns: tuple[int, int] | None, last_s: float | None) -> rrb.TimeAxis
     return rrb.TimeAxis(view_range=rr.TimeRange(at.absolute(nanos=span_ns[0]), at.absolute(nanos=span_ns[1])))
 
 
-def _name(lane: StateTrack, car: str) -> str:
-    """The component of a lane: of roles there is one for each car, on one entity."""
-    return f"{lane.name} {car}" if lane == mapping.ROLE else lane.name
+def _name(track: StateTrack, car: str) -> str:
+    """Return the component of a track. Roles have one component per car on one entity."""
+    return f"{track.name} {car}" if track == panels.ROLE else track.name
 
 
 def _two_pages(name: str, first: rrb.Container, others: list[rrb.View], what: str) -> rrb.Container:
@@ -216,18 +226,18 @@ def _two_pages(name: str, first: rrb.Container, others: list[rrb.View], what: st
 
 
 def _curve(curve: Curve, name: str, rgb: Rgb | None) -> rrb.Visualizer:
-    made = curve.how is not None
+    derived = curve.derivation is not None
     source = VisualizerComponentMapping(
         "Scalars:scalars",
         ComponentSourceKind.SourceComponent,
-        source_component=curve.name if made else component(curve.topic),
-        selector="." if made else f".{curve.field}",
+        source_component=curve.name if derived else component(curve.topic),
+        selector="." if derived else f".{curve.field}",
     )
-    if TOPICS[curve.topic].family == "sensor" and not made:
-        # Readings stop for as long as a mode does not send them: a line across that would look like a measurement.
+    if TOPICS[curve.topic].family == "sensor" and not derived:
+        # Points, no line: some modes send no readings, and a line across the gap would look like measurements.
         points = rr.SeriesPoints(names=name, marker_sizes=4.0, markers="circle", colors=rgb)
         return points.visualizer(mappings=[source])
-    width = 1.0 if curve.how in _THRESHOLDS else 2.0
+    width = 1.0 if curve.derivation in _THRESHOLDS else 2.0
     line = rr.SeriesLines(names=name, widths=width, colors=rgb)
     return line.visualizer(mappings=[source])
 
@@ -238,5 +248,5 @@ def _text(name: str, entities: list[str]) -> rrb.TextLogView:
         origin="/",
         contents=entities,
         name=name,
-        columns=rrb.TextLogColumns(timeline_columns=[PUBLISHED], text_log_columns=columns),
+        columns=rrb.TextLogColumns(timeline_columns=[PUBLISH_TIMELINE], text_log_columns=columns),
     )

@@ -1,7 +1,7 @@
-"""What is drawn from several messages or fields at once: ways, LEDs, the world, marks of commands, roles.
+"""Draws what needs several messages or fields at once: paths, LEDs, the world, marks of commands, roles.
 
-Chunks pass through; those of a few topics are followed by others that are made of them. What was seen is noted on the
-way, because the layout is made of it.
+Chunks pass through unchanged. After chunks of a few topics, `Drawing` inserts derived chunks. It also collects the
+contents of the session for the layout.
 """
 
 from collections import Counter
@@ -16,120 +16,120 @@ import rerun as rr
 import rerun.chunk as rrc
 
 from fleet.replay import panels
-from fleet.replay.colors import OFF, Rgb, colour, rgb
+from fleet.replay.colors import OFF, Rgb, color, rgb
 from fleet.replay.rerun.lenses import component, numbers, triples
-from fleet.replay.rerun.staleness import LOGGED, PUBLISHED, StaleStates
+from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
 from schemas import keys, messages
 from schemas.topics import COMMANDS
 
-TIMELINES: Final = (LOGGED, PUBLISHED)
-MARK_S: Final = 0.4
-"""How long the mark of a command is, if nothing comes after it."""
+TIMELINES: Final = (LOG_TIMELINE, PUBLISH_TIMELINE)
+MAX_MARK_S: Final = 0.4
+"""Maximum length of the mark of a command."""
 _ASKED: Final = "asked"
 _QUEUED: Final = "queued"
 _CARRIED_OUT: Final = frozenset({"sent", "complete"})
 _LED: Final = "led"
-LED: Final = COMMANDS["led"]
+LED_MESSAGE: Final = COMMANDS["led"]
 _THING_M: Final = 0.2
-"""Height at which things are drawn; the world has none."""
-_LAMP: Final = (255, 225, 90)
-_THING: Final = (170, 140, 110)
-_WALL: Final = (150, 155, 165)
-_TAPE: Final = (220, 220, 220)
+"""Drawn height of things: the world is flat."""
+_LAMP_COLOR: Final = (255, 225, 90)
+_THING_COLOR: Final = (170, 140, 110)
+_WALL_COLOR: Final = (150, 155, 165)
+_TAPE_COLOR: Final = (220, 220, 220)
 _Times = dict[str, Any]
-_MANY: Final = 256
-"""Colours of LEDs that get a colour of their own in the lanes."""
+_MAX_LEDS: Final = 256
+"""Maximum LED colors that get their own color in tracks, and LED commands awaiting their outcome."""
 
 
 class Drawing:
-    """What has been seen of a session; `limit`: of each car's way so many points are kept, None: all."""
+    """Derived chunks and contents of a session. `limit` is the maximum of points per path; None: no limit."""
 
     def __init__(self, limit: int | None = None) -> None:
         self._limit = limit
-        self._ways: dict[str, Any] = {}
+        self._paths: dict[str, Any] = {}
         self._parts: dict[str, list[Any]] = {}
-        self._still: dict[str, Any] = {}
+        self._static: dict[str, Any] = {}
         self._ends = StaleStates()
-        self._asked: dict[str, str] = {}
-        """Colours of LEDs that were asked for, by the command's id, until it is known what became of it."""
-        self._drawn: dict[str, Callable[[str, Any, _Times], Iterator[Any]]] = {
+        self._requested: dict[str, str] = {}
+        """Colors of LED commands by command id, until their outcome."""
+        self._drawers: dict[str, Callable[[str, Any, _Times], Iterator[Any]]] = {
             panels.TRUTH: self._truth,
             panels.WORLD: self._world,
-            panels.COMMANDS: self._commands,
+            panels.COMMAND_TOPIC: self._commands,
             panels.ASSIGNMENT: self._roles,
         }
-        self.held: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
         """Messages by key."""
         self.leds: set[str] = set()
-        self.lanes: set[tuple[str, str]] = set()
-        """(entity, name) of the lanes that were drawn."""
+        self.tracks: set[tuple[str, str]] = set()
+        """(entity, name) of the derived tracks."""
         self.corners: list[tuple[float, float]] = []
-        """Of the simulated world's walls."""
+        """Corners of the walls of the simulated world."""
         self.span_ns: tuple[int, int] | None = None
-        """When the first and the last message were published, ns since the epoch; None: nothing came."""
+        """Publish times of the first and last message, ns since the epoch; None without messages."""
 
     def follow(self, chunks: Iterable[Any]) -> Iterator[Any]:
-        """Pass the chunks on, each followed by what is drawn of it."""
+        """Yield each chunk, followed by the chunks derived from it."""
         for chunk in chunks:
             yield chunk
             if chunk.is_static:
                 continue
             key = panels.key_of(chunk.entity_path)
-            self.held[key] += chunk.num_rows
+            self.counts[key] += chunk.num_rows
             batch = chunk.to_record_batch()
             topic = panels.topic_of(key)
-            if PUBLISHED in batch.schema.names:
-                self._widen(batch.column(PUBLISHED))
-                self._ends.heard(chunk.entity_path, topic, batch)
-            draw = self._drawn.get(topic)
+            if PUBLISH_TIMELINE in batch.schema.names:
+                self._extend_span(batch.column(PUBLISH_TIMELINE))
+                self._ends.add(chunk.entity_path, topic, batch)
+            draw = self._drawers.get(topic)
             if draw is None:
                 continue
             if component(topic) in batch.schema.names:
                 times = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in TIMELINES}
                 yield from draw(chunk.entity_path, batch.column(component(topic)).flatten(), times)
 
-    def _widen(self, published: Any) -> None:
+    def _extend_span(self, published: Any) -> None:
         ends = pc.min_max(published.cast(pa.int64())).as_py()
         if ends["min"] is not None:
             first, last = self.span_ns or (ends["min"], ends["max"])
             self.span_ns = min(first, ends["min"]), max(last, ends["max"])
 
     def contents(self) -> panels.Contents:
-        """What there was."""
-        return panels.contents(frozenset(self.held))
+        """Return the contents of the session so far."""
+        return panels.contents(frozenset(self.counts))
 
     def ends(self) -> Iterator[Any]:
-        """Ends of lanes of which nothing was heard any more, as far as is known by now; each once."""
+        """Yield the ends of stale tracks known by now, each once."""
         if self.span_ns is not None:
             yield from self._ends.chunks(self.span_ns[1])
 
-    def still(self) -> Iterator[Any]:
-        """Each simulated car's way as one line, its colour and its name: static, so seen at any time."""
+    def static(self) -> Iterator[Any]:
+        """Yield the path, color and name of each simulated car as static data, visible at any time."""
         contents = self.contents()
         for index, car in enumerate(contents.cars):
             key = keys.topic_key(contents.fleet, car, panels.TRUTH)
-            way = self._way(key)
-            if way is None:
+            points = self._car_path(key)
+            if points is None:
                 continue
             strip = rr.LineStrips3D.columns(
-                strips=[triples(way[:, 0], way[:, 1])], colors=_tints([colour(car, index)]), radii=[0.012]
+                strips=[triples(points[:, 0], points[:, 1])], colors=_tints([color(car, index)]), radii=[0.012]
             )
             name = rr.Arrows3D.columns(
-                colors=_tints([colour(car, index)]), radii=[0.035], labels=[car], show_labels=[True]
+                colors=_tints([color(car, index)]), radii=[0.035], labels=[car], show_labels=[True]
             )
             yield rrc.Chunk.from_columns(f"{panels.entity(key)}/way", indexes=[], columns=strip)
             yield rrc.Chunk.from_columns(panels.entity(key), indexes=[], columns=name)
 
     def ground(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """The lowest and the highest x and y, m, of the walls and of where cars were; None if none was simulated."""
-        ways = [way for key in list(self._parts) if (way := self._way(key)) is not None]
-        if not ways:
+        """Return the lowest and highest x and y of walls and paths in meters; None without a simulated car."""
+        paths = [points for key in list(self._parts) if (points := self._car_path(key)) is not None]
+        if not paths:
             return None
-        every = np.concatenate([*ways, *([np.array(self.corners)] if self.corners else [])])
+        every = np.concatenate([*paths, *([np.array(self.corners)] if self.corners else [])])
         low, high = every.min(axis=0), every.max(axis=0)
         return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
 
-    def _way(self, key: str) -> Any:
+    def _car_path(self, key: str) -> Any:
         parts = self._parts.get(key)
         if not parts:
             return None
@@ -142,24 +142,24 @@ class Drawing:
         x, y, leds = numbers(truths, "x_m"), numbers(truths, "y_m"), truths.field(_LED).dictionary_encode()
         self._parts.setdefault(panels.key_of(path), []).append(np.stack([x, y], axis=1))
         seen = leds.dictionary.to_pylist()
-        self._note(seen)
+        self._add_leds(seen)
         tints = _tints(rgb(each) for each in seen)[leds.indices.to_numpy(zero_copy_only=False)]
         discs = rr.Points3D.columns(positions=triples(x, y), colors=tints, radii=np.full(len(x), 0.07))
         yield rrc.Chunk.from_columns(f"{path}/{_LED}", indexes=_indexes(times), columns=discs)
 
-    def _note(self, leds: Iterable[str]) -> None:
-        if len(self.leds) < _MANY:
+    def _add_leds(self, leds: Iterable[str]) -> None:
+        if len(self.leds) < _MAX_LEDS:
             self.leds.update(leds)
 
     def _world(self, path: str, worlds: Any, times: _Times) -> Iterator[Any]:
         rows = worlds.to_pylist()
-        yield from self._unmoving(path, rows[-1])
+        yield from self._static_world(path, rows[-1])
         lamps = [row["lamps"] or [] for row in rows]
         if any(lamps):
             every = [lamp for row in lamps for lamp in row]
             points = rr.Points3D.columns(
                 positions=[(lamp["x_m"], lamp["y_m"], 0.02) for lamp in every],
-                colors=_tints(_LAMP if lamp["on"] else OFF for lamp in every),
+                colors=_tints(_LAMP_COLOR if lamp["on"] else OFF for lamp in every),
                 radii=[0.06] * len(every),
                 labels=[lamp["name"] for lamp in every],
             )
@@ -172,66 +172,66 @@ class Drawing:
                 centers=[(thing["x_m"], thing["y_m"], 0.0) for thing in every],
                 half_sizes=[_half_size(thing) for thing in every],
                 quaternions=[_about_z(thing["heading_rad"]) for thing in every],
-                colors=_tints([_THING] * len(every)),
+                colors=_tints([_THING_COLOR] * len(every)),
                 labels=[thing["name"] for thing in every],
             )
             boxes = boxes.partition([len(row) for row in things])
             yield rrc.Chunk.from_columns(f"{path}/things", indexes=_indexes(times), columns=boxes)
 
-    def _unmoving(self, path: str, world: Any) -> Iterator[Any]:
-        """Walls and the taped line: once, and again if they are others."""
+    def _static_world(self, path: str, world: Any) -> Iterator[Any]:
+        """Yield the walls and the taped line once, and again if they change."""
         walls = [[_point(wall["begin"]), _point(wall["end"])] for wall in world["walls"] or ()]
         line = [_point(each) for each in world["line"] or ()]
         strips = {
-            "walls": (walls, _WALL, 0.03),
-            "line": ([[*line, line[0]]] if line else [], _TAPE, 0.0125),
+            "walls": (walls, _WALL_COLOR, 0.03),
+            "line": ([[*line, line[0]]] if line else [], _TAPE_COLOR, 0.0125),
         }
         for name, (shapes, tint, radius) in strips.items():
-            if not shapes or self._still.get(name) == shapes:
+            if not shapes or self._static.get(name) == shapes:
                 continue
-            self._still[name] = shapes
-            drawn = rr.LineStrips3D.columns(
+            self._static[name] = shapes
+            columns = rr.LineStrips3D.columns(
                 strips=shapes, colors=_tints([tint] * len(shapes)), radii=[radius] * len(shapes)
             ).partition([len(shapes)])
-            yield rrc.Chunk.from_columns(f"{path}/{name}", indexes=[], columns=drawn)
+            yield rrc.Chunk.from_columns(f"{path}/{name}", indexes=[], columns=columns)
         self.corners = [(x, y) for wall in walls for x, y, _ in wall]
 
     def _commands(self, path: str, events: Any, times: _Times) -> Iterator[Any]:
         rows = events.to_pylist()
         marks = [f"{row['verb']} {row['phase']}" for row in rows]
-        yield self._lane(path, panels.MARKS.name, *_with_ends(times, marks))
+        yield self._track(path, panels.COMMAND_TRACK.name, *_with_ends(times, marks))
         done = [(place, led) for place, row in enumerate(rows) if row["verb"] == _LED and (led := self._led(row))]
         if done:
             places, leds = [place for place, _ in done], [led for _, led in done]
-            self._note(leds)
-            yield self._lane(path, panels.LED_ASKED.name, {name: at[places] for name, at in times.items()}, leds)
+            self._add_leds(leds)
+            yield self._track(path, panels.LED_REQUESTED.name, {name: at[places] for name, at in times.items()}, leds)
 
     def _led(self, event: dict[str, Any]) -> str:
-        """The colour if this says that a command for an LED was sent; what it was it said when it was asked."""
+        """Return the color if this event reports an LED command as sent; the color itself is in its first event."""
         if event["phase"] == _ASKED:
-            if len(self._asked) < _MANY:
-                self._asked[event["id"]] = _led_asked(event)
+            if len(self._requested) < _MAX_LEDS:
+                self._requested[event["id"]] = _led_color(event)
             return ""
         if event["phase"] == _QUEUED:
             return ""
-        asked = self._asked.pop(event["id"], "")
-        return asked if event["phase"] in _CARRIED_OUT else ""
+        requested = self._requested.pop(event["id"], "")
+        return requested if event["phase"] in _CARRIED_OUT else ""
 
     def _roles(self, path: str, assignments: Any, times: _Times) -> Iterator[Any]:
         rows = assignments.to_pylist()
         roles = [{car: role["name"] for role in row["roles"] or () for car in role["cars"] or ()} for row in rows]
         for car in sorted(set().union(*roles)):
-            yield self._lane(path, f"{panels.ROLE.name} {car}", times, [each.get(car) for each in roles])
+            yield self._track(path, f"{panels.ROLE.name} {car}", times, [each.get(car) for each in roles])
 
-    def _lane(self, path: str, name: str, times: _Times, states: Sequence[str | None]) -> Any:
-        self.lanes.add((path, name))
+    def _track(self, path: str, name: str, times: _Times, states: Sequence[str | None]) -> Any:
+        self.tracks.add((path, name))
         columns = rr.AnyValues.columns(**{name: pa.array(states, pa.string())})
         return rrc.Chunk.from_columns(path, indexes=_indexes(times), columns=columns)
 
 
-def _tints(colours: Iterable[Rgb]) -> Any:
-    """As 0xRRGGBBAA: Rerun takes four triples for one colour of four parts."""
-    return np.array([int.from_bytes((*each, 255), "big") for each in colours], dtype=np.uint32)
+def _tints(colors: Iterable[Rgb]) -> Any:
+    """Return colors as 0xRRGGBBAA. Rerun would take four RGB triples for three RGBA colors."""
+    return np.array([int.from_bytes((*each, 255), "big") for each in colors], dtype=np.uint32)
 
 
 def _indexes(times: _Times) -> list[Any]:
@@ -239,8 +239,8 @@ def _indexes(times: _Times) -> list[Any]:
 
 
 def _with_ends(times: _Times, marks: list[str]) -> tuple[_Times, list[str | None]]:
-    """Each mark ends after MARK_S, unless another begins before."""
-    length = np.timedelta64(int(MARK_S * 1e9), "ns")
+    """End each mark after MAX_MARK_S, unless another begins before."""
+    length = np.timedelta64(int(MAX_MARK_S * 1e9), "ns")
     clock = times[TIMELINES[0]]
     ends = [place for place in range(len(marks)) if place + 1 == len(marks) or clock[place + 1] - clock[place] > length]
     return (
@@ -249,13 +249,15 @@ def _with_ends(times: _Times, marks: list[str]) -> tuple[_Times, list[str | None
     )
 
 
-def _led_asked(event: dict[str, Any]) -> str:
-    """The colour that was asked for, as `sim/truth` has it; empty if that is not known."""
+def _led_color(event: dict[str, Any]) -> str:
+    """Return the color of an LED command in the format of `sim/truth`; empty if unknown."""
     try:
-        asked: Any = messages.parse(LED, event["request"], event["request_encoding"])
+        requested: Any = messages.parse(LED_MESSAGE, event["request"], event["request_encoding"])
     except messages.BadPayload:
         return ""
-    return f"#{asked.r:02x}{asked.g:02x}{asked.b:02x}" if asked.r or asked.g or asked.b else "off"
+    return (
+        f"#{requested.r:02x}{requested.g:02x}{requested.b:02x}" if requested.r or requested.g or requested.b else "off"
+    )
 
 
 def _point(point: dict[str, float]) -> tuple[float, float, float]:

@@ -1,6 +1,6 @@
-"""What Rerun's lenses make of the messages, a batch at a time: lanes, lines of text, made curves, arrows for cars.
+"""Rerun lenses that derive tracks, lines of text, curves and arrows from messages.
 
-Nothing here looks at single messages but where something rare is put into words.
+They process whole batches, and single messages only for rare texts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,62 +14,68 @@ import rerun.chunk as rrc
 
 from fleet.fleetfile.models import CRITICAL_V, LOW_V
 from fleet.replay import panels
-from fleet.replay.panels import Curve, How, StateTrack
+from fleet.replay.panels import Curve, Derivation, StateTrack
 from schemas.topics import TOPICS
 
-MESSAGE: Final = ":message"
-"""How Rerun's reader names the component that holds a protobuf message."""
+MESSAGE_SUFFIX: Final = ":message"
+"""Suffix of the component in which Rerun's reader stores a protobuf message."""
 
 _ARROW_M: Final = 0.25
-"""Length of the arrow that stands for a car."""
+"""Length of the arrow of a car."""
 _Pipe = Callable[[Any], Any]
 
 
 def component(topic: str) -> str:
-    """The component that holds the messages of a topic."""
-    return TOPICS[topic].message + MESSAGE
+    """Return the component with the messages of a topic."""
+    return TOPICS[topic].message + MESSAGE_SUFFIX
 
 
 def lenses() -> list[Any]:
-    """One lens per message type that has something drawn; what is drawn from the message itself needs none."""
-    made: dict[str, Any] = {}
+    """Return one lens per message type with derived parts. Curves of plain fields need no lens."""
+    derived: dict[str, Any] = {}
 
     def lens(topic: str) -> Any:
-        return made.get(topic) or rrc.DeriveLens(component(topic))
+        return derived.get(topic) or rrc.DeriveLens(component(topic))
 
     for part in panels.parts():
-        if (isinstance(part, StateTrack) and not part.drawn) or (isinstance(part, Curve) and part.how is not None):
-            made[part.topic] = lens(part.topic).to_component(part.name, _selector(part))
-    for words in panels.WORDS:
+        if (isinstance(part, StateTrack) and not part.drawn) or (
+            isinstance(part, Curve) and part.derivation is not None
+        ):
+            derived[part.topic] = lens(part.topic).to_component(part.name, _selector(part))
+    for words in panels.TEXT_LINES:
         line = rrc.Selector(".").pipe(_line(words.fields, words.before))
-        made[words.topic] = lens(words.topic).to_component(rr.TextLog.descriptor_text(), line, cast_to="auto")
+        derived[words.topic] = lens(words.topic).to_component(rr.TextLog.descriptor_text(), line, cast_to="auto")
         if words.alarm_field:
             level = rrc.Selector(f".{words.alarm_field}").pipe(_level(words.calm))
-            made[words.topic] = made[words.topic].to_component(rr.TextLog.descriptor_level(), level, cast_to="auto")
-    made[panels.PLAN] = lens(panels.PLAN).to_component(rr.TextDocument.descriptor_text(), ".text", cast_to="auto")
-    made[panels.TRUTH] = (
+            derived[words.topic] = derived[words.topic].to_component(
+                rr.TextLog.descriptor_level(), level, cast_to="auto"
+            )
+    derived[panels.PLAN_TOPIC] = lens(panels.PLAN_TOPIC).to_component(
+        rr.TextDocument.descriptor_text(), ".text", cast_to="auto"
+    )
+    derived[panels.TRUTH] = (
         lens(panels.TRUTH)
         .to_component(rr.Arrows3D.descriptor_origins(), rrc.Selector(".").pipe(_origins), cast_to="auto")
         .to_component(rr.Arrows3D.descriptor_vectors(), rrc.Selector(".").pipe(_vectors), cast_to="auto")
     )
-    return list(made.values())
+    return list(derived.values())
 
 
 def triples(x: Any, y: Any) -> Any:
-    """Points on the ground, one row of float32 for each."""
+    """Return points on the ground, one row of float32 each."""
     return np.stack([x, y, np.zeros(len(x))], axis=1).astype("float32")
 
 
 def numbers(messages: Any, name: str) -> Any:
-    """A field of a batch of messages as a numpy array."""
+    """Return a field of a batch of messages as a numpy array."""
     return messages.field(name).to_numpy(zero_copy_only=False)
 
 
 def _selector(part: StateTrack | Curve) -> Any:
     selector = rrc.Selector(f".{part.field}")
-    if part.how is None:
+    if part.derivation is None:
         return selector
-    return selector.pipe(_HOW[part.how])
+    return selector.pipe(_PIPES[part.derivation])
 
 
 def _text_or_nothing(texts: Any) -> Any:
@@ -89,12 +95,12 @@ def _level_at(voltage_v: float) -> _Pipe:
     return lambda voltages: pa.array(np.full(len(voltages), voltage_v))
 
 
-_HOW: Final[dict[How, _Pipe]] = {
-    How.TEXT_OR_NOTHING: _text_or_nothing,
-    How.WHO_AND_WHY: _who_and_why,
-    How.TOTAL: _total,
-    How.LOW: _level_at(LOW_V),
-    How.CRITICAL: _level_at(CRITICAL_V),
+_PIPES: Final[dict[Derivation, _Pipe]] = {
+    Derivation.TEXT_OR_NOTHING: _text_or_nothing,
+    Derivation.WHO_AND_WHY: _who_and_why,
+    Derivation.TOTAL: _total,
+    Derivation.LOW: _level_at(LOW_V),
+    Derivation.CRITICAL: _level_at(CRITICAL_V),
 }
 
 
@@ -112,7 +118,7 @@ def _line(fields: Sequence[str], before: Mapping[str, str]) -> _Pipe:
 
 
 def _words(values: Any) -> Any:
-    """A field as text: bytes with escapes, roles with their cars."""
+    """Return a field as text: bytes with escapes, roles with their cars."""
     if pa.types.is_binary(values.type):
         try:
             return pc.cast(values, pa.string())
@@ -133,7 +139,7 @@ def _level(calm: frozenset[str]) -> _Pipe:
 
 
 def _fixed(points: Any) -> Any:
-    """As the fixed-size lists that Rerun's vectors are."""
+    """Return points as fixed-size lists, Rerun's type for vectors."""
     return pa.FixedSizeListArray.from_arrays(pa.array(points.ravel()), 3)
 
 

@@ -1,8 +1,8 @@
-"""The fleet as it is now, in Rerun: one more subscriber of the bus, that may come and go.
+"""Shows a running fleet in Rerun, as one more subscriber of the bus.
 
-Twice a second what came becomes a small MCAP, and goes the way of a recording: Rerun's reader, the same lenses, the
-same drawings. One thread takes what comes off Zenoh's channels; who sends may wait for a viewer that hangs: what then
-finds no room is counted and left out, so memory stays within bounds.
+Twice a second the new messages become a small MCAP, and pass Rerun's reader, the lenses and the drawings as a recording
+does. A thread drains the subscriptions. If the viewer stalls, further messages are counted and dropped, so that memory
+stays bounded.
 """
 
 import tempfile
@@ -24,66 +24,66 @@ from fleet.replay.rerun.lenses import lenses
 from schemas import keys, messages
 from schemas.bus import Bus, Sample, sample_of
 
-BATCH_S: Final = 0.5
-TICK_S: Final = 0.02
-CHANNEL: Final = 16_384
-"""What a channel of the bus holds until it is taken."""
-LIMIT: Final = 50_000
-"""Messages that wait for the viewer."""
-WAY: Final = 3_000
-"""Points of each simulated car's way that are shown: five minutes."""
-SHOWN_S: Final = 120.0
-"""Of curves and lanes so much is in view, unless it is to be the whole time."""
-FLUSH_S: Final = 2.0
-_KEPT: Final = (f"{keys.COORDINATOR}/plan", f"{keys.COORDINATOR}/assignment")
-"""Published only when they change: asked for at the start."""
-ANSWER_S: Final = 3.0
-"""A coordinator that is slow to answer is waited for; where there is none nothing is."""
+VIEW_INTERVAL_S: Final = 0.5
+VIEW_READ_INTERVAL_S: Final = 0.02
+VIEW_QUEUE_SIZE: Final = 16_384
+"""Maximum messages in the queue of one subscription."""
+MAX_WAITING_MESSAGES: Final = 50_000
+"""Maximum messages in the queue to the viewer."""
+MAX_PATH_POINTS: Final = 3_000
+"""Maximum points of the path of each simulated car: five minutes."""
+DEFAULT_VIEW_S: Final = 120.0
+"""Time span in view, unless all is shown."""
+VIEWER_FLUSH_TIMEOUT_S: Final = 2.0
+_ON_CHANGE_TOPICS: Final = (f"{keys.COORDINATOR}/plan", f"{keys.COORDINATOR}/assignment")
+"""Topics published only on change, so queried at the start."""
+COORDINATOR_TIMEOUT_S: Final = 3.0
+"""Timeout for the coordinator's answer; skipped if there is no coordinator."""
 
 
 class Live:
-    """Follows one fleet from `start` to `close`; `step` brings what came to the viewer or file."""
+    """Follows one fleet from `start` to `close`. `step` sends new messages to the viewer or file."""
 
     def __init__(
-        self, bus: Bus, fleet: str, sink: Callable[[rr.RecordingStream], None], last_s: float | None = SHOWN_S
+        self, bus: Bus, fleet: str, sink: Callable[[rr.RecordingStream], None], last_s: float | None = DEFAULT_VIEW_S
     ) -> None:
         self._bus = bus
         self._fleet = keys.check_name(fleet, "fleet name")
-        self._drawing = Drawing(WAY)
+        self._drawing = Drawing(MAX_PATH_POINTS)
         self._last_s = last_s
-        self._shown: frozenset[object] = frozenset()
+        self._layout_contents: frozenset[object] = frozenset()
         self._lock = threading.Lock()
-        self._waiting: list[Sample] = []
+        self._queue: list[Sample] = []
         self._closing = threading.Event()
         self._subscribers: list[Any] = []
         self._reader = threading.Thread(target=self._read, name="bus-reader")
-        self._stuck = False
+        self._viewer_stalled = False
         self._batch = 0
         self._scratch = tempfile.TemporaryDirectory(prefix="fleet-view-")
         self.dropped = 0
-        """What found no room because the viewer did not take it."""
+        """Messages dropped because the viewer stalled."""
         self._recording = rr.RecordingStream(
             APPLICATION, recording_id=f"live {time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
         )
         sink(self._recording)
 
     def start(self) -> None:
-        """Subscribe, and ask for what is published only when it changes."""
+        """Subscribe, and query the topics that are published only on change."""
         for expression in keys.recorded(self._fleet):
-            self._subscribers.append(self._bus.subscribe_channel(expression, CHANNEL))
+            self._subscribers.append(self._bus.subscribe_channel(expression, VIEW_QUEUE_SIZE))
         self._reader.start()
-        for topic in _KEPT:
-            found = self._bus.query(f"{self._fleet}/{topic}", timeout_s=ANSWER_S)
-            kept = [each for each in found if isinstance(each, Sample)]
+        for topic in _ON_CHANGE_TOPICS:
+            found = self._bus.query(f"{self._fleet}/{topic}", timeout_s=COORDINATOR_TIMEOUT_S)
+            answers = [each for each in found if isinstance(each, Sample)]
             with self._lock:
-                self._waiting += kept
+                self._queue += answers
 
     def step(self) -> int:
-        """Send what has come; how many messages that were."""
-        if self._stuck and not self._flushed():
+        """Send the new messages, and return their number."""
+        if self._viewer_stalled and not self._flush():
             return 0
         with self._lock:
-            batch, self._waiting = self._waiting, []
+            batch, self._queue = self._queue, []
         if batch:
             path = Path(self._scratch.name) / f"{self._batch % 2}.mcap"
             self._batch += 1
@@ -93,24 +93,24 @@ class Live:
                 rrc.LazyChunkStream.from_iter(chunks).lenses(lenses(), output_mode="forward_all")
             )
             self._recording.send_chunks(
-                rrc.LazyChunkStream.from_iter(chain(self._drawing.ends(), self._drawing.still()))
+                rrc.LazyChunkStream.from_iter(chain(self._drawing.ends(), self._drawing.static()))
             )
-        self._lay_out()
-        self._stuck = not self._flushed()
+        self._update_layout()
+        self._viewer_stalled = not self._flush()
         return len(batch)
 
     @property
-    def held(self) -> int:
-        """Messages that were sent."""
-        return self._drawing.held.total()
+    def sent(self) -> int:
+        """Return the number of messages sent."""
+        return self._drawing.counts.total()
 
     @property
     def cars(self) -> tuple[str, ...]:
-        """The cars that were seen."""
+        """Return the cars seen so far."""
         return tuple(self._drawing.contents().cars)
 
     def close(self, *, send: bool = True) -> None:
-        """Send what came until now, if there is somebody to send it to, and end."""
+        """End, and first send the queued messages if `send`."""
         self._closing.set()
         if self._reader.is_alive():
             self._reader.join()
@@ -118,25 +118,25 @@ class Live:
             subscriber.undeclare()
         if send:
             if self._last_s is None:
-                self._shown = frozenset()  # the whole time is known only now
+                self._layout_contents = frozenset()  # the layout needs the whole time span, known only now
             self.step()
         self._recording.disconnect()
         self._scratch.cleanup()
 
-    def _lay_out(self) -> None:
-        """A layout for what there is; only when there is something new, since it takes the place of the user's."""
-        there = frozenset(self._drawing.held) | self._drawing.lanes
-        if there == self._shown:
+    def _update_layout(self) -> None:
+        """Send a new layout, but only if there is new content: it replaces the layout of the user."""
+        contents = frozenset(self._drawing.counts) | self._drawing.tracks
+        if contents == self._layout_contents:
             return
-        self._shown = there
+        self._layout_contents = contents
         self._recording.send_blueprint(
             blueprint.layout(self._drawing, last_s=self._last_s), make_active=True, make_default=True
         )
 
-    def _flushed(self) -> bool:
+    def _flush(self) -> bool:
         try:
-            self._recording.flush(timeout_sec=FLUSH_S)
-        except RuntimeError:  # how it says that the viewer did not take it in time
+            self._recording.flush(timeout_sec=VIEWER_FLUSH_TIMEOUT_S)
+        except RuntimeError:  # Rerun's error for a timeout
             return False
         return True
 
@@ -144,29 +144,29 @@ class Live:
 
     def _read(self) -> None:
         while not self._closing.is_set():
-            if not self._take():
-                time.sleep(TICK_S)
-        self._take()
+            if not self._read_batch():
+                time.sleep(VIEW_READ_INTERVAL_S)
+        self._read_batch()
 
-    def _take(self) -> int:
-        taken: list[Sample] = []
+    def _read_batch(self) -> int:
+        batch: list[Sample] = []
         for subscriber in self._subscribers:
-            while len(taken) < CHANNEL and (sample := subscriber.try_recv()) is not None:
-                taken.append(sample_of(sample))
+            while len(batch) < VIEW_QUEUE_SIZE and (sample := subscriber.try_recv()) is not None:
+                batch.append(sample_of(sample))
         with self._lock:
-            room = max(0, LIMIT - len(self._waiting))
-            self._waiting += taken[:room]
-            self.dropped += max(0, len(taken) - room)
-        return len(taken)
+            free = max(0, MAX_WAITING_MESSAGES - len(self._queue))
+            self._queue += batch[:free]
+            self.dropped += max(0, len(batch) - free)
+        return len(batch)
 
 
 def _write(path: Path, batch: list[Sample]) -> None:
-    """A batch as an MCAP."""
+    """Write a batch of messages to an MCAP."""
     now = time.time_ns()
     schemas: dict[str, int] = {}
     channels: dict[tuple[str, str], int] = {}
     with path.open("wb") as file:
-        # Neither compressed nor checked: it is read back at once, by us.
+        # Without compression and CRCs: we read the file back at once.
         writer: Any = Writer(file, compression=CompressionType.NONE, enable_crcs=False)
         writer.start()
         for sample in batch:
@@ -179,8 +179,8 @@ def _write(path: Path, batch: list[Sample]) -> None:
                 except KeyError:
                     continue
                 schemas[name] = writer.register_schema(name, "protobuf", descriptors)
-            where = (sample.key, name)
-            if where not in channels:
-                channels[where] = writer.register_channel(sample.key, "protobuf", schemas[name])
-            writer.add_message(channels[where], now, sample.payload, sample.time_ns, sample.sequence)
+            channel = (sample.key, name)
+            if channel not in channels:
+                channels[channel] = writer.register_channel(sample.key, "protobuf", schemas[name])
+            writer.add_message(channels[channel], now, sample.payload, sample.time_ns, sample.sequence)
         writer.finish()

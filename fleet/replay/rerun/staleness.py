@@ -1,6 +1,6 @@
-"""Where lanes end: a state that nobody says any more is not shown as if it still were so.
+"""Ends state tracks whose topic became stale, so that the viewer does not extend the last state forever.
 
-A topic is stale after the time that its table tells; one gap or more in what was heard of it become ends of its lanes.
+A topic is stale after the time in schemas/topics.py. Each longer gap between its messages becomes an end of its tracks.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,14 +17,14 @@ from fleet.replay.panels import StateTrack
 from schemas.messages import message_class
 from schemas.topics import TOPICS
 
-PUBLISHED: Final = "message_publish_time"
-"""When a message was published, by its publisher's clock."""
-LOGGED: Final = "message_log_time"
-"""When it came, by the recorder's own clock."""
+PUBLISH_TIMELINE: Final = "message_publish_time"
+"""Timeline of the publisher's clock."""
+LOG_TIMELINE: Final = "message_log_time"
+"""Timeline of the recorder's clock."""
 
 
 class _Run(NamedTuple):
-    """A time in which a topic was never stale, ns since the epoch."""
+    """Time span in which a topic was never stale, ns since the epoch."""
 
     first: int
     last: int
@@ -32,19 +32,19 @@ class _Run(NamedTuple):
 
 
 class StaleStates:
-    """What was heard when, of every entity that has lanes."""
+    """Message times of every entity with state tracks."""
 
     def __init__(self) -> None:
         self._runs: dict[str, list[_Run]] = {}
         self._topics: dict[str, str] = {}
-        self._told: dict[str, int] = {}
-        """Last message before an end that was drawn already."""
+        self._ended_ns: dict[str, int] = {}
+        """Time of the last message before the latest end drawn, by entity."""
 
-    def heard(self, path: str, topic: str, batch: Any) -> None:
-        """Messages of an entity, in any order."""
-        if topic not in _LANES:
+    def add(self, path: str, topic: str, batch: Any) -> None:
+        """Add the times of messages of an entity, in any order."""
+        if topic not in _TRACKS:
             return
-        published, logged = (_ns(batch.column(name)) for name in (PUBLISHED, LOGGED))
+        published, logged = (_ns(batch.column(name)) for name in (PUBLISH_TIMELINE, LOG_TIMELINE))
         order = np.argsort(published, kind="stable")
         published, logged = published[order], logged[order]
         gaps = np.flatnonzero(np.diff(published) > _stale_ns(topic))
@@ -56,7 +56,7 @@ class StaleStates:
         )
 
     def chunks(self, now_ns: int) -> Iterator[Any]:
-        """The ends that were not drawn yet; `now_ns`: when the newest message of all was published."""
+        """Yield the ends that were not drawn yet. `now_ns` is the publish time of the newest message of all."""
         for path, runs in self._runs.items():
             topic = self._topics[path]
             stale_ns = _stale_ns(topic)
@@ -71,18 +71,21 @@ class StaleStates:
             assert before is not None
             self._runs[path] = [before]
             ends += [before] if now_ns - before.last > stale_ns else []
-            ends = [end for end in ends if end.last > self._told.get(path, 0)]
+            ends = [end for end in ends if end.last > self._ended_ns.get(path, 0)]
             if ends:
-                self._told[path] = ends[-1].last
-                yield _nothing(path, topic, ends)
+                self._ended_ns[path] = ends[-1].last
+                yield _end_chunk(path, topic, ends)
 
 
-def _nothing(path: str, topic: str, ends: list[_Run]) -> Any:
+def _end_chunk(path: str, topic: str, ends: list[_Run]) -> Any:
     indexes = [
         rr.TimeColumn(name, timestamp=np.array(at, dtype="datetime64[ns]") + np.timedelta64(_stale_ns(topic), "ns"))
-        for name, at in ((PUBLISHED, [end.last for end in ends]), (LOGGED, [end.last_logged for end in ends]))
+        for name, at in (
+            (PUBLISH_TIMELINE, [end.last for end in ends]),
+            (LOG_TIMELINE, [end.last_logged for end in ends]),
+        )
     ]
-    columns = rr.AnyValues.columns(**{name: pa.nulls(len(ends), kind) for name, kind in _LANES[topic].items()})
+    columns = rr.AnyValues.columns(**{name: pa.nulls(len(ends), kind) for name, kind in _TRACKS[topic].items()})
     return rrc.Chunk.from_columns(path, indexes=indexes, columns=columns)
 
 
@@ -94,15 +97,15 @@ def _stale_ns(topic: str) -> int:
     return int((TOPICS[topic].stale_after_s or 0.0) * 1e9)
 
 
-def _lanes() -> dict[str, dict[str, Any]]:
-    """Topic: its lanes, with what their states are; of topics that can be stale."""
+def _tracks() -> dict[str, dict[str, Any]]:
+    """Return the tracks and types of their states, by topic that can be stale."""
     found: dict[str, dict[str, Any]] = {}
     for part in panels.parts():
         if isinstance(part, StateTrack) and not part.drawn and TOPICS[part.topic].stale_after_s is not None:
             fields = message_class(TOPICS[part.topic].message).DESCRIPTOR.fields_by_name
-            is_bool = part.how is None and fields[part.field].type == FieldDescriptor.TYPE_BOOL
+            is_bool = part.derivation is None and fields[part.field].type == FieldDescriptor.TYPE_BOOL
             found.setdefault(part.topic, {})[part.name] = pa.bool_() if is_bool else pa.string()
     return found
 
 
-_LANES: Final[Mapping[str, Mapping[str, Any]]] = _lanes()
+_TRACKS: Final[Mapping[str, Mapping[str, Any]]] = _tracks()

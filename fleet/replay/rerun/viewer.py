@@ -1,4 +1,4 @@
-"""Rerun's program as a process of ours: where it is, what it is started with, and that it never outlives us."""
+"""Runs Rerun's viewer as a child process that never outlives us."""
 
 import contextlib
 import os
@@ -13,21 +13,21 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Self
 
-LOOPBACK: Final = "127.0.0.1"
-UP_WITHIN_S: Final = 30.0
-LOOK_S: Final = 0.05
+VIEWER_HOST: Final = "127.0.0.1"
+VIEWER_START_TIMEOUT_S: Final = 30.0
+VIEWER_POLL_INTERVAL_S: Final = 0.05
 
 _RERUN_ENVIRONMENT: Final = {"CI": "1", "RUST_LOG": "error"}
-"""CI is the only switch that keeps Rerun 0.41's program from writing analytics into the user's home."""
+"""Without CI, Rerun 0.41 writes analytics to the user's home directory. No other switch prevents it."""
 
 
 def environment() -> dict[str, str]:
-    """The environment for any process of Rerun's program."""
+    """Return the environment for processes of Rerun."""
     return {**os.environ, **_RERUN_ENVIRONMENT}
 
 
 def program() -> Path:
-    """Rerun's program itself: what is on PATH is a wrapper, and ending that leaves the viewer behind."""
+    """Return the path of Rerun's program. The `rerun` on PATH is a wrapper: ending it leaves the viewer running."""
     import rerun_cli  # type: ignore[import-untyped]  # only a wrapper around the program
 
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
@@ -35,34 +35,42 @@ def program() -> Path:
 
 
 def has_display() -> bool:
-    """Whether a window can be opened, as far as one can tell without opening one."""
+    """Return True if a window can probably be opened."""
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 class NoViewer(Exception):
-    """The viewer did not come up; its text says why."""
+    """The viewer did not start. The message gives the reason."""
 
 
 class Viewer:
-    """Rerun's program, bound to loopback, gone when it is closed or when we are gone; use it with `with`."""
+    """Rerun's program, bound to loopback: a context manager. It ends with `close`, or with our process."""
 
     def __init__(self, *arguments: str, extra: Mapping[str, str] = MappingProxyType({})) -> None:
-        self._words = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
-        command = [sys.executable, "-m", "schemas.process.parent_guard", str(program()), "--bind", LOOPBACK, *arguments]
-        # In a group of its own: Ctrl-C at the terminal comes to us, and we end it when what is under way is over.
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
+        command = [
+            sys.executable,
+            "-m",
+            "schemas.process.parent_guard",
+            str(program()),
+            "--bind",
+            VIEWER_HOST,
+            *arguments,
+        ]
+        # In its own process group: Ctrl-C at the terminal reaches only us, and we end it after pending work.
         self._guard = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=self._words,
+            stderr=self._stderr,
             env={**environment(), **extra},
             process_group=0 if os.name == "posix" else None,
         )
         assert self._guard.stdout is not None
         self.pid = int(self._guard.stdout.readline() or 0)
-        """Of Rerun's program itself."""
+        """Process id of Rerun's program, not of the guard."""
 
     def __enter__(self) -> Self:
         return self
@@ -72,49 +80,49 @@ class Viewer:
 
     @property
     def ended(self) -> int | None:
-        """Its exit code; None while it runs."""
+        """Return its exit code; None while it runs."""
         return self._guard.poll()
 
     def wait(self, seconds: float | None = None) -> int | None:
-        """Wait until its window is closed; the exit code, None if it still runs after `seconds`."""
+        """Wait until its window is closed. Return the exit code; None after `seconds`."""
         try:
             return self._guard.wait(seconds)
         except subprocess.TimeoutExpired:
             return None
 
     def wait_until_it_listens(self, port: int) -> None:
-        """Return once it takes data at this port; raises NoViewer if it does not."""
-        deadline = time.monotonic() + UP_WITHIN_S
+        """Wait until it accepts data at this port; raises NoViewer if it does not."""
+        deadline = time.monotonic() + VIEWER_START_TIMEOUT_S
         while True:
             with socket.socket() as probe:
                 probe.settimeout(1.0)
-                if probe.connect_ex((LOOPBACK, port)) == 0:
+                if probe.connect_ex((VIEWER_HOST, port)) == 0:
                     return
-            if self.wait(LOOK_S) is not None or time.monotonic() > deadline:
-                raise NoViewer(f"Rerun's viewer did not come up: {self.last_words}")
+            if self.wait(VIEWER_POLL_INTERVAL_S) is not None or time.monotonic() > deadline:
+                raise NoViewer(f"Rerun's viewer did not come up: {self.last_error}")
 
     @property
-    def last_words(self) -> str:
-        """The last that it said on stderr."""
-        self._words.seek(0)
-        said = self._words.read().decode(errors="replace").strip().splitlines()
-        return said[-1] if said else "it said nothing"
+    def last_error(self) -> str:
+        """Return its last line on stderr."""
+        self._stderr.seek(0)
+        lines = self._stderr.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it printed nothing"
 
     def close(self) -> None:
-        """End it, if it has not ended."""
+        """End it if it still runs."""
         for stream in (self._guard.stdin, self._guard.stdout):
             if stream is not None:
                 stream.close()
         if self._guard.wait() < 0 and self.pid:
-            # The guard was killed from outside, and could not take the viewer with it.
+            # The guard was killed and could not end the viewer.
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGTERM)
-        self._words.close()
+        self._stderr.close()
 
 
 def free_port() -> int:
-    """A port of loopback that nobody uses at this moment."""
+    """Return a loopback port that is free at this moment."""
     with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
+        probe.bind((VIEWER_HOST, 0))
         port: int = probe.getsockname()[1]
         return port

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from fleet.recording.reading.mcap_index import LIMIT
+from fleet.recording.reading.mcap_index import MAX_RECORD_BYTES
 from fleet.recording.reading.session import NoSession, Recorded, Session
 from fleet.recording.writing.segment_writer import Segment
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
 
 CHUNKS, PER_CHUNK = 5, 8
-MOST_MEMORY = 3 * LIMIT
+MOST_MEMORY = 3 * MAX_RECORD_BYTES
 """A chunk as it is in the file, uncompressed, and as messages."""
 
 

@@ -80,7 +80,7 @@ def test_what_is_not_needed_is_not_read(tmp_path: Path) -> None:
     index = next(iter(Session.open(tmp_path).indexes().values()))
     assert index is not None
     data = bytearray(path.read_bytes())
-    for number, place in enumerate(index.places):
+    for number, place in enumerate(index.chunks):
         if number != 7:
             data[place.at + place.length - 3] ^= 1
     path.write_bytes(data)

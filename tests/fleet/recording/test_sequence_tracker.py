@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.recording.sequence_tracker import SENDERS, SequenceTracker
+from fleet.recording.sequence_tracker import MAX_SENDERS, SequenceTracker
 
 
 def live(numbers: SequenceTracker, *given: int, sender: str = "a") -> list[bool]:
@@ -16,7 +16,7 @@ def live(numbers: SequenceTracker, *given: int, sender: str = "a") -> list[bool]
             numbers.last[sender] = number
             found.append(True)
         else:
-            found.append(numbers.live(sender, number, number * 10))
+            found.append(numbers.add_live(sender, number, number * 10))
     return found
 
 
@@ -24,29 +24,29 @@ def test_a_gap_is_missing_until_it_is_filled_and_what_comes_twice_is_told() -> N
     numbers = SequenceTracker()
     assert all(live(numbers, 5, 6, 10))
     assert numbers.missing == 3
-    assert numbers.recalled("a", 8, 80)
+    assert numbers.add_backfilled("a", 8, 80)
     assert numbers.missing == 2
-    assert not numbers.recalled("a", 8, 80)
-    assert not numbers.recalled("a", 6, 60)
-    assert numbers.recalled("a", 7, 70)
-    assert numbers.recalled("a", 9, 90)
-    assert (numbers.missing, numbers.open) == (0, False)
+    assert not numbers.add_backfilled("a", 8, 80)
+    assert not numbers.add_backfilled("a", 6, 60)
+    assert numbers.add_backfilled("a", 7, 70)
+    assert numbers.add_backfilled("a", 9, 90)
+    assert (numbers.missing, numbers.has_gaps) == (0, False)
 
 
 def test_what_was_published_before_the_first_that_came_is_taken_and_what_lies_between_is_missing() -> None:
     numbers = SequenceTracker()
     live(numbers, 5)
-    assert numbers.recalled("a", 2, 20)
+    assert numbers.add_backfilled("a", 2, 20)
     assert numbers.missing == 2
-    assert numbers.recalled("a", 3, 30)
-    assert numbers.recalled("a", 4, 40)
+    assert numbers.add_backfilled("a", 3, 30)
+    assert numbers.add_backfilled("a", 4, 40)
     assert numbers.missing == 0
 
 
 def test_what_was_recalled_before_it_came_is_not_written_again() -> None:
     numbers = SequenceTracker()
     live(numbers, 1)
-    assert all(numbers.recalled("a", number, number * 10) for number in (2, 3, 4))
+    assert all(numbers.add_backfilled("a", number, number * 10) for number in (2, 3, 4))
     assert live(numbers, 2, 3, 4, 5) == [False, False, False, True]
     assert numbers.missing == 0
 
@@ -54,7 +54,7 @@ def test_what_was_recalled_before_it_came_is_not_written_again() -> None:
 def test_what_comes_after_later_ones_were_recalled_is_no_new_stream() -> None:
     numbers = SequenceTracker()
     live(numbers, 1)
-    assert numbers.recalled("a", 5, 50)
+    assert numbers.add_backfilled("a", 5, 50)
     assert numbers.missing == 3
     assert live(numbers, 2, 3, 4, 5, 6) == [True, True, True, False, True]
     assert numbers.missing == 0
@@ -70,36 +70,36 @@ def test_the_wrap_is_no_gap() -> None:
     numbers = SequenceTracker()
     top = (1 << 32) - 1
     live(numbers, top - 1)
-    numbers.live("a", top, 0)
-    numbers.live("a", 0, 0)
+    numbers.add_live("a", top, 0)
+    numbers.add_live("a", 0, 0)
     assert numbers.missing == 0
-    numbers.live("a", 3, 0)
+    numbers.add_live("a", 3, 0)
     assert numbers.missing == 2
-    numbers.live("b", top - 1, 0)
-    numbers.live("b", 2, 0)
+    numbers.add_live("b", top - 1, 0)
+    numbers.add_live("b", 2, 0)
     assert numbers.missing == 5
-    assert numbers.recalled("b", top, 0)
-    assert numbers.recalled("b", 0, 0)
+    assert numbers.add_backfilled("b", top, 0)
+    assert numbers.add_backfilled("b", 0, 0)
     assert numbers.missing == 3
 
 
 def test_of_many_senders_the_oldest_are_forgotten_and_their_gaps_are_not() -> None:
     numbers = SequenceTracker()
-    for sender in range(SENDERS * 3):
+    for sender in range(MAX_SENDERS * 3):
         live(numbers, 1, 3, sender=str(sender))
-    assert numbers.missing == SENDERS * 3
-    assert len(numbers.last) == SENDERS
+    assert numbers.missing == MAX_SENDERS * 3
+    assert len(numbers.last) == MAX_SENDERS
 
 
 @given(st.sets(st.integers(1, 60)), st.integers(0, 2**32))
 def test_whatever_is_lost_and_recalled_each_is_taken_once(lost: set[int], seed: int) -> None:
     chance, numbers, taken = random.Random(seed), SequenceTracker(), []
     for number in range(1, 61):
-        if number not in lost and (numbers.last.get("a") == number - 1 or numbers.live("a", number, number)):
+        if number not in lost and (numbers.last.get("a") == number - 1 or numbers.add_live("a", number, number)):
             numbers.last["a"] = number
             taken.append(number)
         if chance.random() < 0.1:  # everything that is held is had again, now and then
-            taken += [old for old in range(max(1, number - 20), number + 1) if numbers.recalled("a", old, old)]
-    taken += [old for old in range(1, 61) if numbers.recalled("a", old, old)]
+            taken += [old for old in range(max(1, number - 20), number + 1) if numbers.add_backfilled("a", old, old)]
+    taken += [old for old in range(1, 61) if numbers.add_backfilled("a", old, old)]
     assert sorted(taken) == list(range(1, 61))
     assert numbers.missing == 0

@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from fleet.recording.reading.mcap_index import LIMIT
+from fleet.recording.reading.mcap_index import MAX_RECORD_BYTES
 from fleet.recording.reading.mcap_reader import McapReader, NotMcap
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.writing.recorder import LIMIT_BYTES
+from fleet.recording.writing.recorder import MAX_QUEUED_BYTES
 from fleet.recording.writing.segment_writer import Segment
 from tests.fleet.recording.damaged import CHUNKS, PER_CHUNK, Original, judge, places, put, written
 
-ABSURD = (0, 1, 21, 2**16, LIMIT, LIMIT + 1, 2**31 - 1, 2**32, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
+ABSURD = (0, 1, 21, 2**16, MAX_RECORD_BYTES, MAX_RECORD_BYTES + 1, 2**31 - 1, 2**32, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_what_the_recorder_takes_is_read(tmp_path: Path) -> None:
     path = tmp_path / "0001.mcap"
     segment = Segment(path, {})
     channel = segment.channel("fleet/red/big", "application/octet-stream")
-    sizes = (2**20 - 100, LIMIT_BYTES, 10, 20_000_000, 5)
+    sizes = (2**20 - 100, MAX_QUEUED_BYTES, 10, 20_000_000, 5)
     for number, size in enumerate(sizes):
         segment.add(channel, number, chance.randbytes(size), number, 0)
     segment.finish({})
@@ -179,7 +179,7 @@ def test_a_file_in_which_nothing_was_recorded_is_whole(tmp_path: Path) -> None:
     salvage = McapReader(path)
     index = salvage.index()
     assert index is not None
-    assert index.complete
+    assert index.has_all_chunks
     assert list(salvage.messages()) == []
     assert not salvage.damage
 
@@ -228,7 +228,7 @@ def test_a_chunk_that_grows_when_uncompressed_is_not_followed(tmp_path: Path) ->
         writer.add_message(channel, 1, b"small", 1, 1)
         writer.flush()  # type: ignore[no-untyped-call]
         at = out.tell()
-        writer.add_message(channel, 2, bytes(2 * LIMIT), 2, 2)
+        writer.add_message(channel, 2, bytes(2 * MAX_RECORD_BYTES), 2, 2)
         writer.finish()  # type: ignore[no-untyped-call]  # it has no return type
         path = tmp_path / f"{compression.name}.mcap"
         for data in (out.getvalue(), out.getvalue()[:-8]):
@@ -236,7 +236,7 @@ def test_a_chunk_that_grows_when_uncompressed_is_not_followed(tmp_path: Path) ->
             salvage = McapReader(path)
             assert [row[1] for row in salvage.messages()] == [1]
             assert f"byte {at}: " in salvage.words
-            assert str(LIMIT) in salvage.words
+            assert str(MAX_RECORD_BYTES) in salvage.words
 
 
 def test_lz4_and_no_compression_and_no_chunks_are_read_too(tmp_path: Path) -> None:

@@ -196,7 +196,7 @@ def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_dro
         assert description.drops == end["drops"]
         assert len(holds(session, out.key)) + dropped == sent
         assert description.messages == end["messages"] == sum(1 for _ in Session.open(session).messages())
-        assert not (session / session_dir.SPARE).exists()
+        assert not (session / session_dir.SPARE_FILE).exists()
         if kind == "keep free":  # there was room, which only was to stay free
             assert (process.returncode, dropped) == (0, 0)
             assert verify(Session.open(session)).whole

@@ -47,7 +47,7 @@ def test_what_was_made_of_a_damaged_one_says_how_much_is_missing(tmp_path: Path)
     data = bytearray((old / "0001.mcap").read_bytes())
     index = Session.open(old).indexes()[old / "0001.mcap"]
     assert index is not None
-    place = index.places[1]
+    place = index.chunks[1]
     data[place.at + place.length - 2] ^= 1
     (old / "0001.mcap").write_bytes(data)
     assert run("recover", old, "--out", new).exit_code == 0

@@ -9,7 +9,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import Writer
 
 from fleet.recording.reading.session import Session
-from fleet.recording.tools.sequence_check import MOST_GAPS, Stream
+from fleet.recording.sequence_tracker import MAX_LISTED_GAPS, PublisherSequence
 from fleet.recording.tools.verify import SessionVerdict, verify
 from schemas import messages
 from schemas.gen import fleet_v1_pb2 as pb
@@ -120,21 +120,21 @@ def test_any_order_and_any_loss_is_counted_right() -> None:
         kept = [number for number in sent if chance.random() < 0.8] or sent
         twice = [chance.choice(kept) for _ in range(chance.randint(0, 3))]
         chance.shuffle(heard := kept + twice)
-        stream = Stream()
+        stream = PublisherSequence()
         for at, number in enumerate(heard):
             stream.add(number, at)
         assert stream.missing == max(kept) - min(kept) + 1 - len(kept), seed
-        assert stream.twice == len(twice), seed
+        assert stream.duplicates == len(twice), seed
         listed = {number for gap in stream.gaps for number in range(gap.first, gap.last + 1)}
         assert listed == set(range(min(kept), max(kept))) - set(kept), seed
 
 
 def test_more_gaps_than_are_listed_are_counted() -> None:
-    stream = Stream()
-    for number in range(1, 4 * MOST_GAPS, 2):
+    stream = PublisherSequence()
+    for number in range(1, 4 * MAX_LISTED_GAPS, 2):
         stream.add(number, number)
-    assert len(stream.gaps) == MOST_GAPS
-    assert stream.missing == 2 * MOST_GAPS - 1
+    assert len(stream.gaps) == MAX_LISTED_GAPS
+    assert stream.missing == 2 * MAX_LISTED_GAPS - 1
 
 
 def test_clocks_that_are_wrong_are_said_and_make_nothing_missing(written: Written) -> None:

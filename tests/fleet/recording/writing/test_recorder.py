@@ -138,7 +138,7 @@ def test_gaps_in_a_publishers_numbers_are_counted_and_a_restart_is_none(
     assert json.loads((session / "session.json").read_text())["missed"] == {key: 2}
 
 
-@pytest.mark.parametrize("limits", [{"limit_messages": 20}, {"limit_bytes": 1000}])
+@pytest.mark.parametrize("limits", [{"max_messages": 20}, {"max_bytes": 1000}])
 def test_what_does_not_fit_the_queue_is_counted_by_key_and_never_blocks(
     limits: dict[str, Any], endpoint: str, bus: Bus, tmp_path: Path
 ) -> None:
@@ -177,15 +177,15 @@ def test_a_huge_publication_is_read_by_the_stock_reader_and_one_that_is_too_larg
 ) -> None:
     payload = os.urandom(20_000_000)
     with Bus.open(hub_apart) as own, zenoh.open(own_config(hub_apart)) as stranger:
-        recorder = Recorder(own, "fleet", tmp_path, limit_bytes=30_000_000)
+        recorder = Recorder(own, "fleet", tmp_path, max_bytes=30_000_000)
         session = recorder.start()
         # By default Zenoh drops what it cannot pass on at once, on a busy machine most of what is so large.
         whole: Any = {"congestion_control": zenoh.CongestionControl.BLOCK}
         stranger.put("fleet/red/map", payload, **whole)
-        wait_for(lambda: recorder._tape.bytes > len(payload), "it is in the file")
+        wait_for(lambda: recorder._session.bytes > len(payload), "it is in the file")
         stranger.put("fleet/red/larger", bytes(30_000_001), **whole)
         stranger.put("fleet/red/note", b"still there", **whole)
-        wait_for(lambda: recorder._tape.drops, "it has come, and is counted")
+        wait_for(lambda: recorder._session.drops, "it has come, and is counted")
         heard(stranger)
         outcome = recorder.close()
     held = {channel.topic: message.data for _, channel, message in stock(session / "0001.mcap")}

@@ -61,7 +61,7 @@ def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
         feed(tape, BEGUN_NS + second * SECOND_NS)
         tape.tick(BEGUN_NS + second * SECOND_NS)
     tape.close(BEGUN_NS + 12 * SECOND_NS)
-    found = json.loads((tape.path / session_dir.INDEX).read_text())["segments"]
+    found = json.loads((tape.path / session_dir.INDEX_FILE).read_text())["segments"]
     assert [one["file"] for one in found] == [path.name for path in Session.open(tape.path).segments]
     assert [one["bytes"] for one in found] == [path.stat().st_size for path in Session.open(tape.path).segments]
     for one in found:
@@ -80,7 +80,7 @@ def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> Non
     assert verdict.whole
     assert verdict.messages == 50
     assert [round(one["step_s"]) for one in verdict.backwards] == [3602]
-    (one,) = json.loads((tape.path / session_dir.INDEX).read_text())["segments"]
+    (one,) = json.loads((tape.path / session_dir.INDEX_FILE).read_text())["segments"]
     assert (one["first_ns"], one["last_ns"]) == (BEGUN_NS - 3600 * SECOND_NS, BEGUN_NS + 2 * SECOND_NS + 9)
 
 
@@ -153,11 +153,13 @@ def test_a_quota_that_marked_sessions_break_is_told_and_removes_none_of_them(tmp
 def test_files_are_copied_into_each_session(tmp_path: Path) -> None:
     plan = tmp_path / "my.yaml"
     plan.write_text("roles: {}\n")
-    tape = SessionWriter(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN: plan}), BEGUN_NS)
+    tape = SessionWriter(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN_FILE: plan}), BEGUN_NS)
     tape.close(BEGUN_NS)
     assert (tape.path / "plan.yaml").read_text() == "roles: {}\n"
     plan.unlink()
-    after = SessionWriter(tmp_path / "out", "fleet", Options(copied={session_dir.PLAN: plan}), BEGUN_NS + SECOND_NS)
+    after = SessionWriter(
+        tmp_path / "out", "fleet", Options(copied={session_dir.PLAN_FILE: plan}), BEGUN_NS + SECOND_NS
+    )
     assert after.uncopied == [f"{plan} could not be copied into {after.path}: No such file or directory"]
     after.close(BEGUN_NS + SECOND_NS)
     assert verify(Session.open(after.path)).whole

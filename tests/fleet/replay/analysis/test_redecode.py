@@ -11,7 +11,7 @@ from mcap.writer import Writer
 
 from fleet.cli import cli
 from fleet.replay.analysis import test_vector
-from fleet.replay.analysis.recorded_frames import Confirmed, Item, Rx, Treated, Tx
+from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from fleet.replay.analysis.redecode import ReadingDifference, Redecoding
 from gateway.protocol.enums import Mode
 from schemas.gen import fleet_v1_pb2 as pb
@@ -67,7 +67,7 @@ def test_every_field_of_a_vector_counts(path: Path) -> None:
 
 
 def test_a_verdict_and_a_reading_that_is_not_published_any_more() -> None:
-    known: list[Item] = [Treated(0, "arduino"), Confirmed(0, Mode.TRACKING)]
+    known: list[Item] = [KnownPlatform(0, "arduino"), KnownMode(0, Mode.TRACKING)]
     frame = Rx(S, TRACKING, "sensors", ("sensor/line",), LINE)
     assert redecoded([*known, frame])[0] == []
     found, _ = redecoded([*known, replace(frame, verdict="bad_number", published=("sensor/light",), readings={})])
@@ -79,7 +79,7 @@ def test_a_verdict_and_a_reading_that_is_not_published_any_more() -> None:
 
 def test_an_echo_is_known_by_what_was_sent_and_for_two_seconds() -> None:
     sent = b"$1,0,0,0,0,0,0,0,0#"
-    known: list[Item] = [Treated(0, "arduino"), Confirmed(0, None), Tx(3 * S, sent)]
+    known: list[Item] = [KnownPlatform(0, "arduino"), KnownMode(0, None), Tx(3 * S, sent)]
     echo = Rx(4 * S, sent, "echo")
     assert redecoded([*known, echo])[0] == []
     late, _ = redecoded([*known, replace(echo, at_ns=6 * S)])
@@ -94,14 +94,14 @@ def test_what_the_recording_does_not_tell_is_no_difference_and_is_counted() -> N
     seen = {"sensor/obstacle": {"left": True, "right": True}}
     frame = Rx(S, FOLLOWING, "sensors", ("sensor/obstacle",), seen)
     for then in (frame, replace(frame, published=(), readings={})):
-        found, one = redecoded([Treated(0, "arduino"), Confirmed(0, None), then])
+        found, one = redecoded([KnownPlatform(0, "arduino"), KnownMode(0, None), then])
         assert (found, one.counts.undecided) == ([], 1)
     # A mode that was confirmed at that very moment.
-    changing: list[Item] = [Treated(0, "arduino"), Confirmed(0, None), frame, Confirmed(S + 1, Mode.FOLLOWING)]
+    changing: list[Item] = [KnownPlatform(0, "arduino"), KnownMode(0, None), frame, KnownMode(S + 1, Mode.FOLLOWING)]
     assert redecoded(changing)[0] == []
     # What cannot be is a difference all the same.
     wrong = replace(frame, readings={"sensor/obstacle": {"left": False, "right": True}})
-    assert [each.what for each in redecoded([Treated(0, "arduino"), wrong])[0]] == ["sensor/obstacle left"]
+    assert [each.what for each in redecoded([KnownPlatform(0, "arduino"), wrong])[0]] == ["sensor/obstacle left"]
 
 
 def test_a_session_says_what_is_otherwise_and_a_vector_of_it_says_the_same(tmp_path: Path) -> None:

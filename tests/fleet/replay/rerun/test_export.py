@@ -91,16 +91,16 @@ def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
         assert len(names) == 1 or names[1] in fields[names[0]].message_type.fields_by_name, part
         # What may be missing must not be drawn as the zero that stands for it.
         assert not isinstance(part, panels.Curve) or fields[names[0]].has_presence == part.field.endswith("!"), part
-    for words in panels.WORDS:
+    for words in panels.TEXT_LINES:
         fields = message_class(TOPICS[words.topic].message).DESCRIPTOR.fields_by_name
         assert {*words.fields, *words.before} <= set(fields)
 
 
 def test_every_topic_of_the_table_is_drawn() -> None:
-    drawn = {part.topic for part in panels.parts()} | {words.topic for words in panels.WORDS}
+    drawn = {part.topic for part in panels.parts()} | {words.topic for words in panels.TEXT_LINES}
     drawn |= {topic for panel in panels.CAR_PANELS for topic in panel.topics}
     drawn |= {topic for _, ours, theirs in panels.FLEET_TEXTS for topic in (*ours, *theirs)}
-    assert set(TOPICS) - drawn == {panels.PLAN, panels.WORLD}
+    assert set(TOPICS) - drawn == {panels.PLAN_TOPIC, panels.WORLD}
 
 
 @pytest.mark.parametrize("key", ["fleet/red/sensor/range", "fleet/@recorder/status", "my-fleet/car_1/state/mode"])

@@ -85,8 +85,8 @@ def test_what_is_on_the_bus_is_in_the_file(fleet: FleetProcesses, tmp_path: Path
         while sent < 50 and time.monotonic() < deadline:
             sent += following.step()
         publish(fleet.bus, "blue", range(20))
-        wait_for(lambda: following.step() or following.held == 70, "all is sent")
-        while following.held < 70:
+        wait_for(lambda: following.step() or following.sent == 70, "all is sent")
+        while following.sent < 70:
             following.step()
     assert following.cars == ("blue", "red")
     assert following.dropped == 0
@@ -116,12 +116,12 @@ def test_a_plan_from_before_is_asked_for(fleet: FleetProcesses, tmp_path: Path) 
 
 
 def test_what_finds_no_room_is_counted(fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "LIMIT", 10)
+    monkeypatch.setattr(live, "MAX_WAITING_MESSAGES", 10)
     out = tmp_path / "now.rrd"
     with Bus.open(fleet.endpoint) as bus, following_of(bus, lambda recording: recording.save(out)) as following:
         publish(fleet.bus, "red", range(100))
         wait_for(lambda: following.dropped == 90, "90 find no room")
-    assert following.held == 10
+    assert following.sent == 10
 
 
 def test_a_page_on_loopback_that_goes_with_the_command(fleet: FleetProcesses) -> None:
@@ -156,7 +156,7 @@ def test_killed_it_leaves_no_viewer(fleet: FleetProcesses, who: str) -> None:
 def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
     fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "LIMIT", 500)
+    monkeypatch.setattr(live, "MAX_WAITING_MESSAGES", 500)
     port, page = free_port(), free_port()
     with Viewer("--serve-web", "--port", str(port), "--web-viewer-port", str(page)) as viewer:
         viewer.wait_until_it_listens(port)
@@ -165,7 +165,7 @@ def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
             following_of(bus, lambda to: to.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")) as following,
         ):
             publish(fleet.bus, "red", range(10))
-            wait_for(lambda: following.step() >= 0 and following.held == 10, "the viewer takes what there is")
+            wait_for(lambda: following.step() >= 0 and following.sent == 10, "the viewer takes what there is")
             os.kill(viewer.pid, signal.SIGSTOP)
             try:
 
@@ -177,7 +177,7 @@ def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
                 # A viewer that runs may take longer than this to acknowledge what it has, so only a stopped one has
                 # this little time.
                 with monkeypatch.context() as hurried:
-                    hurried.setattr(live, "FLUSH_S", 0.2)
+                    hurried.setattr(live, "VIEWER_FLUSH_TIMEOUT_S", 0.2)
                     wait_for(full, "what comes is left out")
             finally:
                 os.kill(viewer.pid, signal.SIGCONT)
@@ -209,7 +209,7 @@ def test_a_viewer_that_cannot_start_is_said() -> None:
         port = str(taken.getsockname()[1])
         with Viewer("--serve-web", "--port", str(free_port()), "--web-viewer-port", port) as viewer:
             assert viewer.wait(PATIENCE_S)
-            assert viewer.last_words != "it said nothing"
+            assert viewer.last_error != "it printed nothing"
 
 
 def test_the_guard_ends_its_program_with_its_input() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
 
-from fleet.replay.rerun.staleness import LOGGED, PUBLISHED, StaleStates
+from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
 
 LINE = "/fleet/red/sensor/line"
 STALE_S = 3
@@ -14,7 +14,9 @@ LANES = {f"line {side} {place}" for side in ("left", "right") for place in ("inn
 
 def batch(*seconds: float) -> Any:
     at = np.array([int(second * 1e9) for second in seconds], dtype="datetime64[ns]")
-    return pa.record_batch({PUBLISHED: pa.array(at), LOGGED: pa.array(at + np.timedelta64(1_000_000, "ns"))})
+    return pa.record_batch(
+        {PUBLISH_TIMELINE: pa.array(at), LOG_TIMELINE: pa.array(at + np.timedelta64(1_000_000, "ns"))}
+    )
 
 
 def drawn(ends: StaleStates, now: float) -> list[float]:
@@ -26,7 +28,9 @@ def drawn(ends: StaleStates, now: float) -> list[float]:
         for name in LANES:
             assert all(row == [None] for row in made.column(name).to_pylist())
             assert made.schema.field(name).type.value_type == pa.bool_()
-        published, logged = (made.column(name).cast(pa.int64()).to_pylist() for name in (PUBLISHED, LOGGED))
+        published, logged = (
+            made.column(name).cast(pa.int64()).to_pylist() for name in (PUBLISH_TIMELINE, LOG_TIMELINE)
+        )
         assert [each + 1_000_000 for each in published] == logged
         found += [each / 1e9 for each in published]
     return found
@@ -34,8 +38,8 @@ def drawn(ends: StaleStates, now: float) -> list[float]:
 
 def test_a_gap_in_a_batch_between_batches_and_at_the_end_ends_lanes() -> None:
     ends = StaleStates()
-    ends.heard(LINE, "sensor/line", batch(1, 2, 10, 11))
-    ends.heard(LINE, "sensor/line", batch(20, 21))
+    ends.add(LINE, "sensor/line", batch(1, 2, 10, 11))
+    ends.add(LINE, "sensor/line", batch(20, 21))
     assert drawn(ends, 30) == [2 + STALE_S, 11 + STALE_S, 21 + STALE_S]
     assert drawn(ends, 40) == []
 
@@ -43,29 +47,29 @@ def test_a_gap_in_a_batch_between_batches_and_at_the_end_ends_lanes() -> None:
 def test_what_is_heard_often_enough_does_not_end() -> None:
     ends = StaleStates()
     for start in range(0, 60, 6):
-        ends.heard(LINE, "sensor/line", batch(start, start + 3))
+        ends.add(LINE, "sensor/line", batch(start, start + 3))
         assert drawn(ends, start + 3 + STALE_S) == []
 
 
 def test_batches_may_come_in_any_order() -> None:
     ends = StaleStates()
-    ends.heard(LINE, "sensor/line", batch(16, 14, 15))
-    ends.heard(LINE, "sensor/line", batch(3, 1, 2))
-    ends.heard(LINE, "sensor/line", batch(0, 20))
+    ends.add(LINE, "sensor/line", batch(16, 14, 15))
+    ends.add(LINE, "sensor/line", batch(3, 1, 2))
+    ends.add(LINE, "sensor/line", batch(0, 20))
     assert drawn(ends, 20) == [3 + STALE_S, 16 + STALE_S]
 
 
 def test_live_an_end_is_told_once_and_again_after_more_was_heard() -> None:
     ends = StaleStates()
-    ends.heard(LINE, "sensor/line", batch(1, 2))
+    ends.add(LINE, "sensor/line", batch(1, 2))
     assert drawn(ends, 4) == []
     assert drawn(ends, 6) == [2 + STALE_S]
-    ends.heard(LINE, "sensor/line", batch(8))
+    ends.add(LINE, "sensor/line", batch(8))
     assert drawn(ends, 9) == []
     assert drawn(ends, 12) == [8 + STALE_S]
 
 
 def test_what_is_never_stale_never_ends() -> None:
     ends = StaleStates()
-    ends.heard("/fleet/red/event/command", "event/command", batch(1))
+    ends.add("/fleet/red/event/command", "event/command", batch(1))
     assert drawn(ends, 1000) == []
