@@ -1,6 +1,6 @@
 """Several cars from one laptop: drive, watch, record and replay them.
 
-`from fleet import Fleet`; its twin for asyncio is `from fleet.aio import Fleet`.
+`from fleet import Fleet` is the SDK, `from fleet.aio import Fleet` its asyncio twin.
 """
 
 from importlib import import_module
@@ -23,7 +23,7 @@ _HOME: Final = {
 
 
 def __getattr__(name: str) -> object:
-    """Imported when it is first asked for: no command line waits for what it does not use."""
+    """Import a name on first use, so that commands which do not need it start fast."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOME[name]), name)

@@ -1,6 +1,6 @@
-"""Fleet and Car for asyncio: the client of client.py with the same names, each call to be awaited.
+"""Fleet and Car for asyncio: the same names as in `fleet.client`, with coroutines.
 
-The blocking calls run in threads; a watch is an asynchronous iterator fed through a bounded hand-over.
+The blocking calls run in threads. A watch is an asynchronous iterator with a bounded queue.
 """
 
 import asyncio
@@ -17,19 +17,19 @@ from fleet.client import lease as leases
 from fleet.client.commands import CarCommands, CommandRequest
 from fleet.client.condition import KeyCondition
 from fleet.client.outcome import Outcome
-from fleet.client.reading import QUEUE_LIMIT, Reading, Wanted, reading_of
+from fleet.client.reading import READING_QUEUE_LIMIT, Reading, ReadingFilter, reading_of
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages
 from schemas.bus import Handover, Sample
 
 _THREADS: Final = 256
-"""Calls that may wait at the same time: a drive waits until it is over, and no stop may wait for a free thread."""
+"""Maximum number of concurrent calls. A drive blocks its thread until its end, and a stop must find a free one."""
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class Fleet:
-    """`async with Fleet() as fleet`; see fleet.client.client.Fleet for what each does and raises."""
+    """The asyncio twin of fleet.client.client.Fleet: `async with Fleet() as fleet`."""
 
     def __init__(
         self,
@@ -56,36 +56,37 @@ class Fleet:
         self._threads.shutdown(wait=False)
 
     async def call(self, function: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
-        """What a blocking call returns or raises; in a thread, where it runs on if the task is cancelled."""
+        """Run a blocking call in a thread. It runs on if the task is cancelled."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(function, *args, **options))
 
     @property
     def sync(self) -> client.Fleet:
-        """The client underneath."""
+        """The blocking client."""
         if self._client is None:
             raise RuntimeError("use the fleet inside `async with`")
         return self._client
 
     async def cars(self) -> list[str]:
-        """The cars whose gateway is on the bus."""
+        """Return the names of the cars whose gateway is on the bus."""
         return await self.call(self.sync.cars)
 
     def car(self, name: str) -> "Car":
-        """One car, there or not."""
+        """Return a car, whether or not it is on the bus."""
         return Car(self, keys.check_name(name))
 
     async def get(self, expression: str) -> list[Reading]:
-        """The latest value under every key that matches."""
+        """Return the latest value of every matching key."""
         return await self.call(self.sync.get, expression)
 
     async def history(self, expression: str, *, last: int | None = None, since_s: float | None = None) -> list[Reading]:
-        """The last so many values of every key that matches, or of the last so many seconds; each oldest first."""
+        """Return the last `last` values of every matching key, or those of the last `since_s` seconds, or both."""
         return await self.call(self.sync.history, expression, last=last, since_s=since_s)
 
     def watch(self, expression: str, *, when: str | None = None) -> "Watch":
-        """Readings as they are published: `async for reading in fleet.watch("*/sensor/range")`; as `when` says.
+        """Subscribe to readings: `async for reading in fleet.watch("*/sensor/range")`.
 
-        Use it with `async with` if the fleet stays open longer: it takes readings until it, or the fleet, is closed.
+        Use it with `async with` if the fleet stays open longer. Otherwise it receives readings until the fleet is
+        closed.
         """
         written = self.sync.expression(expression)
         watch = Watch(None if when is None else KeyCondition.of(when, written).holds)
@@ -94,7 +95,7 @@ class Fleet:
         return watch
 
     async def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until `when` holds of a fresh reading, and return that; raises waiting.NotInTime."""
+        """Wait until `when` holds of a fresh reading and return that reading. Raises wait.NotInTime."""
         written = self.sync.expression(expression)
         waiting = ConditionWait(KeyCondition.of(when, written), for_s)
         try:
@@ -107,22 +108,22 @@ class Fleet:
                         return reading
         except TimeoutError:
             pass
-        raise waiting.late(written, timeout_s or 0.0, datetime.now(UTC))
+        raise waiting.timeout_error(written, timeout_s or 0.0, datetime.now(UTC))
 
     async def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Stop these cars, or every car."""
         return await self.call(self.sync.stop, cars)
 
     async def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
-        """Emergency stop of these cars, or of the fleet."""
+        """E-stop these cars, or the fleet."""
         return await self.call(self.sync.estop, cars, why)
 
     async def resume(self, cars: Iterable[str], ids: Sequence[str] = ()) -> list[Outcome]:
-        """End the e-stops of these ids; without ids, the hold."""
+        """End the e-stops of these ids. Without ids, end the hold."""
         return await self.call(self.sync.resume, cars, ids)
 
     async def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
-        """Ask the cars and wait for what becomes of it."""
+        """Send a command to the cars and return their outcomes."""
         return await self.call(self.sync.ask, request, cars)
 
 
@@ -135,23 +136,23 @@ class Car(CarCommands[Coroutine[Any, Any, Outcome]]):
         self._leased = leased
 
     async def get(self, topic: str = "sensor/*") -> list[Reading]:
-        """The latest readings of this car."""
+        """Return the latest readings of this car."""
         return await self._fleet.get(f"{self.name}/{topic}")
 
     def lease(self, *, take: bool = False) -> "Lease":
-        """Have the car while a block runs: `async with fleet.car("red").lease() as car: await car.drive("forward")`.
+        """Reserve the car for a block: `async with fleet.car("red").lease() as car: await car.drive("forward")`.
 
-        As fleet.client.client.Car.lease; a task that is cancelled stops the car, too.
+        See fleet.client.client.Car.lease. Cancelling the task stops the car, too.
         """
         return Lease(self._fleet, self.name, take=take)
 
     async def do(self, request: CommandRequest) -> Outcome:
-        """Ask for one command and say what became of it."""
+        """Send one command and return its outcome."""
         return await self._fleet.call((self._leased or self._fleet.sync.car(self.name)).do, request)
 
 
 class Lease:
-    """Made by `Car.lease`; use it with `async with`, which raises LeaseLost if the car is another's."""
+    """A lease, made by `Car.lease`. Use it with `async with`, which raises LeaseLost if another sender has the car."""
 
     def __init__(self, fleet: Fleet, name: str, *, take: bool) -> None:
         self._fleet = fleet
@@ -174,29 +175,31 @@ class Lease:
 
 
 class Watch:
-    """Readings as they come. `async for`; `close` (or `async with`) ends it. Who reads too slowly loses the oldest."""
+    """A stream of readings for `async for`, ended by `close` or `async with`. A full queue drops the oldest samples."""
 
-    def __init__(self, wanted: Wanted | None = None) -> None:
-        self._wanted = wanted
-        self._waiting: asyncio.Queue[Sample | None] = asyncio.Queue(QUEUE_LIMIT)
+    def __init__(self, accept: ReadingFilter | None = None) -> None:
+        self._accept = accept
+        self._queue: asyncio.Queue[Sample | None] = asyncio.Queue(READING_QUEUE_LIMIT)
         self._closed = False
         self._undeclare: Callable[[], object] = lambda: None
-        self.hand_over: Handover[Sample] = Handover(asyncio.get_running_loop(), self._take, limit=QUEUE_LIMIT)
-        self._full = 0
+        self.hand_over: Handover[Sample] = Handover(
+            asyncio.get_running_loop(), self._on_sample, limit=READING_QUEUE_LIMIT
+        )
+        self._dropped = 0
         self.unreadable = 0
-        """Samples that are no message of ours."""
+        """Number of samples that are no message of ours."""
 
     @property
     def dropped(self) -> int:
-        """Samples that made room for newer ones, or came while the loop stood still."""
-        return self._full + self.hand_over.dropped
+        """Number of samples dropped from the full queue, or while the loop was blocked."""
+        return self._dropped + self.hand_over.dropped
 
     def begin(self, undeclare: Callable[[], object]) -> None:
-        """It is subscribed; `undeclare` is called at the end."""
+        """Note the function that ends the subscription."""
         self._undeclare = undeclare
 
     def close(self) -> None:
-        """End the stream; the iteration stops."""
+        """End the stream and its iteration."""
         if not self._closed:
             self._closed = True
             self._undeclare()
@@ -213,7 +216,7 @@ class Watch:
 
     async def __anext__(self) -> Reading:
         while not self._closed:
-            sample = await self._waiting.get()
+            sample = await self._queue.get()
             if sample is None:
                 break
             try:
@@ -221,17 +224,17 @@ class Watch:
             except (messages.BadPayload, KeyError):
                 self.unreadable += 1
                 continue
-            if self._wanted is None or self._wanted(reading):
+            if self._accept is None or self._accept(reading):
                 return reading
         raise StopAsyncIteration
 
-    def _take(self, sample: Sample) -> None:
-        self._full += self._put(sample)
+    def _on_sample(self, sample: Sample) -> None:
+        self._dropped += self._put(sample)
 
     def _put(self, sample: Sample | None) -> bool:
-        """Whether the oldest made room."""
-        full = self._waiting.full()
+        """Queue a sample. Return True if the oldest one was dropped."""
+        full = self._queue.full()
         if full:
-            self._waiting.get_nowait()
-        self._waiting.put_nowait(sample)
+            self._queue.get_nowait()
+        self._queue.put_nowait(sample)
         return full

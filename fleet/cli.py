@@ -1,6 +1,6 @@
-"""The `fleet` command: the table of its subcommands, and what every one of them does with a mistake.
+"""The `fleet` command: the table of its subcommands, and their common error handling.
 
-A subcommand is imported when it is called, so that `fleet --help` takes no longer than click does.
+Subcommands are imported when they are called, so that `fleet --help` is fast.
 """
 
 import importlib
@@ -16,30 +16,30 @@ from schemas.process import startup, stdio
 COMMANDS: Final = {
     "up": ("fleet.commands.up:up", "Start a fleet from its file, or simulated cars, and keep it running."),
     "down": ("fleet.commands.lifecycle:down", "End a fleet that is up: every car is stopped first."),
-    "status": ("fleet.commands.lifecycle:status", "The processes of a fleet that is up."),
-    "reload": ("fleet.commands.lifecycle:reload", "Have the fleet file of a fleet that is up read again."),
-    "logs": ("fleet.commands.lifecycle:logs", "What a car's gateway has said."),
-    "list": ("fleet.commands.observe:list_cars", "The cars on the bus, and how each is."),
-    "get": ("fleet.commands.observe:get", "The latest value of every matching reading, or its history."),
-    "watch": ("fleet.commands.observe:watch", "Readings as they come, until Ctrl-C."),
-    "wait": ("fleet.commands.survey:wait", "Wait until a condition holds of a reading."),
-    "keys": ("fleet.commands.survey:list_keys", "Every key now alive: type, unit, rate, age."),
+    "status": ("fleet.commands.lifecycle:status", "Show the processes of a fleet that is up."),
+    "reload": ("fleet.commands.lifecycle:reload", "Read the fleet file of a fleet that is up again."),
+    "logs": ("fleet.commands.lifecycle:logs", "Show the log of a car's gateway."),
+    "list": ("fleet.commands.observe:list_cars", "List the cars on the bus with their states."),
+    "get": ("fleet.commands.observe:get", "Print the latest value of every matching reading, or its history."),
+    "watch": ("fleet.commands.observe:watch", "Print readings as they come, until Ctrl-C."),
+    "wait": ("fleet.commands.observe:wait", "Wait until a condition holds of a reading."),
+    "keys": ("fleet.commands.observe:list_keys", "List every key in use with type, unit, rate and age."),
     "drive": ("fleet.commands.drive:drive", "Hold a motion for a time, then stop."),
     "mode": ("fleet.commands.drive:mode", "Bring cars into a mode."),
     "stop": ("fleet.commands.drive:stop", "Stop cars (all, if none is named) and hold them against the coordinator."),
     "estop": ("fleet.commands.drive:estop", "Emergency stop of cars, or of the fleet."),
     "resume": ("fleet.commands.drive:resume", "End the hold or the e-stops of cars."),
-    "led": ("fleet.commands.actuators:led", "Set the colour LED."),
+    "led": ("fleet.commands.actuators:led", "Set the color LED."),
     "light": ("fleet.commands.actuators:light", "Set the light."),
     "servo": ("fleet.commands.actuators:servo", "Move a servo."),
     "arm": ("fleet.commands.actuators:arm", "Move the arm's six joints."),
     "whistle": ("fleet.commands.actuators:whistle", "Sound once."),
-    "speed": ("fleet.commands.actuators:speed", "One step faster or slower."),
+    "speed": ("fleet.commands.actuators:speed", "Change the speed by one step."),
     "fan": ("fleet.commands.actuators:fan", "Toggle the fan."),
     "find": ("fleet.commands.actuators:find", "Make cars blink and beep, without moving."),
     "coordinate": ("fleet.commands.coordinate:coordinate", "Keep a plan true: roles, rules, phases; until Ctrl-C."),
-    "why": ("fleet.commands.plan:why", "What the coordinator decided last, why, and what would change it."),
-    "plan": ("fleet.commands.plan:plan", "`fleet plan check FILE`: what can never work in a plan."),
+    "why": ("fleet.commands.plan:why", "Explain the coordinator's last decisions and what would change them."),
+    "plan": ("fleet.commands.plan:plan", "Check a plan for parts that can never work, or restart the plan in force."),
     "init": ("fleet.commands.fleet_file:init", "Write a fleet file: look for cars, ask for their names."),
     "check": (
         "fleet.commands.fleet_file:check",
@@ -48,22 +48,19 @@ COMMANDS: Final = {
     "bind": ("fleet.commands.bind:bind", "Find out which car is at which link: each blinks, you say which it was."),
     "schema": ("fleet.commands.fleet_file:print_schema", "Print the JSON Schema of fleet files, for editors."),
     "record": ("fleet.commands.record:record", "Record everything of the fleet to MCAP, until Ctrl-C."),
-    "mark": ("fleet.commands.record_control:mark", "Write a mark into what is being recorded."),
+    "mark": ("fleet.commands.record:mark", "Write a mark into the running recording."),
     "sessions": ("fleet.commands.sessions:sessions", "List, verify, recover, cut and export recordings."),
     "replay": ("fleet.commands.replay:replay", "Open a recorded session in Rerun, or play it on the bus again."),
-    "view": ("fleet.commands.view:view", "See the fleet live in Rerun."),
-    "replan": ("fleet.commands.replan:replan", "A plan on a recorded session: where it decides otherwise."),
-    "redecode": (
-        "fleet.commands.redecode:redecode",
-        "Recorded raw frames through today's decoder: what is otherwise.",
-    ),
-    "demo": ("fleet.demo:demo", "Three simulated cars do a job, recorded and checked."),
+    "view": ("fleet.commands.view:view", "Show the fleet live in Rerun."),
+    "replan": ("fleet.commands.replan:replan", "Replay a session through a plan and list decisions that differ."),
+    "redecode": ("fleet.commands.redecode:redecode", "Decode a session's raw frames again and list differences."),
+    "demo": ("fleet.demo:demo", "Run a job with three simulated cars, record and check it."),
 }
-"""Subcommand: where it lives, and its line in `fleet --help`."""
+"""Subcommands: function and line in `fleet --help`."""
 
 
 _PACKAGES: Final = {"rerun": "rerun-sdk", "rerun_cli": "rerun-sdk", "yaml": "pyyaml", "zenoh": "eclipse-zenoh"}
-"""Packages by the modules they bring, where the names differ."""
+"""Packages by module, where the names differ."""
 
 
 class _Lazy(click.Group):
@@ -113,7 +110,7 @@ def main() -> None:
         sys.stderr.write(f"fleet: {_one_line(error)} (see {where} --help)\n")
         code = error.exit_code
     except click.ClickException as error:
-        several = "\n" in error.message  # the faults of a file, one a line
+        several = "\n" in error.message  # the errors of a file, one per line
         sys.stderr.write(f"{error.message}\n" if several else f"fleet: {_one_line(error)}\n")
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
@@ -121,7 +118,7 @@ def main() -> None:
     except ModuleNotFoundError as error:
         sys.stderr.write(f"fleet: {_missing(error)}\n")
         code = 1
-    except OSError as error:  # what the commands raise of their own, they explain: this is the output's
+    except OSError as error:  # commands handle their own errors, so this one comes from the output
         code = _no_output(error)
     try:
         sys.stdout.flush()
@@ -131,7 +128,7 @@ def main() -> None:
 
 
 def _missing(error: ModuleNotFoundError) -> str:
-    """Return what is not installed, and what to type; raises the error again if it is a module of ours."""
+    """Return words about the missing package and how to install it. Raises the error again for a module of ours."""
     module = (error.name or "").partition(".")[0]
     if module in ("", "fleet", "gateway", "schemas"):
         raise error
@@ -139,15 +136,15 @@ def _missing(error: ModuleNotFoundError) -> str:
 
     package = _PACKAGES.get(module, module)
     try:
-        wanted = [each.partition(";")[0].strip() for each in metadata.requires("zenoh-car-fleet") or ()]
+        requirements = [each.partition(";")[0].strip() for each in metadata.requires("zenoh-car-fleet") or ()]
     except metadata.PackageNotFoundError:  # a clone that was never installed
-        wanted = []
-    exact = next((each for each in wanted if re.match(rf"{re.escape(package)}(?![\w.-])", each)), package)
+        requirements = []
+    exact = next((each for each in requirements if re.match(rf"{re.escape(package)}(?![\w.-])", each)), package)
     return f"{package} is not installed, and this command needs it: pip install '{exact}'"
 
 
 def _no_output(error: OSError) -> int:
-    """Say that the output cannot be written; whoever closed a pipe has seen enough, and is told nothing."""
+    """Print that the output cannot be written, unless the reader has closed the pipe. Return the exit code."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if not isinstance(error, BrokenPipeError):
         sys.stderr.write(f"fleet: the output cannot be written: {error.strerror}\n")
@@ -156,7 +153,7 @@ def _no_output(error: OSError) -> int:
 
 def _one_line(error: click.ClickException) -> str:
     if isinstance(error, click.BadParameter) and isinstance(error.param, click.Argument) and not error.param.metavar:
-        # What click would call it is the list of its choices, which the message has anyway.
+        # Click would name the argument by its choices, which the message contains anyway.
         error.param_hint = f"'{(error.param.name or '').upper()}'"
     return " ".join(error.format_message().split())
 

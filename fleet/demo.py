@@ -1,6 +1,6 @@
-"""`fleet demo`: three simulated cars do a job as real processes; everything is recorded, checked and ready for Rerun.
+"""`fleet demo`: runs a job with three simulated cars as real processes, records and checks it, and exports it to Rerun.
 
-Each check compares what was believed with what was so: the simulator publishes the true mode, motors and LED of a car.
+Each check compares a belief with the truth: the simulator publishes the true mode, motors and LED of a car.
 """
 
 import json
@@ -11,12 +11,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import click
 
@@ -26,18 +26,19 @@ from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
 
-CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
-PLAN: Final = """\
+DEMO_CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
+DEMO_PLAN: Final = """\
 # Red follows the line, green keeps clear of walls, blue is driven by hand.
 cars:
   red: tracking
   green: obstacle_avoidance
 """
-LED: Final = {"red": (255, 0, 16), "green": (0, 255, 64), "blue": (0, 64, 255)}
-PATIENCE_S: Final = 30.0
-"""What is to be so is waited for so long: on a busy machine a process takes 10 s to start, and news of it a second."""
-END_S: Final = 30.0
-"""How long a process may take to end: the longest stop recipe, its worst case, a second, and as long again."""
+LED_COLORS: Final = {"red": (255, 0, 16), "green": (0, 255, 64), "blue": (0, 64, 255)}
+# On a busy machine, a process takes 10 s to start, and a message a second.
+CHECK_TIMEOUT_S: Final = 30.0
+"""Timeout for a condition of a check."""
+PROCESS_EXIT_TIMEOUT_S: Final = 30.0
+"""Timeout for the exit of a process: twice the longest stop sequence with its worst case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class Check:
 
 @dataclass(slots=True)
 class Demo:
-    """The processes of one run, and what was seen."""
+    """One run: its checks, and the messages that it saw."""
 
     folder: Path
     endpoint: str
@@ -59,18 +60,18 @@ class Demo:
     checks: list[Check] = field(default_factory=list)
     truth: dict[str, pb.Truth] = field(default_factory=dict)
     published: dict[str, set[int]] = field(default_factory=dict)
-    """Sequence numbers that this process saw, by key: a second witness to the recording."""
+    """Sequence numbers that this process received, by key. The recording must contain them."""
 
     def check(self, name: str, words: str, *, ok: bool) -> None:
-        """Note a check and say how it went."""
+        """Note a check and print its result."""
         self.checks.append(Check(name, ok, words))
         mark = click.style("ok  ", fg="green") if ok else click.style("FAIL", fg="red", bold=True)
         self.say(f"{mark} {name}: {words}")
 
-    def witness(self, sample: bus.Sample) -> None:
-        """See every publication; on a Zenoh thread."""
+    def on_sample(self, sample: bus.Sample) -> None:
+        """Note a publication. Runs on a Zenoh thread."""
         key = keys.parse(sample.key)
-        if key is None or key.car not in CARS:
+        if key is None or key.car not in DEMO_CARS:
             return
         if key.topic == "sim/truth":
             truth = sample.message()
@@ -79,8 +80,8 @@ class Demo:
         else:
             self.published.setdefault(sample.key, set()).add(sample.sequence)
 
-    def until(self, condition: Callable[[], object], seconds: float = PATIENCE_S) -> bool:
-        """Wait until it holds; False if it did not in time."""
+    def wait_until(self, condition: Callable[[], object], seconds: float = CHECK_TIMEOUT_S) -> bool:
+        """Wait until the condition holds. Return False after the timeout."""
         deadline = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > deadline:
@@ -88,9 +89,9 @@ class Demo:
             time.sleep(0.02)
         return True
 
-    def truly(self, car: str, field_name: str, value: object) -> bool:
-        """Wait until the simulated car's truth says so; False if it did not in time."""
-        return self.until(lambda: getattr(self.truth[car], field_name) == value)
+    def wait_for_truth(self, car: str, field_name: str, value: object) -> bool:
+        """Wait until a field of the simulated car's truth has this value. Return False after the timeout."""
+        return self.wait_until(lambda: getattr(self.truth[car], field_name) == value)
 
 
 @click.command(
@@ -107,7 +108,7 @@ examples:
     "--view/--no-view", default=None, help="open Rerun's viewer afterwards (default: ask, if there is a display)"
 )
 def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
-    """Three simulated cars of two platforms do a job: modes, driving, LEDs, a cut link, a stop; recorded, checked."""
+    """Run a job with three simulated cars of two platforms: modes, driving, LEDs, a cut link, a stop. Check it."""
 
     def say(text: str) -> None:
         click.echo(text, err=as_json)
@@ -144,7 +145,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
     began = time.monotonic()
     with ExitStack() as stack:
         _started(stack, _process(run, "hub", "schemas.bus.hub", "--endpoint", run.endpoint))
-        if not run.until(lambda: bus.accepts(run.endpoint)):
+        if not run.wait_until(lambda: bus.accepts(run.endpoint)):
             raise click.ClickException(f"no hub came up at {run.endpoint}")
         recorder = _started(
             stack,
@@ -159,7 +160,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
         session = Path(_line(recorder, "recorder")["session"])
         client = stack.enter_context(Fleet(run.endpoint, sender="demo", kind="person"))
         watcher = stack.enter_context(bus.Bus.open(run.endpoint))
-        watcher.subscribe(f"{keys.DEFAULT_FLEET}/**", run.witness)
+        watcher.subscribe(f"{keys.DEFAULT_FLEET}/**", run.on_sample)
         simulator, links = _simulator(run, stack, session)
         gateways = {car: _started(stack, _gateway(run, car, link)) for car, link in links.items()}
         _act(run, stack, client, simulator, session)
@@ -185,30 +186,32 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
 
 def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Popen[str]", session: Path) -> None:
     run.say("three gateways bring their cars to a known state")
-    ready = run.until(lambda: _motors(client) == dict.fromkeys(CARS, "off") and run.truth.keys() == CARS.keys())
+    ready = run.wait_until(
+        lambda: _motors(client) == dict.fromkeys(DEMO_CARS, "off") and run.truth.keys() == DEMO_CARS.keys()
+    )
     run.check("cars ready", f"motors {_motors(client)}", ok=ready)
     if not ready:
         raise click.ClickException("the cars did not get ready: is the machine overloaded?")
 
-    for car, (r, g, b) in LED.items():
+    for car, (r, g, b) in LED_COLORS.items():
         outcome = client.car(car).led(r, g, b)
-        colour = f"#{r:02x}{g:02x}{b:02x}"
-        seen = outcome.ok and run.truly(car, "led", colour)
-        run.check(f"{car} LED", f"asked {colour}, truly {run.truth[car].led}", ok=seen)
+        color = f"#{r:02x}{g:02x}{b:02x}"
+        seen = outcome.ok and run.wait_for_truth(car, "led", color)
+        run.check(f"{car} LED", f"asked {color}, truly {run.truth[car].led}", ok=seen)
 
     readings: list[Reading] = []
 
     def all_measured() -> bool:
         readings[:] = client.get("*/sensor/range")
-        return len(readings) == len(CARS)
+        return len(readings) == len(DEMO_CARS)
 
-    seen = run.until(all_measured)
-    told = ", ".join(f"{reading.key} {reading.value.range_m:.2f} m" for reading in readings)
-    run.check("sensors by key", told, ok=seen)
+    seen = run.wait_until(all_measured)
+    ranges = ", ".join(f"{reading.key} {reading.value.range_m:.2f} m" for reading in readings)
+    run.check("sensors by key", ranges, ok=seen)
 
     run.say("the coordinator assigns modes")
     plan = session / "plan.yaml"
-    plan.write_text(PLAN, encoding="utf-8")
+    plan.write_text(DEMO_PLAN, encoding="utf-8")
     coordinator = _started(
         stack,
         _process(
@@ -220,31 +223,31 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
         ),
     )
     for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):
-        seen = run.truly(car, "mode", mode)
+        seen = run.wait_for_truth(car, "mode", mode)
         run.check(f"{car} mode", f"asked {mode}, truly {run.truth[car].mode}", ok=seen)
-    seen = run.until(lambda: _state(client, "red", "mode").verdict == "confirmed")
+    seen = run.wait_until(lambda: _state(client, "red", "mode").verdict == "confirmed")
     run.check("red mode known", _state(client, "red", "mode").evidence, ok=seen)
 
     run.say("red's link is cut; meanwhile blue is driven by hand")
     _ask(simulator, {"car": "red", "fault": "link_drop"})
     start = (run.truth["blue"].x_m, run.truth["blue"].y_m)
     outcome = client.car("blue").drive("forward", 1.0)
-    moved = run.until(lambda: (run.truth["blue"].x_m, run.truth["blue"].y_m) != start)
-    stood = run.until(lambda: run.truth["blue"].motor_left == 0 == run.truth["blue"].motor_right)
+    moved = run.wait_until(lambda: (run.truth["blue"].x_m, run.truth["blue"].y_m) != start)
+    stood = run.wait_until(lambda: run.truth["blue"].motor_left == 0 == run.truth["blue"].motor_right)
     run.check(
         "blue driven",
         f"{outcome.words or outcome.phase}; moved {moved}, stopped by itself {stood}",
         ok=outcome.ok and moved and stood,
     )
-    lost = run.until(lambda: _state(client, "red", "link").state == "lost")
+    lost = run.wait_until(lambda: _state(client, "red", "link").state == "lost")
     run.check(
         "red cut",
         f"link {_state(client, 'red', 'link').state}, motors {_state(client, 'red', 'safety').motors}",
         ok=lost,
     )
-    # Not after so many seconds: on a busy machine they would be over before it was seen that it is lost.
+    # The link comes back now, and not after a fixed time: on a busy machine that might pass before the loss is noticed.
     _ask(simulator, {"car": "red", "fault": "link_drop", "for_s": 0})
-    back = run.until(
+    back = run.wait_until(
         lambda: (
             _state(client, "red", "mode").verdict == "confirmed"
             and _state(client, "red", "link").state == "online"
@@ -260,14 +263,14 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
         ", ".join(f"{each.car} {each.phase} in {each.took_s:.2f} s" for each in outcomes),
         ok=all(each.ok for each in outcomes),
     )
-    off = run.until(lambda: all(map(_at_rest, run.truth.values())))
+    off = run.wait_until(lambda: all(map(_at_rest, run.truth.values())))
     run.check(
         "all motors off",
         str({car: (truth.motor_left, truth.motor_right) for car, truth in sorted(run.truth.items())}),
         ok=off,
     )
-    moved = run.until(lambda: not all(map(_at_rest, run.truth.values())), 1.5)
-    holds = {car: _state(client, car, "safety").hold.by for car in CARS}
+    moved = run.wait_until(lambda: not all(map(_at_rest, run.truth.values())), 1.5)
+    holds = {car: _state(client, car, "safety").hold.by for car in DEMO_CARS}
     run.check(
         "held", f"on hold by {sorted(set(holds.values()))}, none moved again", ok=not moved and all(holds.values())
     )
@@ -293,7 +296,7 @@ def _motors(client: Fleet) -> dict[str, str]:
 
 
 def _check_recording(run: Demo, session: Path) -> Counter[str]:
-    """Read with the stock reader alone: every message that was published is there, each key's numbers without a gap."""
+    """Check with the mcap package's reader that the recording has every published message, without gaps."""
     from mcap.reader import make_reader
 
     recorded: dict[str, set[int]] = {}
@@ -315,7 +318,7 @@ def _check_recording(run: Demo, session: Path) -> Counter[str]:
 
 
 def _replay(run: Demo, session: Path, recorded: Counter[str]) -> Path | None:
-    """Make the .rrd, and read it back with Rerun: each key has as many messages in it as in the recording."""
+    """Export the recording to Rerun, and check that each key has the same number of messages."""
     from fleet.replay.rerun.export import rows
 
     rrd = session / "session.rrd"
@@ -336,7 +339,7 @@ def _replay(run: Demo, session: Path, recorded: Counter[str]) -> Path | None:
 
 @contextmanager
 def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[subprocess.Popen[str]]":
-    """A process of its own group, so that Ctrl-C at the terminal comes to it from here, and in order."""
+    """Run a process in its own group. So Ctrl-C at the terminal reaches only us, and we end the processes in order."""
     environment = os.environ | {"FLEET_STATE_DIR": str(run.folder / ".state")}
     process = subprocess.Popen(
         [sys.executable, "-m", module, *arguments],
@@ -347,9 +350,10 @@ def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[su
         env=environment,
         process_group=0 if os.name == "posix" else None,
     )
-    said: list[str] = []
+    last_lines: deque[str] = deque(maxlen=3)
     assert process.stderr is not None
-    reader = threading.Thread(target=_drain, args=(process.stderr, said), name=f"log of {name}")
+    # `extend` reads the pipe to its end, so that the process never blocks on it.
+    reader = threading.Thread(target=last_lines.extend, args=(process.stderr,), name=f"log of {name}")
     reader.start()
     try:
         yield process
@@ -357,57 +361,40 @@ def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[su
         if process.poll() is None:
             process.terminate()
         try:
-            process.wait(END_S)
+            process.wait(PROCESS_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
-            run.check(f"{name} ends", f"it did not within {END_S:g} s and was killed", ok=False)
+            run.check(f"{name} ends", f"it did not within {PROCESS_EXIT_TIMEOUT_S:g} s and was killed", ok=False)
         reader.join()
         for pipe in (process.stdin, process.stdout, process.stderr):
             assert pipe is not None
             pipe.close()
         if process.returncode not in (0, -signal.SIGTERM):
-            run.say(f"{name} ended with {process.returncode}: {''.join(said[-3:]).strip()}")
+            run.say(f"{name} ended with {process.returncode}: {''.join(last_lines).strip()}")
 
 
 def _started(stack: ExitStack, process: "AbstractContextManager[subprocess.Popen[str]]") -> "subprocess.Popen[str]":
-    """Start a process that the stack ends. A signal that comes meanwhile waits: it would leave the process behind."""
+    """Start a process that the stack ends. Delay signals meanwhile, which could leave the process behind."""
     with signals.held_back():
         return stack.enter_context(process)
 
 
-def _drain(pipe: IO[str], said: list[str]) -> None:
-    for line in pipe:
-        said.append(line)
-        del said[:-20]
-
-
 def _simulator(run: Demo, stack: ExitStack, session: Path) -> "tuple[subprocess.Popen[str], dict[str, str]]":
     links = {"red": f"pty:{session / 'red.tty'}", "green": "pty", "blue": "tcp://127.0.0.1:0"}
-    cars = [part for car, platform in CARS.items() for part in ("--car", f"{car}:{platform}:{links[car]}")]
+    cars = [part for car, platform in DEMO_CARS.items() for part in ("--car", f"{car}:{platform}:{links[car]}")]
     where = ("--connect", run.endpoint, "--with-parent")
     process = _started(stack, _process(run, "simulator", "gateway.cli", "sim", *cars, "--seed", "7", *where))
-    told = [_line(process, "simulator") for _ in CARS]
-    return process, {each["car"]: each["link"] for each in told}
+    lines = [_line(process, "simulator") for _ in DEMO_CARS]
+    return process, {each["car"]: each["link"] for each in lines}
 
 
 def _gateway(run: Demo, car: str, link: str) -> Any:
-    arguments = (
-        "run",
-        "--car",
-        car,
-        "--link",
-        link,
-        "--platform",
-        CARS[car],
-        "--connect",
-        run.endpoint,
-        "--with-parent",
-    )
-    return _process(run, f"gateway of {car}", "gateway.cli", *arguments)
+    options = ("--car", car, "--link", link, "--platform", DEMO_CARS[car], "--connect", run.endpoint, "--with-parent")
+    return _process(run, f"gateway of {car}", "gateway.cli", "run", *options)
 
 
 def _line(process: "subprocess.Popen[str]", name: str) -> dict[str, Any]:
-    """The next JSON line of a process."""
+    """Return the next JSON line of a process."""
     assert process.stdout is not None
     line = process.stdout.readline()
     if not line:
@@ -417,9 +404,9 @@ def _line(process: "subprocess.Popen[str]", name: str) -> dict[str, Any]:
 
 
 def _ended(process: "subprocess.Popen[str]") -> int | None:
-    """The exit code; None if it did not end in time."""
+    """Return the exit code, None after the timeout."""
     try:
-        return process.wait(END_S)
+        return process.wait(PROCESS_EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         return None
 

@@ -200,9 +200,7 @@ class CarGateway:
 
     async def _has_rival(self) -> bool:
         """Return True if another gateway of the car has to end. Raise AlreadyServed if this one has to."""
-        others = await asyncio.to_thread(self._service.others)
-        self._service.refuse([other for other in others if other.boot_id < self._bus.boot_id])
-        return bool(others)
+        return await asyncio.to_thread(self._service.singleton.check_first)
 
     async def _is_port_in_use(self) -> bool:
         """Return True if another gateway, which has to end, may still have the port open."""

@@ -1,11 +1,11 @@
 """Persists the safety state of one car (its hold, its e-stops, the ended ones) in a small JSON file."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from gateway.control.safety import Estop, Hold, PersistedSafety
+from schemas.atomic_file import write_atomically
 
 
 class SafetyStateFile:
@@ -39,12 +39,7 @@ class SafetyStateFile:
             ],
             "ended": list(state.ended),
         }
-        scratch = self.path.with_suffix(".new")
-        with scratch.open("w", encoding="utf-8") as file:
-            json.dump(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        scratch.replace(self.path)
+        write_atomically(self.path, json.dumps(content).encode(), sync=True)
 
 
 def _parse(content: Any, now_ns: int) -> PersistedSafety:

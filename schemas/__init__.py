@@ -1,6 +1,6 @@
 """What all processes of the fleet share: keys, topics, messages and the bus.
 
-Read `keys` and `topics` first, then `messages` (classes of `proto/`, generated into `gen/`) and `bus` (Zenoh).
-`process` holds what every process does at its start and end. `gateway run` imports nothing else from outside itself, so
-no framework may come in here but where a module says so.
+Read `keys`, `topics` and `commands` first, then `messages` (classes of `proto/`, generated into `gen/`) and `bus`.
+`process` contains the common parts of the start and the end of a process. `gateway run` imports no other package of
+ours, so a module here that imports a framework says so.
 """

@@ -1,4 +1,4 @@
-"""Generate schemas/gen from schemas/proto, or check that it is up to date; run by `make proto` and `make lint`."""
+"""Generates schemas/gen from schemas/proto, or checks that it is up to date (`make proto`, `make lint`)."""
 
 import sys
 import tempfile
@@ -11,7 +11,7 @@ GENERATED = HERE / "gen"
 
 
 def generate(out: Path) -> list[Path]:
-    """Run protoc over every .proto file into `out`; returns the files made."""
+    """Run protoc on every .proto file. Return the files that it wrote into `out`."""
     from grpc_tools import protoc  # type: ignore[import-untyped]  # ships no types
 
     includes = [f"-I{SOURCES}", f"-I{resources.files('grpc_tools') / '_proto'}"]

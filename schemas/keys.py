@@ -1,4 +1,4 @@
-"""Key expressions: build them, take them apart, check names. Pure; what lies under the keys is in topics.py."""
+"""Builds, parses and checks keys, key expressions and names. Pure. `topics` lists the topics under the keys."""
 
 import re
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ SUPERVISOR: Final = "@supervisor"
 SIMULATOR: Final = "@sim"
 OPERATOR: Final = "@operator"
 REPLAY: Final = "@replay"
-"""`<fleet>/@replay/<session>`: the token that says that a fleet is a recording."""
+"""`<fleet>/@replay/<session>` is the token of a fleet that is a replay."""
 
 
 class BadKey(ValueError):
-    """A name or a key expression that is not allowed; its text says which, and what is."""
+    """An invalid name or key expression. The text names it and the rule."""
 
 
 def check_name(name: str, what: str = "car name") -> str:
-    """Return `name` if it may be a car's or a fleet's; raises BadKey naming it and the rule."""
+    """Return `name` if it is a valid name of a car or fleet. Raises BadKey."""
     if not _NAME.fullmatch(name):
         raise BadKey(f"{what} {name!r} is not allowed: use {NAME_RULE}")
     return name
@@ -30,7 +30,7 @@ def check_name(name: str, what: str = "car name") -> str:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A concrete key, taken apart: `fleet/red/sensor/range` is (fleet, red, sensor/range)."""
+    """The parts of a concrete key: `fleet/red/sensor/range` is (fleet, red, sensor/range)."""
 
     fleet: str
     car: str
@@ -41,44 +41,44 @@ class Key:
 
 
 def parse(key: str) -> Key | None:
-    """Take a concrete key apart; None if it has no fleet and car."""
+    """Split a concrete key. Return None if it has no fleet and car."""
     fleet, _, rest = key.partition("/")
     car, _, topic = rest.partition("/")
     return Key(fleet, car, topic) if fleet and car else None
 
 
 def topic_key(fleet: str, car: str, topic: str) -> str:
-    """The key of one topic of one car, or of a service (`@recorder`)."""
+    """Return the key of one topic of one car, or of a service (`@recorder`)."""
     return f"{fleet}/{car}/{topic}"
 
 
 def command_key(fleet: str, car: str, verb: str) -> str:
-    """The key on which a car takes a command."""
+    """Return the key of a car's command."""
     return f"{fleet}/{car}/@cmd/{verb}"
 
 
 def car_token(fleet: str, car: str) -> str:
-    """The liveliness token of a car's gateway."""
+    """Return the liveliness token of a car's gateway."""
     return f"{fleet}/{car}"
 
 
 def operator_token(fleet: str, sender: str) -> str:
-    """The liveliness token of a sender that wants to be watched; `sender` must be one chunk without wildcards."""
+    """Return the liveliness token of a sender. Raises BadKey unless `sender` is one chunk without wildcards."""
     if not sender or set(sender) & set("/*$#?"):
         raise BadKey(f"sender {sender!r} is not allowed: no /, *, $, # or ?, at least one character")
     return f"{fleet}/{OPERATOR}/{sender}"
 
 
 def recorded(fleet: str) -> tuple[str, ...]:
-    """What a recorder subscribes to: `**` does not match chunks that begin with @."""
+    """Return the key expressions of a recorder's subscriptions. `**` does not match chunks that begin with @."""
     services = (f"{fleet}/{service}/**" for service in (COORDINATOR, RECORDER, SUPERVISOR, SIMULATOR))
     return (f"{fleet}/**", *services, f"{fleet}/*/@cmd/drive")
 
 
 def expand(expression: str, fleet: str = DEFAULT_FLEET) -> str:
-    """Write a short form out: `red` is every reading of red; `red/sensor/range`, `*/sensor/battery` get the fleet.
+    """Expand a short form: `red` is every reading of red; `red/sensor/range`, `*/sensor/battery` get the fleet.
 
-    An expression that begins with the fleet's name (or with `**`) is taken as written. Raises BadKey.
+    An expression that begins with the fleet's name (or with `**`) stays as it is. Raises BadKey.
     """
     text = expression.strip("/")
     if not text or "//" in text or set(text) & set("#? \t\n"):

@@ -1,4 +1,4 @@
-"""Message classes by name, their encodings, and the JSON mapping that any Zenoh tool can read; no bus here."""
+"""Message classes by name, their encodings, and the JSON mapping that any Zenoh tool can read. No bus here."""
 
 import json
 from functools import cache
@@ -15,12 +15,12 @@ JSON: Final = "application/json"
 
 
 class BadPayload(ValueError):
-    """A payload that is not the message it should be; its text says why."""
+    """A payload that is not the expected message. The text gives the reason."""
 
 
 @cache
 def message_class(name: str) -> type[Message]:
-    """The class of a full message name (`fleet.v1.Range`, `foxglove.Log`); raises KeyError for an unknown one."""
+    """Return the class of a full message name (`fleet.v1.Range`, `foxglove.Log`). Raises KeyError if it is unknown."""
     if name == "foxglove.Log":
         from foxglove_schemas_protobuf.Log_pb2 import Log
 
@@ -33,30 +33,30 @@ def message_class(name: str) -> type[Message]:
 
 
 def encoding_of(name: str) -> str:
-    """The Zenoh encoding of a message: the full name stands in the schema part."""
+    """Return the Zenoh encoding of a message, with the full name in the schema part."""
     return f"{PROTOBUF};{name}"
 
 
 def name_in(encoding: str) -> str | None:
-    """The message name in a Zenoh encoding; None if it is not protobuf with a schema part."""
+    """Return the message name in a Zenoh encoding. None if it is not protobuf with a schema part."""
     kind, _, name = encoding.partition(";")
     return name if kind == PROTOBUF and name else None
 
 
 def to_dict(message: Message) -> dict[str, Any]:
-    """Protobuf's JSON mapping with the field names of the .proto; fields that were not measured are left out."""
+    """Return protobuf's JSON mapping with the field names of the .proto, without fields that were not measured."""
     return json_format.MessageToDict(
         message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
     )
 
 
 def to_json(message: Message) -> str:
-    """`to_dict` as one line of JSON."""
+    """Return `to_dict` as one line of JSON."""
     return json.dumps(to_dict(message), separators=(",", ":"))
 
 
 def parse(name: str, payload: bytes, encoding: str) -> Message:
-    """Read a payload as message `name`, protobuf or JSON by its encoding; raises BadPayload."""
+    """Parse a payload as message `name`, protobuf or JSON by its encoding. Raises BadPayload."""
     kind, _, schema = encoding.partition(";")
     message = message_class(name)()
     if kind == PROTOBUF:
@@ -67,7 +67,7 @@ def parse(name: str, payload: bytes, encoding: str) -> Message:
         except DecodeError:
             raise BadPayload(f"the payload does not parse as {name}") from None
         return message
-    # Any other encoding is read as JSON: shells and REST clients seldom set one.
+    # Parse any other encoding as JSON: shells and REST clients seldom set one.
     try:
         json_format.Parse(payload, message)
     except (json_format.ParseError, UnicodeDecodeError) as error:
@@ -78,7 +78,7 @@ def parse(name: str, payload: bytes, encoding: str) -> Message:
 
 @cache
 def descriptor_set(name: str) -> bytes:
-    """The FileDescriptorSet of a message, dependencies first, as MCAP embeds it in a schema."""
+    """Return the FileDescriptorSet of a message, dependencies first, as MCAP embeds it in a schema."""
     files = FileDescriptorSet()
     seen: set[str] = set()
 

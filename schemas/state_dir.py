@@ -1,4 +1,4 @@
-"""The directory of what outlives a process: e-stops, holds, runs and their logs, what a coordinator leaves."""
+"""The directory of persisted state: e-stops, holds, runs with their logs, the state of coordinators."""
 
 import hashlib
 import os
@@ -17,7 +17,7 @@ _HASH_LENGTH: Final = 8
 
 
 def default_directory() -> Path:
-    """Return FLEET_STATE_DIR, else the user's state directory as the platform has it."""
+    """Return FLEET_STATE_DIR, else the user's state directory on this platform."""
     if chosen := os.environ.get(STATE_VARIABLE):
         return Path(chosen)
     if sys.platform == "darwin":
@@ -28,14 +28,12 @@ def default_directory() -> Path:
 
 
 def directory_of(endpoint: str, directory: Path | None = None) -> Path:
-    """Return the place of one bus in a state directory: two fleets of one name at two hubs share nothing.
-
-    The default endpoint has the directory itself, as every endpoint had before: an e-stop survives the upgrade.
-    """
+    """Return the state directory of one bus, so that fleets of one name at two hubs do not share state."""
+    # The default endpoint uses the directory itself, as all endpoints did before. So e-stops survive the upgrade.
     directory = default_directory() if directory is None else directory
     endpoint = _LOCALHOST.sub("127.0.0.1", endpoint.lower())
     if endpoint == DEFAULT_ENDPOINT:
         return directory
-    # The hash tells apart what the readable part does not, such as [::1] and a host named 1.
+    # The hash distinguishes endpoints with the same readable part, such as [::1] and a host named 1.
     readable = _NO_NAME.sub("-", endpoint)[:_NAME_LENGTH]
     return directory / "buses" / f"{readable}-{hashlib.sha256(endpoint.encode()).hexdigest()[:_HASH_LENGTH]}"

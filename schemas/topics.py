@@ -9,17 +9,16 @@ from typing import Final
 
 PROTOBUF: Final = "application/protobuf"
 HISTORY: Final = 1500  # docs/reference/keys.md#topics: one minute of the fastest readings
-HELD_S: Final = 10.0
-"""How long a publication can be had again by who missed it: a hub or a recorder is back after two or three seconds."""
-_HELD_AT_LEAST: Final = 100  # events and states come in bursts
+# A hub or a recorder is back after two or three seconds.
+CACHE_S: Final = 10.0
+"""Time for which a publisher caches its publications for backfill."""
+_MIN_CACHE_SIZE: Final = 100  # events and states come in bursts
 
 
 class Qos(StrEnum):
-    """How a publication travels; bus.py turns it into Zenoh's priority, congestion control and express.
+    """The quality of service of a publication. `bus.publisher` maps it to Zenoh's options."""
 
-    Publications are dropped under congestion, never blocked: one stalled subscriber must not freeze a gateway.
-    """
-
+    # Under congestion, Zenoh drops publications and never blocks: one stalled subscriber must not freeze a gateway.
     READING = "reading"  # batched
     STATE = "state"  # overtakes readings
     COMMAND = "command"  # overtakes everything, sent at once
@@ -27,7 +26,7 @@ class Qos(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One row: what is published under `<fleet>/<car>/<name>`."""
+    """One row of the table: the messages under `<fleet>/<car>/<name>`."""
 
     name: str
     message: str
@@ -35,38 +34,38 @@ class Topic:
     about: str
     qos: Qos
     rate_hz: float = 0.0
-    """Expected rate at its fastest; 0: on events only."""
+    """Maximum expected rate. 0 for events."""
     stale_after_s: float | None = None
-    """Age at which a value no longer says how things are; None: it never expires."""
+    """Age at which a value is stale. None if it never expires."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Unit by field, where a field has one."""
+    """Units by field, for fields with a unit."""
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Lowest and highest published value by field (docs/reference/protocol.md#readings)."""
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """All published values by field, where a field has one of a few words."""
     recorded: bool = True
     entity: str = ""
-    """Rerun entity below the car; empty: shown through frames and logs only."""
+    """Rerun entity below the car. Empty if it is shown through frames and logs only."""
 
     @property
     def encoding(self) -> str:
-        """The Zenoh encoding of its messages: the full name stands in the schema part."""
+        """The Zenoh encoding of its messages, with the full name in the schema part."""
         return f"{PROTOBUF};{self.message}"
 
     @property
     def family(self) -> str:
-        """`sensor`, `state`, `frame`, `event` or `sim`; a service's topics have none."""
+        """`sensor`, `state`, `frame`, `event` or `sim`. The service's name for the topics of a service."""
         return self.name.partition("/")[0]
 
     @property
-    def kept(self) -> int:
-        """How many values a gateway keeps for queries: of a reading its history, of a state the latest."""
+    def history_size(self) -> int:
+        """Number of values that a gateway stores for queries: the history of a reading, the latest state."""
         return {"sensor": HISTORY, "state": 1}.get(self.family, 0)
 
     @property
-    def held(self) -> int:
-        """How many publications its publisher holds for who missed them, a recorder above all."""
-        return max(_HELD_AT_LEAST, math.ceil(HELD_S * self.rate_hz))
+    def cache_size(self) -> int:
+        """Number of publications that a publisher caches for backfill."""
+        return max(_MIN_CACHE_SIZE, math.ceil(CACHE_S * self.rate_hz))
 
 
 # A mode-0 report comes about once a second and may be blocked for another (docs/reference/protocol.md#blocking-times),
@@ -276,37 +275,11 @@ SERVICE_TOPICS: Final = (
 
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({topic.name: topic for topic in CAR_TOPICS + SERVICE_TOPICS})
 
-COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        verb: f"fleet.v1.{verb.capitalize()}Command"
-        for verb in (
-            "drive",
-            "mode",
-            "led",
-            "light",
-            "servo",
-            "arm",
-            "whistle",
-            "speed",
-            "fan",
-            "stop",
-            "estop",
-            "resume",
-            "lease",
-            "find",
-        )
-    }
-)
-"""Verb to the full name of its payload message."""
-
-STOPS: Final = ("stop", "estop")
-"""The verbs that need no payload, and are obeyed whatever is in it."""
-
 RESULT: Final = "fleet.v1.Result"
 
 
 def of_key(key: str) -> Topic | None:
-    """The topic of a concrete key (`fleet/red/sensor/range`), None if it is not one of the table's."""
+    """Return the topic of a concrete key (`fleet/red/sensor/range`). None if it is not in the table."""
     _, _, rest = key.partition("/")
     if rest.startswith("@"):
         return TOPICS.get(rest)

@@ -1,6 +1,7 @@
-"""Commands as values, and the methods that make them: the same names for the sync and the async client. Pure.
+"""Command requests, and the methods that make them for the blocking and the asyncio client. Pure.
 
-Whether a car may or can carry a command out is its gateway's to judge; here only what no gateway could take is refused.
+Each gateway decides whether its car may and can carry out a command. Here, only values that no gateway accepts are
+rejected.
 """
 
 import math
@@ -14,32 +15,32 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 R = TypeVar("R")
 
-LONGEST_DRIVE_S: Final = 3600.0
-"""No gateway allows more; each allows 10 s unless it was started with a longer `--longest-drive`."""
+MAX_DRIVE_S: Final = 3600.0
+"""Maximum duration of a drive. A gateway allows 10 s unless it was started with a longer `--longest-drive`."""
 
 STOP_TTL_S: Final = 10.0
-"""How old a stop may be when it arrives: a drive that was held up is refused after 0.5 s, its end is wanted still."""
+"""Maximum age of a stop when it arrives. A delayed drive is rejected after 0.5 s, a delayed stop is still useful."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandRequest:
-    """One command before it has a sender, an id and a time."""
+    """One command without a sender, an id and a time."""
 
     verb: str
     message: Any
-    """Its payload, a `fleet.v1.<Verb>Command`; Any: the generated classes share no type with these fields."""
+    """The payload, a `fleet.v1.<Verb>Command`. Any, because the generated classes have no common type."""
     until: Until = Until.SENT
-    lasts_s: float = 0.0
-    """How long a drive holds, s."""
+    duration_s: float = 0.0
+    """Duration of a drive, s."""
     take: bool = False
-    """As a person, also if another person drives the car."""
+    """True if a person takes the car over from another person."""
 
 
 def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) -> CommandRequest:
-    """Hold a motion for `duration_s` (at most 10 s, or what its gateway allows); `wait`: until the drive is over."""
-    if not (math.isfinite(duration_s) and 0 < duration_s <= LONGEST_DRIVE_S):
+    """Request a motion for `duration_s` (at most 10 s, or the gateway's limit). wait: wait for the end of the drive."""
+    if not (math.isfinite(duration_s) and 0 < duration_s <= MAX_DRIVE_S):
         raise ValueError(
-            f"duration {duration_s:g} s is not allowed: more than 0 and at most {LONGEST_DRIVE_S:g} s; "
+            f"duration {duration_s:g} s is not allowed: more than 0 and at most {MAX_DRIVE_S:g} s; "
             "to go on, drive again"
         )
     message = pb.DriveCommand(motion=motion, duration_s=duration_s)
@@ -50,90 +51,90 @@ def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) ->
 
 
 def mode_request(mode: str) -> CommandRequest:
-    """Bring the car into a mode."""
+    """Request a mode."""
     return CommandRequest("mode", pb.ModeCommand(mode=mode))
 
 
 def led_request(r: int, g: int, b: int) -> CommandRequest:
-    """The colour LED, 0..255 each."""
+    """Request a color of the LED, 0..255 each."""
     for name, value in (("r", r), ("g", g), ("b", b)):
-        _whole(name, value, 255)
+        _check_range(name, value, 255)
     return CommandRequest("led", pb.LedCommand(r=r, g=g, b=b))
 
 
 def servo_request(servo: str, action: str = "", deg: int | None = None) -> CommandRequest:
-    """Move a servo by an action, or the front one to `deg` (0..180)."""
+    """Request an action of a servo, or an angle (0..180) of the front one."""
     message = pb.ServoCommand(servo=servo, action=action)
     if deg is not None:
-        _whole("deg", deg, 180)
+        _check_range("deg", deg, 180)
         message.deg = deg
     return CommandRequest("servo", message)
 
 
 def arm_request(joint_deg: Sequence[int]) -> CommandRequest:
-    """Six joints, 0..180 degrees each."""
+    """Request angles of the arm's six joints, 0..180 degrees each."""
     if len(joint_deg) != 6:
         raise ValueError(f"an arm has six joints, {len(joint_deg)} given")
     for number, value in enumerate(joint_deg, start=1):
-        _whole(f"joint {number}", value, 180)
+        _check_range(f"joint {number}", value, 180)
     return CommandRequest("arm", pb.ArmCommand(joint_deg=joint_deg))
 
 
 def light_request(light: str) -> CommandRequest:
-    """The light's colour, or off."""
+    """Request a color of the light, or off."""
     return CommandRequest("light", pb.LightCommand(light=light))
 
 
 def whistle_request() -> CommandRequest:
-    """Sound once."""
+    """Request one whistle."""
     return CommandRequest("whistle", pb.WhistleCommand())
 
 
 def speed_request(step: str) -> CommandRequest:
-    """One step up or down."""
+    """Request one speed step up or down."""
     return CommandRequest("speed", pb.SpeedCommand(step=step))
 
 
 def fan_request(state: str | None = None) -> CommandRequest:
-    """Toggle the fan, or bring it to a state."""
+    """Request a toggle of the fan, or a state."""
     return CommandRequest("fan", pb.FanCommand(state=state or ""))
 
 
 def lease_request(*, take: bool = False, release: bool = False) -> CommandRequest:
-    """Have the car for 2 s, or give it back; `take`: as a person, also from another person."""
+    """Request a lease for 2 s, or its release. take: as a person, take the car over from another person."""
     return CommandRequest("lease", pb.LeaseCommand(release=release), take=take)
 
 
 def find_request() -> CommandRequest:
-    """Blink and beep."""
+    """Request a blink and a beep."""
     return CommandRequest("find", pb.FindCommand())
 
 
 def stop_request() -> CommandRequest:
-    """Stop, and hold against the coordinator."""
+    """Request a stop and a hold against the coordinator."""
     return CommandRequest("stop", pb.StopCommand(), Until.STOPPED)
 
 
 def estop_request(why: str, scope: str) -> CommandRequest:
-    """Emergency stop; `scope` is car or fleet."""
+    """Request an e-stop. scope: car or fleet."""
     return CommandRequest("estop", pb.EstopCommand(why=why, scope=scope), Until.STOPPED)
 
 
 def resume_request(ids: Sequence[str] = ()) -> CommandRequest:
-    """End the e-stops of these ids; without ids, the hold."""
+    """Request the end of the e-stops of these ids. Without ids, request the end of the hold."""
     return CommandRequest("resume", pb.ResumeCommand(ids=ids))
 
 
-def _whole(name: str, value: int, top: int) -> None:
+def _check_range(name: str, value: int, top: int) -> None:
     if not 0 <= value <= top:
         raise ValueError(f"{name} {value!r} is not allowed: a whole number, 0 to {top}")
 
 
 class CarCommands(ABC, Generic[R]):
-    """The commands of one car. R is `Outcome`, or an awaitable of it.
+    """The commands of one car. R is `Outcome` or an awaitable of it.
 
-    Each waits until the car's gateway says what became of the command (a stop: until it is complete); none raises
-    because of a car: `Outcome.ok` says whether it was carried out. A value out of range raises ValueError.
+    Each command waits for its outcome (a stop waits until it is complete). `Outcome.ok` is True if the command was
+    carried out. Commands raise ValueError for a value out of range, but never because of a car.
     """
 
     def __init__(self, name: str) -> None:
@@ -141,35 +142,38 @@ class CarCommands(ABC, Generic[R]):
 
     @abstractmethod
     def do(self, request: CommandRequest) -> R:
-        """Ask for one command; the methods below make the requests."""
+        """Send one command. The methods below make the requests."""
 
     def drive(self, motion: str, duration_s: float = 0.5, *, wait: bool = True) -> R:
-        """Hold `forward, back, left, right, spin_left, spin_right` for `duration_s`; `stop` ends the motion.
+        """Drive `forward, back, left, right, spin_left, spin_right` for `duration_s`; `stop` ends the motion.
 
-        More than 0 s and at most 10, unless the gateway was started with a longer `--longest-drive`; then the gateway
-        stops the car. Returns when the drive is over; with `wait=False` when the motion was sent, so that another can
-        follow: a drive replaces the one before without a stop between them.
+        The duration is more than 0 s and at most 10, unless the gateway was started with a longer `--longest-drive`.
+        The gateway stops the car at the end. The call returns at the end of the drive. With `wait=False`, it returns
+        when the motion was sent. A further drive replaces the running one without a stop in between.
         """
         return self.do(drive_request(motion, duration_s, wait=wait))
 
     def mode(self, mode: str) -> R:
-        """`manual, remote_control, tracking, obstacle_avoidance, color_led, light_seeking` or `following`."""
+        """Set the mode: `manual, remote_control, tracking, obstacle_avoidance, color_led, light_seeking, following`."""
         return self.do(mode_request(mode))
 
     def led(self, r: int, g: int, b: int) -> R:
-        """The colour LED, 0..255 each."""
+        """Set the color LED, 0..255 each."""
         return self.do(led_request(r, g, b))
 
     def light(self, light: str) -> R:
-        """`white, red, green, blue, cyan, magenta, yellow` or `off`."""
+        """Set the light: `white, red, green, blue, cyan, magenta, yellow` or `off`."""
         return self.do(light_request(light))
 
     def servo(self, servo: str, action: str = "", deg: int | None = None) -> R:
-        """`front`, `horizontal`: left, right, reset; `vertical`: up, down, reset; `front` instead to `deg` (0..180)."""
+        """Move a servo: `front` and `horizontal` left, right or reset; `vertical` up, down or reset.
+
+        deg: the angle (0..180) of `front`, instead of an action.
+        """
         return self.do(servo_request(servo, action, deg))
 
     def arm(self, joint_deg: Sequence[int]) -> R:
-        """Six joints, 0..180 degrees each."""
+        """Move the arm's six joints, 0..180 degrees each."""
         return self.do(arm_request(joint_deg))
 
     def whistle(self) -> R:
@@ -177,23 +181,23 @@ class CarCommands(ABC, Generic[R]):
         return self.do(whistle_request())
 
     def speed(self, step: str) -> R:
-        """One step `up` or `down`: the car knows no absolute speed."""
+        """Change the speed by one step `up` or `down`: the car has no absolute speed."""
         return self.do(speed_request(step))
 
     def fan(self, state: str | None = None) -> R:
-        """Toggle the fan; `on` or `off` only while the gateway knows its state."""
+        """Toggle the fan. `on` and `off` work only while the gateway knows its state."""
         return self.do(fan_request(state))
 
     def stop(self) -> R:
-        """Stop, and hold against the coordinator; waits until the stop is complete."""
+        """Stop the car and hold it against the coordinator. Wait until the stop is complete."""
         return self.do(stop_request())
 
     def estop(self, why: str = "") -> R:
-        """Emergency stop of this car."""
+        """E-stop this car."""
         return self.do(estop_request(why, "car"))
 
     def resume(self, ids: Sequence[str] = ()) -> R:
-        """End the e-stops of these ids; without ids, the hold."""
+        """End the e-stops of these ids. Without ids, end the hold."""
         return self.do(resume_request(ids))
 
     def find(self) -> R:

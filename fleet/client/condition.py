@@ -1,6 +1,6 @@
-"""A condition over the messages that a key expression can match: `range_m < 0.3` of `*/sensor/range`.
+"""A condition on the messages that a key expression can match: `range_m < 0.3` of `*/sensor/range`.
 
-Understood before anything is asked: a field that no message there has is an error, and so is what can never be true.
+It is checked before the first query. Unknown fields and conditions that can never hold are errors.
 """
 
 from collections.abc import Mapping
@@ -22,20 +22,20 @@ _PATTERNS: Final = {
 
 
 def topics_under(written: str) -> list[topics.Topic]:
-    """The topics that a written-out key expression can match, in the table's order."""
+    """Return the topics that a key expression can match, in the table's order."""
     return [topic for topic in topics.TOPICS.values() if intersects(written, _PATTERNS[topic.name])]
 
 
 @dataclass(frozen=True, slots=True)
 class KeyCondition:
-    """What must hold of one reading; each type of message that has the fields has its own expression."""
+    """A condition on one reading. Each message type that has the fields has its own expression."""
 
     text: str
     by_message: Mapping[str, Expression]
 
     @classmethod
     def of(cls, text: str, written: str) -> Self:
-        """Understand a condition over what `written` can match; raises BadExpression, BadKey (nothing is there)."""
+        """Parse a condition on the messages under `written`. Raises BadExpression, or BadKey if it matches no topic."""
         under = topics_under(written)
         if not under:
             there = ", ".join(topics.TOPICS)
@@ -65,12 +65,12 @@ class KeyCondition:
         return self.text
 
     def holds(self, reading: Reading) -> bool | None:
-        """Whether it holds of this reading; None: its message has no such field, or it was not measured."""
+        """Return True if it holds of this reading. None if the message lacks a field or it was not measured."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         return None if expression is None else expression.value(value_in(reading.value))
 
     def read(self, reading: Reading) -> list[str]:
-        """What it reads in a message, as `range_m=0.5`; nothing, if the message has not what it is about."""
+        """Return the values that it reads in a message, such as `range_m=0.5`. Empty if the message lacks a field."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         if expression is None:
             return []

@@ -1,4 +1,4 @@
-"""What gateways still know of the past: how it is asked for, and what is said when they know less than was asked."""
+"""The history of readings that gateways store: queries, merged answers, and words about missing values."""
 
 import itertools
 from collections.abc import Iterable
@@ -8,29 +8,28 @@ from typing import Final
 from fleet.client.reading import Reading
 from schemas import topics
 
-ANSWER_S: Final = 10.0
-"""How long the whole history of many cars may take."""
-TRIES: Final = 4
-LONGEST_S: Final = 7 * 86_400.0
+HISTORY_TIMEOUT_S: Final = 10.0
+"""Timeout for the history of many cars."""
+MAX_HISTORY_QUERIES: Final = 4
+"""Maximum number of queries for values that were lost on the way."""
+MAX_HISTORY_S: Final = 7 * 86_400.0
 
 
 def selector(written: str, *, last: int | None = None, since_s: float | None = None) -> str:
-    """The query for the last so many values of each key, or of the last so many seconds; raises ValueError."""
+    """Return the selector for the last values of each key, or those of the last `since_s`. Raises ValueError."""
     if last is None and since_s is None:
         raise ValueError("a history needs last (how many), since_s (how far back), or both")
     if last is not None and last < 1:
         raise ValueError(f"last {last} is not allowed: a whole number from 1 on")
-    if since_s is not None and not 0 < since_s <= LONGEST_S:
-        raise ValueError(f"since_s {since_s:g} is not allowed: more than 0 and at most {LONGEST_S:g} s")
-    asked = [] if since_s is None else [f"_time=[now(-{since_s:f}s)..]"]
-    return f"{written}?{';'.join(asked + ([] if last is None else [f'last={last}']))}"
+    if since_s is not None and not 0 < since_s <= MAX_HISTORY_S:
+        raise ValueError(f"since_s {since_s:g} is not allowed: more than 0 and at most {MAX_HISTORY_S:g} s")
+    parameters = [] if since_s is None else [f"_time=[now(-{since_s:f}s)..]"]
+    return f"{written}?{';'.join(parameters + ([] if last is None else [f'last={last}']))}"
 
 
-def united(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None = None) -> list[Reading]:
-    """The readings of two answers to one question: sorted by key, each key's oldest first, at most its `last`.
-
-    Answers are dropped where a link has no room for them (a blocked gateway would be worse): who sees a gap asks again.
-    """
+def merge(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None = None) -> list[Reading]:
+    """Merge the readings of two answers, sorted by key and time, at most `last` of each key."""
+    # A gateway drops answers if a link's queue is full, rather than to block. So a client with gaps queries again.
     boots: dict[str, int] = {}
     found: dict[tuple[str, int, int], Reading] = {}
     for reading in (*earlier, *more):
@@ -44,7 +43,7 @@ def united(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None
 
 
 def gaps(readings: Iterable[Reading]) -> dict[str, int]:
-    """How many are missing between the readings of each key (sorted as `united` does), where some are."""
+    """Return the number of missing readings for each key that has gaps. The readings are sorted as by `merge`."""
     missing: dict[str, int] = {}
     for one, other in itertools.pairwise(readings):
         if (one.key, one.value.boot_id) == (other.key, other.value.boot_id):
@@ -54,36 +53,39 @@ def gaps(readings: Iterable[Reading]) -> dict[str, int]:
     return missing
 
 
-def shortfalls(
+def describe_shortfalls(
     readings: Iterable[Reading], now: datetime, *, last: int | None = None, since_s: float | None = None
 ) -> list[str]:
-    """For each key (readings sorted by key) of which less came than was asked, why, if it is known; states at once."""
-    said, states = [], 0
+    """Describe why there are fewer readings than requested, one line for each key and one for all states.
+
+    readings: sorted by key.
+    """
+    lines, states = [], 0
     every = list(readings)
-    said += [f"{key}: {count} in between were lost on the way, ask again" for key, count in gaps(every).items()]
+    lines += [f"{key}: {count} in between were lost on the way, ask again" for key, count in gaps(every).items()]
     for key, group in itertools.groupby(every, key=lambda reading: reading.key):
         found, topic = list(group), topics.of_key(key)
-        if topic is None or topic.kept <= 1:
+        if topic is None or topic.history_size <= 1:
             states += topic is not None
             continue
-        keeps = f"its gateway keeps the last {topic.kept}"
+        keeps = f"its gateway keeps the last {topic.history_size}"
         oldest_s = found[0].age_s(now)
-        full = len(found) >= topic.kept
+        full = len(found) >= topic.history_size
         if since_s is not None:
-            if full and oldest_s < since_s and (last is None or last > topic.kept):
-                said.append(f"{key}: goes back {oldest_s:.1f} s of {since_s:g} s, {keeps}")
+            if full and oldest_s < since_s and (last is None or last > topic.history_size):
+                lines.append(f"{key}: goes back {oldest_s:.1f} s of {since_s:g} s, {keeps}")
         elif last is not None and len(found) < last:
             more = keeps if full else "its gateway has had no more"
-            said.append(f"{key}: {len(found)} of {last}, {more}")
+            lines.append(f"{key}: {len(found)} of {last}, {more}")
     if states and last != 1:
-        said.append("of states gateways keep only the latest; a recording has all (fleet record)")
-    return said
+        lines.append("of states gateways keep only the latest; a recording has all (fleet record)")
+    return lines
 
 
-def without_history(under: Iterable[topics.Topic]) -> str:
-    """Why nothing can be asked of the past of these topics; empty if something can, or if there are none."""
+def describe_missing_history(under: Iterable[topics.Topic]) -> str:
+    """Describe why these topics have no history. Return an empty string if one of them has, or if there are none."""
     listed = list(under)
-    if not listed or any(topic.kept for topic in listed):
+    if not listed or any(topic.history_size for topic in listed):
         return ""
     names = ", ".join(topic.name for topic in listed)
     return f"gateways keep no history of {names}, only of sensor/*; a recording has everything (fleet record)"

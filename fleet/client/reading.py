@@ -1,4 +1,4 @@
-"""Readings as an operator sees them: key, time, value; and a stream of them with a bounded queue. No Zenoh here."""
+"""Readings (key, time, value), and a stream of them with a bounded queue. No Zenoh here."""
 
 import contextlib
 import queue
@@ -13,9 +13,10 @@ from fleet.conditions import fields_of, value_in
 from schemas import messages, topics
 from schemas.bus import Sample
 
-QUEUE_LIMIT: Final = 1024
-"""Samples that wait for a reader."""
-_LOOK_S: Final = 0.2
+READING_QUEUE_LIMIT: Final = 1024
+"""Maximum number of queued samples."""
+_CLOSE_POLL_S: Final = 0.2
+"""Interval at which a waiting reader notices that the stream was closed."""
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -25,19 +26,19 @@ class Reading:
 
     key: str
     time: datetime
-    """When its publisher had it, UTC: the message's own stamp, else the time Zenoh put on it."""
+    """The message's stamp, else its Zenoh timestamp, UTC."""
     value: Any
-    """The protobuf message, e.g. `fleet.v1.Range`; optional fields that were not measured are not set."""
+    """The protobuf message, e.g. `fleet.v1.Range`. Optional fields that were not measured are not set."""
 
     @property
     def car(self) -> str:
-        """The car's name; empty for what is the fleet's."""
+        """The car's name. Empty for messages of the whole fleet."""
         return getattr(self.value, "car", "")
 
     def __getitem__(self, field: str) -> Any:
-        """A field of the message by name, as `range_m` or `hold.by`; None if it was not measured, or is not there.
+        """Return a field by name, such as `range_m` or `hold.by`. None if it was not measured or is not set.
 
-        Of what is repeated, or a message of its own, whether it is there. Raises KeyError with the names there are.
+        For a repeated field or a submessage, return True if it is set. Raises KeyError, which lists the fields.
         """
         known = fields_of(type(self.value))
         if field not in known:
@@ -45,25 +46,25 @@ class Reading:
         return value_in(self.value)(field)
 
     def age_s(self, now: datetime | None = None) -> float:
-        """How old it is, s, by this machine's clock; at least 0, since clocks differ."""
+        """Return the age, s, by this machine's clock. At least 0, since clocks differ."""
         return max(0.0, ((now or datetime.now(UTC)) - self.time).total_seconds())
 
     def stale(self, now: datetime | None = None) -> bool:
-        """Whether it is too old to say how things are (`stale_after_s` of its topic)."""
+        """Return True if it is older than `stale_after_s` of its topic."""
         topic = topics.of_key(self.key)
         return topic is not None and topic.stale_after_s is not None and self.age_s(now) > topic.stale_after_s
 
     def as_dict(self) -> dict[str, Any]:
-        """The message in protobuf's JSON mapping, with the field names of the .proto."""
+        """Return the message in protobuf's JSON mapping, with the field names of the .proto."""
         return messages.to_dict(self.value)
 
 
-Wanted: TypeAlias = Callable[[Reading], bool | None]
-"""Which readings of a stream are wanted."""
+ReadingFilter: TypeAlias = Callable[[Reading], bool | None]
+"""Returns True if a stream shall contain the reading."""
 
 
 def reading_of(sample: Sample) -> Reading:
-    """The reading in a sample; raises messages.BadPayload or KeyError for what is no message of ours."""
+    """Return the reading in a sample. Raises messages.BadPayload or KeyError if it is no message of ours."""
     value: Any = sample.message()
     stamp = getattr(value, "stamp", None) or getattr(value, "timestamp", None)
     time_ns = stamp.seconds * 1_000_000_000 + stamp.nanos if stamp is not None and stamp.seconds else sample.time_ns
@@ -71,21 +72,21 @@ def reading_of(sample: Sample) -> Reading:
 
 
 class Watch:
-    """Readings as they come. Iterate; `close` (or `with`) ends it. A reader that is too slow loses the oldest."""
+    """A stream of readings to iterate over. `close` (or `with`) ends it. A full queue drops the oldest samples."""
 
-    def __init__(self, wanted: Wanted | None = None) -> None:
-        self._wanted = wanted
-        self._waiting: queue.Queue[Sample] = queue.Queue(QUEUE_LIMIT)
+    def __init__(self, accept: ReadingFilter | None = None) -> None:
+        self._accept = accept
+        self._queue: queue.Queue[Sample] = queue.Queue(READING_QUEUE_LIMIT)
         self._closed = threading.Event()
         self._undeclare: Callable[[], object] = lambda: None
         self.dropped = 0
-        """Samples that made room for newer ones."""
+        """Number of samples dropped from the full queue."""
         self.unreadable = 0
-        """Samples that are no message of ours."""
+        """Number of samples that are no message of ours."""
 
     def begin(self, subscribe: Callable[[Callable[[Sample], None]], Callable[[], object]]) -> Self:
-        """Subscribe; what `subscribe` returns is called at the end."""
-        self._undeclare = subscribe(self._take)
+        """Subscribe. `subscribe` returns the function that ends the subscription."""
+        self._undeclare = subscribe(self._on_sample)
         return self
 
     def __enter__(self) -> Self:
@@ -99,36 +100,36 @@ class Watch:
 
     def __next__(self) -> Reading:
         while not self._closed.is_set():
-            reading = self.within(_LOOK_S)
+            reading = self.within(_CLOSE_POLL_S)
             if reading is not None:
                 return reading
         raise StopIteration
 
     def within(self, seconds: float) -> Reading | None:
-        """The next reading, waited for so long at most; None if there is none."""
+        """Return the next reading. None if none comes within this time."""
         deadline = time.monotonic() + seconds
         while not self._closed.is_set():
             try:
-                reading = reading_of(self._waiting.get(timeout=max(0.0, deadline - time.monotonic())))
+                reading = reading_of(self._queue.get(timeout=max(0.0, deadline - time.monotonic())))
             except queue.Empty:
                 return None
             except (messages.BadPayload, KeyError):
                 self.unreadable += 1
                 continue
-            if self._wanted is None or self._wanted(reading):
+            if self._accept is None or self._accept(reading):
                 return reading
         return None
 
     def close(self) -> None:
-        """End the stream; the iteration stops."""
+        """End the stream and its iteration."""
         if not self._closed.is_set():
             self._closed.set()
             self._undeclare()
 
-    def _take(self, sample: Sample) -> None:
-        """On the one Zenoh thread of this subscription: nobody else puts."""
-        if self._waiting.full():
-            with contextlib.suppress(queue.Empty):  # the reader was quicker
-                self._waiting.get_nowait()
+    def _on_sample(self, sample: Sample) -> None:
+        """Queue a sample. Runs on the subscription's Zenoh thread, the only one that puts."""
+        if self._queue.full():
+            with contextlib.suppress(queue.Empty):  # the reader was faster
+                self._queue.get_nowait()
                 self.dropped += 1
-        self._waiting.put_nowait(sample)
+        self._queue.put_nowait(sample)

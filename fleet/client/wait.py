@@ -1,7 +1,4 @@
-"""Waiting until a condition holds of a reading, or has held for a time: which one ends it, what is said if none does.
-
-Readings and the time come in as arguments; nothing is asked here.
-"""
+"""Waits until a condition holds of a reading, or has held for some time. Pure: readings and time are arguments."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -12,7 +9,7 @@ from schemas import topics
 
 
 class NotInTime(TimeoutError):
-    """The condition did not hold in time; `last`: the newest reading that was seen, if any."""
+    """The condition did not hold in time. last: the newest reading, if there was one."""
 
     def __init__(self, words: str, last: Reading | None) -> None:
         super().__init__(words)
@@ -21,26 +18,26 @@ class NotInTime(TimeoutError):
 
 @dataclass(slots=True)
 class _LastMatch:
-    """What is known of one key."""
+    """The newest reading of one key."""
 
     at: datetime
     since: datetime | None = None
-    """The first of the readings of which it has held without a gap."""
+    """Time of the first reading since which the condition has held without a gap."""
 
 
 class ConditionWait:
-    """One condition that is waited for. `for_s`: how long its readings must agree, by their own stamps."""
+    """A wait for one condition. for_s: minimum time for which it must hold, by the readings' stamps."""
 
     def __init__(self, condition: KeyCondition, for_s: float = 0.0) -> None:
         self._condition = condition
         self._for_s = for_s
         self._seen: dict[str, _LastMatch] = {}
         self.last: Reading | None = None
-        """The newest reading of those of which the condition can be said to hold or not."""
+        """The newest reading for which the condition is decidable."""
         self._undecided: Reading | None = None
 
     def ends(self, reading: Reading, now: datetime) -> bool:
-        """Whether this reading ends the waiting; a stale one does not, nor one older than another of its key."""
+        """Return True if this reading ends the wait. Stale readings and readings out of order do not."""
         before = self._seen.get(reading.key)
         if before is not None and reading.time < before.at:
             return False
@@ -57,20 +54,20 @@ class ConditionWait:
         assert seen.since is not None
         return (reading.time - seen.since).total_seconds() >= self._for_s
 
-    def late(self, written: str, after_s: float, now: datetime) -> NotInTime:
-        """What is said when the time is over."""
+    def timeout_error(self, written: str, after_s: float, now: datetime) -> NotInTime:
+        """Return the error for a timeout."""
         lasting = f" for {self._for_s:g} s" if self._for_s else ""
         words = f"{self._condition} did not hold{lasting} within {after_s:g} s"
         last = self.last or self._undecided
         if last is None:
             return NotInTime(f"{words}: nothing came under {written}", None)
-        said = ", ".join(self._condition.read(last))
+        values = ", ".join(self._condition.read(last))
         age = f"{last.age_s(now):.1f} s ago{' (stale)' if last.stale(now) else ''}"
-        return NotInTime(f"{words}: {last.key} had {said}, {age}", last)
+        return NotInTime(f"{words}: {last.key} had {values}, {age}", last)
 
 
 def _gap(reading: Reading, before: datetime) -> bool:
-    """Whether more time than a reading is worth lies between two of its key."""
+    """Return True if the time between two readings of a key exceeds the topic's `stale_after_s`."""
     topic = topics.of_key(reading.key)
-    worth_s = topic.stale_after_s if topic is not None else None
-    return worth_s is not None and (reading.time - before).total_seconds() > worth_s
+    limit_s = topic.stale_after_s if topic is not None else None
+    return limit_s is not None and (reading.time - before).total_seconds() > limit_s

@@ -1,4 +1,4 @@
-"""`fleet led, light, servo, arm, whistle, speed, fan, find`: what a car does once."""
+"""`fleet led, light, servo, arm, whistle, speed, fan, find`: actions of a car without a duration."""
 
 import re
 from typing import Any, Final
@@ -21,7 +21,7 @@ from fleet.commands.options import carry_out, cars_argument, json_option, take_o
 from gateway.protocol.enums import Light, SpeedStep
 
 _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
-"""So that -1 is told what is allowed instead of being taken for an option."""
+"""Context settings with which -1 is a wrong value and not an unknown option."""
 _ARM_EXAMPLE: Final = "fleet arm red 90 90 45 120 90 30"
 
 
@@ -31,7 +31,7 @@ class _Color(click.ParamType[tuple[int, int, int]]):
     name = "'#RRGGBB'"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int, int]:
-        """Three numbers, 0..255."""
+        """Return three numbers, 0..255."""
         match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", str(value))
         if match is None:
             self.fail(
@@ -42,12 +42,12 @@ class _Color(click.ParamType[tuple[int, int, int]]):
         return int(match[1], 16), int(match[2], 16), int(match[3], 16)
 
     def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:  # noqa: ARG002 - click's
-        """What helps who did not quote it."""
+        """Return a hint for users who forgot the quotes."""
         return "Six hexadecimal digits, in quotes: to a shell, what follows a bare # is a comment"
 
 
 def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> CommandRequest:
-    """The request for what is asked of the servo named before; wrong use is found before anyone is asked."""
+    """Return the request for an action of the servo. Reject a wrong action before any query."""
     servo = ctx.params["servo"]
     if action is None or not re.fullmatch("[0-9]+", action):
         allowed = ("up", "down", "reset") if servo == "vertical" else ("left", "right", "reset")
@@ -66,7 +66,7 @@ def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> Comman
 
 
 def _arm(_: click.Context, __: click.Parameter, joints: tuple[str, ...]) -> CommandRequest:
-    """The request for six joints."""
+    """Return the request for six joints."""
     needed = f"6 are needed, 0 to 180 degrees each, as: {_ARM_EXAMPLE}"
     for number, joint in enumerate(joints, start=1):
         if not re.fullmatch("[0-9]{1,3}", joint) or int(joint) > 180:
@@ -82,7 +82,7 @@ def _arm(_: click.Context, __: click.Parameter, joints: tuple[str, ...]) -> Comm
 @json_option
 @with_client
 def led(client: Fleet, cars: tuple[str, ...], colour: tuple[int, int, int], *, as_json: bool) -> None:
-    """Set the colour LED."""
+    """Set the color LED."""
     carry_out(client, led_request(*colour), cars, as_json=as_json)
 
 
@@ -149,7 +149,7 @@ def whistle(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
 @json_option
 @with_client
 def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_json: bool) -> None:
-    """One step faster or slower: cars know no absolute speed."""
+    """Change the speed by one step: cars have no absolute speed."""
     carry_out(client, speed_request(step), cars, take=take, as_json=as_json)
 
 

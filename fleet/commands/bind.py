@@ -1,6 +1,6 @@
-"""`fleet bind`: which car is at which link. Each unknown link's car blinks and beeps, and a person says which it was.
+"""`fleet bind`: finds out which car is at which link. The car at each unknown link blinks, and a person names it.
 
-For each link one gateway runs for a moment, under a name of its own; no car moves.
+For each link, a gateway runs for a moment under a temporary name. No car moves.
 """
 
 import contextlib
@@ -19,13 +19,13 @@ from fleet.commands.fleet_file import (
     file_argument,
     link_option,
     look_for,
+    print_errors,
     prompt_name,
     read,
     seconds_option,
-    tell,
     write,
 )
-from fleet.commands.options import explained
+from fleet.commands.options import cli_errors
 from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import FleetFile
 from fleet.fleetfile.models import validate_link
@@ -37,10 +37,10 @@ from schemas.process import signals
 from schemas.yaml_document.document import BadFile, read_text
 
 _READY_S: Final = 15.0
-"""A gateway starts in one, and brings a car of an unknown platform to a known state within six."""
-_LOOK_S: Final = 0.1
+"""Timeout for a gateway. It starts in 1 s, and brings a car of an unknown platform to a known state within 6 s."""
+_READY_POLL_S: Final = 0.1
 _AGAIN: Final = "again"
-_NONE: Final = "-"
+_NO_CAR: Final = "-"
 
 
 @click.command(
@@ -57,7 +57,7 @@ A TCP car is named by its address: write that into the file."""
 @click.option("--connect", metavar="ENDPOINT", help="The bus (default: the file's, FLEET_ENDPOINT, or loopback).")
 def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str | None) -> None:
     """Find out which car is at which link: each blinks and beeps, you say which it was, and the file has it."""
-    with explained():
+    with cli_errors():
         for link in links:
             validate_link(link)
     fleet = read(file, unbound=True)
@@ -67,7 +67,7 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
             "there is no link that may be a car's and is no car's in the file: see what `gateway scan` shows"
         )
     with (
-        explained(),
+        cli_errors(),
         signals.sigterm_interrupts(),
         Fleet(connect or fleet.endpoint, fleet.name, start_hub=True) as client,
     ):
@@ -77,7 +77,7 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
                 if name is None:
                     continue
                 car = _which(client, name, file)
-            if car != _NONE:
+            if car != _NO_CAR:
                 _write(file, car, each.url)
     left = read(file, unbound=True).unbound
     if left:
@@ -94,11 +94,11 @@ def _unknown(found: FoundLink, fleet: FleetFile) -> bool:
 
 @contextlib.contextmanager
 def _gateway(client: Fleet, name: str, link: str) -> Iterator[str | None]:
-    """A gateway for this link while it lasts, its car in a known state if there is one; None if it did not come up."""
+    """Run a gateway for this link. Yield its car's name, or None if the gateway did not come up."""
     with tempfile.TemporaryDirectory() as directory, (Path(directory) / "log").open("w+", encoding="utf-8") as log:
         command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, "--with-parent"]
         command += ["--fleet", client.name, "--connect", client.bus.endpoint, "--state-dir", directory]
-        # A session of its own: Ctrl-C at the terminal reaches only us, and we let it stop its car.
+        # In its own session, so that Ctrl-C at the terminal reaches only us. We let the gateway stop its car.
         gateway = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         try:
             yield name if _ready(client, name, gateway, log.name) else None
@@ -112,34 +112,34 @@ def _gateway(client: Fleet, name: str, link: str) -> Iterator[str | None]:
 
 
 def _ready(client: Fleet, name: str, gateway: "subprocess.Popen[bytes]", log: str) -> bool:
-    """Wait until the gateway serves, and its car is known to stand; a silent car is not waited for longer."""
+    """Wait until the gateway serves and its car stands. Return True if it serves, also for a silent car."""
     deadline, served = time.monotonic() + _READY_S, False
     while time.monotonic() < deadline:
         if gateway.poll() is not None:
-            said = Path(log).read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            click.echo(f"  {said[-1] if said else 'its gateway ended'}", err=True)
+            lines = Path(log).read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            click.echo(f"  {lines[-1] if lines else 'its gateway ended'}", err=True)
             return False
         states = client.get(f"{name}/state/safety")
         served = served or bool(states)
         if any(each.value.motors == "off" for each in states):
             return True
-        time.sleep(_LOOK_S)
+        time.sleep(_READY_POLL_S)
     if not served:
         click.echo("  its gateway did not come up", err=True)
     return served
 
 
 def _which(client: Fleet, name: str, file: Path) -> str:
-    """Let the car blink until somebody says which it is: a name, or `-`."""
+    """Let the car blink until the user names it. Return the name, or `-` for none."""
     while True:
         outcome = client.car(name).find()
         if not outcome.ok:
             click.echo(f"  it could not blink: {outcome.words or outcome.reason or outcome.phase}", err=True)
-            return _NONE
+            return _NO_CAR
         fleet = read(file, unbound=True)
         listed = ", ".join([*fleet.unbound, *(car for car in fleet.cars if car not in fleet.unbound)])
         first = fleet.unbound[0] if len(fleet.unbound) == 1 else None
-        words = f"  Which car blinked? ({listed}, a new name, {_AGAIN}, {_NONE} for none)"
+        words = f"  Which car blinked? ({listed}, a new name, {_AGAIN}, {_NO_CAR} for none)"
         answer = prompt_name(words, first, set())
         if answer == _AGAIN:
             continue
@@ -155,7 +155,7 @@ def _write(file: Path, car: str, link: str) -> None:
     try:
         write(file, set_link(read_text(file), file, car, link))
     except BadFile as error:
-        tell(error)
+        print_errors(error)
         raise SystemExit(1) from None
     except CannotEdit as error:
         raise click.ClickException(str(error)) from None

@@ -1,4 +1,4 @@
-"""`fleet coordinate`: the coordinator as a process. What it does is coordinator.py's."""
+"""`fleet coordinate`: runs the coordinator as a process."""
 
 import json
 import os
@@ -36,7 +36,9 @@ a plan:
 )
 @click.option("--plan", "path", required=True, type=click.Path(path_type=Path, dir_okay=False), help="The plan, YAML.")
 @click.option(
-    "--fleet-file", type=click.Path(path_type=Path, dir_okay=False), help="The fleet file: what its cars may do."
+    "--fleet-file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="The fleet file with the cars' capabilities and roles.",
 )
 @click.option(
     "--run", default="", metavar="NAME", help="Phase and rules outlive the coordinator within one run (of fleet up)."
@@ -47,7 +49,7 @@ a plan:
 def coordinate(
     path: Path, fleet_file: Path | None, run: str, connect: str | None, fleet: str, *, with_parent: bool, as_json: bool
 ) -> None:
-    """Keep a plan true, until Ctrl-C; cars on hold are left alone. One line per decision."""
+    """Carry out a plan until Ctrl-C. Leave cars on hold alone. Print one line per decision."""
     parent = os.getppid() if with_parent else None
     plan = parse(read_text(path), str(path))
     listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file, unbound=True))
@@ -60,20 +62,20 @@ def coordinate(
 
     signals.calls(stop.set)
 
-    def decided(decision: Decision) -> None:
+    def on_decided(decision: Decision) -> None:
         click.echo(_json(decision) if as_json else line(decision))
 
     with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True) as client:
         try:
-            Coordinator(client, plan, decided, lambda words: click.echo(f"fleet: {words}", err=True), listed, run).run(
-                lambda: stop.is_set() or parent not in (None, os.getppid())
-            )
+            Coordinator(
+                client, plan, on_decided, lambda words: click.echo(f"fleet: {words}", err=True), listed, run
+            ).run(lambda: stop.is_set() or parent not in (None, os.getppid()))
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None
 
 
 def line(decision: Decision) -> str:
-    """A decision for a person."""
+    """Return a decision as text for a person."""
     readings = f" ({', '.join(decision.readings)})" if decision.readings else ""
     return (
         f"{decision.subject}: {decision.decided}, because of {decision.why}{readings}; "

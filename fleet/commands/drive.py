@@ -1,23 +1,23 @@
-"""`fleet drive, mode, stop, estop, resume`: what moves cars, and what keeps them from moving."""
+"""`fleet drive, mode, stop, estop, resume`: the commands that move cars or stop them."""
 
 from dataclasses import replace
 
 import click
 
 from fleet.client.client import Fleet
-from fleet.client.commands import drive_request, estop_request, mode_request, resume_request, stop_request
+from fleet.client.commands import MAX_DRIVE_S, drive_request, estop_request, mode_request, resume_request, stop_request
 from fleet.client.outcome import Outcome
 from fleet.commands.options import (
     CarNames,
-    SecondsType,
     carry_out,
     cars_argument,
     end_with,
     json_option,
-    say,
+    print_outcomes,
     take_option,
     with_client,
 )
+from fleet.commands.params import DurationType
 from gateway.protocol.enums import Mode, Motion
 from schemas.process import signals, startup
 
@@ -33,21 +33,21 @@ examples:
 @click.option(
     "--for",
     "duration_s",
-    type=SecondsType(),
+    type=DurationType(MAX_DRIVE_S),
     default="500ms",
     show_default=True,
-    help="How long; at most 10s, or what the car's gateway allows.",
+    help="Duration, at most 10s or the limit of the car's gateway.",
 )
 @take_option
 @json_option
 @with_client
 def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, take: bool, as_json: bool) -> None:
-    """Hold a motion for a time, then stop; stays until the drive is over. Ctrl-C stops the car."""
+    """Hold a motion for a time, then stop. Wait until the drive is over; Ctrl-C stops the car."""
     with signals.sigterm_interrupts():
         try:
             outcomes = client.ask(replace(drive_request(motion, duration_s), take=take), cars)
         except KeyboardInterrupt:
-            say(client.ask(drive_request("stop"), cars), as_json=as_json)
+            print_outcomes(client.ask(drive_request("stop"), cars), as_json=as_json)
             raise SystemExit(startup.INTERRUPTED) from None
     end_with(outcomes, as_json=as_json)
 
@@ -64,7 +64,7 @@ example:
 @json_option
 @with_client
 def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json: bool) -> None:
-    """Bring cars into a mode; `manual` ends whatever they do by themselves."""
+    """Bring cars into a mode. `manual` ends every mode in which cars drive by themselves."""
     carry_out(client, mode_request(mode), cars, take=take, as_json=as_json)
 
 
@@ -79,7 +79,7 @@ examples:
 @with_client
 def stop(client: Fleet, cars: tuple[tuple[str, ...], ...], *, as_json: bool) -> None:
     """Stop these cars, or all, and hold them against the coordinator until someone drives or resumes them."""
-    _some(client, client.ask(stop_request(), _flat(cars)), as_json=as_json)
+    _end_with_any(client, client.ask(stop_request(), _flat(cars)), as_json=as_json)
 
 
 @click.command(
@@ -95,7 +95,7 @@ examples:
 def estop(client: Fleet, cars: tuple[tuple[str, ...], ...], why: str, *, as_json: bool) -> None:
     """Emergency stop of these cars, or of the whole fleet."""
     request = estop_request(why, "car" if cars else "fleet")
-    _some(client, client.ask(request, _flat(cars)), as_json=as_json)
+    _end_with_any(client, client.ask(request, _flat(cars)), as_json=as_json)
 
 
 @click.command(
@@ -127,34 +127,34 @@ def resume(
     outcomes = []
     for car in named:
         in_force = _in_force(client, car)
-        chosen = in_force if estops else [_the_one(car, begun, in_force) for begun in ids]
+        chosen = in_force if estops else [_complete_id(car, prefix, in_force) for prefix in ids]
         if chosen:
             outcomes += client.ask(resume_request(chosen), [car])
         elif car not in client.cars():
-            outcomes += client.ask(resume_request(), [car])  # which says that it is not there
+            outcomes += client.ask(resume_request(), [car])  # the outcome says that the car is missing
         else:
             click.echo(f"{car}: no e-stop is in force", err=True)
     end_with(outcomes, as_json=as_json)
 
 
 def _in_force(client: Fleet, car: str) -> list[str]:
-    """The ids of the e-stops in force on a car."""
+    """Return the ids of the e-stops in force on a car."""
     return [estop.id for reading in client.get(f"{car}/state/safety") for estop in reading.value.estops]
 
 
-def _the_one(car: str, begun: str, in_force: list[str]) -> str:
-    """The id that begins so; what is no e-stop of this car is left to its gateway to refuse."""
-    found = [each for each in in_force if each.startswith(begun)]
-    if len(found) > 1 and begun not in found:
-        raise click.UsageError(f"--id {begun}: several e-stops of {car} begin so: {', '.join(found)}")
-    return begun if begun in found or not found else found[0]
+def _complete_id(car: str, prefix: str, in_force: list[str]) -> str:
+    """Return the id with this prefix. The gateway rejects an id that is no e-stop of its car."""
+    found = [each for each in in_force if each.startswith(prefix)]
+    if len(found) > 1 and prefix not in found:
+        raise click.UsageError(f"--id {prefix}: several e-stops of {car} begin so: {', '.join(found)}")
+    return prefix if prefix in found or not found else found[0]
 
 
 def _flat(cars: tuple[tuple[str, ...], ...]) -> list[str] | None:
     return [car for some in cars for car in some] or None
 
 
-def _some(client: Fleet, outcomes: list[Outcome], *, as_json: bool) -> None:
+def _end_with_any(client: Fleet, outcomes: list[Outcome], *, as_json: bool) -> None:
     if not outcomes:
         raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
     end_with(outcomes, as_json=as_json)

@@ -1,8 +1,6 @@
-"""`fleet init, check, schema`: a fleet file made, looked at, and described to an editor. Nothing here moves a car."""
+"""`fleet init, check, schema`: writes, checks and describes fleet files. Nothing here moves a car."""
 
 import json
-import os
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -11,25 +9,26 @@ from typing import Final
 
 import click
 
-from fleet.commands.options import explained, json_option
+from fleet.commands.options import cli_errors, json_option
 from fleet.fleetfile.fleet_file import PALETTE, FleetFile, parse_fleet, read_fleet
 from fleet.fleetfile.link_check import check_link
 from fleet.fleetfile.models import schema, validate_color, validate_link, validate_name, validate_platform
 from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, scan
 from schemas import bus
+from schemas.atomic_file import write_atomically
 from schemas.yaml_document.document import BadFile
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
-NAMES: Final = ("red", "green", "blue", "yellow", "violet", "orange", "teal", "brown")
-"""In the order of the palette."""
-_AT_ONCE: Final = 16
+DEFAULT_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "violet", "orange", "teal", "brown")
+"""Default names, in the order of the palette."""
+_CHECK_THREADS: Final = 16
 _SKIP: Final = "-"
 
 file_argument = click.argument(
     "file", default=DEFAULT_FILE, type=click.Path(path_type=Path, dir_okay=False), metavar="[FILE]"
 )
 link_option = click.option(
-    "--link", "links", multiple=True, metavar="URL", help="Look at this link, and at no other; may be repeated."
+    "--link", "links", multiple=True, metavar="URL", help="Scan only this link; may be repeated."
 )
 seconds_option = click.option(
     "--seconds", type=click.FloatRange(0.5, 120), help="How long to listen at each port (default 6)."
@@ -47,10 +46,10 @@ Exit codes: 0 all is well, 1 a car cannot be reached as it stands, 2 the file is
 @file_argument
 @json_option
 def check(file: Path, *, as_json: bool) -> None:
-    """Check a fleet file, and whether its cars' ports are there, permitted and free; nothing is opened or moved."""
+    """Check a fleet file, and whether its cars' ports exist, are permitted and free. Open nothing, move nothing."""
     fleet = read(file, as_json=as_json)
     served = _served(fleet)
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
+    with ThreadPoolExecutor(_CHECK_THREADS) as pool:
         found = list(pool.map(lambda car: check_link(car, served), fleet.cars.values()))
     widest = max(len(each.car) for each in found)
     for each in found:
@@ -62,18 +61,18 @@ def check(file: Path, *, as_json: bool) -> None:
 
 
 def read(file: Path, *, as_json: bool = False, unbound: bool = False) -> FleetFile:
-    """The fleet file; for a bad one every fault is told, one a line, and the command ends with code 2."""
+    """Read the fleet file. If it is invalid, print every error on its own line and exit with code 2."""
     try:
         return read_fleet(file, unbound=unbound)
     except BadFile as error:
-        tell(error, as_json=as_json)
+        print_errors(error, as_json=as_json)
         if not file.exists():
             click.echo("fleet: make one with `fleet init`", err=True)
         raise SystemExit(2) from None
 
 
-def tell(error: BadFile, *, as_json: bool = False) -> None:
-    """Every fault of a file, one a line: for a person on stderr, for a script on stdout."""
+def print_errors(error: BadFile, *, as_json: bool = False) -> None:
+    """Print every error of a file on its own line: for a person to stderr, as JSON to stdout."""
     if as_json:
         for problem in error.problems:
             click.echo(json.dumps({"file": error.source, **asdict(problem)}))
@@ -82,10 +81,10 @@ def tell(error: BadFile, *, as_json: bool = False) -> None:
 
 
 def _served(fleet: FleetFile) -> dict[str, tuple[str, str]]:
-    """State and reason of the link of every car that has a gateway now; none if no fleet runs."""
+    """Return state and reason of the link of every car with a running gateway. Empty if no fleet is running."""
     from fleet.client.client import Fleet
 
-    with explained():
+    with cli_errors():
         if not bus.accepts(bus.resolve_endpoint(fleet.endpoint)):
             return {}
         with Fleet(fleet.endpoint, fleet.name, kind="person") as client:
@@ -99,7 +98,7 @@ def print_schema() -> None:
 
 
 def schema_text() -> str:
-    """The JSON Schema as it is checked in."""
+    """Return the JSON Schema as it is checked in."""
     return json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
 
 
@@ -110,14 +109,14 @@ examples:
   fleet init --yes --out lab.yaml
   fleet init --link /dev/ttyUSB0 --link tcp://192.168.1.7:8888"""
 )
-@click.option("--yes", is_flag=True, help="Take what speaks as a car does, ask nothing.")
-@click.option("--force", is_flag=True, help="Write over a file that is there.")
+@click.option("--yes", is_flag=True, help="Accept every detected car without asking.")
+@click.option("--force", is_flag=True, help="Overwrite an existing file.")
 @click.option("--out", default=DEFAULT_FILE, show_default=True, type=click.Path(path_type=Path, dir_okay=False))
 @link_option
 @seconds_option
 def init(*, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: float | None) -> None:
     """Write a fleet file: look for cars, ask for their names."""
-    with explained():
+    with cli_errors():
         for link in links:
             validate_link(link)
     if out.exists() and not force:
@@ -127,7 +126,7 @@ def init(*, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: 
     if not out.absolute().parent.is_dir():
         raise click.UsageError(f"{out}: there is no such directory")
     found = look_for(links, seconds)
-    cars = _taken(found) if yes else _asked(found)
+    cars = _likely_cars(found) if yes else _prompt_cars(found)
     if not cars:
         raise click.ClickException(
             "no car was found: switch one on, plug it in or pair it, and see what `gateway scan` shows; a car that is "
@@ -138,14 +137,14 @@ def init(*, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: 
     try:
         parse_fleet(text, out)
     except BadFile as error:
-        tell(error)
+        print_errors(error)
         raise click.ClickException("nothing was written: two links may be one port") from None
     write(out, text)
     click.echo(f"wrote {out} with {', '.join(car.name for car in cars)}: fleet check {out}, then fleet up {out}")
 
 
 def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:
-    """What may be a car, likely ones first; what is amiss becomes one line."""
+    """Scan for cars, likely ones first. An error becomes one line."""
     try:
         found = scan(links, seconds)
     except ScanFailed as error:
@@ -154,62 +153,54 @@ def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a file whole or not at all, over what is there; its line ends are the text's."""
+    """Write or replace a file atomically, with the text's line ends."""
     path = path.resolve()
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-                file.write(text)
-            Path(name).chmod(path.stat().st_mode if path.exists() else 0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
+        write_atomically(path, text.encode())
     except OSError as error:
         raise click.ClickException(f"{path} cannot be written: {error.strerror}") from None
 
 
-def _taken(found: list[FoundLink]) -> list[NewCar]:
+def _likely_cars(found: list[FoundLink]) -> list[NewCar]:
     likely = [each for each in found if each.verdict in LIKELY_VERDICTS]
     cars = []
     for index, each in enumerate(likely):
-        name = NAMES[index] if index < len(NAMES) else f"car{index + 1}"
+        name = DEFAULT_CAR_NAMES[index] if index < len(DEFAULT_CAR_NAMES) else f"car{index + 1}"
         cars.append(NewCar(name, each.url, each.platform, PALETTE[index % len(PALETTE)], each.words))
     return cars
 
 
-def _asked(found: list[FoundLink]) -> list[NewCar]:
+def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:
     cars: list[NewCar] = []
     for each in found:
         click.echo(f"\n{each.url}\n  {each.words}")
-        free = [name for name in NAMES if name not in {car.name for car in cars}] or [f"car{len(cars) + 1}"]
+        free = [name for name in DEFAULT_CAR_NAMES if name not in {car.name for car in cars}] or [f"car{len(cars) + 1}"]
         offered = free[0] if each.verdict in LIKELY_VERDICTS else _SKIP
         name = prompt_name(f"  its name ({_SKIP} to leave it out)", offered, {car.name for car in cars})
         if name == _SKIP:
             continue
         platform = click.prompt("  its platform", default=each.platform, value_proc=_checked(validate_platform))
-        colour = PALETTE[NAMES.index(name) if name in NAMES else len(cars) % len(PALETTE)]
+        colour = PALETTE[DEFAULT_CAR_NAMES.index(name) if name in DEFAULT_CAR_NAMES else len(cars) % len(PALETTE)]
         colour = click.prompt("  its colour", default=colour, value_proc=_checked(validate_color))
         cars.append(NewCar(name, each.url, platform, colour, each.words))
     return cars
 
 
 def prompt_name(words: str, offered: str | None, taken: set[str]) -> str:
-    """Ask for a car's name that is not taken, or `-`."""
+    """Prompt for an unused name of a car, or `-`."""
 
-    def proper(name: str) -> str:
+    def check_name(name: str) -> str:
         name = name.strip()
         if name in taken:
             raise click.UsageError(f"{name} is another car's name already")
         return name if name == _SKIP else _checked(validate_name)(name)
 
-    name: str = click.prompt(words, default=offered, value_proc=proper)
+    name: str = click.prompt(words, default=offered, value_proc=check_name)
     return name
 
 
 def _checked(rule: Callable[[str], str]) -> Callable[[str], str]:
-    """The rule for an answer: a prompt says again what is wrong, and asks again."""
+    """Return the rule as a value processor of a prompt, which repeats the question after an error."""
 
     def check_it(text: str) -> str:
         try:

@@ -1,4 +1,4 @@
-"""`fleet status, down, reload, logs`: what is asked of a fleet that is up, from another terminal."""
+"""`fleet status, down, reload, logs`: commands for a running fleet, from another terminal."""
 
 import json
 import os
@@ -11,20 +11,22 @@ import click
 
 from fleet.client.client import default_sender
 from fleet.commands.options import bus_options, json_option
-from fleet.supervisor.child import entry, runs
-from fleet.supervisor.service import STATUS, ask_service, ask_status
+from fleet.supervisor.child import parse_log_line, runs_directory
+from fleet.supervisor.service import SUPERVISOR_STATUS, ask_service, ask_status
 from fleet.supervisor.shutdown import NOT_STOPPED
 from schemas import keys, messages
 from schemas.bus import Bus, BusError, resolve_endpoint
 from schemas.process import signals, startup
 
-DOWN_S: Final = 120.0
-"""The longest stop of a car, and a recorder that writes what it has."""
-GONE_S: Final = 3.0
-LOOK_S: Final = 0.2
+FLEET_DOWN_TIMEOUT_S: Final = 120.0
+"""Timeout for the shutdown: the longest stop of a car, and a recorder that writes its buffers."""
+SUPERVISOR_LOST_S: Final = 3.0
+"""Time without a status after which a missing token means that the supervisor has ended."""
+FLEET_DOWN_POLL_S: Final = 0.2
+LOG_POLL_S: Final = 0.2
 
 
-def _none(fleet: str, endpoint: str) -> click.ClickException:
+def _not_up(fleet: str, endpoint: str) -> click.ClickException:
     return click.ClickException(
         f"fleet {fleet} is not up at {endpoint}: fleet up starts it, --connect names another bus"
     )
@@ -34,12 +36,12 @@ def _none(fleet: str, endpoint: str) -> click.ClickException:
 @json_option
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """What `fleet up` runs: each process, since when, how often it was started again, and why."""
+    """Show the processes of `fleet up`: state, since when, number of restarts and their reason."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         found = ask_status(bus, fleet)
         if not found:
-            raise _none(fleet, bus.endpoint)
+            raise _not_up(fleet, bus.endpoint)
     for each in found:
         if as_json:
             click.echo(messages.to_json(each))
@@ -59,54 +61,54 @@ def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @json_option
 @bus_options
 def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """End a fleet that is up, as Ctrl-C there does, wait, and say what became of each car."""
+    """End a fleet that is up, as Ctrl-C there does. Wait, and report the result for each car."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        heard: list[Any] = []
-        bus.subscribe(f"{fleet}/{STATUS.name}", lambda sample: heard.append(sample.message()))
+        received: list[Any] = []
+        bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.append(sample.message()))
         if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", default_sender())) is None:
-            raise _none(fleet, bus.endpoint)
+            raise _not_up(fleet, bus.endpoint)
         if answer.status == "rejected":
             raise click.ClickException(answer.words)
-        last = _until_ended(bus, fleet, heard)
-    became = dict(last.became) if last is not None else {}
+        last = _until_ended(bus, fleet, received)
+    results = dict(last.became) if last is not None else {}
     ended = last is not None and last.state == "ended"
-    bad = sorted(car for car, words in became.items() if words.startswith(NOT_STOPPED))
+    bad = sorted(car for car, words in results.items() if words.startswith(NOT_STOPPED))
     if as_json:
-        click.echo(json.dumps({"ended": ended, "cars": became}))
+        click.echo(json.dumps({"ended": ended, "cars": results}))
     else:
-        for car, words in sorted(became.items()):
+        for car, words in sorted(results.items()):
             click.echo(f"{car}: {words}", err=car in bad)
     if not ended:
         raise click.ClickException("the supervisor is gone without a last word: see fleet logs, and fleet list")
     raise SystemExit(1 if bad else 0)
 
 
-def _until_ended(bus: Bus, fleet: str, heard: list[Any]) -> Any:
-    """The last status that is heard."""
-    deadline, at = time.monotonic() + DOWN_S, time.monotonic()
+def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> Any:
+    """Wait for the end of the shutdown. Return the last status that was received."""
+    deadline, at = time.monotonic() + FLEET_DOWN_TIMEOUT_S, time.monotonic()
     count = 0
     while time.monotonic() < deadline:
-        if len(heard) != count:
-            count, at = len(heard), time.monotonic()
-            if heard[-1].state == "ended":
+        if len(received) != count:
+            count, at = len(received), time.monotonic()
+            if received[-1].state == "ended":
                 break
-        elif time.monotonic() - at > GONE_S and not bus.tokens(keys.car_token(fleet, keys.SUPERVISOR)):
+        elif time.monotonic() - at > SUPERVISOR_LOST_S and not bus.tokens(keys.car_token(fleet, keys.SUPERVISOR)):
             break
-        time.sleep(LOOK_S)
-    return heard[-1] if heard else None
+        time.sleep(FLEET_DOWN_POLL_S)
+    return received[-1] if received else None
 
 
 @click.command(epilog="\b\nexample:\n  fleet reload")
 @json_option
 @bus_options
 def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Have the fleet file read again: cars that are new, gone or changed, and the plan; says what needs a new start."""
+    """Read the fleet file again and apply changes of cars and plan. Tell which changes need a restart."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         answer = ask_service(bus, fleet, "reload", default_sender())
         if answer is None:
-            raise _none(fleet, bus.endpoint)
+            raise _not_up(fleet, bus.endpoint)
     if as_json:
         click.echo(messages.to_json(answer))
     else:
@@ -120,7 +122,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @json_option
 @bus_options
 def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: bool) -> None:
-    """What a car's gateway has said, or hub, simulator, coordinator, recorder; of the run that is up, else the last."""
+    """Show the log of a car's gateway, or of hub, simulator, coordinator or recorder, of the current or last run."""
     directory = _directory(connect, keys.check_name(fleet, "fleet name"))
     found = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]
     path = next((each for each in found if each.parent == directory and _either(each)), None)
@@ -130,13 +132,13 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: b
     with signals.sigterm_interrupts():
         try:
             for line in _lines(path, follow=follow):
-                click.echo(json.dumps(entry(line)) + "\n" if as_json else line, nl=False)
+                click.echo(json.dumps(parse_log_line(line)) + "\n" if as_json else line, nl=False)
         except KeyboardInterrupt:
             raise SystemExit(startup.INTERRUPTED) from None
 
 
 def _directory(connect: str | None, fleet: str) -> Path:
-    """Of the run that is up, if it is on this machine, else of the newest."""
+    """Return the log directory of the running fleet if it is on this machine, else of the last run."""
     try:
         with Bus.open(connect) as bus:
             for each in ask_status(bus, fleet):
@@ -144,7 +146,7 @@ def _directory(connect: str | None, fleet: str) -> Path:
                     return Path(each.directory)
     except BusError:
         pass  # nothing is up: the logs are files
-    place = runs(fleet, resolve_endpoint(connect))
+    place = runs_directory(fleet, resolve_endpoint(connect))
     newest = sorted(each for each in place.iterdir() if each.is_dir()) if place.is_dir() else []
     if not newest:
         raise click.ClickException(f"fleet {fleet} has never been up here: there is nothing in {place}")
@@ -156,7 +158,7 @@ def _either(path: Path) -> bool:
 
 
 def _lines(path: Path, *, follow: bool) -> Iterator[str]:
-    """The older file, then the newer; with `follow` what is added, also when the file is begun anew."""
+    """Yield the lines of the older and the newer file. With `follow`, yield new lines, also after a rollover."""
     before = path.with_suffix(".log.1")
     if before.exists():
         with before.open(encoding="utf-8", errors="replace") as older:
@@ -169,10 +171,10 @@ def _lines(path: Path, *, follow: bool) -> Iterator[str]:
                     yield line
                 elif not follow:
                     return
-                elif _moved(path, file):
+                elif _is_rolled_over(path, file):
                     break
                 else:
-                    time.sleep(LOOK_S)
+                    time.sleep(LOG_POLL_S)
         file = _opened(path, follow=follow)
 
 
@@ -180,12 +182,12 @@ def _opened(path: Path, *, follow: bool) -> IO[str] | None:
     while not path.exists():
         if not follow:
             return None
-        time.sleep(LOOK_S)
+        time.sleep(LOG_POLL_S)
     return path.open(encoding="utf-8", errors="replace")
 
 
-def _moved(path: Path, file: IO[str]) -> bool:
-    """Whether the open file is no longer the one under its name."""
+def _is_rolled_over(path: Path, file: IO[str]) -> bool:
+    """Return True if another file now has the name of the open file."""
     there = os.fstat(file.fileno())
     try:
         now = path.stat()

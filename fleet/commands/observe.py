@@ -1,7 +1,8 @@
-"""`fleet list, get, watch`: what cars say, now and before. Nothing here makes a car do anything."""
+"""`fleet list, get, watch, keys, wait`: reads the cars' messages. Nothing here moves a car."""
 
 import json
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -10,33 +11,38 @@ import click
 from fleet.client import history
 from fleet.client.client import Fleet
 from fleet.client.condition import KeyCondition, topics_under
-from fleet.client.reading import Reading
+from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
+from fleet.client.reading import Reading, Watch
+from fleet.client.wait import NotInTime
 from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.output import json_text, line, show_table
-from fleet.commands.params import DurationType, warn_if_missing, what_there_is, written_out
+from fleet.commands.params import DurationType, describe_available, warn_if_missing, written_out
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
+from schemas.bus import Sample, intersects
 
-_COLUMNS: Final = ("car", "platform", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
+_CAR_COLUMNS: Final = ("car", "platform", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
+_KEY_COLUMNS: Final = ("key", "type", "unit", "rate", "age")
+_DAY_S: Final = 86_400.0
 _UNHEARD_S: Final = 3.0
-"""Silence of a car whose motors are unknown that makes it unheard, whatever its link is called (gateway: stale)."""
-_TOLD: Final = 5
+"""Silence after which a car counts as unheard if the state of its motors is unknown."""
+_MAX_SHORTFALL_LINES: Final = 5
 
 
 @click.command("list", epilog="\b\nexample:\n  fleet list --json")
 @json_option
 @with_client
 def list_cars(client: Fleet, *, as_json: bool) -> None:
-    """The cars on the bus: platform, link, mode and how sure that is, motion, who drives or stopped it, battery."""
+    """List the cars on the bus: platform, link, mode and its verdict, motion, driver, hold and battery."""
     cars = client.cars()
-    said: dict[str, dict[str, Reading]] = {car: {} for car in cars}
-    for reading in client.get("*/*/*"):  # one query: a gateway that hangs is waited for once
+    latest: dict[str, dict[str, Reading]] = {car: {} for car in cars}
+    for reading in client.get("*/*/*"):  # one query, so that a hung gateway delays it only once
         key = keys.parse(reading.key)
         if key is not None:
-            said.setdefault(key.car, {})[key.topic] = reading
-    if not said:
+            latest.setdefault(key.car, {})[key.topic] = reading
+    if not latest:
         raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
-    rows = [row_of(car, values) for car, values in sorted(said.items())]
+    rows = [row_of(car, values) for car, values in sorted(latest.items())]
     for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
         session = token.rpartition("/")[2]
         click.echo(f"fleet: {client.name} is a replay of {session}: ages are those of the recording", err=True)
@@ -45,14 +51,14 @@ def list_cars(client: Fleet, *, as_json: bool) -> None:
         for row in rows:
             click.echo(json.dumps(row))
         return
-    show_table(_COLUMNS, [{name: shown(name, row) for name in _COLUMNS} for row in rows])
+    show_table(_CAR_COLUMNS, [{name: shown(name, row) for name in _CAR_COLUMNS} for row in rows])
     for row in rows:
         for words in row["platform_contradictions"]:
             click.echo(f"fleet: {row['car']} may be no {row['platform']} car: {words}", err=True)
 
 
 def row_of(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
-    """Return what `fleet list` shows of a car, by its latest readings: the fields of its JSON object."""
+    """Return the row of a car in `fleet list`, which is also its JSON object. readings: its latest ones, by topic."""
     values = {topic: reading.value for topic, reading in readings.items()}
     measured = readings.get("sensor/battery")
     link, mode, motion = (values.get(f"state/{name}") for name in ("link", "mode", "motion"))
@@ -116,7 +122,7 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
 @click.argument("keyexpr")
 @click.option("--last", type=click.IntRange(1), metavar="N", help="The last N values of each key, oldest first.")
 @click.option(
-    "--since", type=DurationType(history.LONGEST_S), help="The values of the last so many seconds, as 30s or 5m."
+    "--since", type=DurationType(history.MAX_HISTORY_S), help="The values of the last so many seconds, as 30s or 5m."
 )
 @click.option("--csv", "as_csv", is_flag=True, help="One CSV table; KEYEXPR must mean one type of message.")
 @json_option
@@ -131,7 +137,7 @@ def get(
     connect: str | None,
     fleet: str,
 ) -> None:
-    """The latest value of every reading that matches KEYEXPR, or its last values from the gateways' memory.
+    """Print the latest value of every reading that matches KEYEXPR, or its last values from the gateways' memory.
 
     `red` is every sensor of red, * is any one part.
     """
@@ -143,17 +149,17 @@ def get(
         meant = ", ".join(topic.name for topic in under) or "nothing that is ever published"
         raise click.UsageError(f"a table has one type of message, {written} means {meant}: name one")
     past = last is not None or since is not None
-    why_not = history.without_history(under) if past else ""
+    why_not = history.describe_missing_history(under) if past else ""
     if why_not:
         raise click.UsageError(why_not)
     with Fleet(connect, fleet, kind="person") as client:
         readings = client.history(keyexpr, last=last, since_s=since) if past else client.get(keyexpr)
         if not readings:
             within = f" of the last {since:g} s" if since is not None else ""
-            raise click.ClickException(f"nothing under {written}{within}; {what_there_is(client, written)}")
+            raise click.ClickException(f"nothing under {written}{within}; {describe_available(client, written)}")
     _show(readings, csv_of=under[0] if as_csv else None, as_json=as_json, past=past)
     if past:
-        _tell(history.shortfalls(readings, datetime.now(UTC), last=last, since_s=since))
+        _print_shortfalls(history.describe_shortfalls(readings, datetime.now(UTC), last=last, since_s=since))
 
 
 def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: bool, past: bool) -> None:
@@ -165,11 +171,12 @@ def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: 
         click.echo(json_text(reading) if as_json else line(reading, width, past=past))
 
 
-def _tell(words: Sequence[str]) -> None:
-    """Say why there is less than was asked, for a few keys."""
-    more = [f"and {len(words) - _TOLD} more likewise"] if len(words) > _TOLD + 1 else words[_TOLD : _TOLD + 1]
-    for each in (*words[:_TOLD], *more):
-        click.echo(f"fleet: {each}", err=True)
+def _print_shortfalls(lines: Sequence[str]) -> None:
+    """Print why there are fewer readings than requested, for a few keys."""
+    limit = _MAX_SHORTFALL_LINES
+    more = [f"and {len(lines) - limit} more likewise"] if len(lines) > limit + 1 else lines[limit : limit + 1]
+    for words in (*lines[:limit], *more):
+        click.echo(f"fleet: {words}", err=True)
 
 
 @click.command(
@@ -182,23 +189,145 @@ def _tell(words: Sequence[str]) -> None:
 @json_option
 @bus_options
 def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, connect: str | None, fleet: str) -> None:
-    """Readings that match KEYEXPR as they are published, until Ctrl-C.
+    """Print readings that match KEYEXPR as they are published, until Ctrl-C.
 
     CONDITION is about the fields of one message: < <= > >= == != with numbers, 'words', true and false, a yes/no field
-    by itself, and, or, not, parentheses. What was not measured makes it hold never.
+    by itself, and, or, not, parentheses. A field that was not measured makes a comparison false.
     """
     written = written_out(keyexpr, fleet)
     if when is not None:
         KeyCondition.of(when, written)
     with Fleet(connect, fleet, kind="person") as client:
         warn_if_missing(written, client.cars())
-        told = shown = 0
+        reported = shown = 0
         with client.watch(keyexpr, when=when) as readings:
             for reading in readings:
                 click.echo(json_text(reading) if as_json else line(reading))
-                if readings.dropped > told:
-                    told = readings.dropped
-                    click.echo(f"fleet: {told} readings dropped so far: what reads this is too slow", err=True)
+                if readings.dropped > reported:
+                    reported = readings.dropped
+                    click.echo(f"fleet: {reported} readings dropped so far: what reads this is too slow", err=True)
                 shown += 1
                 if shown == count:
                     return
+
+
+@click.command(
+    "keys",
+    epilog="\b\nexamples:\n  fleet keys\n  fleet keys red\n  fleet keys '*/state/*' --json\n  fleet keys --for 10s",
+)
+@click.argument("keyexpr", required=False)
+@click.option(
+    "--for",
+    "look_s",
+    type=DurationType(600.0),
+    default=f"{SURVEY_S:g}s",
+    show_default=True,
+    help="How long rates are measured.",
+)
+@json_option
+@bus_options
+def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str | None, fleet: str) -> None:
+    """List every key in use, or those under KEYEXPR: message type, units, rate and age of the newest value.
+
+    A rate of - means fewer than two messages during the survey; an age of - means no message at all.
+    """
+    everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
+    written = [written_out(each, fleet) for each in ([keyexpr] if keyexpr else everything)]
+    with Fleet(connect, fleet, kind="person") as client:
+        found = _alive(client, written, look_s)
+        if not found:
+            what = f"under {written[0]}" if keyexpr else f"of fleet {fleet}"
+            raise click.ClickException(f"no key {what} is alive; {describe_available(client, written[0])}")
+    if as_json:
+        for each in found:
+            click.echo(json.dumps(_row(each)))
+    else:
+        show_table(_KEY_COLUMNS, [_cells(each) for each in found])
+
+
+def _alive(client: Fleet, written: Sequence[str], look_s: float) -> list[KeyInfo]:
+    """Survey the keys for `look_s`."""
+
+    def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
+        subscribers = [client.bus.subscribe(each, take) for each in written]
+
+        def end() -> None:
+            for subscriber in subscribers:
+                subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+
+        return end
+
+    survey, until = KeySurvey(look_s), time.monotonic() + look_s
+    with Watch().begin(subscribe) as stream:
+        for each in written:
+            for reading in client.get(each):
+                survey.add(reading, datetime.now(UTC))
+        while (left := until - time.monotonic()) > 0:
+            coming = stream.within(left)
+            if coming is not None:
+                survey.add(coming, datetime.now(UTC))
+    silent = [key for key in event_keys(client.name, client.cars()) if any(intersects(each, key) for each in written)]
+    return survey.keys(silent, datetime.now(UTC))
+
+
+def _row(alive: KeyInfo) -> dict[str, Any]:
+    topic = alive.topic
+    return {
+        "key": alive.key,
+        "type": topic.message if topic else None,
+        "about": topic.about if topic else None,
+        "units": dict(topic.units) if topic else {},
+        "rate_hz": None if alive.rate_hz is None else round(alive.rate_hz, 2),
+        "age_s": None if alive.age_s is None else round(alive.age_s, 3),
+        "stale": alive.stale,
+    }
+
+
+def _cells(alive: KeyInfo) -> dict[str, str]:
+    stale = " (stale)" if alive.stale else ""
+    return {
+        "key": alive.key,
+        "type": alive.topic.message if alive.topic else "-",
+        "unit": ", ".join(alive.units) or "-",
+        "rate": "-" if alive.rate_hz is None else f"{alive.rate_hz:.1f} Hz",
+        "age": "-" if alive.age_s is None else f"{alive.age_s:.1f} s{stale}",
+    }
+
+
+@click.command(
+    epilog="\b\nexamples:\n  fleet wait red/sensor/range 'range_m < 0.3' --timeout 10s\n"
+    "  fleet wait '*/sensor/light' 'left or right' --for 2s\n"
+    "  fleet wait red/state/link \"state == 'online'\" --timeout 1m && fleet drive red forward\n\n\b\n"
+    "Exit codes: 0 it holds, 1 time-out or no fleet, 2 wrong use, 130 Ctrl-C."
+)
+@click.argument("keyexpr")
+@click.argument("condition", metavar="CONDITION")
+@click.option("--timeout", "timeout_s", type=DurationType(_DAY_S), help="Give up after this time (default: never).")
+@click.option("--for", "for_s", type=DurationType(_DAY_S), help="Minimum time for which the condition must hold.")
+@json_option
+@bus_options
+def wait(
+    keyexpr: str,
+    condition: str,
+    *,
+    timeout_s: float | None,
+    for_s: float | None,
+    as_json: bool,
+    connect: str | None,
+    fleet: str,
+) -> None:
+    """Wait until CONDITION holds of a fresh reading of KEYEXPR, and print that reading. The current one counts.
+
+    With a wildcard any key will do. CONDITION is as in `fleet watch --when`.
+    """
+    written = written_out(keyexpr, fleet)
+    KeyCondition.of(condition, written)
+    if for_s is not None and timeout_s is not None and for_s >= timeout_s:
+        raise click.UsageError(f"--for {for_s:g} s cannot be over within --timeout {timeout_s:g} s: give more time")
+    with Fleet(connect, fleet, kind="person") as client:
+        warn_if_missing(written, client.cars())
+        try:
+            reading = client.wait(keyexpr, condition, timeout_s=timeout_s, for_s=for_s or 0.0)
+        except NotInTime as late:
+            raise click.ClickException(str(late)) from None
+    click.echo(json_text(reading) if as_json else line(reading))

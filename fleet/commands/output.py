@@ -1,8 +1,11 @@
-"""How readings are shown: one line, one JSON object, a table."""
+"""Output of readings: as a line, a JSON object or a table."""
 
 import json
-from collections.abc import Mapping, Sequence
-from typing import Final
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Final
 
 import click
 
@@ -10,36 +13,63 @@ from fleet.client.reading import Reading
 from fleet.recording.tools.csv_table import iso
 from schemas import topics
 
-_HEADER: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
+PROGRESS_BAR_DELAY_S: Final = 1.0
+_HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 
 
 def json_text(reading: Reading) -> str:
-    """One object: key, time, age, whether it is stale, and the message."""
+    """Return a JSON object: key, time, age, staleness, and the message."""
     age_s, stale = round(reading.age_s(), 3), reading.stale()
     whole = {"key": reading.key, "time": iso(reading.time), "age_s": age_s, "stale": stale, "value": reading.as_dict()}
     return json.dumps(whole)
 
 
 def line(reading: Reading, width: int = 0, *, past: bool = False) -> str:
-    """Key (padded to `width`), fields with their units, age; of the `past` nobody expects that it is fresh."""
+    """Return a line: key (padded to `width`), fields with units, age. past: True to leave out the staleness."""
     topic = topics.of_key(reading.key)
     units = topic.units if topic is not None else {}
     fields = [
         f"{name}={_value(value)}{_unit(units.get(name, ''))}"
         for name, value in reading.as_dict().items()
-        if name not in _HEADER and value not in ("", [], {})
+        if name not in _HEADER_FIELDS and value not in ("", [], {})
     ]
     age = f"{reading.age_s():.1f} s ago{' (stale)' if not past and reading.stale() else ''}"
     return f"{reading.key:<{width}}  {'  '.join(fields)}  {age}"
 
 
 def show_table(columns: Sequence[str], rows: Sequence[Mapping[str, str]]) -> None:
-    """Columns as wide as they need to be; the header is bold on a terminal."""
+    """Print a table with aligned columns and a bold header."""
     widths = {name: max(len(row[name]) for row in ({name: name}, *rows)) for name in columns}
     header = "  ".join(name.upper().ljust(widths[name]) for name in columns).rstrip()
     click.echo(click.style(header, bold=True))
     for row in rows:
         click.echo("  ".join(row[name].ljust(widths[name]) for name in columns).rstrip())
+
+
+@contextmanager
+def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar on a terminal after a second, if the total is known.
+
+    Yield the function that takes the number of newly done items.
+    """
+    bar: Any = None
+    began = time.monotonic()
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal bar, done
+        done += count
+        if bar is not None:
+            bar.update(count)
+        elif total and sys.stderr.isatty() and time.monotonic() - began > PROGRESS_BAR_DELAY_S:
+            bar = click.progressbar(length=total, label=label, file=sys.stderr).__enter__()
+            bar.update(done)
+
+    try:
+        yield advance
+    finally:
+        if bar is not None:
+            bar.render_finish()
 
 
 def _value(value: object) -> str:

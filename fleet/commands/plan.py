@@ -1,4 +1,4 @@
-"""`fleet why` and `fleet plan check`: what the coordinator decided, and what a plan means before anything moves."""
+"""`fleet why` and `fleet plan`: explains decisions of the coordinator, checks a plan and restarts it."""
 
 import json
 import time
@@ -9,9 +9,9 @@ from typing import Any
 import click
 
 from fleet.client.client import Fleet
-from fleet.client.command_tracker import ANSWER_S
+from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from fleet.client.reading import Reading
-from fleet.commands.options import explained, json_option, with_client
+from fleet.commands.options import cli_errors, json_option, with_client
 from fleet.coordinator.coordinator import RESTART_VERB
 from schemas import keys, messages, topics
 from schemas.bus import Failure
@@ -28,7 +28,7 @@ examples:
 @json_option
 @with_client
 def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
-    """What the coordinator decided last of a car or role, why, with which readings, and what would change it."""
+    """Explain the coordinator's last decision on a car or role: reason, readings, and what would change it."""
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}
     if not found and not client.bus.tokens(f"{client.name}/{keys.COORDINATOR}"):
@@ -40,10 +40,10 @@ def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
         if reading is None:
             there = ", ".join(name.removeprefix("role ") for name in sorted(found)) or "nothing"
             raise click.ClickException(f"nothing was decided of {subject}; there are decisions of {there}")
-        click.echo(json.dumps(reading.as_dict()) if as_json else _told(reading))
+        click.echo(json.dumps(reading.as_dict()) if as_json else _describe(reading))
 
 
-def _told(reading: Reading) -> str:
+def _describe(reading: Reading) -> str:
     decision = reading.value
     since_s = decision.since.seconds + decision.since.nanos / 1e9
     at = datetime.fromtimestamp(since_s).astimezone().strftime("%H:%M:%S")
@@ -57,7 +57,7 @@ def _told(reading: Reading) -> str:
 
 @click.group(epilog="\b\nexamples:\n  fleet plan check deploy/plan.yaml --fleet-file fleet.yaml\n  fleet plan restart")
 def plan() -> None:
-    """Plans: what the coordinator keeps true."""
+    """Check a plan, or restart the plan in force."""
 
 
 @plan.command(
@@ -77,7 +77,7 @@ Exit codes: 0 nothing that can never work, 1 something, 2 no plan."""
 )
 @json_option
 def check(file: Path, fleet_file: Path | None, *, as_json: bool) -> None:
-    """Roles that no car can fill, rules that can never fire or that fight, phases nothing leads to."""
+    """Find roles that no car can fill, rules that never fire or contradict each other, and unreachable phases."""
     from fleet.coordinator.observer import listed_cars
     from fleet.fleetfile.fleet_file import read_fleet
     from fleet.policy.plan.lint import Severity
@@ -85,7 +85,7 @@ def check(file: Path, fleet_file: Path | None, *, as_json: bool) -> None:
     from fleet.policy.plan.parser import parse
     from schemas.yaml_document.document import read_text
 
-    with explained():
+    with cli_errors():
         read = parse(read_text(file), str(file))
         cars = None if fleet_file is None else listed_cars(read_fleet(fleet_file))
     findings = check_plan(read, cars)
@@ -110,9 +110,9 @@ example:
 @json_option
 @with_client
 def restart(client: Fleet, *, as_json: bool) -> None:
-    """Begin the plan in force anew: its first phase, no rule in force. Cars keep the roles that they still fit."""
+    """Restart the plan in force: its first phase, no rule in force. Cars keep the roles that they still fit."""
     key = keys.command_key(client.name, keys.COORDINATOR, RESTART_VERB)
-    for answer in client.bus.query(key, timeout_s=ANSWER_S):
+    for answer in client.bus.query(key, timeout_s=ANSWER_TIMEOUT_S):
         if isinstance(answer, Failure):
             raise click.ClickException(answer.words)
         result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)

@@ -1,4 +1,4 @@
-"""`fleet replay SESSION --to-bus`: its options, and what it says. What is published is to_bus.py's."""
+"""`fleet replay SESSION --to-bus`: plays a session on the bus."""
 
 import sys
 import threading
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from fleet.recording.reading.session import Recorded, Session
     from fleet.recording.tools.summary import SessionSummary
 
-TOLD_EVERY_S: Final = 0.5
-REMEMBERED_NS: Final = 300_000_000_000
-"""What was said so long before the beginning can be asked for: a battery that is not measured in a mode, a plan."""
+PROGRESS_INTERVAL_S: Final = 0.5
+INITIAL_VALUES_NS: Final = 300_000_000_000
+"""Time before the start from which latest values are loaded, such as a plan or a battery voltage."""
 _DEFAULTS: Final = {"name": None, "rate": 1.0, "loop": False, "offset": None, "skip_gaps": None, "connect": None}
 _ONLY: Final = {
     "name": "--as",
@@ -32,29 +32,29 @@ _ONLY: Final = {
 
 
 def to_bus_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add what `to_bus` takes."""
+    """Add the options of `to_bus`."""
     for option in (
         click.option(
             "--connect", metavar="ENDPOINT", help="With --to-bus: the bus (default: FLEET_ENDPOINT, or loopback)."
         ),
         click.option(
-            "--cars-only", is_flag=True, help="Leave out what coordinator, recorder and supervisor said then."
+            "--cars-only", is_flag=True, help="Leave out the messages of coordinator, recorder and supervisor."
         ),
-        click.option("--skip-gaps", metavar="TIME", help="A pause that is longer, as 5s, is made so long."),
-        click.option("--offset", metavar="TIME", help="Begin so far into it; with --loop the first time only."),
-        click.option("--loop", is_flag=True, help="Over and over."),
-        click.option("--rate", default=1.0, type=click.FloatRange(0.01, 1000.0), help="So many times as fast."),
+        click.option("--skip-gaps", metavar="TIME", help="Shorten longer pauses to this time, such as 5s."),
+        click.option("--offset", metavar="TIME", help="Start at this time; with --loop in the first round only."),
+        click.option("--loop", is_flag=True, help="Repeat until Ctrl-C."),
+        click.option("--rate", default=1.0, type=click.FloatRange(0.01, 1000.0), help="Speed factor."),
         click.option(
-            "--as", "name", metavar="NAME", help="The fleet's name then (default: the recorded one, -replay)."
+            "--as", "name", metavar="NAME", help="Name of the replayed fleet (default: the recorded name with -replay)."
         ),
-        click.option("--to-bus", is_flag=True, help="Publish it again, as a fleet of another name, until Ctrl-C."),
+        click.option("--to-bus", is_flag=True, help="Play it on the bus as a fleet of another name, until Ctrl-C."),
     ):
         function = option(function)
     return function
 
 
 def refuse_without(options: dict[str, Any]) -> None:
-    """What means something only with --to-bus is not to be overlooked."""
+    """Reject options that need --to-bus."""
     given = [_ONLY[name] for name, value in options.items() if value != _DEFAULTS.get(name, False)]
     if given:
         raise click.UsageError(f"{', '.join(given)}: only with --to-bus")
@@ -75,7 +75,7 @@ def to_bus(
     connect: str | None,
 ) -> None:
     """Play a session on the bus."""
-    from fleet.commands.options import explained
+    from fleet.commands.options import cli_errors
     from fleet.commands.sessions import part_of
     from fleet.recording import time_spec
     from fleet.recording.reading.session import NoSession, Session
@@ -86,7 +86,7 @@ def to_bus(
 
     stop = threading.Event()
     signals.calls(stop.set)
-    with explained():
+    with cli_errors():
         try:
             session = Session.open(path)
             part = part_of(session, start, end, cars)
@@ -111,7 +111,7 @@ def to_bus(
             raise click.ClickException(str(error)) from None
         if not any(keys.parse(key) for key in about.keys):
             raise click.ClickException(f"{path} holds nothing that is a fleet's: no FLEET/CAR/... key")
-        wanted = _wanted(cars, cars_only=cars_only)
+        expressions = _key_expressions(cars, cars_only=cars_only)
         there = cars or tuple(about.cars)
         words = f"fleet {name} is a replay of {session.name}: nothing in it takes commands"
         schedule = Schedule(rate, gap_ns)
@@ -125,21 +125,21 @@ def to_bus(
                 f"{session.name} as fleet {name} at {bus.endpoint}, {rate:g} times as fast: "
                 f"{', '.join(there) or 'no car'}; Ctrl-C ends"
             )
-            player.remember(session.messages(wanted, first_ns - REMEMBERED_NS, first_ns))
+            player.remember(session.messages(expressions, first_ns - INITIAL_VALUES_NS, first_ns))
             # The earliest time is not the first message's if the clock went back.
             from_ns = part.start_ns if offset is None else first_ns
-            told = _Progress((end_ns - begin_ns) / 1e9)
+            progress = _Progress((end_ns - begin_ns) / 1e9)
             origin_s = time.monotonic()
             while not stop.is_set():
-                recorded = session.messages(wanted, from_ns, part.end_ns)
-                player.play(_counted_from(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, told)
+                recorded = session.messages(expressions, from_ns, part.end_ns)
+                player.play(_counted_from(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, progress)
                 if not player.published and not stop.is_set():
                     raise click.ClickException(f"{path} holds nothing there that is published again")
                 if not loop or stop.is_set():
                     break
                 schedule.again(LOOP_PAUSE_NS)
                 from_ns = part.start_ns
-            told.end()
+            progress.end()
     took_s = time.monotonic() - origin_s
     click.echo(f"{player.published} messages in {took_s:.1f} s")
     notes = {
@@ -154,7 +154,7 @@ def to_bus(
 
 
 def _counted_from(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:
-    """The time from where it is to begin until the first message is part of it, too."""
+    """Start the schedule at `from_ns`, so that the time until the first message counts."""
     if from_ns is not None:
         schedule.due_s(from_ns)
     yield from recorded
@@ -170,25 +170,25 @@ def _time(option: str, text: str, start_ns: int, end_ns: int) -> int:
 
 
 def _fleets(session: "Session", about: "SessionSummary") -> list[str]:
-    """The recorded fleet's name, then others that keys have."""
+    """Return the recorded fleet's name, then other fleets' names in keys."""
     described = [session.description.fleet] if session.description is not None and session.description.fleet else []
     of_keys = (key.fleet for key in map(keys.parse, about.keys) if key is not None)
     return list(dict.fromkeys([*described, *of_keys])) or [keys.DEFAULT_FLEET]
 
 
-def _wanted(cars: tuple[str, ...], *, cars_only: bool) -> list[str]:
+def _key_expressions(cars: tuple[str, ...], *, cars_only: bool) -> list[str]:
     services = (keys.COORDINATOR, keys.RECORDER, keys.SUPERVISOR)
-    wanted = [f"*/{car}/**" for car in cars or ("*",)] + [f"*/{keys.SIMULATOR}/**"]
-    return wanted if cars_only else [*wanted, *(f"*/{service}/**" for service in services)]
+    expressions = [f"*/{car}/**" for car in cars or ("*",)] + [f"*/{keys.SIMULATOR}/**"]
+    return expressions if cars_only else [*expressions, *(f"*/{service}/**" for service in services)]
 
 
 class _Progress:
-    """How far it is: one line of a terminal, which stays."""
+    """The progress on one line of the terminal."""
 
     def __init__(self, length_s: float) -> None:
         self._length_s = length_s
         self._shown = sys.stderr.isatty()
-        self._told_at = 0.0
+        self._printed_at = 0.0
         self._start_ns: int | None = None
 
     def __call__(self, one: "Recorded") -> None:
@@ -196,13 +196,13 @@ class _Progress:
             return
         self._start_ns = one.recorded_ns if self._start_ns is None else min(self._start_ns, one.recorded_ns)
         now = time.monotonic()
-        if now - self._told_at > TOLD_EVERY_S:
-            self._told_at = now
+        if now - self._printed_at > PROGRESS_INTERVAL_S:
+            self._printed_at = now
             at_s = (one.recorded_ns - self._start_ns) / 1e9
             sys.stderr.write(f"\r{at_s:8.1f} s of {self._length_s:.1f} s ")
             sys.stderr.flush()
 
     def end(self) -> None:
-        """Leave the line."""
+        """Clear the line."""
         if self._shown:
             sys.stderr.write("\r" + " " * 40 + "\r")

@@ -1,10 +1,9 @@
-"""`fleet record`: the recorder as a process. What it records is recorder.py's; what it is asked, asking.py's."""
+"""`fleet record` and `fleet mark`: runs the recorder as a process, and sends commands to a running recorder."""
 
 import json
 import os
 import re
 import threading
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -12,19 +11,22 @@ from typing import Any, Final
 import click
 from click.core import ParameterSource
 
-from fleet.commands import record_control
+from fleet.client.client import default_sender
+from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import DurationType
-from schemas import keys
-from schemas.bus import BadEndpoint, Bus, BusError, ensure_hub
+from schemas import keys, messages
+from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
 
-LOOK_S: Final = 0.25
-ALONE_S: Final = 0.5
-"""Without a link for this long: see that there is a hub."""
+POLL_INTERVAL_S: Final = 0.25
+HUB_RESTART_DELAY_S: Final = 0.5
+"""Time without a link after which the recorder restarts the hub."""
 DEFAULT_OUT: Final = "sessions"
+_RECORDER_TIMEOUT_S: Final = 15.0
+"""Timeout for the recorder's answer. It may have to wait for the disk."""
 
 
-_UNITS: Final = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+_SIZE_UNITS: Final = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _WEEK_S: Final = 7 * 86_400.0
 
 
@@ -37,9 +39,9 @@ class SizeType(click.ParamType[int]):
         self._least = least
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Bytes; fails outside the range."""
+        """Return the number of bytes. Fail outside the range."""
         match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([KMGT]?B|)", str(value).upper())
-        size = int(float(match[1]) * _UNITS[match[2]]) if match else -1
+        size = int(float(match[1]) * _SIZE_UNITS[match[2]]) if match else -1
         if not self._least <= size <= 10**15:
             least = f"{self._least / 10**6:g} MB" if self._least else "0"
             self.fail(f"{value!r} is not allowed: {least} to 1000 TB, as 512MB, 1.5GB or a number of bytes", param, ctx)
@@ -57,49 +59,49 @@ examples:
   fleet record status
   fleet mark "the blue one lost the line"
 
-What was marked is spared by the quota.""",
+The quota does not remove marked sessions.""",
 )
 @click.option(
     "--out",
     default=DEFAULT_OUT,
     show_default=True,
     type=click.Path(path_type=Path, file_okay=False),
-    help="Directory in which the session's own directory is made.",
+    help="Directory in which the session's directory is created.",
 )
 @click.option(
-    "--segment-size", type=SizeType(10**6), default="512MB", show_default=True, help="A file has at most so much."
+    "--segment-size", type=SizeType(10**6), default="512MB", show_default=True, help="Maximum size of a file."
 )
 @click.option(
-    "--segment-time", type=DurationType(_WEEK_S), default="10m", show_default=True, help="... and is at most so long."
+    "--segment-time", type=DurationType(_WEEK_S), default="10m", show_default=True, help="Maximum duration of a file."
 )
 @click.option(
     "--sync",
     type=click.Choice(("never", "segment", "second")),
     default="segment",
     show_default=True,
-    help="When the disk is waited for. A crash of the recorder costs a second at most, whatever this is; one of the "
-    "computer costs what was not synced.",
+    help="When to wait for the disk. A crash of the recorder loses at most a second in any case; a crash of the "
+    "computer loses everything since the last sync.",
 )
 @click.option(
     "--session-size",
     type=SizeType(10**6),
-    help="A session that has so much is closed, and the next one begins; with --quota half of it at "
-    "most, and if this is not given a tenth.",
+    help="Maximum size of a session, after which the next one begins. With --quota at most half of it (default: a "
+    "tenth).",
 )
 @click.option(
     "--quota",
     type=SizeType(10**6),
-    help="What all sessions in --out may have; the oldest that nobody marked are removed.",
+    help="Maximum size of all sessions in --out. The oldest ones without a mark are removed.",
 )
 @click.option(
     "--keep-free",
     type=SizeType(0),
     default="50MB",
     show_default=True,
-    help="With less than that on the disk, recording waits until there is room again.",
+    help="Minimum free disk space. With less, recording pauses until there is room again.",
 )
-@click.option("--fleet-file", type=_FILE, help="Copied into the session, as fleet.yaml.")
-@click.option("--plan", type=_FILE, help="Copied into the session, as plan.yaml.")
+@click.option("--fleet-file", type=_FILE, help="Copy this file into the session as fleet.yaml.")
+@click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
 @click.option("--connect", metavar="ENDPOINT", help="The fleet's bus, e.g. tcp/127.0.0.1:7447.")
 @click.option("--fleet", default=keys.DEFAULT_FLEET, show_default=True, help="Name of the fleet.")
 @click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
@@ -122,7 +124,7 @@ def record(
     with_parent: bool,
     as_json: bool,
 ) -> None:
-    """Record everything of a fleet to MCAP until Ctrl-C; prints the session's directory once nothing can be missed."""
+    """Record all messages of a fleet to MCAP until Ctrl-C. Print the session's directory when the recorder is ready."""
     if ctx.invoked_subcommand is not None:
         asked = [name for name in ctx.params if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT]
         if asked:
@@ -184,17 +186,10 @@ def record(
 
 
 def _wait(bus: Bus, stop: threading.Event, ended: threading.Event, parent: int | None) -> None:
-    """Until told to stop, the recorder failed, or `parent` ended; meanwhile see that there is a hub."""
-    linked = time.monotonic()
-    while not stop.wait(LOOK_S) and not ended.is_set() and parent in (None, os.getppid()):
-        if bus.connected:
-            linked = time.monotonic()
-        elif time.monotonic() - linked > ALONE_S:
-            try:
-                ensure_hub(bus.endpoint)
-            except BusError as error:
-                click.echo(f"fleet record: {error}", err=True)
-            linked = time.monotonic()
+    """Wait until a signal, a failure of the recorder or the end of the parent. Restart a lost hub meanwhile."""
+    hub_keeper = HubKeeper(bus.endpoint, HUB_RESTART_DELAY_S, _warn)
+    while not stop.wait(POLL_INTERVAL_S) and not ended.is_set() and parent in (None, os.getppid()):
+        hub_keeper.check(connected=bus.connected)
 
 
 def _say(as_json: bool, values: dict[str, Any], words: str) -> None:  # noqa: FBT001 - the flag of the command
@@ -212,6 +207,75 @@ def _count(lost: Mapping[str, int], what: str) -> str:
     return f"{sum(lost.values())} {what} (most on {worst}: {lost[worst]})"
 
 
-record.add_command(record_control.start)
-record.add_command(record_control.stop)
-record.add_command(record_control.status)
+def _query(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
+    """Send a command to the recorder and return its status. Raises click's errors."""
+    keys.check_name(fleet, "fleet name")
+    with Bus.open(connect) as bus:
+        key = keys.command_key(fleet, keys.RECORDER, verb)
+        payload = json.dumps(fields).encode()
+        for answer in bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=_RECORDER_TIMEOUT_S):
+            if isinstance(answer, Failure):
+                raise click.ClickException(f"the recorder says: {answer.words}")
+            return answer.message()
+        raise click.ClickException(
+            f"no recorder of fleet {fleet!r} is on the bus at {bus.endpoint}: `fleet record` starts one"
+        )
+
+
+def _show_status(found: Any, *, as_json: bool) -> None:
+    if as_json:
+        from google.protobuf.json_format import MessageToDict
+
+        click.echo(json.dumps(MessageToDict(found, preserving_proto_field_name=True)))
+        return
+    click.echo(
+        f"{found.state}: {found.session}, {found.messages} messages, {found.bytes / 1e6:.1f} MB in "
+        f"{found.segments} file{'s' * (found.segments != 1)}, {found.free_bytes / 1e9:.1f} GB free"
+    )
+    for counts, words in ((found.drops, "dropped for want of room"), (found.missed, "missed on the bus")):
+        if counts:
+            worst = max(counts, key=lambda key: counts[key])
+            click.echo(f"{sum(counts.values())} {words}, most of {worst}: {counts[worst]}")
+    if found.recovered:
+        click.echo(f"{sum(found.recovered.values())} were missed at first and had again from their publishers")
+    for words in (found.error, found.warning):
+        if words:
+            click.echo(words)
+
+
+@record.command()
+@json_option
+@bus_options
+def start(connect: str | None, fleet: str, *, as_json: bool) -> None:
+    """Start a new session after `stop`."""
+    _show_status(_query("start", connect, fleet), as_json=as_json)
+
+
+@record.command()
+@json_option
+@bus_options
+def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
+    """Close the session. The recorder keeps running and waits for `start`."""
+    _show_status(_query("stop", connect, fleet), as_json=as_json)
+
+
+@record.command()
+@json_option
+@bus_options
+def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
+    """Show what is being recorded, where to, how much was lost, and whether there is room."""
+    _show_status(_query("status", connect, fleet), as_json=as_json)
+
+
+@click.command(epilog="\b\nexample:\n  fleet mark 'the blue one lost the line'")
+@click.argument("text")
+@click.option("--by", metavar="NAME", help="Author of the mark (default: your sender name).")
+@bus_options
+def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
+    """Write TEXT into the running recording. The quota does not remove a marked session."""
+    from fleet.recording.writing.recorder import MAX_MARK_CHARACTERS
+
+    if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
+        raise click.UsageError(f"TEXT must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
+    found = _query("mark", connect, fleet, text=text, by=by or default_sender())
+    click.echo(f"marked in {found.session}")

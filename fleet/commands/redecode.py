@@ -1,4 +1,4 @@
-"""`fleet redecode` and `fleet sessions vector`: recorded frames against today's decoder, on the command line."""
+"""`fleet redecode` and `fleet sessions vector`: decodes recorded frames again, and cuts test vectors."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -25,13 +25,13 @@ Exit codes: 0 no difference, 1 some, or nothing to decode."""
 )
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--car", "cars", type=CarNames(), default=(), help="Only these cars.")
-@click.option("--platform", help="What the cars were, instead of what was recorded: arduino, raspberry_pi, stm32+imu.")
+@click.option("--platform", help="Platform to use instead of the recorded one: arduino, raspberry_pi, stm32+imu.")
 @json_option
 def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_json: bool) -> None:
-    """Decode the raw frames of SESSION again and say everything that is otherwise than it was recorded.
+    """Decode the raw frames of SESSION again and list the differences to the recorded readings.
 
-    SESSION may also be a vector that `fleet sessions vector` made. What is a measurement depends on the platform and
-    the mode that were known: the recorded ones are used.
+    SESSION may also be a vector that `fleet sessions vector` made. Decoding depends on platform and mode: the recorded
+    ones are used.
     """
     from fleet.recording.reading.session import NoSession
     from fleet.replay.analysis.redecode import NoPlatform
@@ -62,7 +62,7 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
 
 
 class _RedecodeReport:
-    """One run: where the frames come from, and what came of it."""
+    """One run of `fleet redecode`: the source of the frames, and the result."""
 
     def __init__(self, path: Path, cars: tuple[str, ...], platform: str | None) -> None:
         from fleet.replay.analysis.recorded_frames import SkippedMessages
@@ -77,27 +77,27 @@ class _RedecodeReport:
         self.start_ns = 0
 
     def of_vector(self) -> None:
-        """Take a vector; raises BadVector, OSError."""
+        """Read frames from a vector. Raises BadVector, OSError."""
         from fleet.replay.analysis.test_vector import read
 
         car, items = read(self._path)
         self._items = ((car, item) for item in items)
 
     def of_session(self) -> None:
-        """Take a session; raises NoSession."""
+        """Read frames from a session. Raises NoSession."""
         from fleet.commands.sessions import part_of, watched
         from fleet.recording.reading.session import Session
         from fleet.recording.tools.summary import of_session as overview
         from fleet.replay.analysis.recorded_frames import FRAME_KEYS, of_session
 
         self._session = session = Session.open(self._path)
-        part_of(session, None, None, self._cars)  # says what is not there
+        part_of(session, None, None, self._cars)  # raises for unknown cars
         self.start_ns = overview(session).start_ns
-        wanted = [f"*/{car}/{key.split('/', 2)[2]}" for car in self._cars or ("*",) for key in FRAME_KEYS]
-        self._items = of_session(watched("redecode", None)(session.messages(keys=wanted)), self._unread)
+        expressions = [f"*/{car}/{key.split('/', 2)[2]}" for car in self._cars or ("*",) for key in FRAME_KEYS]
+        self._items = of_session(watched("redecode", None)(session.messages(keys=expressions)), self._unread)
 
     def differences(self) -> Iterator["ReadingDifference"]:
-        """As they are found; raises NoPlatform, and ClickException if there is nothing to decode."""
+        """Yield the differences. Raises NoPlatform, and ClickException if there is nothing to decode."""
         from fleet.replay.analysis.redecode import Redecoding
 
         running: dict[str, Redecoding] = {}
@@ -118,7 +118,7 @@ class _RedecodeReport:
             )
 
     def report(self, differences: int, *, as_json: bool) -> None:
-        """What was compared, and what could not be."""
+        """Print the numbers of compared and skipped frames and readings."""
         frames = sum(each.frames for each in self.counts.values())
         readings = sum(each.readings for each in self.counts.values())
         undecided = sum(each.undecided for each in self.counts.values())
@@ -206,10 +206,10 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
         about = overview(found)
     except NoSession as error:
         raise click.ClickException(str(error)) from None
-    wanted = [f"*/{car}/{key.split('/', 2)[2]}" for key in FRAME_KEYS]
+    expressions = [f"*/{car}/{key.split('/', 2)[2]}" for key in FRAME_KEYS]
     before_ns = None if part.start_ns is None else part.start_ns - vectors.BEFORE_NS
     after_ns = None if part.end_ns is None else part.end_ns + vectors.BEFORE_NS
-    recorded = of_session(found.messages(wanted, before_ns, after_ns), SkippedMessages())
+    recorded = of_session(found.messages(expressions, before_ns, after_ns), SkippedMessages())
     items = [*vectors.stretch((item for _, item in recorded), part.start_ns or 0, part.end_ns)]
     frames = sum(isinstance(item, Rx) for item in items)
     if not frames:

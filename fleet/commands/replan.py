@@ -1,4 +1,4 @@
-"""`fleet replan`: a plan on recorded readings, against what was decided then, on the command line."""
+"""`fleet replan`: replays a session through a plan, and compares its decisions with the recorded ones."""
 
 import json
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from fleet.commands.options import explained, json_option
+from fleet.commands.options import cli_errors, json_option
 
 if TYPE_CHECKING:
     from fleet.policy.plan.plan import Plan
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     )
     from fleet.replay.analysis.replan import Replanning
 
+# States come once a second. So a replay notices up to a second later that a car has gone; its token shows it at once.
 TOLERANCE_S: Final = 2.0
-"""A car that went is missed up to a second later here: its states come once a second, its token went at once."""
+"""Default time by which the same decision may come earlier or later."""
 
 
 @click.command(
@@ -49,14 +50,13 @@ Exit codes: 0 no difference, 1 some, or nothing to compare, 2 no plan."""
     default=TOLERANCE_S,
     show_default=True,
     type=click.FloatRange(0.1, 60.0),
-    help="s; the same decision so much sooner or later is no difference.",
+    help="Seconds by which the same decision may come earlier or later.",
 )
 @json_option
 def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance: float, *, as_json: bool) -> None:
-    """Give what cars said in SESSION to a plan, and say where it decides otherwise than was decided then, and why.
+    """Replay SESSION through a plan. List decisions that differ from the recorded ones, with their reasons.
 
-    The cars do what they did then: what the plan would have made of them is not known. A person's stops and drives are
-    in what they said.
+    The cars' messages stay as recorded, whatever the plan decides. They include a person's stops and drives.
     """
     from fleet.coordinator.observer import listed_cars
     from fleet.fleetfile.fleet_file import read_fleet
@@ -65,7 +65,7 @@ def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance:
     from fleet.recording.session_dir import FLEET_FILE
     from schemas.yaml_document.document import read_text
 
-    with explained():
+    with cli_errors():
         plan = None if path is None else parse(read_text(path), str(path))
         try:
             found = Session.open(session)
@@ -81,13 +81,13 @@ def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance:
         except NoSession as error:
             raise click.ClickException(str(error)) from None
     for each in compared.found:
-        click.echo(json.dumps(_fields(each, compared.origin_ns)) if as_json else _told(each, compared.origin_ns))
+        click.echo(json.dumps(_fields(each, compared.origin_ns)) if as_json else _describe(each, compared.origin_ns))
     compared.report(as_json=as_json)
     raise SystemExit(1 if compared.found else 0)
 
 
 class _ReplanReport:
-    """Every coordinator of a session again, and where it decides otherwise."""
+    """One run of `fleet replan`: replays every coordinator of a session and collects the differences."""
 
     def __init__(
         self, session: "Session", plan: "Plan | None", listed: "Mapping[str, CarSnapshot]", tolerance_ns: int
@@ -103,7 +103,7 @@ class _ReplanReport:
         self._late_ns: list[int] = []
 
     def go(self) -> None:
-        """Compare; raises BadPlan, and ClickException if there is nothing to compare."""
+        """Compare the decisions. Raises BadPlan, and ClickException if there is nothing to compare."""
         from fleet.policy.state import PersistedPolicy
         from fleet.recording.tools.summary import of_session
         from fleet.replay.analysis import recorded_decisions
@@ -125,7 +125,7 @@ class _ReplanReport:
             )
         self._refuse_without_cars()
         tokens = recorded_decisions.presence(self._session.messages(recorded_decisions.STATE_KEYS), about.end_ns)
-        kept = PersistedPolicy()
+        persisted = PersistedPolicy()
         for run in self._runs:
             if not run.plans and (self._session.path / "plan.yaml").is_file():
                 run.plans.append((run.start_ns, read_text(self._session.path / "plan.yaml")))
@@ -137,11 +137,11 @@ class _ReplanReport:
             )
             if not plans:
                 raise click.ClickException(f"{self._session.path} has no plan: name one with --plan")
-            again = Replanning(run, plans, self._listed, kept)
-            kept = self._one(run, again, tokens)
+            again = Replanning(run, plans, self._listed, persisted)
+            persisted = self._one(run, again, tokens)
 
     def _refuse_without_cars(self) -> None:
-        """A session that was cut to some cars has not what the decisions were made of."""
+        """Reject a session that was cut to some cars: messages on which the decisions depend are missing."""
         from fleet.recording.tools.transform import origin_of
 
         left = origin_of(self._session).get("cars")
@@ -160,22 +160,22 @@ class _ReplanReport:
         from fleet.replay.analysis.recorded_decisions import differences
         from fleet.replay.analysis.replan import COORDINATOR_HISTORY_NS, keys_for
 
-        wanted = keys_for(run.fleet, (plan for _, plan in again.plans))
-        messages = self._session.messages(wanted, run.start_ns - COORDINATOR_HISTORY_NS, run.end_ns + 1)
-        kept = again.go(messages, tokens)
+        expressions = keys_for(run.fleet, (plan for _, plan in again.plans))
+        messages = self._session.messages(expressions, run.start_ns - COORDINATOR_HISTORY_NS, run.end_ns + 1)
+        persisted = again.go(messages, tokens)
         self._decisions += sum(map(len, run.decisions.values()))
         for each in differences(run.decisions, again.decisions, run.start_ns, run.end_ns):
             if not run.whole and (each.then is None or (each.now is None and self._plan is None)):
-                continue  # said before the recording began
+                continue  # from before the recording began
             if each.to_ns - each.from_ns > self._tolerance_ns:
                 self.found.append(each)
             else:
                 self._late_ns.append(each.to_ns - each.from_ns)
         self.found.sort(key=lambda each: each.from_ns)
-        return kept
+        return persisted
 
     def report(self, *, as_json: bool) -> None:
-        """What was compared, and how exactly."""
+        """Print what was compared."""
         late_s = max(self._late_ns, default=0) / 1e9
         partly = sum(not run.whole for run in self._runs)
         spans = [[(run.start_ns - self.origin_ns) / 1e9, (run.end_ns - self.origin_ns) / 1e9] for run in self._runs]
@@ -194,17 +194,17 @@ class _ReplanReport:
             click.echo(f"what is whole was taken: {self._session.damage_words}", err=True)
 
 
-def _told(each: "DecisionDifference", origin_ns: int) -> str:
+def _describe(each: "DecisionDifference", origin_ns: int) -> str:
     start_s, length_s = (each.from_ns - origin_ns) / 1e9, (each.to_ns - each.from_ns) / 1e9
     lines = [f"{each.subject} at +{start_s:.1f}s for {length_s:.1f} s:"]
-    for name, said in (("then", each.then), ("now", each.now)):
-        if said is None:
+    for name, decision in (("then", each.then), ("now", each.now)):
+        if decision is None:
             lines.append(f"  {name}: nothing was decided")
             continue
-        lines.append(f"  {name}: {said}, because of {said.why}")
-        lines += [f"        with {reading}" for reading in said.readings]
-        if said.would_change:
-            lines.append(f"        would change with {said.would_change}")
+        lines.append(f"  {name}: {decision}, because of {decision.why}")
+        lines += [f"        with {reading}" for reading in decision.readings]
+        if decision.would_change:
+            lines.append(f"        would change with {decision.would_change}")
     return "\n".join(lines)
 
 
@@ -213,19 +213,19 @@ def _fields(each: "DecisionDifference", origin_ns: int) -> dict[str, Any]:
         "subject": each.subject,
         "from_s": (each.from_ns - origin_ns) / 1e9,
         "to_s": (each.to_ns - origin_ns) / 1e9,
-        "then": _said(each.then),
-        "now": _said(each.now),
+        "then": _fields_of(each.then),
+        "now": _fields_of(each.now),
     }
 
 
-def _said(said: "RecordedDecision | None") -> dict[str, Any] | None:
-    if said is None:
+def _fields_of(decision: "RecordedDecision | None") -> dict[str, Any] | None:
+    if decision is None:
         return None
     return {
-        "kind": said.kind,
-        "decided": said.decided,
-        "role": said.role,
-        "why": said.why,
-        "readings": list(said.readings),
-        "would_change": said.would_change,
+        "kind": decision.kind,
+        "decided": decision.decided,
+        "role": decision.role,
+        "why": decision.why,
+        "readings": list(decision.readings),
+        "would_change": decision.would_change,
     }

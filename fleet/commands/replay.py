@@ -1,17 +1,17 @@
-"""`fleet replay`: a session in Rerun, in its viewer or as a file that carries its layout."""
+"""`fleet replay`: shows a session in Rerun, or saves it as a Rerun file with a layout."""
 
 import os
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fleet.commands.options import CarNames, from_option
+from fleet.commands.output import progress_bar
 from fleet.commands.play import refuse_without, to_bus_options
 from fleet.commands.play import to_bus as play_to_bus
 from schemas.process import startup
@@ -19,8 +19,6 @@ from schemas.process import startup
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
     from fleet.replay.rerun.export import Part
-
-BAR_AFTER_S: Final = 1.0
 
 
 @click.command(
@@ -33,7 +31,7 @@ examples:
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--car", "--cars", "cars", type=CarNames(), default=(), help="Only these cars, and the services.")
 @from_option
-@click.option("--to", "end", metavar="TIME", help="Likewise; what comes then is not shown.")
+@click.option("--to", "end", metavar="TIME", help="Likewise; messages from then on are left out.")
 @click.option(
     "--save",
     type=click.Path(dir_okay=False, path_type=Path),
@@ -73,7 +71,7 @@ def replay(
         part = _part(found, cars, start, end)
         with tempfile.TemporaryDirectory() as scratch:
             if found.damage:
-                # What is whole is copied first: Rerun's own reader shows also what fails its checksum.
+                # Copy the undamaged messages first: Rerun's own reader would also show chunks with a wrong checksum.
                 whole = _rescue(found, Path(scratch) / f"{found.name}.mcap")
                 click.echo(f"{found.damage_words}; showing what is whole", err=True)
                 found = whole
@@ -86,7 +84,7 @@ def replay(
 
 
 def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
-    """A recording or a device is not to be overwritten."""
+    """Reject a target that is a recording, a device, or no .rrd file."""
     if save.suffix != ".rrd":
         raise click.UsageError(
             f"--save {save}: Rerun opens files that end in .rrd: name it {save.stem.strip('.') or 'out'}.rrd"
@@ -121,7 +119,7 @@ def _rescue(session: "Session", out: Path) -> "Session":
 
 
 def quiet_rerun() -> None:
-    """Rerun has a log of its own, which would stand between our lines; it reads this when it is imported."""
+    """Turn off Rerun's log, which would mix with our output. Rerun reads the variable when it is imported."""
     os.environ.setdefault("RUST_LOG", "off")
 
 
@@ -140,32 +138,15 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
 
 @contextmanager
 def _bar(session: "Session") -> Iterator[Callable[[int], None]]:
-    """On a terminal a bar appears if it takes over a second; it is told how many messages have been read."""
+    """Show a progress bar. Yield the function that takes the number of newly read messages."""
     from fleet.replay.rerun.export import count_of
 
-    count = count_of(session) if sys.stderr.isatty() else 0
-    bar: Any = None
-    began = time.monotonic()
-    done = 0
-
-    def seen(messages: int) -> None:
-        nonlocal bar, done
-        done += messages
-        if bar is not None:
-            bar.update(messages)
-        elif count and time.monotonic() - began > BAR_AFTER_S:
-            bar = click.progressbar(length=count, label="replay", file=sys.stderr).__enter__()
-            bar.update(done)
-
-    try:
-        yield seen
-    finally:
-        if bar is not None:
-            bar.render_finish()
+    with progress_bar("replay", count_of(session) if sys.stderr.isatty() else 0) as advance:
+        yield advance
 
 
 def _view(rrd: Path) -> int:
-    """Rerun's viewer until its window is closed; it listens on loopback only."""
+    """Run Rerun's viewer until its window is closed. Return the exit code."""
     from fleet.replay.rerun.viewer import Viewer
 
     with Viewer("--port", "auto", str(rrd)) as viewer:

@@ -1,8 +1,6 @@
-"""`fleet sessions`: what was recorded, on the command line. What each command does is beside this."""
+"""`fleet sessions`: lists, verifies, recovers, cuts and exports recordings."""
 
 import json
-import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 
 from fleet.commands.options import CarNames, from_option, json_option, to_option
+from fleet.commands.output import progress_bar
 from fleet.commands.redecode import vector
 
 if TYPE_CHECKING:
@@ -18,14 +17,13 @@ if TYPE_CHECKING:
     from fleet.recording.tools.summary import SessionSummary
 
 DEFAULT_DIR: Final = "sessions"
-BAR_AFTER_S: Final = 1.0
-_LOOK: Final = 1024
+_PROGRESS_STEP: Final = 1024
 
 T = TypeVar("T")
 
 
 class _DefaultCommandGroup(click.Group):
-    """`fleet sessions` and `fleet sessions DIR` are `fleet sessions list`."""
+    """A group for which `fleet sessions` and `fleet sessions DIR` mean `fleet sessions list`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if not args or (args[0] not in self.commands and args[0] != "--help"):
@@ -44,7 +42,7 @@ examples:
 """,
 )
 def sessions() -> None:
-    """List, look into, verify, recover, cut and export recordings; alone: list those of a directory."""
+    """List, inspect, verify, recover, cut and export recordings. Without a command, list those of a directory."""
 
 
 sessions.add_command(vector)
@@ -56,8 +54,8 @@ out_option = click.option(
 
 
 @contextmanager
-def _explained(out: Path | None = None) -> Iterator[None]:
-    """What a user can cause becomes one line."""
+def _session_errors(out: Path | None = None) -> Iterator[None]:
+    """Turn errors of a user into one line."""
     from fleet.recording.reading.session import NoSession
     from fleet.recording.tools.table_formats import FormatMissing
     from fleet.recording.tools.transform import Exists
@@ -83,29 +81,14 @@ def _open(path: Path) -> "Session":
 
 
 def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:
-    """Passes on; on a terminal a bar appears if it takes over a second, and how much there is is known."""
+    """Return a function that passes on items and shows a progress bar."""
 
     def watch(items: Iterable[T]) -> Iterator[T]:
-        if not total or not sys.stderr.isatty():
-            yield from items
-            return
-        began = time.monotonic()
-        bar: Any = None
-        seen = 0
-        try:
-            for item in items:
+        with progress_bar(label, total) as advance:
+            for count, item in enumerate(items, 1):
                 yield item
-                seen += 1
-                if seen % _LOOK:
-                    continue
-                if bar is None and time.monotonic() - began > BAR_AFTER_S:
-                    bar = click.progressbar(length=total, label=label, file=sys.stderr).__enter__()
-                    bar.update(seen)
-                elif bar is not None:
-                    bar.update(_LOOK)
-        finally:
-            if bar is not None:
-                bar.render_finish()
+                if count % _PROGRESS_STEP == 0:
+                    advance(_PROGRESS_STEP)
 
     return watch
 
@@ -121,7 +104,7 @@ examples:
 @click.argument("directory", default=DEFAULT_DIR, type=click.Path(path_type=Path))
 @json_option
 def list_sessions(directory: Path, *, as_json: bool) -> None:
-    """The sessions in DIRECTORY: cars, length, size, what was lost, marks, and whether each is whole."""
+    """List the sessions in DIRECTORY: state, length, size, lost messages, marks and cars."""
     from fleet.recording.tools.summary import overviews
 
     try:
@@ -171,11 +154,11 @@ example:
 @session_argument
 @json_option
 def info(session: Path, *, as_json: bool) -> None:
-    """What is in SESSION: versions, cars, keys with their rates, marks, what was lost."""
+    """Show the content of SESSION: versions, cars, keys with their rates, marks, lost messages."""
     from fleet.recording.tools.summary import marks_of, of_session
     from fleet.recording.tools.transform import origin_words
 
-    with _explained():
+    with _session_errors():
         found = _open(session)
         about = of_session(found)
         about.marks = marks_of(found, about)
@@ -221,14 +204,14 @@ example:
 @session_argument
 @json_option
 def verify(session: Path, *, as_json: bool) -> None:
-    """Hold SESSION against its checksums, its publishers' numbers, today's schemas and the clocks.
+    """Check SESSION against its checksums, sequence numbers, today's schemas and the clocks.
 
-    Says exactly what is missing; ends with 1 if anything is.
+    List exactly what is missing. The exit code is 1 if anything is.
     """
     from fleet.recording.tools.summary import growing, total
     from fleet.recording.tools.verify import verify as look
 
-    with _explained():
+    with _session_errors():
         found = _open(session)
         verdict = look(found, watched("verify", total(found)), growing(found))
     if as_json:
@@ -248,14 +231,14 @@ example:
 @session_argument
 @out_option
 def recover(session: Path, out: Path | None) -> None:
-    """Write every whole chunk of a cut or damaged SESSION into a whole session, which says so."""
+    """Write every intact chunk of a truncated or damaged SESSION into a new session, which is marked as recovered."""
     from fleet.recording.tools.summary import total
     from fleet.recording.tools.transform import recover as make
 
-    with _explained():
+    with _session_errors():
         found = _open(session)
     out = out or found.path.resolve().with_name(f"{found.name}-recovered")
-    with _explained(out):
+    with _session_errors(out):
         count, words = make(found, out, watched("recover", total(found)))
     click.echo(f"{out}: {count} messages{f'; could not be saved: {words}' if words else ', no message was damaged'}")
 
@@ -282,16 +265,16 @@ def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...]
     """Write a part of SESSION as a session of its own."""
     from fleet.recording.tools.transform import cut as make
 
-    with _explained():
+    with _session_errors():
         found = _open(session)
         selection = part_of(found, start, end, cars)
-    with _explained(out):
+    with _session_errors(out):
         count = make(found, out, selection, cars, watched("cut", None))
     click.echo(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
 
 
 def part_of(session: "Session", start: str | None, end: str | None, cars: Iterable[str]) -> Any:
-    """The part that is meant; a car or a time that is not there is said before anything is written."""
+    """Return the selected part of a session. Raises UsageError for a car or time that is not in the session."""
     from fleet.recording import time_spec
     from fleet.recording.selection import Selection
     from fleet.recording.tools.summary import of_session
@@ -331,19 +314,19 @@ examples:
 def export(session: Path, csv: Path | None, parquet: Path | None) -> None:
     """Write SESSION as tidy tables, one file for each type of message, into a new directory.
 
-    Columns: key, car, log_time, publish_time, sequence, then the fields. Times are UTC. Units stand in the columns'
-    names, in Parquet also in the fields' metadata. What is no protobuf message is in `other`.
+    Columns: key, car, log_time, publish_time, sequence, then the fields. Times are UTC. Units are in the columns'
+    names, in Parquet also in the fields' metadata. Messages that are not protobuf are in `other`.
     """
     from fleet.recording.tools.export import export as write
     from fleet.recording.tools.summary import total
     from fleet.recording.tools.table_formats import FORMATS
     from fleet.recording.tools.transform import atomic_directory
 
-    wanted = {name: out for name, out in (("csv", csv), ("parquet", parquet)) if out is not None}
-    if not wanted or csv == parquet:
+    outputs = {name: out for name, out in (("csv", csv), ("parquet", parquet)) if out is not None}
+    if not outputs or csv == parquet:
         raise click.UsageError("say where to, and as what: --csv DIR, --parquet DIR, or both (two directories)")
-    for name, out in wanted.items():
-        with _explained(out), atomic_directory(out) as new:
+    for name, out in outputs.items():
+        with _session_errors(out), atomic_directory(out) as new:
             found = _open(session)
             done = write(watched(f"export {name}", total(found))(found.rows()), new, FORMATS[name])
         click.echo(f"{out}: {sum(done.rows.values())} messages in {len(done.rows)} tables")

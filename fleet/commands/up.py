@@ -1,4 +1,4 @@
-"""`fleet up`: a fleet from its file, or of simulated cars, until Ctrl-C. What it does is supervisor.py's."""
+"""`fleet up`: runs the supervisor of a fleet from its file, or of simulated cars, until Ctrl-C."""
 
 import asyncio
 import json
@@ -14,21 +14,21 @@ from typing import Final
 
 import click
 
-from fleet.commands.options import explained
+from fleet.commands.options import cli_errors
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.supervisor.service import AnotherSupervisor
-from fleet.supervisor.spec import MOST_SIMULATED, Asked, FleetSpec, listing, wanted
-from fleet.supervisor.supervisor import TRIES_S, Supervisor, SupervisorEvent
+from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, build_spec, coordinator_fleet_file
+from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, Supervisor, SupervisorEvent
 from schemas import keys
 from schemas.bus import accepts, check_listening, resolve_endpoint
 from schemas.process import signals
 from schemas.yaml_document.document import BadFile, read_text
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
-_Tell = Callable[[SupervisorEvent], None]
+_Write = Callable[[SupervisorEvent], None]
 
 
 @click.command(
@@ -43,7 +43,7 @@ Without FILE and --sim it takes ./fleet.yaml. With --sim and --json, lines on st
 Exit codes: 0 every car was stopped, 1 one was not or nothing came up, 2 wrong use."""
 )
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--sim", "simulated", type=click.IntRange(1, MOST_SIMULATED), metavar="N",
+@click.option("--sim", "simulated", type=click.IntRange(1, MAX_SIMULATED_CARS), metavar="N",
               help="Simulate N cars: those of the file first, whatever their link.")  # fmt: skip
 @click.option(
     "--plan",
@@ -76,27 +76,27 @@ def up(
     fleet: str | None,
     insecure_lan: bool,
 ) -> None:
-    """Start all that a fleet needs, show its cars, start again what dies; Ctrl-C stops every car, then ends."""
+    """Start all processes of a fleet, show its cars, restart crashed processes. Ctrl-C stops every car, then exits."""
     if file is None and simulated is None:
         if not DEFAULT_FILE.exists():
             raise click.UsageError(
                 "there is no fleet.yaml here: name a file, make one with fleet init, or give --sim 3"
             )
         file = DEFAULT_FILE
-    asked = Asked(simulated or 0, plan, world, record, out, connect, fleet, insecure_lan)
-    with explained():
+    options = UpOptions(simulated or 0, plan, world, record, out, connect, fleet, insecure_lan)
+    with cli_errors():
         if fleet is not None:
             keys.check_name(fleet, "fleet name")
-        wish = read(file, asked)
-        for doubt in wish.doubts:
-            click.echo(f"fleet: {doubt}", err=True)
-        if not wish.cars:
+        spec = read(file, options)
+        for warning in spec.warnings:
+            click.echo(f"fleet: {warning}", err=True)
+        if not spec.cars:
             raise click.UsageError(f"{file} has no car with a link: fleet bind finds links, --sim {3} simulates cars")
-        endpoint = resolve_endpoint(wish.endpoint)
+        endpoint = resolve_endpoint(spec.endpoint)
         if not accepts(endpoint):  # the hub will be ours
             check_listening(endpoint, insecure_lan=insecure_lan)
         try:
-            stopped = asyncio.run(_serve(wish, file, asked, as_json=as_json))
+            stopped = asyncio.run(_serve(spec, file, options, as_json=as_json))
         except AnotherSupervisor as error:
             raise click.ClickException(str(error)) from None
         except OSError as error:
@@ -104,40 +104,42 @@ def up(
     raise SystemExit(0 if stopped else 1)
 
 
-def read(file: Path | None, asked: Asked) -> FleetSpec:
-    """What is wanted, with a plan that can be read; raises ValueError."""
-    wish = wanted(None if file is None else read_fleet(file, unbound=asked.simulated > 0), asked)
-    for path, what in ((wish.plan, "the plan"), (wish.world, "the world")):
+def read(file: Path | None, options: UpOptions) -> FleetSpec:
+    """Return the spec of the fleet file and the options, with a checked plan. Raises ValueError."""
+    spec = build_spec(None if file is None else read_fleet(file, unbound=options.simulated > 0), options)
+    for path, what in ((spec.plan, "the plan"), (spec.world, "the world")):
         if path is None:
             continue
         try:
             text = read_text(path)
         except BadFile as error:
             raise ValueError(f"{what}: {error}") from None
-        if path is wish.plan:
-            wish = _with_plan(wish, text)
-    return wish
+        if path is spec.plan:
+            spec = _with_plan(spec, text)
+    return spec
 
 
-def _with_plan(wish: FleetSpec, text: str) -> FleetSpec:
-    """With this plan, if it can work; raises ValueError with all that cannot."""
-    plan = parse_plan(text, str(wish.plan))
-    cars = listed_cars(parse_fleet(listing(wish), Path("fleet.yaml"), unbound=True))  # as the coordinator will
+def _with_plan(spec: FleetSpec, text: str) -> FleetSpec:
+    """Return the spec with this plan. Raises ValueError with everything in the plan that can never work."""
+    plan = parse_plan(text, str(spec.plan))
+    cars = listed_cars(
+        parse_fleet(coordinator_fleet_file(spec), Path("fleet.yaml"), unbound=True)
+    )  # as the coordinator will
     found = find_faults(plan, cars)
     if found.errors:
-        raise ValueError(f"the plan can never work:\n{found.refusal(str(wish.plan))}")
-    return replace(wish, plan_text=text, doubts=tuple(f"{wish.plan}: {each}" for each in found.warnings))
+        raise ValueError(f"the plan can never work:\n{found.refusal(str(spec.plan))}")
+    return replace(spec, plan_text=text, warnings=tuple(f"{spec.plan}: {each}" for each in found.warnings))
 
 
-async def _serve(wish: FleetSpec, file: Path | None, asked: Asked, *, as_json: bool) -> bool:
+async def _serve(spec: FleetSpec, file: Path | None, options: UpOptions, *, as_json: bool) -> bool:
     loop = asyncio.get_running_loop()
-    teller = _json if as_json else _plain
+    write = _json if as_json else _plain
     live = sys.stdout.isatty() and not as_json
 
-    def tell(happening: SupervisorEvent) -> None:
-        _written(teller, happening) if table is None else table.tell(happening)
+    def tell(event: SupervisorEvent) -> None:
+        _written(write, event) if table is None else table.on_event(event)
 
-    supervisor = Supervisor(wish, str(file) if file else "", lambda: read(file, asked), tell)
+    supervisor = Supervisor(spec, str(file) if file else "", lambda: read(file, options), tell)
     table = None
     if live:
         from fleet.supervisor.status_table import Table
@@ -149,12 +151,12 @@ async def _serve(wish: FleetSpec, file: Path | None, asked: Asked, *, as_json: b
             case signal.SIGINT:
                 supervisor.end("Ctrl-C")
             case signal.SIGTERM:
-                supervisor.end("told to end", TRIES_S)
+                supervisor.end("told to end", CAR_STOP_RETRY_S)
             case _:
-                supervisor.end("the terminal was closed", TRIES_S)
+                supervisor.end("the terminal was closed", CAR_STOP_RETRY_S)
 
     signals.calls_in(loop, end)
-    if as_json and wish.simulated:
+    if as_json and spec.simulated:
         await _pass_stdin(loop, supervisor.tell_simulator)
     if table is None:
         return await supervisor.run()
@@ -167,40 +169,41 @@ async def _serve(wish: FleetSpec, file: Path | None, asked: Asked, *, as_json: b
             await asyncio.gather(drawing, return_exceptions=True)
 
 
-class _PlainStatus(asyncio.Protocol):
-    """Lines as they come."""
+class LineProtocol(asyncio.Protocol):
+    """Calls `on_line` for each line from stdin."""
 
-    def __init__(self, take: Callable[[str], None]) -> None:
-        self._take = take
+    def __init__(self, on_line: Callable[[str], None]) -> None:
+        self._on_line = on_line
         self._rest = b""
 
     def data_received(self, data: bytes) -> None:
+        """Split the bytes into lines."""
         *whole, rest = (self._rest + data).split(b"\n")
         self._rest = rest[-65536:]
         for line in whole:
             if line.strip():
-                self._take(line.decode("utf-8", "replace"))
+                self._on_line(line.decode("utf-8", "replace"))
 
 
 async def _pass_stdin(loop: asyncio.AbstractEventLoop, take: Callable[[str], None]) -> None:
-    """Whoever writes JSON to our stdin plays with the simulator; a terminal, a file or nothing does not."""
+    """Pass lines from stdin to the simulator, if stdin is a pipe or socket."""
     mode = os.fstat(sys.stdin.fileno()).st_mode
     if stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode):
-        await loop.connect_read_pipe(lambda: _PlainStatus(take), sys.stdin)
+        await loop.connect_read_pipe(lambda: LineProtocol(take), sys.stdin)
 
 
-def _written(teller: _Tell, happening: SupervisorEvent) -> None:
-    """A reader that has gone (a pipe, a closed terminal) must not keep the cars from being stopped."""
+def _written(write: _Write, event: SupervisorEvent) -> None:
+    """Print an event. A closed pipe or terminal must not prevent the shutdown."""
     try:
-        teller(happening)
+        write(event)
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _json(happening: SupervisorEvent) -> None:
-    told = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "what": happening.what}
-    click.echo(json.dumps({**told, "name": happening.name, "words": happening.words}))
+def _json(event: SupervisorEvent) -> None:
+    time = datetime.now(UTC).isoformat(timespec="milliseconds")
+    click.echo(json.dumps({"time": time, "what": event.what, "name": event.name, "words": event.words}))
 
 
-def _plain(happening: SupervisorEvent) -> None:
-    click.echo(f"{datetime.now(UTC):%H:%M:%S} {happening.name}: {happening.words}")
+def _plain(event: SupervisorEvent) -> None:
+    click.echo(f"{datetime.now(UTC):%H:%M:%S} {event.name}: {event.words}")

@@ -1,4 +1,4 @@
-"""`fleet view`: the fleet as it is now, in Rerun. What is shown and how it comes there is live.py's."""
+"""`fleet view`: shows the fleet live in Rerun."""
 
 import signal
 import threading
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from fleet.replay.rerun.viewer import Viewer
 
 MEMORY: Final = "1GiB"
-SETTLE_S: Final = 1.5
-"""What comes within this time is laid out at once, so that the tabs do not change under the user's hands."""
+LAYOUT_DELAY_S: Final = 1.5
+"""Delay of the first layout, so that the tabs do not change while the user clicks on them."""
 
 
 @click.command(
@@ -45,11 +45,11 @@ examples:
     default=MEMORY,
     show_default=True,
     metavar="SIZE",
-    help="What the viewer may hold: the oldest goes first.",
+    help="Maximum memory of the viewer; the oldest data is dropped first.",
 )
 @bus_options
 def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, connect: str | None, fleet: str) -> None:
-    """See the fleet live in Rerun until its window is closed, or Ctrl-C. Cars and `fleet up` do not notice."""
+    """Show the fleet live in Rerun until its window is closed, or Ctrl-C. Cars and `fleet up` are not affected."""
     import re
 
     if web and save is not None:
@@ -88,7 +88,7 @@ def _follow(
         live = Live(bus, fleet, sink, last_s=None if save is not None else DEFAULT_VIEW_S)
         try:
             live.start()
-            pause = SETTLE_S
+            pause = LAYOUT_DELAY_S
             while not stop.wait(pause) and (viewer is None or viewer.ended is None):
                 live.step()
                 if until is not None and time.monotonic() > until:
@@ -103,7 +103,7 @@ def _follow(
 
 @contextmanager
 def _signals(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end it in order."""
+    """Set `stop` on Ctrl-C and SIGTERM."""
 
     def ask(_number: int, _frame: FrameType | None) -> None:
         stop.set()
@@ -118,7 +118,7 @@ def _signals(stop: threading.Event) -> Iterator[None]:
 
 @contextmanager
 def _sink(save: Path | None, memory: str, *, web: bool) -> "Iterator[tuple[Viewer | None, Callable[[Any], None]]]":
-    """Where it goes: a file, or a viewer that is up."""
+    """Yield the running viewer (None for a file) and the function that connects a recording to it."""
     from fleet.replay.rerun.viewer import VIEWER_HOST, Viewer, free_port
 
     if save is not None:

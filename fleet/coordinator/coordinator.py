@@ -30,7 +30,7 @@ from fleet.policy.plan.plan import Plan
 from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
 from fleet.policy.state import PolicyState, carry_over, on_hub_back, restart_plan, restore, to_persisted
 from schemas import keys, messages, topics
-from schemas.bus import BusError, Latest, Publisher, Sample, ensure_hub, reply, reply_value
+from schemas.bus import HubKeeper, Latest, Publisher, Sample, reply_message, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos
 
@@ -131,7 +131,7 @@ class Coordinator:
             bus.queryable(keys.command_key(fleet, keys.COORDINATOR, verb), self._on_query)
         republish_at = time.monotonic() + REPUBLISH_INTERVAL_S
         recheck_at: float | None = time.monotonic() + SINGLETON_RECHECK_S
-        hubs, linked_at = bus.hubs, time.monotonic()
+        hubs, hub_keeper = bus.hubs, HubKeeper(bus.endpoint, HUB_OUTAGE_S, self.on_failure)
         with ThreadPoolExecutor(max_workers=32) as pool:
             try:
                 self._drain_inbox(observer, pool, wait_s=0.0)
@@ -147,12 +147,11 @@ class Coordinator:
                     linked_hubs = bus.hubs
                     self._drain_inbox(observer, pool)
                     now = time.monotonic()
+                    hub_keeper.check(connected=bool(linked_hubs))
                     if not linked_hubs:
-                        linked_at = self._ensure_hub(linked_at, now)
                         continue
                     if linked_hubs != hubs:
                         hubs, self._memory = linked_hubs, on_hub_back(self._memory, now)
-                    linked_at = now
                     try:
                         self._step(observer, pool, state_file, now)
                     except OSError:  # its own output is closed: its parent has ended
@@ -249,10 +248,7 @@ class Coordinator:
         self._reply_result(query, result)
 
     def _reply_result(self, query: zenoh.Query, result: pb.Result) -> None:
-        if query.parameters.get("format") == "json":
-            reply(query, str(query.key_expr), messages.to_json(result).encode(), messages.JSON)
-        else:
-            reply(query, str(query.key_expr), result.SerializeToString(), messages.encoding_of(topics.RESULT))
+        reply_message(query, str(query.key_expr), result, as_json=query.parameters.get("format") == "json")
 
     def _take_over(self, plan: Plan) -> None:
         self._memory = carry_over(self._memory, self.plan, plan)
@@ -326,7 +322,7 @@ class Coordinator:
     def _handle_tokens(self, observer: FleetObserver, pool: ThreadPoolExecutor) -> None:
         """Note arrived and lost gateways, and query the states of those that arrived."""
         now = time.monotonic()
-        for car, alive in self._tokens.taken().items():
+        for car, alive in self._tokens.take().items():
             observer.on_token(car, now, alive=alive)
             if alive and self._memory.started_at is not None:
                 self._arrived.add(car)
@@ -406,16 +402,6 @@ class Coordinator:
     def _describe(self, others: list[str]) -> str:
         who = ", ".join(others) or "one that does not say who it is"
         return f"fleet {self.client.name} has a coordinator already ({who}): stop that one first"
-
-    def _ensure_hub(self, linked_at: float, now: float) -> float:
-        """Start a hub if there was no link to one for HUB_OUTAGE_S; return the new start of the outage."""
-        if now - linked_at < HUB_OUTAGE_S:
-            return linked_at
-        try:
-            ensure_hub(self.client.bus.endpoint)
-        except BusError as error:
-            self.on_failure(str(error))
-        return now
 
     def _publish(self, name: str, message: Any) -> None:
         publisher = self._publisher(name)

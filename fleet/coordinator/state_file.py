@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet.policy.state import PersistedPolicy
+from schemas.atomic_file import write_atomically
 from schemas.state_dir import directory_of
 
 
@@ -55,11 +56,9 @@ class CoordinatorStateFile:
             return
         self._last = state
         content = {"endpoint": self._endpoint, "run": self._run, **asdict(state)}
-        temporary = self.path.with_suffix(".new")
         with contextlib.suppress(OSError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_text(json.dumps(content), encoding="utf-8")
-            temporary.replace(self.path)
+            write_atomically(self.path, json.dumps(content).encode())
 
 
 def _same(one: PersistedPolicy, other: PersistedPolicy) -> bool:

@@ -1,1 +1,1 @@
-"""Programs to start from, each under thirty lines; CI runs each against simulated cars. Nothing imports them."""
+"""Example programs, each under thirty lines. CI runs each of them against simulated cars. Nothing imports them."""

@@ -1,4 +1,4 @@
-"""A policy of our own: the car with most room ahead avoids obstacles, the others rest; 3 rounds of 5 s.
+"""A custom policy: the car with most room ahead avoids obstacles, the others rest; 3 rounds of 5 s.
 
 `python -m fleet.examples.custom_policy`
 """
@@ -9,7 +9,7 @@ from fleet import Fleet
 
 
 def main() -> None:
-    """As a coordinator: a car that a person has stopped or drives is refused to us, and the next one is asked."""
+    """Run as a coordinator: the gateway of a car that a person has stopped or drives rejects us; try the next car."""
     with Fleet(kind="coordinator") as fleet:
         for _ in range(3):
             room = {reading.car: reading["range_m"] or 0.0 for reading in fleet.get("*/sensor/range")}
@@ -21,7 +21,7 @@ def main() -> None:
                     fleet.car(car).mode("manual")  # closes the mode, and stops
                     break
             else:
-                time.sleep(5)  # nobody may, or can
+                time.sleep(5)  # no car may or can
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from fleet import Fleet, NotCarriedOut
 
 
 def main(name: str) -> None:
-    """The car is ours while the block runs; however that ends, it is stopped and given back."""
+    """Reserve the car while the block runs. At its end, the car is stopped and released."""
     with Fleet() as fleet, fleet.car(name).lease() as car:
         for _ in range(4):
             car.drive("forward", 0.5)
@@ -17,5 +17,5 @@ def main(name: str) -> None:
 if __name__ == "__main__":
     try:
         main(*sys.argv[1:])
-    except NotCarriedOut as error:  # on which car, why, and by whom if another took it
+    except NotCarriedOut as error:  # the text names the car and the reason
         sys.exit(str(error))

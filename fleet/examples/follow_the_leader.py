@@ -8,7 +8,7 @@ from fleet.aio import Fleet
 
 
 async def main(leader: str, follower: str) -> None:
-    """A motion is held for 1.5 s at most, and asked again every second: were we killed, the car would stop."""
+    """Repeat a motion of at most 1.5 s every second. If this program is killed, the car stops."""
     async with Fleet() as fleet, fleet.car(follower).lease() as car:
         motion = "stop"
         async for reading in fleet.watch(f"{leader}/state/motion"):  # at each change, and once a second

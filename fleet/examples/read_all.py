@@ -1,4 +1,4 @@
-"""Read every car: what each measured last, then 20 readings as they come: `python -m fleet.examples.read_all`."""
+"""Read every car: the latest values, then 20 readings as they come: `python -m fleet.examples.read_all`."""
 
 from itertools import islice
 
@@ -6,7 +6,7 @@ from fleet import Fleet
 
 
 def main() -> None:
-    """A field that was not measured is None, never a made-up number."""
+    """Print readings. A field that was not measured is None."""
     with Fleet() as fleet:
         print("cars:", ", ".join(fleet.cars()))
         for reading in fleet.get("*/sensor/battery"):

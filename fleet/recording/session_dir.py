@@ -23,6 +23,8 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, Final, Self
 
+from schemas.atomic_file import write_atomically
+
 SESSION_FILE: Final = "session.json"
 INDEX_FILE: Final = "index.json"
 SPARE_FILE: Final = "session.json.spare"
@@ -129,14 +131,7 @@ def _write_all(file: FileIO, data: bytes) -> int:
 
 def replace(path: Path, values: object, indent: int | None = None) -> None:
     """Write JSON to a file atomically; raises OSError."""
-    new = path.with_name(path.name + ".new")
-    try:
-        new.write_text(json.dumps(values, indent=indent) + "\n", encoding="utf-8")
-        new.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):  # on a full disk an empty file would stay
-            new.unlink()
-        raise
+    write_atomically(path, f"{json.dumps(values, indent=indent)}\n".encode())
 
 
 _COUNTS: Final = ("drops", "missed", "recovered")

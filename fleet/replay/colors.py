@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from schemas.topics import COMMANDS
+from schemas.commands import COMMANDS
 
 Rgb = tuple[int, int, int]
 

@@ -1,24 +1,24 @@
-"""Decides which processes may be started or killed now, so that a loaded machine is not loaded more. Pure.
+"""Rate limits for starts and kills, so that restarts do not overload the machine further. Pure.
 
-`fleet up --sim 100` on two cores: a gateway takes 0.3 s of a processor to start. A hundred that start together are not
-heard in time, and each restart makes the others later.
+A gateway takes 0.3 s of CPU time to start. A hundred gateways on two cores cannot all send a heartbeat in time. Each
+restart would delay the others further.
 """
 
 from collections.abc import Iterable
 from typing import Final
 
-PLACE_S: Final = 10.0
-"""Maximum time for which a starting process keeps others from starting. A process that hangs must not hold them up."""
+START_SLOT_TIMEOUT_S: Final = 10.0
+"""Maximum time for which a starting process delays others. A hung process must not block them."""
 RESTARTS_AT_ONCE: Final = 16
 RESTART_INTERVAL_S: Final = 1.0
-"""Restarts of the whole fleet beyond the first ones. A restart takes 0.3 to 0.7 s of a processor."""
+"""Interval of further restarts in the whole fleet. A restart takes 0.3 to 0.7 s of CPU time."""
 KILLS_AT_ONCE: Final = 3
 KILL_INTERVAL_S: Final = 5.0
-"""Kills of hung processes of the whole fleet beyond the first ones."""
+"""Interval of further kills of hung processes in the whole fleet."""
 
 
 class Budget:
-    """Allows `at_once` events, and one more for each interval that passes."""
+    """A rate limit: `at_once` events, and one more for each interval that passes."""
 
     def __init__(self, at_once: int, interval_s: float) -> None:
         self._at_once = at_once
@@ -39,7 +39,7 @@ class Budget:
 
 
 class Admission:
-    """Admits starts a few at a time: the next one when a process before it is heard, or has had its time."""
+    """Limits concurrent starts. A start ends with the first heartbeat or after START_SLOT_TIMEOUT_S."""
 
     def __init__(self, places: int) -> None:
         self._places = places
@@ -47,8 +47,8 @@ class Admission:
         self._kills = Budget(KILLS_AT_ONCE, KILL_INTERVAL_S)
 
     def admit_start(self, now: float, starting_since: Iterable[float], *, restart: bool) -> bool:
-        """Return True if one more process may be started now, beside those that start since these times."""
-        if sum(now - since < PLACE_S for since in starting_since) >= self._places:
+        """Return True if one more process may start now. starting_since: when the starting processes were started."""
+        if sum(now - since < START_SLOT_TIMEOUT_S for since in starting_since) >= self._places:
             return False
         if restart:
             if not self._restarts.has(now):
@@ -60,6 +60,6 @@ class Admission:
         """Return True if one more hung process may be killed now."""
         return self._kills.has(now)
 
-    def killed(self) -> None:
-        """Count a hung process that was killed."""
+    def count_kill(self) -> None:
+        """Count one killed hung process."""
         self._kills.take()

@@ -1,16 +1,17 @@
-"""What the cars of a fleet show, one row each, and which changes are worth a line. Pure: time is an argument."""
+"""The status of one car from its messages, and the changes that deserve a line. Pure: time is an argument."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
-RATE_OVER_S: Final = 2.0
+RATE_WINDOW_S: Final = 2.0
+"""Minimum time over which the frame rate is measured."""
 
 
 @dataclass(slots=True)
 class CarStatus:
-    """One car as it was last heard."""
+    """The latest state of one car, as its gateway published it."""
 
     car: str
     link: str = ""
@@ -24,17 +25,17 @@ class CarStatus:
     lease: str = ""
     battery: str = ""
     rate_hz: float | None = None
-    """Frames from the car."""
+    """Frames per second from the car."""
     event: str = ""
-    welcomed: bool = False
-    """Its state of safety was heard, of any gateway."""
+    safety_received: bool = False
+    """True if any gateway has published the car's state/safety."""
     reached: bool = False
-    """Its link was open at some time, of any gateway."""
+    """True if any gateway has had an open link to the car."""
     _counted: tuple[float, int] | None = None
-    _told: dict[str, str] = field(default_factory=dict)
+    _reported: dict[str, str] = field(default_factory=dict)
 
     def take(self, topic: str, value: Any, now: float) -> str:
-        """Take a message; the words for a change that is worth a line, else nothing."""
+        """Update from a message. Return a line for a notable change, else an empty string."""
         match topic:
             case "state/link":
                 self.link, self.reason = value.state, value.reason
@@ -60,11 +61,11 @@ class CarStatus:
                 pass
         return ""
 
-    def gone(self) -> None:
-        """Its gateway is away: nothing of it is known."""
+    def reset(self) -> None:
+        """Forget the state: the car's gateway has ended."""
         self.link, self.reason, self.rate_hz, self._counted = "", "", None, None
         self.mode = self.verdict = self.motion = self.motors = self.lease = ""
-        self._told.clear()
+        self._reported.clear()
 
     def _safety(self, value: Any) -> str:
         self.hold = value.hold.by if value.HasField("hold") else ""
@@ -78,25 +79,25 @@ class CarStatus:
     def _count(self, frames: int, now: float) -> None:
         if self._counted is None or frames < self._counted[1]:
             self._counted = (now, frames)
-        elif now - self._counted[0] >= RATE_OVER_S:
+        elif now - self._counted[0] >= RATE_WINDOW_S:
             self.rate_hz = (frames - self._counted[1]) / (now - self._counted[0])
             self._counted = (now, frames)
 
     def _change(self, what: str, words: str) -> str:
-        """The words, if they say something new; what is as it should be at first is not new."""
-        before, self._told[what] = self._told.get(what), words
+        """Return the words if they are news. Normal values are no news in the first message."""
+        before, self._reported[what] = self._reported.get(what), words
         return "" if words == before or (before is None and words in _AT_FIRST) else words
 
     def as_dict(self) -> Mapping[str, object]:
-        """For a script."""
+        """Return the status as JSON values."""
         names = ("car", "link", "reason", "mode", "verdict", "motion", "hold", "estop", "lease", "battery")
         return {name: getattr(self, name) for name in (*names, "rate_hz", "event")}
 
 
-def left_from_before(car: str, safety: Any, began_s: float, options: str = "") -> str:
-    """Return words for a hold and e-stops that are older than `began_s` (s since the epoch); empty if there are none.
+def describe_old_stops(car: str, safety: Any, began_s: float, options: str = "") -> str:
+    """Describe a hold and e-stops older than `began_s` (s since the epoch). Return an empty string if there are none.
 
-    safety: a fleet.v1.Safety. options: what `fleet resume` needs to find this fleet.
+    safety: a fleet.v1.Safety. options: options of `fleet resume` that select this fleet.
     """
     estops = [each for each in safety.estops if each.stamp.ToDatetime(UTC).timestamp() < began_s]
     held = safety.HasField("hold") and safety.hold.since.ToDatetime(UTC).timestamp() < began_s

@@ -1,113 +1,107 @@
-"""One child process: started in a group of its own, its lines taken, its log kept within bounds. Decides nothing.
+"""One child process, its log file of limited size, and the directory of a run.
 
-A group of its own: Ctrl-C at the terminal comes to it from its supervisor, and in order.
+Each child has its own process group. So Ctrl-C at the terminal reaches only the supervisor, which ends the children in
+order.
 """
 
 import asyncio
 import contextlib
 import hashlib
+import logging
 import os
 import re
 import signal
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Final
 
+from schemas.atomic_file import write_atomically
 from schemas.state_dir import directory_of
 
-LOG_BYTES: Final = 1_000_000
-"""Of one log file; there are at most two for each process."""
-LINE_BYTES: Final = 65_536
-RUNS: Final = 10
-"""Directories of runs that are kept."""
-IN_USE_S: Final = 3600.0
-"""A run that was touched within this time may go on: it is not removed."""
+MAX_LOG_BYTES: Final = 1_000_000
+"""Maximum size of one log file. Each process has at most two."""
+MAX_LINE_BYTES: Final = 65_536
+MAX_RUN_DIRECTORIES: Final = 10
+"""Maximum number of run directories, apart from those that may be in use."""
+RUN_IN_USE_S: Final = 3600.0
+"""A run directory that was changed within this time may be in use and is not removed."""
 _LOGGED: Final = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (?P<level>[A-Z]+) (?P<words>.*)")
 
 
-class Log:
-    """The lines of one process, each with its time; when the file is full it becomes `.1`, in place of an older one."""
+class Log(RotatingFileHandler):
+    """The log file of one process. At rollover it becomes `.log.1` and replaces an older one."""
 
-    def __init__(self, path: Path, limit_bytes: int = LOG_BYTES) -> None:
+    def __init__(self, path: Path, limit_bytes: int = MAX_LOG_BYTES) -> None:
+        super().__init__(path, "a", limit_bytes, backupCount=1, encoding="utf-8", delay=True, errors="replace")
         self.path = path
-        self._limit = limit_bytes
+        self.older = path.with_suffix(".log.1")
         self.failed = ""
-        """Why nothing is written any more."""
+        """Error of the last line, if it was not written."""
 
     def add(self, line: str, now: float) -> None:
-        """Add a line; `now` in s since the epoch. A disk that takes no more ends the log, not the supervisor."""
+        """Add a line. now: s since the epoch."""
         stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(now)) + f".{int(now % 1 * 1000):03d}Z"
-        try:
-            with self.path.open("a", encoding="utf-8", errors="replace") as file:
-                file.write(f"{stamp} {self.path.stem.lstrip('@')} | {line}\n")
-                full = file.tell() >= self._limit
-            if full:
-                self.path.replace(self.older)
-        except OSError as error:
-            self.failed = f"{self.path} cannot be written: {error.strerror}"
+        text = f"{stamp} {self.path.stem.lstrip('@')} | {line}"
+        self.handle(logging.makeLogRecord({"msg": text}))
 
-    @property
-    def older(self) -> Path:
-        """Where the lines before are."""
-        return self.path.with_suffix(".log.1")
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: ARG002, N802 - logging calls it so
+        """Note why the line was not written. A full disk must not end the supervisor."""
+        self.failed = f"{self.path} cannot be written: {getattr(sys.exception(), 'strerror', sys.exception())}"
 
 
-def entry(line: str) -> dict[str, str]:
-    """A line of a log taken apart: when, which process, and what it said; of one that was cut, only that."""
+def parse_log_line(line: str) -> dict[str, str]:
+    """Split a log line into time, process name and text. A truncated line has only a text."""
     when, bar, words = line.rstrip("\n").partition(" | ")
     stamp, _, name = when.partition(" ")
     return {"time": stamp, "name": name, "line": words} if bar else {"time": "", "name": "", "line": when}
 
 
-def runs(fleet: str, endpoint: str) -> Path:
-    """Where the runs of a fleet are kept."""
+def runs_directory(fleet: str, endpoint: str) -> Path:
+    """Return the directory of all runs of a fleet."""
     return directory_of(endpoint) / "runs" / fleet
 
 
 def new_run(fleet: str, endpoint: str, now: float) -> Path:
-    """A directory for one run; the oldest that are over are removed. Raises OSError."""
-    place = runs(fleet, endpoint)
+    """Create a directory for one run and remove the oldest ones. Raises OSError."""
+    place = runs_directory(fleet, endpoint)
     path = place / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime(now))}-{os.getpid()}"
     path.mkdir(parents=True)
-    for old in sorted((each for each in place.iterdir() if each.is_dir()), reverse=True)[RUNS:]:
+    for old in sorted((each for each in place.iterdir() if each.is_dir()), reverse=True)[MAX_RUN_DIRECTORIES:]:
         with contextlib.suppress(OSError):  # another `fleet up` removes it at this moment
-            if now - old.stat().st_mtime > IN_USE_S:
+            if now - old.stat().st_mtime > RUN_IN_USE_S:
                 for file in old.iterdir():
                     file.unlink()
                 old.rmdir()
     return path
 
 
-def copied(directory: Path, name: str, text: str) -> Path:
-    """A file of this text, named by it: it is whole, or not there. Raises OSError."""
+def write_copy(directory: Path, name: str, text: str) -> Path:
+    """Write a file that is named by the hash of its text, unless there is one. Raises OSError."""
     data = text.encode()
     path = directory / f"{name}-{hashlib.sha256(data).hexdigest()[:12]}.yaml"
     if not path.is_file():
-        begun = path.with_suffix(".part")
-        try:
-            begun.write_bytes(data)
-            begun.replace(path)
-        finally:
-            begun.unlink(missing_ok=True)
+        write_atomically(path, data)
     return path
 
 
 def remove_links(directory: Path) -> None:
-    """Remove the symlinks to terminals of a simulator that has ended: another's car may be at such a terminal next."""
+    """Remove the symlinks to the terminals of a simulator that has ended. Another car may get such a terminal next."""
     for path in directory.glob("*.tty"):
         with contextlib.suppress(OSError):
             path.unlink()
 
 
 class Child:
-    """A process that was started; `said` hears each line of its stdout, `ended` once how it ended."""
+    """A running child process."""
 
     def __init__(self, process: asyncio.subprocess.Process, log: Log) -> None:
         self._process = process
         self.log = log
         self.last = ""
-        """Its last line on stderr that is no mere note: why it ended, if it knew."""
+        """Last error line on stderr: usually the reason why the process ended."""
         self.task: asyncio.Task[None]
 
     @classmethod
@@ -116,10 +110,13 @@ class Child:
         command: Sequence[str],
         environment: Mapping[str, str],
         log: Log,
-        said: Callable[[str], None],
-        ended: Callable[[int], None],
+        on_line: Callable[[str], None],
+        on_exit: Callable[[int], None],
     ) -> "Child":
-        """Start it; raises OSError."""
+        """Start a process. on_line: called with each line of stdout. on_exit: called with the exit code.
+
+        Raises OSError.
+        """
         process = await asyncio.create_subprocess_exec(
             *command,
             stdin=asyncio.subprocess.PIPE,
@@ -129,44 +126,44 @@ class Child:
             process_group=0 if os.name == "posix" else None,
         )
         child = cls(process, log)
-        child.task = asyncio.ensure_future(child._follow(said, ended))
+        child.task = asyncio.ensure_future(child._follow(on_line, on_exit))
         return child
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """The process id."""
         return self._process.pid
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal; nothing if it has ended."""
+        """Send a signal. Do nothing if the process has ended."""
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(number)
 
     def kill(self) -> None:
-        """End it without a word."""
+        """Kill the process."""
         with contextlib.suppress(ProcessLookupError):
             self._process.kill()
 
-    def tell(self, line: str) -> None:
-        """Write a line to its stdin, which may be closed."""
+    def write_line(self, line: str) -> None:
+        """Write a line to the process's stdin. Do nothing if stdin is closed."""
         if self._process.stdin is not None and not self._process.stdin.is_closing():
             self._process.stdin.write(line.encode() + b"\n")
 
-    async def _follow(self, said: Callable[[str], None], ended: Callable[[int], None]) -> None:
+    async def _follow(self, on_line: Callable[[str], None], on_exit: Callable[[int], None]) -> None:
         assert self._process.stdout is not None
         assert self._process.stderr is not None
         pumps = asyncio.gather(
-            self._pump(self._process.stdout, said), self._pump(self._process.stderr, self._complained)
+            self._pump(self._process.stdout, on_line), self._pump(self._process.stderr, self._on_stderr_line)
         )
         code = await self._process.wait()
-        # A grandchild may hold the pipes open for longer than the process lives.
+        # A grandchild may keep the pipes open after the process has ended.
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(pumps, 1.0)
         if self._process.stdin is not None:
             self._process.stdin.close()
-        ended(code)
+        on_exit(code)
 
-    def _complained(self, line: str) -> None:
+    def _on_stderr_line(self, line: str) -> None:
         logged = _LOGGED.fullmatch(line)
         if logged is None:
             self.last = line
@@ -177,7 +174,7 @@ class Child:
         rest = b""
         while data := await stream.read(4096):
             *whole, rest = (rest + data).split(b"\n")
-            rest = rest[-LINE_BYTES:]
+            rest = rest[-MAX_LINE_BYTES:]
             for line in whole:
                 self._line(line, take)
         if rest:

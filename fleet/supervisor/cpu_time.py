@@ -1,4 +1,4 @@
-"""Reads how much CPU time a process has had. Decides nothing: hang.py does."""
+"""Reads the CPU time of a process. `hang` decides what it means."""
 
 import subprocess
 from pathlib import Path
@@ -9,18 +9,16 @@ from fleet.supervisor.hang import CpuTime
 _PROC: Final = Path("/proc")
 _PS_TIMEOUT_S: Final = 1.0
 _READY: Final = frozenset("RD")
-"""States of a process that runs or waits for a processor (R), or for the disk (D)."""
+"""Process states: running or ready to run (R), waiting for the disk (D)."""
 
 
 def read(pid: int) -> CpuTime | None:
-    """Return the CPU time of a process's main thread (Linux) or of the process (elsewhere); None if unknown.
-
-    The asyncio loop of a gateway is its main thread. Threads of Zenoh run on while it is blocked.
-    """
+    """Return the CPU time of a process's main thread (Linux) or of the process (other systems). None if unknown."""
+    # A gateway's asyncio loop runs on its main thread. Zenoh's threads run on while that one is blocked.
     if not _PROC.joinpath("self", "stat").exists():
         return _of_ps(pid)
     try:
-        # What follows the name, which may hold blanks and brackets, begins with the state.
+        # The state follows the name, and the name may contain blanks and brackets.
         state = (_PROC / str(pid) / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
         run_ns, wait_ns, *_ = (_PROC / str(pid) / "schedstat").read_text(encoding="ascii").split()
     except (OSError, ValueError, IndexError):
@@ -29,7 +27,7 @@ def read(pid: int) -> CpuTime | None:
 
 
 def _of_ps(pid: int) -> CpuTime | None:
-    """Without /proc (macOS): `ps` tells it in hundredths of a second."""
+    """Return the CPU time from `ps`, for systems without /proc (macOS)."""
     command = ["ps", "-o", "state=,time=", "-p", str(pid)]
     try:
         listed = subprocess.run(command, capture_output=True, text=True, check=True, timeout=_PS_TIMEOUT_S).stdout

@@ -1,9 +1,9 @@
-"""Tells a process that hangs from one that is slow, and from a machine or hub on which nobody is heard. Pure.
+"""Tells a hung process from a slow one, and from a stalled hub or machine. Pure.
 
-A process that is silent for its patience (restart.py) is killed unless one of these shows another cause:
-- The supervisor itself was late (`WatchClock`): nobody could be heard meanwhile.
-- Many are silent at once (`are_many`): the hub or the machine stands, not each of them.
-- The process runs or waits for a processor (`Pulse`): a gateway that hangs uses none, or all of one.
+The supervisor kills a process that sends no heartbeat for its `Patience`, unless there is another explanation:
+- The supervisor itself stalled (`WatchClock`) and could not receive heartbeats.
+- Many processes are silent at once (`are_many`): the hub or the machine stalls.
+- The process is slow (`Pulse`). A hung gateway uses no CPU time, or a whole CPU.
 """
 
 from collections import deque
@@ -11,25 +11,26 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-LONGEST_TURN_S: Final = 0.5
-"""Maximum time that passes for the supervisor from one look to the next."""
+MAX_POLL_GAP_S: Final = 0.5
+"""Maximum time that counts between two polls of the supervisor. A longer gap means that the supervisor stalled."""
 MANY_SHARE: Final = 0.25
-"""Share of the processes whose silence at once has a common cause."""
+"""Minimum share of silent processes that indicates a common cause."""
 MANY_SILENT_S: Final = 30.0
-"""Silence for which a common cause is assumed. A hub that stands is replaced after 8 s."""
+"""Maximum silence of a process while many are silent. A stalled hub is replaced after 8 s."""
 SLOW_SILENT_S: Final = 30.0
+"""Maximum silence of a slow process."""
 MOVING_SILENT_S: Final = 300.0
-"""Silence of a gateway that runs, and whose car may move: only this gateway stops the car when a drive ends."""
-WINDOW_S: Final = 3.0
-SHORTEST_WINDOW_S: Final = 0.9
+"""Maximum silence of a slow gateway whose car may move. Only this gateway stops the car when a drive ends."""
+CPU_WINDOW_S: Final = 3.0
+MIN_CPU_WINDOW_S: Final = 0.9
 SPINNING_SHARE: Final = 0.8
-"""Share of a processor that only an endless loop takes for seconds."""
+"""Share of a CPU that only an endless loop uses for seconds."""
 RUNNING_SHARE: Final = 1e-4
-"""A gateway at rest takes 0.5 % of a processor, a blocked process none."""
+"""Minimum share of a CPU of a process that is not blocked. An idle gateway uses 0.5 %, a blocked one nothing."""
 
 
 class Sign(StrEnum):
-    """What a process shows by its use of the processor."""
+    """The state of a silent process, judged by its CPU time."""
 
     UNKNOWN = "unknown"
     BLOCKED = "blocked"
@@ -39,56 +40,56 @@ class Sign(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CpuTime:
-    """Time since the start of a process, s: on a processor, and ready to run but waiting for one."""
+    """CPU time since the start of a process, s: running, and waiting for a CPU while ready to run."""
 
     run_s: float
     wait_s: float = 0.0
     ready: bool = False
-    """True if the process is ready to run, or waits for the disk, at this moment."""
+    """True if the process is now ready to run or waits for the disk."""
 
 
 @dataclass(slots=True)
 class Pulse:
-    """The CPU time of one process over the last seconds of its silence."""
+    """Samples of the CPU time of one silent process over the last seconds."""
 
-    _looks: deque[tuple[float, CpuTime]] = field(default_factory=deque)
+    _samples: deque[tuple[float, CpuTime]] = field(default_factory=deque)
 
-    def look(self, now: float, time: CpuTime | None) -> None:
-        """Note the CPU time; None if the system does not tell."""
+    def add(self, now: float, time: CpuTime | None) -> None:
+        """Add a sample. None if the system does not report the CPU time."""
         if time is None:
-            self._looks.clear()
+            self._samples.clear()
             return
-        self._looks.append((now, time))
-        while now - self._looks[0][0] > WINDOW_S:
-            self._looks.popleft()
+        self._samples.append((now, time))
+        while now - self._samples[0][0] > CPU_WINDOW_S:
+            self._samples.popleft()
 
     def clear(self) -> None:
-        """Forget all: the process was heard, or another process is looked at."""
-        self._looks.clear()
+        """Drop all samples: the process sent a heartbeat or was replaced."""
+        self._samples.clear()
 
     def is_due(self, now: float) -> bool:
-        """Return True if the last look is old enough for the next one."""
-        return not self._looks or now - self._looks[-1][0] >= WINDOW_S / 6
+        """Return True if it is time for the next sample."""
+        return not self._samples or now - self._samples[-1][0] >= CPU_WINDOW_S / 6
 
     @property
     def sign(self) -> Sign:
-        """What the looks show."""
-        if not self._looks:
+        """The state that the samples indicate."""
+        if not self._samples:
             return Sign.UNKNOWN
-        (began, first), (ended, last) = self._looks[0], self._looks[-1]
+        (began, first), (ended, last) = self._samples[0], self._samples[-1]
         seconds = ended - began
-        if seconds < SHORTEST_WINDOW_S:
+        if seconds < MIN_CPU_WINDOW_S:
             return Sign.UNKNOWN
         run, wait = (last.run_s - first.run_s) / seconds, (last.wait_s - first.wait_s) / seconds
         if run >= SPINNING_SHARE:
             return Sign.SPINNING
-        if run + wait >= RUNNING_SHARE or any(time.ready for _, time in self._looks):
+        if run + wait >= RUNNING_SHARE or any(time.ready for _, time in self._samples):
             return Sign.SLOW
         return Sign.BLOCKED
 
 
 def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
-    """Return the silence that is allowed beyond a process's own patience; 0 if only that counts."""
+    """Return the allowed silence if it is longer than the process's own patience, else 0."""
     longest = MANY_SILENT_S if many else 0.0
     if sign is Sign.SLOW:
         longest = max(longest, MOVING_SILENT_S if may_move else SLOW_SILENT_S)
@@ -96,18 +97,18 @@ def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
 
 
 def are_many(silent: int, total: int) -> bool:
-    """Return True if so many of all processes are silent that there is a common cause."""
+    """Return True if the silent processes are so many that they have a common cause."""
     return silent >= 2 and silent >= MANY_SHARE * total
 
 
 class WatchClock:
-    """A clock that stands while its watcher does: from one look to the next it passes at most LONGEST_TURN_S."""
+    """A clock that stops while the supervisor stalls: it advances at most MAX_POLL_GAP_S from one poll to the next."""
 
     def __init__(self, now: float) -> None:
         self._shown = self._last = now
 
-    def look(self, now: float) -> float:
-        """Return the watcher's time, at `now` of the machine."""
-        self._shown += min(now - self._last, LONGEST_TURN_S)
+    def advance(self, now: float) -> float:
+        """Advance to `now` of the machine and return the clock's time."""
+        self._shown += min(now - self._last, MAX_POLL_GAP_S)
         self._last = now
         return self._shown

@@ -1,42 +1,43 @@
-"""What a fleet file that was changed while running means: what is done, and what needs a new start. Pure."""
+"""Compares the running spec with an edited one: which changes apply now, and which need a restart. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from fleet.supervisor.spec import SIMULATED, CarProcessSpec, FleetSpec, Listed
+from fleet.supervisor.spec import SIMULATED, CarProcessSpec, CoordinatorCar, FleetSpec
 
-_FIXED: Final[Mapping[str, str]] = {
+_FIXED_PROPERTIES: Final[Mapping[str, str]] = {
     "fleet": "the fleet's name",
     "endpoint": "the endpoint",
     "world": "the world",
     "recordings": "where recordings go",
     "record": "whether it records",
 }
-"""What the processes that run are bound to."""
+"""Properties that cannot change while the fleet is running, with their names in messages."""
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
-    """From one wish to the next; `words` tell of it, one line each."""
+class SpecChange:
+    """The difference of two specs, as far as it can be applied while the fleet is running."""
 
-    wish: FleetSpec
-    """What can be had now."""
-    gone: tuple[str, ...]
-    begun: tuple[str, ...]
-    """Cars whose gateway is started, or started anew."""
+    spec: FleetSpec
+    """The spec after the reload."""
+    removed: tuple[str, ...]
+    restarted: tuple[str, ...]
+    """Cars whose gateway is started or restarted."""
     words: tuple[str, ...]
+    """One line for each change, and for each that needs a restart of the fleet."""
 
 
-def change(old: FleetSpec, new: FleetSpec) -> Change:
-    """What becomes of `old` when `new` is wanted."""
+def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
+    """Return the changes from `old` to `new`."""
     words = [
         f"{what} cannot be changed while running (fleet down, fleet up)"
-        for name, what in _FIXED.items()
+        for name, what in _FIXED_PROPERTIES.items()
         if getattr(old, name) != getattr(new, name)
     ]
     cars: dict[str, CarProcessSpec] = {}
-    begun = []
+    restarted = []
     for name, car in new.cars.items():
         before = old.cars.get(name)
         if car == before:
@@ -47,25 +48,25 @@ def change(old: FleetSpec, new: FleetSpec) -> Change:
                 cars[name] = before
         else:
             cars[name] = car
-            begun.append(name)
+            restarted.append(name)
             words.append(f"{name} is {'begun anew' if before else 'added'}")
-    gone = tuple(name for name in old.cars if name not in cars)
-    words += [f"{name} is taken out" for name in gone]
-    # A car that stays as it was, against the file, keeps what is said of it there, too.
-    kept = {name for name, car in cars.items() if car != new.cars.get(name)}
-    listed = {name: told for name, told in new.listed.items() if name in cars and name not in kept}
-    listed |= {name: told for name, told in old.listed.items() if name in kept}
+    removed = tuple(name for name in old.cars if name not in cars)
+    words += [f"{name} is taken out" for name in removed]
+    # If a car cannot change, the coordinator's entry for it does not change either.
+    unchanged = {name for name, car in cars.items() if car != new.cars.get(name)}
+    listed = {name: entry for name, entry in new.listed.items() if name in cars and name not in unchanged}
+    listed |= {name: entry for name, entry in old.listed.items() if name in unchanged}
     words += [
-        f"{name}: {said}"
+        f"{name}: {difference}"
         for name in cars
-        if name not in begun and (said := _told_anew(old.listed.get(name), listed.get(name)))
+        if name not in restarted and (difference := _describe_difference(old.listed.get(name), listed.get(name)))
     ]
-    wish = replace(old, cars=cars, plan=new.plan, plan_text=new.plan_text, listed=listed, doubts=new.doubts)
-    return Change(wish, gone, tuple(begun), tuple(words))
+    spec = replace(old, cars=cars, plan=new.plan, plan_text=new.plan_text, listed=listed, warnings=new.warnings)
+    return SpecChange(spec, removed, tuple(restarted), tuple(words))
 
 
-def _told_anew(before: Listed | None, now: Listed | None) -> str:
-    """What the coordinator has to learn of a car that was there before."""
+def _describe_difference(before: CoordinatorCar | None, now: CoordinatorCar | None) -> str:
+    """Describe changes of a car that concern the coordinator. Return an empty string if there are none."""
     if before is None or now is None:
         return ""
     fields = ("platform", "capabilities", "roles")

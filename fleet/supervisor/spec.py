@@ -1,6 +1,6 @@
-"""What is to run: from a fleet file and the command line to the processes' arguments. Nothing is started here.
+"""The specification of a fleet and the command lines of its processes, from a fleet file and the options of `fleet up`.
 
-What fleet needs of links and simulators it starts as processes; it imports none of them.
+Links and simulators belong to the gateway package: they run as processes, nothing of them is imported here.
 """
 
 import json
@@ -17,23 +17,23 @@ from fleet.supervisor.restart_policy import Patience
 from schemas.keys import DEFAULT_FLEET
 
 SIMULATED: Final = "sim"
-"""The link of a car that the supervisor's simulator plays."""
-NAMES: Final = ("red", "green", "blue", "yellow", "orange", "violet", "white", "black")
+"""The link of a car that the supervisor's simulator simulates."""
+SIMULATED_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "orange", "violet", "white", "black")
 PLATFORMS: Final = ("arduino", "stm32", "arduino", "raspberry_pi")
-"""Of simulated cars without a file, in turns."""
-MOST_SIMULATED: Final = 200
+"""Platforms of simulated cars without a fleet file, in turn."""
+MAX_SIMULATED_CARS: Final = 200
 RECORDINGS: Final = Path("sessions")
 
 HUB: Final = "@hub"
-SIMULATOR: Final = "@simulator"
+SIMULATOR_PROCESS: Final = "@simulator"
 RECORDER: Final = "@recorder"
 COORDINATOR: Final = "@coordinator"
 SELF: Final = "@supervisor"
-"""Names of processes; all others are a car's gateway, and no car's name begins with @."""
+"""Names of processes. All other processes are gateways, and no car's name begins with @."""
 
 
 class ProcessKind(StrEnum):
-    """What a process is for."""
+    """The kind of a process."""
 
     HUB = "hub"
     SIMULATOR = "simulator"
@@ -43,18 +43,18 @@ class ProcessKind(StrEnum):
 
 
 PATIENCE: Final[Mapping[ProcessKind, Patience]] = {
-    # A client is linked again after half a second, a lease is 2 s. A hub that stood for 6 s need not be replaced.
+    # Clients reconnect within 0.5 s, and Zenoh's lease is 2 s. A hub that stalls for 6 s need not be replaced.
     ProcessKind.HUB: Patience(start_s=10.0, silence_s=8.0),
-    ProcessKind.SIMULATOR: Patience(start_s=20.0, silence_s=5.0),  # asked each second
-    ProcessKind.GATEWAY: Patience(start_s=20.0, silence_s=4.0, to_the_end=True),  # state/health comes each second
-    ProcessKind.COORDINATOR: Patience(start_s=20.0, silence_s=6.0),  # asked each second
+    ProcessKind.SIMULATOR: Patience(start_s=20.0, silence_s=5.0),  # queried each second
+    ProcessKind.GATEWAY: Patience(start_s=20.0, silence_s=4.0, to_the_end=True),  # state/health each second
+    ProcessKind.COORDINATOR: Patience(start_s=20.0, silence_s=6.0),  # queried each second
     ProcessKind.RECORDER: Patience(start_s=20.0, silence_s=10.0),  # each second, from a thread that waits for the disk
 }
 
 
 @dataclass(frozen=True, slots=True)
 class CarProcessSpec:
-    """One car: its link, or SIMULATED, and what its gateway is told besides."""
+    """One car: its link (or SIMULATED) and further options of its gateway."""
 
     name: str
     link: str
@@ -63,47 +63,47 @@ class CarProcessSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
-    """What the coordinator is told of one car: what it may do with it."""
+class CoordinatorCar:
+    """The coordinator's entry for one car in the fleet file."""
 
     platform: str
     capabilities: tuple[str, ...] | None = None
-    """None: its platform's."""
+    """None: the capabilities of the platform."""
     roles: tuple[str, ...] | None = None
-    """None: any."""
+    """None: any role."""
 
 
 @dataclass(frozen=True, slots=True)
 class FleetSpec:
-    """All that is to run."""
+    """Everything that `fleet up` runs."""
 
     fleet: str = DEFAULT_FLEET
     endpoint: str | None = None
     cars: Mapping[str, CarProcessSpec] = field(default_factory=dict)
     plan: Path | None = None
     plan_text: str = ""
-    """As it was read and checked: a file that is changed counts when it is reloaded."""
+    """The checked text of the plan. Later changes of the file take effect at a reload."""
     record: bool = True
     recordings: Path = RECORDINGS
     file: Path | None = None
-    """The fleet file, of which a recording keeps a copy."""
+    """The fleet file. The recorder stores a copy of it."""
     world: Path | None = None
-    listed: Mapping[str, Listed] = field(default_factory=dict)
-    """Every car, as the fleet file says; those that are only simulated, as their platform is."""
+    listed: Mapping[str, CoordinatorCar] = field(default_factory=dict)
+    """The coordinator's entries, by car."""
     insecure_lan: bool = False
-    """A hub may listen where others than this machine reach it."""
-    doubts: tuple[str, ...] = ()
-    """What is hardly meant so, a line each."""
+    """True if the hub may listen on an address that other machines can reach."""
+    warnings: tuple[str, ...] = ()
+    """Warnings of the plan's checks, one line each."""
 
     @property
     def simulated(self) -> list[CarProcessSpec]:
-        """The cars that the simulator plays."""
+        """The simulated cars."""
         return [car for car in self.cars.values() if car.link == SIMULATED]
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """What the command line says; None: as the file says."""
+class UpOptions:
+    """The options of `fleet up`. None: as in the fleet file."""
 
     simulated: int = 0
     plan: Path | None = None
@@ -115,34 +115,43 @@ class Asked:
     insecure_lan: bool = False
 
 
-def wanted(file: FleetFile | None, asked: Asked) -> FleetSpec:
-    """Unite file and command line, which wins. Of `asked.simulated` cars the file's come first, whatever their link."""
+def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
+    """Return the spec of a fleet file and the options, which take precedence.
+
+    The first `options.simulated` cars of the file are simulated, whatever their link.
+    """
     specs = {} if file is None else {**file.cars, **file.unlinked}
     cars = {name: _car(spec) for name, spec in specs.items()}
-    names = _names(list(cars), asked.simulated)
+    names = _names(list(cars), options.simulated)
     cars = {name: car for name, car in cars.items() if car.link or name in names}
     for index, name in enumerate(names):
         car = cars.get(name) or CarProcessSpec(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
-        # A simulated car must be of some platform, one of a real car may be found out.
+        # A simulated car needs a platform. The platform of a real car can be detected.
         platform = "arduino" if car.platform in ("auto", "unknown") else car.platform
         cars[name] = CarProcessSpec(name, SIMULATED, platform, car.arguments)
     return FleetSpec(
-        fleet=asked.fleet or (file.name if file else DEFAULT_FLEET),
-        endpoint=asked.connect or (file.endpoint if file else None),
+        fleet=options.fleet or (file.name if file else DEFAULT_FLEET),
+        endpoint=options.connect or (file.endpoint if file else None),
         cars=cars,
-        plan=asked.plan or (file.plan if file else None),
-        record=(file.record if file else True) if asked.record is None else asked.record,
-        recordings=asked.out or (file.recordings if file else None) or RECORDINGS,
+        plan=options.plan or (file.plan if file else None),
+        record=(file.record if file else True) if options.record is None else options.record,
+        recordings=options.out or (file.recordings if file else None) or RECORDINGS,
         file=file.path if file else None,
-        world=asked.world or (file.world if file else None),
-        insecure_lan=asked.insecure_lan,
+        world=options.world or (file.world if file else None),
+        insecure_lan=options.insecure_lan,
         listed={name: _listed(specs.get(name), car.platform) for name, car in cars.items()},
     )
 
 
 def _names(known: Sequence[str], count: int) -> list[str]:
-    """So many names: those of the file, then ours."""
-    more = (name for name in (*NAMES, *(f"car{number}" for number in range(len(NAMES) + 1, MOST_SIMULATED + 1))))
+    """Return `count` names: those of the file, then default ones."""
+    more = (
+        name
+        for name in (
+            *SIMULATED_CAR_NAMES,
+            *(f"car{number}" for number in range(len(SIMULATED_CAR_NAMES) + 1, MAX_SIMULATED_CARS + 1)),
+        )
+    )
     names = list(known)[:count]
     for name in more:
         if len(names) >= count:
@@ -172,68 +181,67 @@ def _car(spec: FleetCar) -> CarProcessSpec:
     )
 
 
-def _listed(spec: FleetCar | None, platform: str) -> Listed:
+def _listed(spec: FleetCar | None, platform: str) -> CoordinatorCar:
     if spec is None:
-        return Listed(platform)
+        return CoordinatorCar(platform)
     fewer = spec.capabilities != profile_capabilities(spec.platform)
-    return Listed(spec.platform, tuple(sorted(spec.capabilities)) if fewer else None, spec.roles)
+    return CoordinatorCar(spec.platform, tuple(sorted(spec.capabilities)) if fewer else None, spec.roles)
 
 
-def listing(wish: FleetSpec) -> str:
-    """A fleet file for the coordinator, of what was accepted.
-
-    The user's own may be wrong, or gone, when the coordinator is started again.
-    """
+def coordinator_fleet_file(spec: FleetSpec) -> str:
+    """Return the text of a fleet file for the coordinator, made from the accepted spec."""
+    # The user's file may be invalid or missing when the coordinator is restarted.
     cars = {
         name: {
             "platform": car.platform,
             **({} if car.capabilities is None else {"capabilities": car.capabilities}),
             **({} if car.roles is None else {"roles": car.roles}),
         }
-        for name, car in wish.listed.items()
+        for name, car in spec.listed.items()
     }
     return json.dumps({"cars": cars}, indent=1)
 
 
 def module(name: str, *arguments: str) -> tuple[str, ...]:
-    """The command that runs a module with this interpreter."""
+    """Return the command that runs a module with this interpreter."""
     return (sys.executable, "-m", name, *arguments)
 
 
-def hub_command(wish: FleetSpec, endpoint: str) -> tuple[str, ...]:
-    """The hub."""
-    open_to_lan = ("--insecure-lan",) if wish.insecure_lan else ()
+def hub_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
+    """Return the command of the hub."""
+    open_to_lan = ("--insecure-lan",) if spec.insecure_lan else ()
     return module("schemas.bus.hub", "--endpoint", endpoint, *open_to_lan)
 
 
-def gateway_command(wish: FleetSpec, car: CarProcessSpec, link: str, endpoint: str) -> tuple[str, ...]:
-    """The gateway of a car, which keeps trying when its car is off."""
-    where = ("--fleet", wish.fleet, "--connect", endpoint, "--retry", "--with-parent")
-    told = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
-    return module("gateway.cli", "run", *told, *where)
+def gateway_command(spec: FleetSpec, car: CarProcessSpec, link: str, endpoint: str) -> tuple[str, ...]:
+    """Return the command of a car's gateway."""
+    where = ("--fleet", spec.fleet, "--connect", endpoint, "--retry", "--with-parent")
+    options = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
+    return module("gateway.cli", "run", *options, *where)
 
 
-def simulator_command(wish: FleetSpec, directory: Path, endpoint: str) -> tuple[str, ...]:
-    """One simulator for all simulated cars; a named terminal is found again by a gateway when it was away."""
-    cars = [f"{car.name}:{car.platform}:{_terminal(directory, car.name)}" for car in wish.simulated]
-    world = () if wish.world is None else ("--world", str(wish.world))
-    told = [word for car in cars for word in ("--car", car)]
-    return module("gateway.cli", "sim", *told, *world, "--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
+def simulator_command(spec: FleetSpec, directory: Path, endpoint: str) -> tuple[str, ...]:
+    """Return the command of the simulator, one for all simulated cars."""
+    # Terminals have fixed names, so that gateways find them again after a restart of the simulator.
+    cars = [f"{car.name}:{car.platform}:{_terminal(directory, car.name)}" for car in spec.simulated]
+    world = () if spec.world is None else ("--world", str(spec.world))
+    options = [word for car in cars for word in ("--car", car)]
+    return module("gateway.cli", "sim", *options, *world, "--fleet", spec.fleet, "--connect", endpoint, "--with-parent")
 
 
 def _terminal(directory: Path, car: str) -> str:
     return f"pty:{directory / car}.tty" if os.name == "posix" else "tcp"
 
 
-def recorder_command(wish: FleetSpec, endpoint: str) -> tuple[str, ...]:
-    """The recorder."""
-    where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent")
-    files = {"--fleet-file": wish.file, "--plan": wish.plan}
-    kept = [word for option, path in files.items() if path is not None for word in (option, str(path))]
-    return module("fleet.cli", "record", "--out", str(wish.recordings), "--json", *kept, *where)
+def recorder_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
+    """Return the command of the recorder."""
+    where = ("--fleet", spec.fleet, "--connect", endpoint, "--with-parent")
+    files = {"--fleet-file": spec.file, "--plan": spec.plan}
+    copies = [word for option, path in files.items() if path is not None for word in (option, str(path))]
+    return module("fleet.cli", "record", "--out", str(spec.recordings), "--json", *copies, *where)
 
 
-def coordinator_command(wish: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
-    """The coordinator, with copies of the plan and of what is said of the cars, both in the directory of this run."""
-    where = ("--fleet", wish.fleet, "--connect", endpoint, "--with-parent", "--run", plan.parent.name)
+def coordinator_command(spec: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
+    """Return the command of the coordinator, with its copies of the plan and the fleet file in the run directory."""
+    where = ("--fleet", spec.fleet, "--connect", endpoint, "--with-parent", "--run", plan.parent.name)
     return module("fleet.cli", "coordinate", "--plan", str(plan), "--fleet-file", str(listed), "--json", *where)

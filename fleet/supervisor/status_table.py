@@ -1,7 +1,8 @@
-"""The live table of `fleet up` on a terminal: a row for each car, above it what happens. rich is imported only here."""
+"""The live table of `fleet up` on a terminal, a row for each car and events above. The only import of rich."""
 
 import asyncio
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Self
 
@@ -16,18 +17,18 @@ from fleet.supervisor.restart_policy import RunState
 if TYPE_CHECKING:
     from fleet.supervisor.supervisor import Supervisor, SupervisorEvent
 
-DRAW_S: Final = 0.25
-SHARE: Final = 10.0
-"""Drawing takes at most a tenth of the time: a hundred rows take 50 ms."""
+DRAW_INTERVAL_S: Final = 0.25
+DRAW_IDLE_FACTOR: Final = 10.0
+"""Minimum pause, as a multiple of the time to draw. A hundred rows take 50 ms."""
 _LINK: Final = {"online": "green", "quiet": "green", "stale": "yellow", "lost": "red"}
 _VERDICT: Final = {"confirmed": "green", "contradicted": "red"}
-_COLUMNS: Final = ("car", "link", "mode", "motion", "held, driven by", "battery", "Hz", "last event")
-_WHOLE: Final = frozenset({"car", "link", "motion", "battery", "Hz"})
-"""What is not cut in a narrow terminal."""
+_TABLE_COLUMNS: Final = ("car", "link", "mode", "motion", "held, driven by", "battery", "Hz", "last event")
+_FIXED_WIDTH_COLUMNS: Final = frozenset({"car", "link", "motion", "battery", "Hz"})
+"""Columns that are never truncated."""
 
 
 class Table:
-    """The table of one supervisor; use it with `with`."""
+    """The table of one supervisor. Use it with `with`."""
 
     def __init__(self, supervisor: "Supervisor", console: Console | None = None) -> None:
         self._supervisor = supervisor
@@ -43,46 +44,46 @@ class Table:
         self._safely(lambda: self._live.update(self.rendered(), refresh=True))
         self._safely(self._live.stop)
 
-    def tell(self, happening: "SupervisorEvent") -> None:
-        """A line above the table; what a car shows in its row is no line."""
-        if happening.what in ("process", "hold", "end"):
-            line = Text(f"{datetime.now(UTC):%H:%M:%S} {happening.name}: {happening.words}")
+    def on_event(self, event: "SupervisorEvent") -> None:
+        """Print an event above the table, unless the car's row shows it."""
+        if event.what in ("process", "hold", "end"):
+            line = Text(f"{datetime.now(UTC):%H:%M:%S} {event.name}: {event.words}")
             self._safely(lambda: self._console.print(line))
 
     async def draw(self) -> None:
-        """Draw, at most four times a second, until cancelled."""
+        """Redraw the table until cancelled."""
         while True:
             began = time.monotonic()
             self._safely(lambda: self._live.update(self.rendered(), refresh=True))
-            await asyncio.sleep(max(DRAW_S, SHARE * (time.monotonic() - began)))
+            await asyncio.sleep(max(DRAW_INTERVAL_S, DRAW_IDLE_FACTOR * (time.monotonic() - began)))
 
     def rendered(self) -> Group:
-        """The table, and under it the processes that are not as they should be."""
+        """Return the table, with the states of the services below it."""
         grid = Grid(box=None, pad_edge=False, header_style="bold", expand=True)
-        for column in _COLUMNS:
+        for column in _TABLE_COLUMNS:
             grid.add_column(
                 column,
-                no_wrap=column in _WHOLE,
+                no_wrap=column in _FIXED_WIDTH_COLUMNS,
                 ratio=1 if column == "last event" else None,
                 min_width=16 if column == "last event" else None,
             )
         for name, row in self._supervisor.rows.items():
-            process = self._supervisor.crew.get(name)
-            running = process is not None and process.ward.state is RunState.RUNNING
-            state = "" if running else "starting" if process is None else str(process.ward.state)
+            process = self._supervisor.processes.get(name)
+            running = process is not None and process.status.state is RunState.RUNNING
+            state = "" if running else "starting" if process is None else str(process.status.state)
             grid.add_row(*_cells(row, state))
         services = [
             Text.assemble(
-                each.name, " ", (str(each.ward.state), "green" if each.ward.state is RunState.RUNNING else "yellow")
+                each.name, " ", (str(each.status.state), "green" if each.status.state is RunState.RUNNING else "yellow")
             )
-            for each in self._supervisor.crew
+            for each in self._supervisor.processes
             if each.name.startswith("@")
         ]
-        return Group(grid, Text("  ").join([*services, Text(f"logs in {self._supervisor.crew.directory}", "dim")]))
+        return Group(grid, Text("  ").join([*services, Text(f"logs in {self._supervisor.processes.directory}", "dim")]))
 
-    def _safely(self, write: "object") -> None:
-        """A terminal that was closed must not keep the cars from being stopped."""
-        if self._broken or not callable(write):
+    def _safely(self, write: Callable[[], object]) -> None:
+        """Write unless the terminal was closed. A closed terminal must not prevent the shutdown."""
+        if self._broken:
             return
         try:
             write()

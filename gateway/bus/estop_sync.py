@@ -12,7 +12,8 @@ from typing import Any, Final
 
 from gateway.control.commands import Command, EmergencyStop, Resume
 from gateway.control.safety import Estop, PersistedSafety
-from schemas import bus, keys, messages, topics
+from schemas import bus, keys, messages
+from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 
 BATCH_DELAY_S: Final = 0.2
@@ -83,7 +84,7 @@ class EstopSync:
                 return
         payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
         key = keys.command_key(self._fleet, "*", command.verb)
-        encoding = messages.encoding_of(topics.COMMANDS[command.verb])
+        encoding = messages.encoding_of(COMMANDS[command.verb].message)
         task = asyncio.ensure_future(asyncio.to_thread(self._send_to_all, key, payload.SerializeToString(), encoding))
         self._forwarding.add(task)
         task.add_done_callback(self._forwarding.discard)

@@ -72,8 +72,8 @@ class CarPublisher:
                 continue
             key = keys.topic_key(fleet, car, topic.name)
             self._publishers[topic.name] = opened.publisher(key, topic, car)
-            if topic.kept:
-                self._histories[topic.name] = HistoryBuffer(topic.kept)
+            if topic.history_size:
+                self._histories[topic.name] = HistoryBuffer(topic.history_size)
         self._wall = WallClock()
         self._raw = TokenBucket(RAW_PER_S, RAW_BURST)
         self._process = ProcessStats()

@@ -31,7 +31,8 @@ from gateway.control.commands import (
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from schemas import messages
-from schemas.topics import COMMANDS, PROTOBUF, STOPS
+from schemas.commands import COMMANDS, STOPS
+from schemas.topics import PROTOBUF
 
 DEFAULT_MAX_DRIVE_S: Final = 10.0
 """Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
@@ -39,14 +40,10 @@ MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
 MAX_REASON_LENGTH: Final = 200
 """Maximum characters of an e-stop's reason. The rest is cut off, so that no e-stop fails for its reason."""
-_DRIVE_TTL_S: Final = 0.5
-_TTL_S: Final = (
-    2.0  # docs/reference/messages.md#commands: maximum age at arrival, default 0.5 for drive, 2 for the rest
-)
 _SAME_QUERY_NS: Final = 2_000_000_000
 """Maximum time in which one query reaches every gateway."""
-WILDCARD_VERBS: Final = ("stop", "estop", "resume")
-"""Verbs that one query may send to several cars (docs/reference/keys.md#command-keys)."""
+# One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
+WILDCARD_VERBS: Final = tuple(verb for verb, row in COMMANDS.items() if row.wildcard)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +94,7 @@ def parse(request: ParsedRequest) -> Command:
             raise BadRequest(Reason.BAD_VALUE, f"{verb}: {request.unread}", blank)
         return _stop_anyway(blank, request.unread, request)
     if request.payload is None and verb not in STOPS:
-        words = f"{verb} without a payload: give {COMMANDS[verb]} or its JSON (only stop and estop need none)"
+        words = f"{verb} without a payload: give {COMMANDS[verb].message} or its JSON (only stop and estop need none)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     try:
         return _parse_payload(blank, request)
@@ -129,7 +126,7 @@ def _readable_estop(request: ParsedRequest) -> EmergencyStop:
         fields = None
     if not isinstance(fields, dict):
         try:
-            message: Any = messages.parse(COMMANDS["estop"], request.payload or b"", _encoding(request))
+            message: Any = messages.parse(COMMANDS["estop"].message, request.payload or b"", _encoding(request))
         except messages.BadPayload:
             return EmergencyStop()
         fields = {"why": message.why, "scope": message.scope}
@@ -140,7 +137,7 @@ def _readable_estop(request: ParsedRequest) -> EmergencyStop:
 def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
     verb = blank.verb
     try:
-        message: Any = messages.parse(COMMANDS[verb], request.payload or b"", _encoding(request))
+        message: Any = messages.parse(COMMANDS[verb].message, request.payload or b"", _encoding(request))
     except messages.BadPayload as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", blank) from None
     command = blank
@@ -157,7 +154,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
         command,
         what=what,
         age_s=_age_s(message, request),
-        ttl_s=ttl_s if ttl_s is not None else _DRIVE_TTL_S if verb == "drive" else _TTL_S,
+        ttl_s=ttl_s if ttl_s is not None else COMMANDS[verb].ttl_s,
     )
 
 

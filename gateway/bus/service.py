@@ -7,14 +7,13 @@ Commands go before queries of values. A command waits for one turn of the loop. 
 queries of the history in another one.
 """
 
-import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
 from schemas import bus, keys
-from schemas.topics import STOPS
+from schemas.commands import STOPS
 
 if TYPE_CHECKING:
     import asyncio
@@ -48,7 +47,9 @@ class CarService:
         self._bus = opened
         self._fleet = fleet
         self._car = car
-        self.refuse(self.others())
+        health_key = keys.topic_key(fleet, car, "state/health")
+        self.singleton = bus.Singleton(opened, health_key, self._already_served, RIVAL_TIMEOUT_S)
+        self.singleton.check_alone()
         self._commands: bus.Handover[tuple[zenoh.Query, str]] = bus.Handover(limit=MAX_QUEUED_QUERIES)
         self._large: bus.Handover[tuple[zenoh.Query, str]] = bus.Handover(limit=MAX_QUEUED_OVERSIZED)
         self._stream: bus.Handover[bus.Sample] = bus.Handover(limit=MAX_QUEUED_DRIVES, newest=True)
@@ -98,30 +99,11 @@ class CarService:
         handovers = (self._commands, self._large, self._stream, self.values, self.histories, self._senders, self._cars)
         return sum(handover.dropped for handover in handovers)
 
-    def others(self) -> list[Any]:
-        """Return the fleet.v1.Health of each other gateway that answers for this car."""
-        healths: list[Any] = []
-        deadline, busy = time.monotonic() + RIVAL_TIMEOUT_S, True
-        while busy and time.monotonic() < deadline:
-            busy = False
-            for answer in self._bus.query(
-                keys.topic_key(self._fleet, self._car, "state/health"), timeout_s=RIVAL_TIMEOUT_S
-            ):
-                if isinstance(answer, bus.Failure):
-                    busy = busy or answer.words == bus.BUSY  # there is one: repeat the query until it answers
-                    continue
-                health: Any = answer.message()
-                if health.boot_id != self._bus.boot_id:
-                    healths.append(health)
-        return healths
-
-    def refuse(self, others: list[Any]) -> None:
-        """Raise AlreadyServed if there is another."""
-        for other in others:
-            raise AlreadyServed(
-                f"car {self._car} is served already, by process {other.pid} on {other.host} "
-                f"(link {other.link}): stop that one first, or give this car another name"
-            )
+    def _already_served(self, other: Any) -> AlreadyServed:
+        return AlreadyServed(
+            f"car {self._car} is served already, by process {other.pid} on {other.host} "
+            f"(link {other.link}): stop that one first, or give this car another name"
+        )
 
     def _on_query(self, family: str, query: zenoh.Query) -> bool:
         """Queue a query of values. Runs on a Zenoh thread."""

@@ -1,7 +1,8 @@
 """The Zenoh bus, for every process of the fleet.
 
 Read `session` first: `Bus` is one Zenoh session. `endpoint` finds or starts the `hub`, `publisher` publishes a topic,
-`sample` and `replies` are what comes and what is answered, `handover` brings it from Zenoh's threads to a loop.
+`sample` and `replies` are the messages that come in and go out. `handover` passes them from Zenoh's threads to a loop.
+`hub_keeper` restarts a lost hub, `singleton` makes sure that there is only one service of a kind.
 """
 
 from schemas.bus.endpoint import (
@@ -16,11 +17,13 @@ from schemas.bus.endpoint import (
 )
 from schemas.bus.errors import BadEndpoint, BusError, NoFleet
 from schemas.bus.handover import Backlog, Handover, Latest
+from schemas.bus.hub_keeper import HubKeeper
 from schemas.bus.key_expressions import canon, intersects
 from schemas.bus.publisher import Publisher
-from schemas.bus.replies import BUSY, refuse, reply, reply_value
+from schemas.bus.replies import BUSY, is_json_wanted, refuse, reply, reply_message, reply_value
 from schemas.bus.sample import LARGEST_PAYLOAD, LONGEST_SELECTOR, Failure, Sample, sample_of, sequence_of, unread
 from schemas.bus.session import Bus
+from schemas.bus.singleton import Singleton
 
 __all__ = [
     "BUSY",
@@ -34,18 +37,22 @@ __all__ = [
     "BusError",
     "Failure",
     "Handover",
+    "HubKeeper",
     "Latest",
     "NoFleet",
     "Publisher",
     "Sample",
+    "Singleton",
     "accepts",
     "canon",
     "check_listening",
     "ensure_hub",
     "intersects",
+    "is_json_wanted",
     "is_loopback",
     "refuse",
     "reply",
+    "reply_message",
     "reply_value",
     "resolve_endpoint",
     "router_config",

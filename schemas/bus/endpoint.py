@@ -1,4 +1,4 @@
-"""Where the hub listens: endpoints, Zenoh configurations, and starting a hub that is missing."""
+"""Endpoints, Zenoh configurations, and the start of a missing hub."""
 
 import contextlib
 import json
@@ -21,7 +21,7 @@ _LOOPBACK: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 
 def resolve_endpoint(argument: str | None = None) -> str:
-    """The endpoint to use: the argument, else FLEET_ENDPOINT, else loopback port 7447; raises BadEndpoint."""
+    """Return the endpoint: the argument, else FLEET_ENDPOINT, else loopback port 7447. Raises BadEndpoint."""
     endpoint = argument or os.environ.get(ENDPOINT_VARIABLE) or DEFAULT_ENDPOINT
     _host_and_port(endpoint)
     return endpoint
@@ -38,16 +38,14 @@ def _host_and_port(endpoint: str) -> tuple[str, int]:
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Return True if no other machine can reach the endpoint; raises BadEndpoint."""
+    """Return True if no other machine can reach the endpoint. Raises BadEndpoint."""
     host, _ = _host_and_port(endpoint)
     return _LOOPBACK.fullmatch(host) is not None
 
 
 def check_listening(endpoint: str, *, insecure_lan: bool) -> None:
-    """Raise BadEndpoint if a hub would be open to a network without a word from the user.
-
-    A hub knows no passwords and no certificates: whoever reaches it drives the cars.
-    """
+    """Raise BadEndpoint if a hub would be open to a network without the user's consent."""
+    # A hub has no passwords and no certificates: everyone who reaches it can drive the cars.
     if not insecure_lan and not is_loopback(endpoint):
         raise BadEndpoint(
             f"a hub at {endpoint} would let everyone on that network drive the cars: "
@@ -65,7 +63,7 @@ _COMMON: Final[dict[str, Any]] = {
 
 
 def router_config(endpoint: str) -> zenoh.Config:
-    """The hub's configuration: it listens, everyone else is its client."""
+    """Return the configuration of the hub. All other sessions are its clients."""
     _host_and_port(endpoint)
     listen = {"endpoints": [endpoint], "exit_on_failure": True, "timeout_ms": 0}
     return zenoh.Config.from_json5(json.dumps({"mode": "router", "listen": listen, **_COMMON}))
@@ -83,7 +81,7 @@ def client_config(endpoint: str, timeout_s: float) -> zenoh.Config:
 
 
 def accepts(endpoint: str, timeout_s: float = 1.0) -> bool:
-    """Whether something accepts connections at the endpoint; a datagram endpoint cannot be asked and counts as yes."""
+    """Return True if something accepts connections at the endpoint. Always True for a datagram endpoint."""
     host, port = _host_and_port(endpoint)
     if endpoint.startswith(("udp/", "quic/")):
         return True
@@ -95,12 +93,9 @@ def accepts(endpoint: str, timeout_s: float = 1.0) -> bool:
 
 
 def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
-    """Start a hub if nothing accepts at a loopback endpoint, and wait until it does; raises BusError.
-
-    The hub outlives its starter: it is a session leader of its own, so that Ctrl-C at a terminal does not take the bus
-    away before the cars are stopped. It ends by itself 10 s after its last link. A busy computer may take ten seconds
-    to start it.
-    """
+    """Start a hub if nothing accepts connections at a loopback endpoint, and wait until it listens. Raises BusError."""
+    # The hub outlives the process that started it: it runs in its own session. So Ctrl-C at a terminal does not end
+    # the bus before the cars have stopped. It exits 10 s after its last link. On a busy machine the start takes 10 s.
     if accepts(endpoint):
         return
     if not is_loopback(endpoint):
@@ -122,9 +117,9 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     while not accepts(endpoint):
         if time.monotonic() > deadline:
             raise BusError(f"no hub came up at {endpoint} within {timeout_s:g} s: is the port used by something else?")
-        # A hub that lost the race for the port has ended; the winner accepts in a moment.
+        # If two hubs start at once, the loser ends, and the winner listens in a moment.
         with contextlib.suppress(subprocess.TimeoutExpired):
             hub.wait(0.02)
             time.sleep(0.02)
-    # The hub is nobody's child to wait for; without this the interpreter warns that it still runs.
+    # Nobody waits for the hub. Without this line, the interpreter warns that it is still running.
     hub.returncode = 0 if hub.returncode is None else hub.returncode

@@ -1,8 +1,8 @@
-"""Errors of the bus; each names the endpoint and what to do."""
+"""Errors of the bus. Each text names the endpoint and what to do."""
 
 
 class BusError(Exception):
-    """The bus cannot be had; its text names the endpoint and what to do."""
+    """The bus is not available. The text names the endpoint and what to do."""
 
 
 class NoFleet(BusError):
@@ -10,4 +10,4 @@ class NoFleet(BusError):
 
 
 class BadEndpoint(BusError):
-    """An endpoint that Zenoh cannot take, or at which no hub may listen."""
+    """An endpoint that is invalid for Zenoh, or at which no hub may listen."""

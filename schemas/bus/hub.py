@@ -1,6 +1,6 @@
-"""The local rendezvous: a Zenoh router on loopback in a process of its own; it ends by itself when nobody is left.
+"""The hub: a Zenoh router on loopback in its own process, which exits when it has no links.
 
-The listening port is the mutex: a second hub on it fails at once. Started by `bus.ensure_hub`, or by hand:
+The listening port is the mutex: a second hub on it fails at once. `bus.ensure_hub` starts it, or you by hand:
 `python -m schemas.bus.hub --endpoint tcp/127.0.0.1:7447`.
 """
 
@@ -16,12 +16,12 @@ from schemas.bus import DEFAULT_ENDPOINT, BusError, check_listening, router_conf
 from schemas.process import signals
 
 IDLE_S: Final = 10.0
-"""How long a hub outlives its last link."""
+"""Time from the last link until the hub exits."""
 _POLL_S: Final = 0.5
 
 
 def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
-    """Route until `stop` is set or nobody has had a link for `idle_s`; raises zenoh.ZError if the port is taken."""
+    """Route until `stop` is set or there was no link for `idle_s`. Raises zenoh.ZError if the port is in use."""
     with zenoh.open(router_config(endpoint)) as session:
         last_link = time.monotonic()
         while not stop.wait(_POLL_S):
@@ -33,7 +33,7 @@ def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
 
 
 def main() -> int:
-    """Run a hub; 0 when it ended by itself or was told to, 1 if it could not listen, 2 for wrong use."""
+    """Run a hub. Return 0 at its regular end, 1 if it could not listen, 2 for wrong use."""
     parser = argparse.ArgumentParser(prog="python -m schemas.bus.hub", description=__doc__)
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
     parser.add_argument("--idle-s", type=float, default=IDLE_S, help="end after so long without a link (default 10)")

@@ -20,9 +20,9 @@ ZENOH_QOS: Final[dict[Qos, dict[str, Any]]] = {
 
 
 class Publisher:
-    """Publishes one topic of one car; numbers the messages and fills their common fields.
+    """Publishes one topic of one car, numbers the messages and fills their common fields.
 
-    It holds the last of them (`Topic.held`), also those published while there was no hub: see `Bus.recall`.
+    It caches the latest messages (`Topic.cache_size`) for backfill, also while there is no hub: see `Bus.recall`.
     """
 
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, source: str, boot_id: str) -> None:
@@ -30,8 +30,8 @@ class Publisher:
             session,
             key,
             encoding=zenoh.Encoding(topic.encoding),
-            cache=ext.CacheConfig(topic.held),
-            # Numbers only. Heartbeats and a token for each would double what a hub of a hundred cars has to do.
+            cache=ext.CacheConfig(topic.cache_size),
+            # Sequence numbers only: heartbeats and a token per publisher would double the load of a hub with 100 cars.
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
             **ZENOH_QOS[topic.qos],
         )
@@ -43,7 +43,7 @@ class Publisher:
         self.sequence = 0
 
     def put(self, message: Any, stamp_ns: int) -> bytes:
-        """Publish, return the payload; `stamp_ns`: ns since the epoch, when bytes were had or a decision was made."""
+        """Publish a message and return its payload. stamp_ns: time of its measurement, ns since the epoch."""
         self.sequence += 1
         if self._headed:
             message.stamp.seconds, message.stamp.nanos = divmod(stamp_ns, 1_000_000_000)

@@ -1,4 +1,4 @@
-"""Publications and replies as values, and the limits on what a process reads of a query."""
+"""Publications and replies as values, and size limits of queries."""
 
 import time
 from dataclasses import dataclass
@@ -6,36 +6,35 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-if TYPE_CHECKING:  # a gateway is on the bus before it has imported these
+if TYPE_CHECKING:  # a gateway joins the bus before it imports protobuf
     from google.protobuf.message import Message
 
 
+# Parsing 5 MB of JSON stalls a process for a second.
 LARGEST_PAYLOAD: Final = 1 << 16
-"""Bytes of a query's payload, or of a streamed command's: what is larger is refused, and its payload is not read.
-
-Reading 5 MB of JSON stalls a process for a second."""
+"""Maximum size of a command's payload in bytes. Larger ones are rejected without parsing."""
 
 LONGEST_SELECTOR: Final = 4096
-"""Characters of a query's selector (key and parameters), and of its encoding."""
+"""Maximum length of a query's selector (key and parameters), and of its encoding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One publication or reply as it came: payload bytes untouched."""
+    """One publication or reply, with the payload's bytes."""
 
     key: str
     payload: bytes
     encoding: str
     time_ns: int
-    """Zenoh timestamp of the publisher's session, ns since the epoch; the time of receipt where there is none."""
+    """Zenoh timestamp of the publisher's session, ns since the epoch. The time of receipt if there is none."""
     sequence: int
-    """The publisher's number for the key, modulo 2^32; 0 if it gave none."""
+    """The publisher's sequence number for the key, modulo 2^32. 0 if there is none."""
     deleted: bool = False
     unread: str = ""
-    """Why the payload was not read, and is left out: it is too large."""
+    """Why the payload is left out: it is too large."""
 
     def message(self) -> "Message":
-        """The payload as the message that the encoding names; raises messages.BadPayload or KeyError."""
+        """Parse the payload as the message that the encoding names. Raises messages.BadPayload or KeyError."""
         from schemas import messages
 
         name = messages.name_in(self.encoding)
@@ -52,12 +51,12 @@ class Failure:
 
 
 def sequence_of(info: zenoh.SourceInfo) -> int:
-    """A publisher's number for a key, from 1, modulo 2^32: Zenoh counts from 0."""
+    """Return a publisher's sequence number for a key, from 1, modulo 2^32. Zenoh counts from 0."""
     return (int(info.source_sn) + 1) & 0xFFFFFFFF
 
 
 def sample_of(sample: zenoh.Sample, largest: int | None = None) -> Sample:
-    """Copy what is wanted out of a Zenoh sample; `largest`: bytes of a payload that is read."""
+    """Convert a Zenoh sample. largest: maximum size of the payload in bytes."""
     stamp = sample.timestamp
     info = sample.source_info
     unread = "" if largest is None else _too_many_bytes(len(sample.payload), largest)
@@ -79,7 +78,7 @@ def _too_many_bytes(size: int, largest: int) -> str:
 
 
 def unread(query: zenoh.Query) -> str:
-    """Why nothing of a query is read: something in it is too large. Empty if nothing is."""
+    """Return why a query is not read: some part of it is too large. Return an empty string if all parts fit."""
     payload = query.payload
     if payload is not None and (words := _too_many_bytes(len(payload), LARGEST_PAYLOAD)):
         return words

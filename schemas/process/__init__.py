@@ -1,1 +1,1 @@
-"""One process of the fleet: its start, its standard streams, its signals, its state directory, its parent."""
+"""The common parts of all processes: startup, standard streams, signals and the guard of the parent."""

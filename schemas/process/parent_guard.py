@@ -1,7 +1,7 @@
 """Runs one program and ends it when its own standard input ends: `python -m schemas.process.parent_guard PROGRAM ...`.
 
-Whoever started it holds the other end, so the program goes with its starter however that ends, SIGKILL included. The
-first line on stdout is the program's process id.
+Its parent has the other end of stdin. So the program ends with the parent, even if that is killed. The first line on
+stdout is the program's process id.
 """
 
 import os
@@ -12,11 +12,11 @@ import threading
 from types import FrameType
 from typing import Final
 
-GRACE_S: Final = 3.0
+PROGRAM_EXIT_TIMEOUT_S: Final = 3.0
 
 
 def main() -> int:
-    """The program's exit code."""
+    """Run the program and return its exit code."""
     child = subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     sys.stdout.write(f"{child.pid}\n")
     sys.stdout.flush()
@@ -29,7 +29,7 @@ def main() -> int:
             pass
         child.terminate()
         try:
-            child.wait(GRACE_S)
+            child.wait(PROGRAM_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             child.kill()
 

@@ -1,4 +1,4 @@
-"""The signals that end a process of ours, so that it ends in order: Ctrl-C, `kill`, and a terminal that was closed."""
+"""The signals that shut down a process: Ctrl-C, `kill`, and a closed terminal."""
 
 import signal
 from collections.abc import Callable, Iterable, Iterator
@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # most processes have no loop
 
 
 def signals() -> list[signal.Signals]:
-    """Those that there are here; SIGHUP only if whoever started the process did not have it ignored (`nohup`)."""
+    """Return the signals that shut down the process. Leave out SIGHUP if it is ignored (`nohup`)."""
     hup = getattr(signal, "SIGHUP", None)  # Windows has none
     if hup is None or signal.getsignal(hup) is signal.SIG_IGN:
         return [signal.SIGINT, signal.SIGTERM]
@@ -19,13 +19,13 @@ def signals() -> list[signal.Signals]:
 
 
 def calls(end: Callable[[], object]) -> None:
-    """From now on each of them calls `end`, in the main thread."""
+    """Call `end` on each of the signals, in the main thread."""
     for number in signals():
         signal.signal(number, lambda *_: end())
 
 
 def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[signal.Signals], object]) -> None:
-    """From now on each of them calls `end` in this loop, with its number."""
+    """Call `end` with the number of the signal on each of them, in this loop."""
     for number in signals():
         try:
             loop.add_signal_handler(number, end, number)
@@ -35,7 +35,7 @@ def calls_in(loop: "asyncio.AbstractEventLoop", end: Callable[[signal.Signals], 
 
 @contextmanager
 def _taken(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Meanwhile they are this handler's; afterwards whose they were."""
+    """Install the handler for a block."""
     before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
@@ -46,10 +46,7 @@ def _taken(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType 
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """What comes meanwhile counts afterwards: for what must be done wholly, as starting a process that is to be ended.
-
-    In the main thread only.
-    """
+    """Delay signals until the end of a block that must not be interrupted. Only for the main thread."""
     came: list[int] = []
     try:
         with _taken(signals(), lambda number, _: came.append(number)):
@@ -61,10 +58,8 @@ def held_back() -> Iterator[None]:
 
 @contextmanager
 def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
-    """Meanwhile each of them but SIGINT, which Python takes itself, calls `interrupt` in the main thread.
-
-    Python does not take it where it came ignored, as a shell has it in what is put in the background: here it does.
-    """
+    """Call `interrupt` on each of the signals during a block, in the main thread. SIGINT raises KeyboardInterrupt."""
+    # A shell starts background processes with SIGINT ignored, and Python keeps that. Here, SIGINT is handled anyway.
     others = [number for number in signals() if number is not signal.SIGINT]
     ignored = [signal.SIGINT] if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else []
     with _taken(ignored, signal.default_int_handler), _taken(others, lambda *_: interrupt()):

@@ -1,4 +1,4 @@
-"""What a process of ours does before its imports, which take a tenth of a second and more."""
+"""The first steps of a process, before its imports, which take 0.1 s and more."""
 
 import os
 import signal
@@ -10,16 +10,14 @@ INTERRUPTED: Final = 130
 
 
 def begin() -> None:
-    """Let Ctrl-C end the process at once and without a traceback, until `interruptible`.
-
-    Nothing is open yet that would have to be closed. A SIGINT that came ignored stays ignored.
-    """
+    """Let Ctrl-C end the process at once and without a traceback, until `interruptible`."""
+    # There is nothing to clean up yet. An ignored SIGINT stays ignored.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
 
 
 def interruptible() -> None:
-    """From now on Ctrl-C is a KeyboardInterrupt again: there may be something to clean up."""
+    """Let Ctrl-C raise KeyboardInterrupt again: from now on there may be something to clean up."""
     if signal.getsignal(signal.SIGINT) is _end:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -1,4 +1,4 @@
-"""Standard streams that a process was started without, or that cannot be written any more."""
+"""Repairs closed or broken standard streams."""
 
 import os
 import sys
@@ -6,15 +6,13 @@ from typing import IO
 
 
 def complete() -> None:
-    """Put something where stdin, stdout or stderr is closed: a link that got its number would be taken for it.
-
-    Reading finds the end, writing to stdout fails as on a full disk and is told like that, stderr goes nowhere.
-    """
+    """Open /dev/null on closed standard descriptors, so that no port or socket gets descriptor 0, 1 or 2."""
+    # stdin is then at its end, writing to stdout fails as on a full disk, and stderr is discarded.
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            # The lowest free number is given, which is this one.
+            # The system returns the lowest free number, which is this one.
             opened = os.open(os.devnull, os.O_WRONLY if number == 2 else os.O_RDONLY)
             os.set_inheritable(opened, True)  # noqa: FBT003 - it takes no keyword
     if sys.__stdout__ is None:
@@ -24,7 +22,7 @@ def complete() -> None:
 
 
 def silence(stream: IO[str]) -> None:
-    """After a write has failed: what is still held would be tried again at the end, with a complaint."""
+    """Redirect a broken stream to /dev/null, so that the interpreter does not flush it at exit and print an error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)

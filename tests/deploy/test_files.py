@@ -13,8 +13,8 @@ import pytest
 from fleet.commands.fleet_file import schema_text
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
-from fleet.supervisor.shutdown import LINK_S, START_S
-from fleet.supervisor.supervisor import END_S, RECORDER_END_S, TRIES_S
+from fleet.supervisor.shutdown import CAR_LINK_TIMEOUT_S, GATEWAY_START_TIMEOUT_S
+from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, RECORDER_EXIT_TIMEOUT_S, SERVICE_EXIT_TIMEOUT_S
 
 DEPLOY = Path(__file__).parent.parent.parent / "deploy"
 FILES = sorted(DEPLOY.glob("fleet.*.yaml"))
@@ -81,8 +81,10 @@ def test_the_unit_gives_cars_the_time_to_stop(tmp_path: Path) -> None:
     assert unit.sections() == ["Unit", "Service", "Install"]
     service = unit["Service"]
     assert (service["Restart"], service["KillMode"], service["KillSignal"]) == ("on-failure", "mixed", "SIGTERM")
-    first_s = 2 * GATEWAY_GRACE_S + START_S + LINK_S  # a gateway hangs, and the gateway that replaces it is slow
-    longest_s = max(first_s, TRIES_S + GATEWAY_GRACE_S) + RECORDER_END_S + 2 * END_S
+    first_s = (
+        2 * GATEWAY_GRACE_S + GATEWAY_START_TIMEOUT_S + CAR_LINK_TIMEOUT_S
+    )  # a gateway hangs, and the gateway that replaces it is slow
+    longest_s = max(first_s, CAR_STOP_RETRY_S + GATEWAY_GRACE_S) + RECORDER_EXIT_TIMEOUT_S + 2 * SERVICE_EXIT_TIMEOUT_S
     assert int(service["TimeoutStopSec"]) >= longest_s
     assert re.fullmatch(r"/usr/bin/env %h/\S+/\.venv/bin/fleet up fleet\.yaml", service["ExecStart"])
     assert unit["Install"]["WantedBy"] == "default.target"  # of a user's systemd: multi-user.target is the system's

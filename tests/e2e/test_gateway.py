@@ -363,18 +363,18 @@ SEES_NOBODY_FIRST = """
 import os
 os.urandom = bytes([0]).__mul__
 from gateway import cli
-from gateway.bus.service import CarService
-looks = iter([lambda _: [], *[CarService.others] * 99])
-CarService.others = lambda self: next(looks)(self)
+from schemas.bus import Singleton
+looks = iter([lambda _: [], *[Singleton.others] * 99])
+Singleton.others = lambda self: next(looks)(self)
 cli.main()
 """
 LOOKS_AGAIN_AT_THE_WORD = """
 import os, sys
 os.urandom = bytes([255]).__mul__
 from gateway import cli
-from gateway.bus.service import CarService
-look, before = CarService.others, iter([lambda: None, sys.stdin.readline])
-CarService.others = lambda self: (next(before)(), look(self))[1]
+from schemas.bus import Singleton
+look, before = Singleton.others, iter([lambda: None, sys.stdin.readline])
+Singleton.others = lambda self: (next(before)(), look(self))[1]
 cli.main()
 """
 

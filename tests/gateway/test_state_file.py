@@ -45,7 +45,7 @@ def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -
     assert SafetyStateFile(tmp_path / "file", "fleet", "red").load(NOW).hold is not None
     store = SafetyStateFile(tmp_path, "fleet", "red")
     store.save(PersistedSafety(Hold("mia", 1)))
-    (tmp_path / "fleet.red.new").mkdir()
+    (tmp_path / ".fleet.red.json.new").mkdir()
     with pytest.raises(OSError, match="fleet"):
         store.save(PersistedSafety())
     assert store.load(NOW) == PersistedSafety(Hold("mia", 1))

@@ -257,7 +257,7 @@ async def test_the_latest_of_each_name_comes_once() -> None:
     assert latest("bob", True)
     assert latest("early", False)
     assert not latest("eve", True), "there is no room for more names"
-    await asyncio.sleep(2 * latest.APART_S)
+    await asyncio.sleep(2 * latest.INTERVAL_S)
     assert batches[1:] == [{"ann": False, "bob": True, "early": False}]
     assert latest.dropped == 1
 

@@ -11,12 +11,16 @@ from gateway.control.estimate.link_health import LinkState
 from gateway.control.estimate.mode import Verdict
 from gateway.protocol.enums import Mode, Motion
 from schemas import messages, topics
+from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 
 SERVICES = {"fleet.v1.DownCommand", "fleet.v1.ReloadCommand"}
 """What the fleet's own services take."""
 NAMES = sorted(
-    {topic.message for topic in topics.TOPICS.values()} | set(topics.COMMANDS.values()) | {topics.RESULT} | SERVICES
+    {topic.message for topic in topics.TOPICS.values()}
+    | {row.message for row in COMMANDS.values()}
+    | {topics.RESULT}
+    | SERVICES
 )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.supervisor.spec import NAMES
+from fleet.supervisor.spec import SIMULATED_CAR_NAMES
 from tests.support.claims import KINDS, Claims
 from tests.support.ports import free_endpoint
 from tests.support.processes import wait_for
@@ -20,7 +20,7 @@ from tests.support.up import Up
 
 SECONDS = float(os.environ.get("FLEET_SOAK_S", "600"))
 SEED = int(os.environ.get("FLEET_SOAK_SEED", random.randrange(10**6)))
-CARS = NAMES[:8]
+CARS = SIMULATED_CAR_NAMES[:8]
 FAULTS = ("gateway", "coordinator", "hub", "link", "brownout")
 
 

@@ -19,6 +19,7 @@ from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.control.stops.evidence import EVIDENCE
 from gateway.control.stops.sequences import REPEAT_INTERVAL_S
 from schemas import messages, topics
+from schemas.commands import COMMANDS
 from tests.support import vectors
 from tests.tools.vectors import STOPS
 
@@ -27,22 +28,6 @@ README = ROOT / "README.md"
 STOP_EVIDENCE = ROOT / "docs/reference/stop-evidence.md"
 KEYS = ROOT / "docs/reference/keys.md"
 _COMMON = {"sender", "kind", "id", "asked", "take", "ttl_s"}
-_ABOUT = {
-    "drive": "hold a motion for `duration_s` (0.5 s by default, at most 10 or what its gateway allows), then stop",
-    "mode": "bring the car into a mode; `manual` closes whatever is open",
-    "led": "the colour LED, 0..255 each",
-    "light": "the light's colour, or `off`",
-    "servo": "move a servo a step, or the front one to `deg` (0..180)",
-    "arm": "six joints, 0..180 degrees each (option `+arm`)",
-    "whistle": "sound once",
-    "speed": "one step `up` or `down`: cars know no absolute speed",
-    "fan": "toggle; `on` or `off` while its state is known",
-    "stop": "stop, and hold the car against the coordinator",
-    "estop": "stop, and refuse everything until it is resumed by its id; `scope` is car or fleet",
-    "resume": "end the e-stops of these ids; without ids, the hold",
-    "lease": "reserve the car for a moment, or give it back",
-    "find": "blink and beep, without moving",
-}
 
 
 def topic_table() -> str:
@@ -72,8 +57,8 @@ def key_table() -> str:
             f"{topic.rate_hz:g}/s" if topic.rate_hz else "",
             f"{topic.stale_after_s:g} s" if topic.stale_after_s is not None else "",
             topic.qos,
-            str(topic.kept or ""),
-            str(topic.held),
+            str(topic.history_size or ""),
+            str(topic.cache_size),
             f"`{topic.entity}`" if topic.entity else "",
         )
         rows.append(f"| {' | '.join(cell or '-' for cell in cells)} |")
@@ -83,10 +68,10 @@ def key_table() -> str:
 def verb_table() -> str:
     """The table of commands, with the fields of each message."""
     rows = ["| verb | fields | what |", "|---|---|---|"]
-    for verb, name in topics.COMMANDS.items():
-        fields: Any = messages.message_class(name).DESCRIPTOR.fields
+    for verb, row in COMMANDS.items():
+        fields: Any = messages.message_class(row.message).DESCRIPTOR.fields
         own = [_field(field) for field in fields if field.name not in _COMMON]
-        rows.append(f"| `{verb}` | {', '.join(own) or '-'} | {_ABOUT[verb]} |")
+        rows.append(f"| `{verb}` | {', '.join(own) or '-'} | {row.about} |")
     return "\n".join(rows)
 
 

@@ -7,9 +7,9 @@ from typing import Final
 
 from fleet.recording import session_dir
 from fleet.recording.reading.session import NoSession, Session
-from schemas.topics import HELD_S
+from schemas.topics import CACHE_S
 
-RESUME_WINDOW_S: Final = 3 * HELD_S
+RESUME_WINDOW_S: Final = 3 * CACHE_S
 """Length of the end of an interrupted session that publishers may still cache."""
 
 
@@ -77,5 +77,5 @@ def _find_latest(root: Path, fleet: str, now_ns: int) -> Session | None:
             written_ns = session.segments[-1].stat().st_mtime_ns
         except (NoSession, OSError):
             return None
-        return session if now_ns - written_ns < HELD_S * 2e9 else None
+        return session if now_ns - written_ns < CACHE_S * 2e9 else None
     return None

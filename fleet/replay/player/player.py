@@ -4,7 +4,6 @@ Readers see a normal fleet: cars have tokens, and queries return the latest valu
 and never publishes messages recorded under `@cmd`, so that no gateway can obey a recording.
 """
 
-import contextlib
 import queue
 import time
 from collections.abc import Callable, Iterable
@@ -16,7 +15,8 @@ import zenoh
 from fleet.recording.reading.session import Recorded
 from fleet.replay.player.schedule import Schedule
 from schemas import keys, messages, topics
-from schemas.bus import Bus, BusError, ensure_hub, reply, reply_value
+from schemas.bus import Bus, HubKeeper, is_json_wanted, reply_message, reply_value
+from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos, Topic
 
@@ -49,10 +49,13 @@ class Player:
     """Messages published over MAX_DELAY_S late: this machine or the bus was too slow for the rate."""
     _cars: list[str] = field(default_factory=list)
     _polled_s: float = 0.0
-    _disconnected_since_s: float | None = None
+    _hub_keeper: HubKeeper = field(init=False)
     _latest: dict[tuple[str, str], tuple[bytes, str]] = field(default_factory=dict)
     """Latest values by key; decisions by key and subject."""
     _inbox: "queue.Queue[zenoh.Query]" = field(default_factory=lambda: queue.Queue(_MAX_PLAYER_QUERIES))
+
+    def __post_init__(self) -> None:
+        self._hub_keeper = HubKeeper(self.bus.endpoint, _HUB_RESTART_DELAY_S)
 
     def begin(self, session: str, cars: Iterable[str]) -> None:
         """Declare the tokens of these cars, and answer queries; raises NameTaken."""
@@ -115,7 +118,7 @@ class Player:
             now_s = time.monotonic()
             if now_s - self._polled_s > _HUB_POLL_INTERVAL_S:
                 self._polled_s = now_s
-                self._restart_hub(now_s)
+                self._hub_keeper.check(connected=self.bus.connected)
             left_s = until_s - now_s
             try:
                 query = (
@@ -128,17 +131,6 @@ class Player:
                     return
             else:
                 self._answer(query)
-
-    def _restart_hub(self, now_s: float) -> None:
-        """Start a hub if the old one is gone."""
-        if self.bus.connected:
-            self._disconnected_since_s = None
-        elif self._disconnected_since_s is None:
-            self._disconnected_since_s = now_s
-        elif now_s - self._disconnected_since_s > _HUB_RESTART_DELAY_S:
-            self._disconnected_since_s = now_s
-            with contextlib.suppress(BusError):  # a hub on another machine: only wait for it
-                ensure_hub(self.bus.endpoint)
 
     def _key_of(self, message: Recorded) -> str | None:
         key = keys.parse(message.key)
@@ -192,10 +184,7 @@ class Player:
             if "*" in verb or not query.key_expr.intersects(key):
                 continue
             result = pb.Result(id=identity, car=car, status="rejected", reason="unsupported", words=self.refuse)
-            if query.parameters.get("format") == "json" or not encoding.startswith(topics.PROTOBUF):
-                reply(query, key, messages.to_json(result).encode(), messages.JSON)
-            else:
-                reply(query, key, result.SerializeToString(), messages.encoding_of(topics.RESULT))
+            reply_message(query, key, result, as_json=is_json_wanted(query))
 
 
 def _encoding(message: Recorded) -> str:
@@ -217,10 +206,10 @@ def _subject(topic: Topic, payload: bytes) -> str:
 
 def _identity(verb: str, query: zenoh.Query, encoding: str) -> str:
     """Return the id that the sender gave a command; empty if unreadable."""
-    if verb not in topics.COMMANDS or query.payload is None:
+    if verb not in COMMANDS or query.payload is None:
         return ""
     try:
-        command: Any = messages.parse(topics.COMMANDS[verb], query.payload.to_bytes(), encoding)
+        command: Any = messages.parse(COMMANDS[verb].message, query.payload.to_bytes(), encoding)
     except messages.BadPayload:
         return ""
     return str(command.id)

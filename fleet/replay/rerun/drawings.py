@@ -20,7 +20,7 @@ from fleet.replay.colors import OFF, Rgb, color, rgb
 from fleet.replay.rerun.lenses import component, numbers, triples
 from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
 from schemas import keys, messages
-from schemas.topics import COMMANDS
+from schemas.commands import COMMANDS
 
 TIMELINES: Final = (LOG_TIMELINE, PUBLISH_TIMELINE)
 MAX_MARK_S: Final = 0.4
@@ -29,7 +29,7 @@ _ASKED: Final = "asked"
 _QUEUED: Final = "queued"
 _CARRIED_OUT: Final = frozenset({"sent", "complete"})
 _LED: Final = "led"
-LED_MESSAGE: Final = COMMANDS["led"]
+LED_MESSAGE: Final = COMMANDS["led"].message
 _THING_M: Final = 0.2
 """Drawn height of things: the world is flat."""
 _LAMP_COLOR: Final = (255, 225, 90)

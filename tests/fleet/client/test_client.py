@@ -185,8 +185,8 @@ def test_a_gateway_that_hangs_is_told_from_one_that_answers_late(
     cars: Cars, gateway: Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Of 50 cars that stopped, six were said to hang: their answers took more than two seconds."""
-    monkeypatch.setattr("fleet.client.command_tracker.ANSWER_S", 0.1)
-    monkeypatch.setattr("fleet.client.client.LATEST_ANSWER_S", 1.2)
+    monkeypatch.setattr("fleet.client.command_tracker.ANSWER_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("fleet.client.client.OVERLOAD_ANSWER_TIMEOUT_S", 1.2)
     caplog.set_level("WARNING", "fleet")
     events = gateway.publisher("odd/fine/event/command", topics.TOPICS["event/command"], "fine")
     held: list[zenoh.Query] = []

@@ -124,16 +124,16 @@ def test_a_rate_is_counted_by_the_publishers_numbers(
 ) -> None:
     survey = KeySurvey(2.5)
     for seq, age in seen:
-        survey.take(reading("sensor/range", seq, age), NOW)
-    (found,) = survey.found([], NOW)
+        survey.add(reading("sensor/range", seq, age), NOW)
+    (found,) = survey.keys([], NOW)
     assert (found.rate_hz, found.age_s) == (rate, age_s)
 
 
 def test_a_publisher_that_began_anew_counts_anew() -> None:
     survey = KeySurvey(2.5)
     for seq, age, boot in ((900, 2.0, "a"), (1, 1.0, "b"), (2, 0.0, "b")):
-        survey.take(reading("sensor/range", seq, age, boot), NOW)
-    (found,) = survey.found([], NOW)
+        survey.add(reading("sensor/range", seq, age, boot), NOW)
+    (found,) = survey.keys([], NOW)
     assert found.rate_hz == 1.0
 
 
@@ -357,15 +357,15 @@ def test_each_key_holds_for_itself_and_a_stale_value_holds_nothing() -> None:
 
 def test_what_is_said_when_the_time_is_over() -> None:
     waiting = close(1.5)
-    assert str(waiting.late("fleet/red/sensor/range", 5.0, NOW)) == (
+    assert str(waiting.timeout_error("fleet/red/sensor/range", 5.0, NOW)) == (
         "range_m < 0.3 did not hold for 1.5 s within 5 s: nothing came under fleet/red/sensor/range"
     )
     waiting.ends(reading("sensor/range", 1, 9.0, no_echo=True), NOW)
-    assert str(waiting.late("x", 5.0, NOW)).endswith(
+    assert str(waiting.timeout_error("x", 5.0, NOW)).endswith(
         ": fleet/red/sensor/range had range_m=not measured, 9.0 s ago (stale)"
     )
     waiting.ends(reading("sensor/range", 2, 2.0, range_m=0.5), NOW)
-    late = waiting.late("x", 5.0, NOW)
+    late = waiting.timeout_error("x", 5.0, NOW)
     assert str(late).endswith(": fleet/red/sensor/range had range_m=0.5, 2.0 s ago")
     assert late.last is not None
     assert late.last.value.range_m == 0.5

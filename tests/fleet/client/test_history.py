@@ -222,12 +222,12 @@ def numbered(*seqs: int, key: str = "fleet/red/sensor/range", boot: str = "a") -
 def test_what_one_answer_lost_another_has() -> None:
     blue = numbered(7, key="fleet/blue/sensor/range", boot="b")
     first, second = numbered(1, 2, 5) + blue, numbered(2, 3, 4, 5, 6)
-    assert history.gaps(history.united(first, [])) == {"fleet/red/sensor/range": 2}
-    assert history.united(first, second) == blue + numbered(1, 2, 3, 4, 5, 6)
-    assert history.gaps(history.united(first, second)) == {}
-    assert history.united(first, second, last=3) == blue + numbered(4, 5, 6)
+    assert history.gaps(history.merge(first, [])) == {"fleet/red/sensor/range": 2}
+    assert history.merge(first, second) == blue + numbered(1, 2, 3, 4, 5, 6)
+    assert history.gaps(history.merge(first, second)) == {}
+    assert history.merge(first, second, last=3) == blue + numbered(4, 5, 6)
     assert history.gaps(numbered(900) + numbered(3, boot="z")) == {}, "a gateway that began anew counts anew"
-    told = history.shortfalls(numbered(1, 2, 5), NOW, last=3)
+    told = history.describe_shortfalls(numbered(1, 2, 5), NOW, last=3)
     assert told == ["fleet/red/sensor/range: 2 in between were lost on the way, ask again"]
 
 
@@ -245,7 +245,7 @@ def test_what_one_answer_lost_another_has() -> None:
     ],
 )
 def test_what_is_said_of_less(count: int, last: int | None, since_s: float | None, told: list[str]) -> None:
-    assert history.shortfalls(readings(count), NOW, last=last, since_s=since_s) == told
+    assert history.describe_shortfalls(readings(count), NOW, last=last, since_s=since_s) == told
 
 
 def test_a_table_of_every_type_has_the_same_columns_whatever_was_measured() -> None:

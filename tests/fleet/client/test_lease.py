@@ -53,7 +53,7 @@ def safety(holder: str = "", *, hold: str = "", since_s: int = 1, estop: str = "
 def test_what_a_gateway_says_of_a_car(heard: list[pb.Safety], lost: str) -> None:
     ours = LeaseMonitor("red", "bot")
     for message in heard:
-        ours.heard(message)
+        ours.on_safety(message)
     assert ours.lost == lost
 
 
@@ -62,24 +62,24 @@ def test_what_was_published_before_is_no_news_when_it_comes_late() -> None:
     for seq, message in enumerate(told, start=1):
         message.boot_id, message.seq = "a", seq
     before, had, taken = told
-    ours.heard(had)  # it was asked for
-    ours.heard(before)
+    ours.on_safety(had)  # it was asked for
+    ours.on_safety(before)
     assert not ours.lost
-    ours.heard(taken)
+    ours.on_safety(taken)
     assert ours.lost == "red was taken by mia (person)"
     again = safety("bob")
     again.boot_id, again.seq = "b", 1
     ours = LeaseMonitor("red", "bot")
     for message in (had, again):
-        ours.heard(message)
+        ours.on_safety(message)
     assert ours.lost == "red was taken by bob (person)", "a gateway that began anew counts anew"
 
 
 def test_a_refusal_says_who_has_it() -> None:
     ours = LeaseMonitor("red", "bot")
-    ours.refused(Outcome("red", ok=False, phase="rejected", reason="unsupported", words="no arm"))
+    ours.on_outcome(Outcome("red", ok=False, phase="rejected", reason="unsupported", words="no arm"))
     assert not ours.lost
-    ours.refused(Outcome("red", ok=False, phase="rejected", reason="leased", words="red is driven by mia"))
+    ours.on_outcome(Outcome("red", ok=False, phase="rejected", reason="leased", words="red is driven by mia"))
     assert ours.lost == "red is driven by mia"
 
 
@@ -190,10 +190,10 @@ def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars, late: 
                 leased = other.car("blue").lease()
                 lease = leased._lease
                 if late != "nothing":
-                    setattr(lease, "_heard", lambda _: None)  # noqa: B010 - mypy lets nobody assign a method
+                    setattr(lease, "_on_sample", lambda _: None)  # noqa: B010 - mypy lets nobody assign a method
                 async with leased as car:
                     if late == "what is asked for, too":
-                        setattr(lease, "_look", lambda look=lease._look: paused_look(look))  # noqa: B010 - likewise
+                        setattr(lease, "_query", lambda look=lease._query: paused_look(look))  # noqa: B010 - likewise
                     await stopped(car)
 
         def paused_look(look: Callable[[], None]) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.client.outcome import SHOW_S, Progress, Until
+from fleet.client.outcome import STOP_EVIDENCE_S, Progress, Until
 
 # Each step: ("answer" | "event", phase, worst case); at 1, 2, 3 ... s after asking at 100.
 Steps = list[tuple[str, str, float]]
@@ -11,7 +11,7 @@ Steps = list[tuple[str, str, float]]
 def told(until: Until, steps: Steps, lasts_s: float = 0.0) -> Progress:
     progress = Progress("red", until, 100.0, lasts_s)
     for number, (how, phase, worst_s) in enumerate(steps, start=1):
-        take = progress.answered if how == "answer" else progress.event
+        take = progress.on_answer if how == "answer" else progress.on_event
         take(phase, "held" if phase == "rejected" else "", "", worst_s, 100.0 + number)
     return progress
 
@@ -58,14 +58,14 @@ def test_an_answer_that_its_last_record_overtook_still_says_the_worst_case() -> 
 
 
 def test_a_stop_is_waited_for_as_long_as_its_gateway_announced_and_a_margin() -> None:
-    assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(100 + 7.3 + SHOW_S + 5.0)
+    assert told(Until.STOPPED, [("answer", "queued", 7.3)]).deadline == pytest.approx(100 + 7.3 + STOP_EVIDENCE_S + 5.0)
 
 
 def test_what_is_waited_for_after_a_late_answer_is_counted_from_it() -> None:
     progress = Progress("red", Until.STOPPED, 100.0)
     assert progress.deadline > 110.0, "the query is over before it"
-    progress.answered("queued", "", "", 0.5, 108.0)
-    assert progress.deadline == pytest.approx(108.0 + 0.5 + SHOW_S + 5.0)
+    progress.on_answer("queued", "", "", 0.5, 108.0)
+    assert progress.deadline == pytest.approx(108.0 + 0.5 + STOP_EVIDENCE_S + 5.0)
 
 
 @pytest.mark.parametrize(
@@ -77,17 +77,17 @@ def test_what_is_waited_for_after_a_late_answer_is_counted_from_it() -> None:
 )
 def test_no_answer_says_whether_there_is_a_gateway(alive: bool, words: str) -> None:
     progress = Progress("red", Until.STOPPED, 100.0)
-    progress.token(109.5, alive=alive)
-    progress.unanswered(110.0)
+    progress.on_presence(109.5, alive=alive)
+    progress.on_query_timeout(110.0)
     assert progress.outcome is not None
     assert (progress.outcome.phase, progress.outcome.words) == ("no_answer", f"no answer after 10 s; {words}")
 
 
 def test_a_car_whose_records_come_is_not_without_an_answer() -> None:
     progress = told(Until.STOPPED, [("event", "asked", 0.0), ("event", "sent", 0.5)])
-    progress.unanswered(110.0)
+    progress.on_query_timeout(110.0)
     assert progress.outcome is None
-    progress.event("complete", "", "", 0.0, 111.0)
+    progress.on_event("complete", "", "", 0.0, 111.0)
     assert progress.outcome is not None
     assert progress.outcome.ok
 
@@ -102,12 +102,12 @@ def test_giving_up_says_what_was_heard_last() -> None:
 
 def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0), ("event", "sent", 0.0)], 9.0)
-    progress.token(102.0, alive=False)
+    progress.on_presence(102.0, alive=False)
     assert progress.deadline == 103.0
-    progress.token(102.4, alive=True)
+    progress.on_presence(102.4, alive=True)
     assert progress.deadline == 109.0
-    progress.token(103.0, alive=False)
-    progress.token(103.4, alive=False)
+    progress.on_presence(103.0, alive=False)
+    progress.on_presence(103.4, alive=False)
     assert progress.deadline == 104.0
     progress.give_up(104.0)
     assert progress.outcome is not None
@@ -127,13 +127,13 @@ def test_a_drive_whose_records_come_late_is_not_taken_for_one_that_only_prolonge
     progress = told(Until.OVER, [("answer", "sent", 0.0)], 2.0)
     assert progress.deadline == 107.0
     for at, phase in enumerate(("queued", "sent", "complete"), start=104):
-        progress.event(phase, "", "", 0.0, at)
+        progress.on_event(phase, "", "", 0.0, at)
     assert progress.outcome is not None
     assert (progress.outcome.ok, progress.outcome.phase) == (True, "complete")
 
 
 def test_the_first_last_word_stays() -> None:
     progress = told(Until.SENT, [("answer", "rejected", 0.0), ("event", "sent", 0.0)])
-    progress.silent("nothing", 105.0)
+    progress.on_query_failed("nothing", 105.0)
     assert progress.outcome is not None
     assert (progress.outcome.phase, progress.outcome.reason) == ("rejected", "held")

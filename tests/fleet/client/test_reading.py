@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from fleet.aio import Watch as AsyncWatch
-from fleet.client.reading import QUEUE_LIMIT, Reading, Watch, reading_of
+from fleet.client.reading import READING_QUEUE_LIMIT, Reading, Watch, reading_of
 from schemas import messages
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
@@ -57,10 +57,12 @@ def test_a_reader_that_is_too_slow_loses_the_oldest_and_is_told_how_many() -> No
         return takes.clear
 
     with Watch().begin(subscribe) as readings:
-        for seq in range(1, QUEUE_LIMIT + 101):
+        for seq in range(1, READING_QUEUE_LIMIT + 101):
             takes[0](sample(seq))
         assert readings.dropped == 100
-        assert [next(readings).value.seq for _ in range(QUEUE_LIMIT)] == list(range(101, QUEUE_LIMIT + 101))
+        assert [next(readings).value.seq for _ in range(READING_QUEUE_LIMIT)] == list(
+            range(101, READING_QUEUE_LIMIT + 101)
+        )
         takes[0](sample(1, b"\xff"))
         takes[0](sample(7))
         assert next(readings).value.seq == 7
@@ -71,10 +73,12 @@ def test_a_reader_that_is_too_slow_loses_the_oldest_and_is_told_how_many() -> No
 
 async def test_so_does_an_async_reader() -> None:
     readings = AsyncWatch()
-    for seq in range(1, QUEUE_LIMIT + 101):
+    for seq in range(1, READING_QUEUE_LIMIT + 101):
         assert readings.hand_over(sample(seq))
         await asyncio.sleep(0)
     for _ in range(3):
         await asyncio.sleep(0)  # the last is on its way through the loop
-    assert [(await anext(readings)).value.seq for _ in range(QUEUE_LIMIT)] == list(range(101, QUEUE_LIMIT + 101))
+    assert [(await anext(readings)).value.seq for _ in range(READING_QUEUE_LIMIT)] == list(
+        range(101, READING_QUEUE_LIMIT + 101)
+    )
     assert readings.dropped == 100

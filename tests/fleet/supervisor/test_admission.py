@@ -7,9 +7,9 @@ import pytest
 from fleet.supervisor.admission import (
     KILL_INTERVAL_S,
     KILLS_AT_ONCE,
-    PLACE_S,
     RESTART_INTERVAL_S,
     RESTARTS_AT_ONCE,
+    START_SLOT_TIMEOUT_S,
     Admission,
     Budget,
 )
@@ -21,7 +21,7 @@ from fleet.supervisor.admission import (
         ([], True),
         ([99.0], True),
         ([99.0, 99.5], False),
-        ([99.0, 100.0 - PLACE_S], True),  # one of them has had its time
+        ([99.0, 100.0 - START_SLOT_TIMEOUT_S], True),  # one of them has had its time
         ([0.0, 1.0, 2.0, 3.0], True),
     ],
 )
@@ -54,7 +54,7 @@ def test_kills_have_a_budget_for_the_whole_fleet() -> None:
     admission, killed = Admission(2), 0
     for tenth in range(round(10 * 4 * KILL_INTERVAL_S)):
         if admission.may_kill(tenth / 10):
-            admission.killed()
+            admission.count_kill()
             killed += 1
     assert killed == KILLS_AT_ONCE + 3
 

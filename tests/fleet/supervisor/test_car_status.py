@@ -8,8 +8,8 @@ import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
 from rich.console import Console
 
-from fleet.supervisor.car_status import CarStatus, left_from_before
-from fleet.supervisor.child import RUNS, Log, new_run, runs
+from fleet.supervisor.car_status import CarStatus, describe_old_stops
+from fleet.supervisor.child import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
 from fleet.supervisor.restart_policy import RunState
 from fleet.supervisor.spec import FleetSpec, ProcessKind
 from fleet.supervisor.status_table import Table
@@ -79,7 +79,7 @@ BOBS = pb.Estop(id="e1", by="bob", why="smoke", stamp=_since(YESTERDAY + 60))
     ],
 )
 def test_what_keeps_a_car_still_from_an_earlier_day_is_told_with_how_to_end_it(safety: pb.Safety, words: str) -> None:
-    assert left_from_before("red", safety, TODAY, " --fleet lab") == words
+    assert describe_old_stops("red", safety, TODAY, " --fleet lab") == words
 
 
 def test_the_rate_is_what_came_over_some_seconds() -> None:
@@ -89,18 +89,18 @@ def test_the_rate_is_what_came_over_some_seconds() -> None:
     assert row.rate_hz == 25.0
     row.take("state/link", pb.Link(state="online", rx_frames=3), 9.0)
     assert row.rate_hz == 25.0, "another gateway counts anew"
-    row.gone()
+    row.reset()
     assert (row.rate_hz, row.link, row.mode) == (None, "", "")
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
 def test_the_table_fits_and_names_every_car(width: int) -> None:
-    wish = FleetSpec(endpoint="tcp/127.0.0.1:7999")
-    supervisor = Supervisor(wish, "", lambda: wish, lambda happening: None)
+    spec = FleetSpec(endpoint="tcp/127.0.0.1:7999")
+    supervisor = Supervisor(spec, "", lambda: spec, lambda event: None)
     for name, kind in (("@hub", ProcessKind.HUB), ("red", ProcessKind.GATEWAY), ("green", ProcessKind.GATEWAY)):
-        supervisor.crew.add(name, kind, ())
-    for process in supervisor.crew:
-        process.ward.state = RunState.RUNNING
+        supervisor.processes.add(name, kind, ())
+    for process in supervisor.processes:
+        process.status.state = RunState.RUNNING
     for name in ("red", "green"):
         supervisor.rows[name] = CarStatus(name, link="online", mode="obstacle_avoidance", event="x" * 300)
     console = Console(file=io.StringIO(), width=width)
@@ -115,6 +115,7 @@ def test_a_log_keeps_its_bounds_and_the_newest_lines(tmp_path: Path) -> None:
     log = Log(tmp_path / "red.log", limit_bytes=10_000)
     for number in range(2000):
         log.add(f"line {number}", 1_700_000_000.25)
+    log.close()
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 21_000
     text = log.older.read_text() + log.path.read_text()
     assert text.splitlines()[-1] == "2023-11-14T22:13:20.250Z red | line 1999"
@@ -129,8 +130,8 @@ def test_a_log_that_cannot_be_written_says_so_and_hurts_nobody(tmp_path: Path) -
 
 def test_the_oldest_runs_are_removed_unless_they_may_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
-    place = runs("lab", DEFAULT_ENDPOINT)
-    for number in range(RUNS + 5):
+    place = runs_directory("lab", DEFAULT_ENDPOINT)
+    for number in range(MAX_RUN_DIRECTORIES + 5):
         old = place / f"20200101-0000{number:02}-1"
         old.mkdir(parents=True)
         (old / "red.log").write_text("x")
@@ -142,4 +143,4 @@ def test_the_oldest_runs_are_removed_unless_they_may_go_on(tmp_path: Path, monke
     left = sorted(each.name for each in place.iterdir())
     assert made.name in left
     assert touched.name in left
-    assert len(left) == RUNS + 1
+    assert len(left) == MAX_RUN_DIRECTORIES + 1

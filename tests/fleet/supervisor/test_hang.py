@@ -11,8 +11,8 @@ import pytest
 
 from fleet.supervisor import cpu_time
 from fleet.supervisor.hang import (
-    LONGEST_TURN_S,
     MANY_SILENT_S,
+    MAX_POLL_GAP_S,
     MOVING_SILENT_S,
     SLOW_SILENT_S,
     CpuTime,
@@ -44,7 +44,7 @@ def test_a_process_shows_by_its_cpu_time_what_its_silence_means(
     for half in range(10):
         now = 100.0 + half / 2
         assert pulse.is_due(now)
-        pulse.look(now, CpuTime(7.0 + run_share * now, 3.0 + wait_share * now, ready))
+        pulse.add(now, CpuTime(7.0 + run_share * now, 3.0 + wait_share * now, ready))
         assert not pulse.is_due(now + 0.4)
         assert pulse.sign is (sign if half >= 2 else Sign.UNKNOWN)
     pulse.clear()
@@ -54,9 +54,9 @@ def test_a_process_shows_by_its_cpu_time_what_its_silence_means(
 def test_only_the_last_seconds_count_and_a_system_that_does_not_tell_shows_nothing() -> None:
     pulse = Pulse()
     for half in range(20):  # it worked, then it stands
-        pulse.look(half / 2, CpuTime(min(half, 8) / 2))
+        pulse.add(half / 2, CpuTime(min(half, 8) / 2))
     assert pulse.sign is Sign.BLOCKED
-    pulse.look(11.0, None)
+    pulse.add(11.0, None)
     assert pulse.sign is Sign.UNKNOWN
 
 
@@ -89,11 +89,11 @@ def test_the_watchers_clock_stands_while_the_watcher_does() -> None:
     clock, now = WatchClock(100.0), 100.0
     for _ in range(10):
         now += 0.1
-        assert clock.look(now) == pytest.approx(now)
-    began = clock.look(now)
+        assert clock.advance(now) == pytest.approx(now)
+    began = clock.advance(now)
     now += 6.0
-    assert clock.look(now) == pytest.approx(began + LONGEST_TURN_S)
-    assert clock.look(now + 0.1) == pytest.approx(began + LONGEST_TURN_S + 0.1)
+    assert clock.advance(now) == pytest.approx(began + MAX_POLL_GAP_S)
+    assert clock.advance(now + 0.1) == pytest.approx(began + MAX_POLL_GAP_S + 0.1)
 
 
 def test_a_process_is_seen_to_be_blocked_to_spin_and_to_have_gone(tmp_path: Path) -> None:

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.supervisor.restart_policy import (
-    FIRST_S,
+    FIRST_RESTART_DELAY_S,
     GATEWAY_GRACE_S,
-    JITTER,
-    LONGEST_S,
-    STEADY_S,
+    MAX_RESTART_DELAY_S,
+    RESTART_JITTER,
+    STABLE_RUN_S,
     WRONG_USE_RETRY_S,
     Patience,
     ProcessState,
@@ -28,11 +28,11 @@ PATIENCE = Patience(start_s=20.0, silence_s=4.0)
 
 
 def running(at: float = 100.0) -> ProcessState:
-    ward = ProcessState(PATIENCE, at)
-    assert ward.turn(at, None) is RestartAction.START
-    ward.started(at)
-    assert ward.heard(at)
-    return ward
+    state = ProcessState(PATIENCE, at)
+    assert state.turn(at, None) is RestartAction.START
+    state.on_started(at)
+    assert state.on_heartbeat(at)
+    return state
 
 
 @pytest.mark.parametrize(
@@ -40,53 +40,53 @@ def running(at: float = 100.0) -> ProcessState:
 )
 def test_the_delay_doubles_to_its_longest_and_is_spread_either_way(falls: int, delay: float) -> None:
     assert delay_s(falls, 0.5) == delay
-    assert delay_s(falls, 0.0) == pytest.approx(delay * (1 - JITTER))
-    assert delay_s(falls, 1.0) == pytest.approx(delay * (1 + JITTER))
+    assert delay_s(falls, 0.0) == pytest.approx(delay * (1 - RESTART_JITTER))
+    assert delay_s(falls, 1.0) == pytest.approx(delay * (1 + RESTART_JITTER))
 
 
 def test_a_gateway_is_killed_no_sooner_than_its_own_wait_for_evidence_is_over() -> None:
-    ward = running()
-    assert ward.end(200.0, GATEWAY_GRACE_S)
-    assert ward.turn(200.0 + SHUTDOWN_S + LEAVES_BUS_S, None) is RestartAction.NOTHING
-    assert ward.turn(200.0 + GATEWAY_GRACE_S, None) is RestartAction.KILL
+    state = running()
+    assert state.end(200.0, GATEWAY_GRACE_S)
+    assert state.turn(200.0 + SHUTDOWN_S + LEAVES_BUS_S, None) is RestartAction.NOTHING
+    assert state.turn(200.0 + GATEWAY_GRACE_S, None) is RestartAction.KILL
 
 
 def test_what_dies_is_started_again_after_the_delay() -> None:
-    ward = running()
-    ward.ended(-9, "", 101.0, 0.5)
-    assert ward.state is RunState.WAITING
-    assert ward.words == "was ended by signal 9"
-    assert ward.turn(101.0 + FIRST_S - 0.01, 0.0) is RestartAction.NOTHING
-    assert ward.turn(101.0 + FIRST_S, 0.0) is RestartAction.START
-    ward.started(102.0)
-    assert (ward.state, ward.restarts) == (RunState.STARTING, 1)
+    state = running()
+    state.on_exit(-9, "", 101.0, 0.5)
+    assert state.state is RunState.WAITING
+    assert state.words == "was ended by signal 9"
+    assert state.turn(101.0 + FIRST_RESTART_DELAY_S - 0.01, 0.0) is RestartAction.NOTHING
+    assert state.turn(101.0 + FIRST_RESTART_DELAY_S, 0.0) is RestartAction.START
+    state.on_started(102.0)
+    assert (state.state, state.restarts) == (RunState.STARTING, 1)
 
 
 def test_who_falls_at_once_again_and_again_waits_ever_longer_and_who_ran_steadily_does_not() -> None:
-    ward, at, delays = ProcessState(PATIENCE, 0.0), 0.0, []
+    state, at, delays = ProcessState(PATIENCE, 0.0), 0.0, []
     for _ in range(8):
-        ward.started(at)
-        ward.ended(1, "no", at + 0.1, 0.5)
-        delays.append(ward.due - at - 0.1)
-        at = ward.due
+        state.on_started(at)
+        state.on_exit(1, "no", at + 0.1, 0.5)
+        delays.append(state.due - at - 0.1)
+        at = state.due
     assert delays == sorted(delays)
-    assert delays[-1] == pytest.approx(LONGEST_S)
-    ward.started(at)
-    ward.heard(at)
-    ward.ended(1, "no", at + STEADY_S, 0.5)
-    assert ward.due - at - STEADY_S == pytest.approx(FIRST_S)
-    assert ward.words == "ended with exit code 1: no"
+    assert delays[-1] == pytest.approx(MAX_RESTART_DELAY_S)
+    state.on_started(at)
+    state.on_heartbeat(at)
+    state.on_exit(1, "no", at + STABLE_RUN_S, 0.5)
+    assert state.due - at - STABLE_RUN_S == pytest.approx(FIRST_RESTART_DELAY_S)
+    assert state.words == "ended with exit code 1: no"
 
 
 def test_a_process_that_refuses_its_arguments_is_retried_each_minute_and_at_once_after_a_reload() -> None:
-    ward = running()
-    ward.ended(2, "no such platform", 101.0, 0.5)
-    assert ward.state is RunState.REFUSED
-    assert ward.words == "ended with exit code 2: no such platform"
-    assert ward.turn(101.0 + WRONG_USE_RETRY_S - 0.1, 0.0) is RestartAction.NOTHING
-    assert ward.turn(101.0 + WRONG_USE_RETRY_S, 0.0) is RestartAction.START
-    ward.end(120.0, 5.0, again=True)
-    assert ward.turn(120.0, 0.0) is RestartAction.START
+    state = running()
+    state.on_exit(2, "no such platform", 101.0, 0.5)
+    assert state.state is RunState.REFUSED
+    assert state.words == "ended with exit code 2: no such platform"
+    assert state.turn(101.0 + WRONG_USE_RETRY_S - 0.1, 0.0) is RestartAction.NOTHING
+    assert state.turn(101.0 + WRONG_USE_RETRY_S, 0.0) is RestartAction.START
+    state.end(120.0, 5.0, again=True)
+    assert state.turn(120.0, 0.0) is RestartAction.START
 
 
 @pytest.mark.parametrize(
@@ -98,9 +98,9 @@ def test_a_silent_process_may_be_left_longer_than_its_patience(leave_s: float, a
 
 
 def test_a_process_that_is_to_end_has_its_time_however_long_it_may_be_silent() -> None:
-    ward = running()
-    ward.end(110.0, 7.0)
-    assert ward.turn(117.0, 0.0, inf) is RestartAction.KILL
+    state = running()
+    state.end(110.0, 7.0)
+    assert state.turn(117.0, 0.0, inf) is RestartAction.KILL
 
 
 @pytest.mark.parametrize(
@@ -116,52 +116,52 @@ def test_a_process_that_is_to_end_has_its_time_however_long_it_may_be_silent() -
 def test_who_is_silent_hangs_if_it_could_have_been_heard(
     now: float, listening_since: float | None, act: RestartAction
 ) -> None:
-    ward = running(100.0)
-    assert ward.turn(now, listening_since) is act
+    state = running(100.0)
+    assert state.turn(now, listening_since) is act
     if act is RestartAction.KILL:
-        assert ward.words.startswith("hung: not heard for ")
-        assert ward.killed
-        assert ward.turn(now + 10, listening_since) is RestartAction.NOTHING, "once is enough"
-        ward.ended(-9, "", now + 0.1, 0.5)
-        assert ward.words.startswith("hung"), "the reason stays the first"
+        assert state.words.startswith("hung: not heard for ")
+        assert state.killed
+        assert state.turn(now + 10, listening_since) is RestartAction.NOTHING, "once is enough"
+        state.on_exit(-9, "", now + 0.1, 0.5)
+        assert state.words.startswith("hung"), "the reason stays the first"
 
 
 def test_who_starts_has_longer() -> None:
-    ward = ProcessState(PATIENCE, 0.0)
-    ward.started(100.0)
-    assert ward.turn(119.9, 0.0) is RestartAction.NOTHING
-    assert ward.turn(120.1, 0.0) is RestartAction.KILL
+    state = ProcessState(PATIENCE, 0.0)
+    state.on_started(100.0)
+    assert state.turn(119.9, 0.0) is RestartAction.NOTHING
+    assert state.turn(120.1, 0.0) is RestartAction.KILL
 
 
 def test_told_to_end_it_has_its_time_and_then_is_killed_and_not_started_again() -> None:
-    ward = running()
-    assert ward.end(110.0, 7.0)
-    assert not ward.end(111.0, 7.0), "told twice is told once"
-    assert ward.turn(116.9, 0.0) is RestartAction.NOTHING
-    assert ward.turn(117.0, 0.0) is RestartAction.KILL
-    ward.ended(-9, "", 117.1, 0.5)
-    assert ward.state is RunState.ENDED
-    assert ward.turn(1e6, 0.0) is RestartAction.NOTHING
+    state = running()
+    assert state.end(110.0, 7.0)
+    assert not state.end(111.0, 7.0), "told twice is told once"
+    assert state.turn(116.9, 0.0) is RestartAction.NOTHING
+    assert state.turn(117.0, 0.0) is RestartAction.KILL
+    state.on_exit(-9, "", 117.1, 0.5)
+    assert state.state is RunState.ENDED
+    assert state.turn(1e6, 0.0) is RestartAction.NOTHING
 
 
 def test_begun_anew_is_no_fall() -> None:
-    ward = running()
-    ward.end(110.0, 7.0, again=True)
-    ward.ended(0, "", 111.0, 0.5)
-    assert ward.turn(111.0, 0.0) is RestartAction.START
+    state = running()
+    state.end(110.0, 7.0, again=True)
+    state.on_exit(0, "", 111.0, 0.5)
+    assert state.turn(111.0, 0.0) is RestartAction.START
 
 
 def test_what_somebody_else_does_is_not_started_until_nobody_does() -> None:
-    ward = ProcessState(PATIENCE, 0.0)
-    ward.elsewhere(1.0, "somebody else's")
-    assert ward.turn(100.0, 0.0) is RestartAction.NOTHING
-    ward.wanted(101.0)
-    assert ward.turn(101.0, 0.0) is RestartAction.START
+    state = ProcessState(PATIENCE, 0.0)
+    state.served_elsewhere(1.0, "somebody else's")
+    assert state.turn(100.0, 0.0) is RestartAction.NOTHING
+    state.schedule(101.0)
+    assert state.turn(101.0, 0.0) is RestartAction.START
 
 
 @dataclass
 class FakeProcess:
-    """What a ward is told of: at most one lives."""
+    """What a state is told of: at most one lives."""
 
     alive: bool = False
 
@@ -176,40 +176,40 @@ class FakeProcess:
     )
 )
 def test_for_any_order_there_is_at_most_one_and_what_may_run_is_due(steps: list[tuple[str, float, float]]) -> None:
-    ward, process, now = ProcessState(PATIENCE, 0.0), FakeProcess(), 0.0
+    state, process, now = ProcessState(PATIENCE, 0.0), FakeProcess(), 0.0
     for step, seconds, chance in steps:
         now += seconds
         if step in ("turn", "deaf"):
-            act = ward.turn(now, None if step == "deaf" else 0.0)
+            act = state.turn(now, None if step == "deaf" else 0.0)
             if act is RestartAction.START:
                 assert not process.alive
                 process.alive = True
-                ward.started(now)
+                state.on_started(now)
             elif act is RestartAction.KILL:
                 assert process.alive
                 process.alive = False
-                ward.ended(-9, "", now, chance)
+                state.on_exit(-9, "", now, chance)
         elif step == "heard" and process.alive:
-            ward.heard(now)
+            state.on_heartbeat(now)
         elif step in ("die", "wrong") and process.alive:
             process.alive = False
-            ward.ended(2 if step == "wrong" else 1, "", now, chance)
+            state.on_exit(2 if step == "wrong" else 1, "", now, chance)
         elif step in ("end", "again"):
-            assert ward.end(now, 5.0, again=step == "again") <= process.alive
-        assert ward.alive == process.alive
-        if ward.state is RunState.WAITING:
-            assert ward.due <= now + LONGEST_S * (1 + JITTER)
+            assert state.end(now, 5.0, again=step == "again") <= process.alive
+        assert state.alive == process.alive
+        if state.state is RunState.WAITING:
+            assert state.due <= now + MAX_RESTART_DELAY_S * (1 + RESTART_JITTER)
 
 
 def test_who_is_heard_to_the_end_is_killed_when_it_hangs_while_it_ends_and_nobody_else() -> None:
     for to_the_end in (True, False):
-        ward = ProcessState(Patience(start_s=20.0, silence_s=4.0, to_the_end=to_the_end), 100.0)
-        ward.started(100.0)
-        ward.heard(101.0)
-        ward.end(110.0, 15.0)
-        assert ward.turn(114.0, None) is RestartAction.NOTHING, "nobody could be heard"
-        assert ward.turn(114.0, 112.0) is RestartAction.NOTHING
-        ward.heard(112.5)
-        assert ward.turn(116.4, 112.0) is RestartAction.NOTHING
-        assert ward.turn(116.6, 112.0) is (RestartAction.KILL if to_the_end else RestartAction.NOTHING)
-        assert ward.turn(125.0, 112.0) is (RestartAction.NOTHING if to_the_end else RestartAction.KILL)
+        state = ProcessState(Patience(start_s=20.0, silence_s=4.0, to_the_end=to_the_end), 100.0)
+        state.on_started(100.0)
+        state.on_heartbeat(101.0)
+        state.end(110.0, 15.0)
+        assert state.turn(114.0, None) is RestartAction.NOTHING, "nobody could be heard"
+        assert state.turn(114.0, 112.0) is RestartAction.NOTHING
+        state.on_heartbeat(112.5)
+        assert state.turn(116.4, 112.0) is RestartAction.NOTHING
+        assert state.turn(116.6, 112.0) is (RestartAction.KILL if to_the_end else RestartAction.NOTHING)
+        assert state.turn(125.0, 112.0) is (RestartAction.NOTHING if to_the_end else RestartAction.KILL)

@@ -1,4 +1,4 @@
-"""From a fleet file and the command line to what is to run, and from one wish to the next."""
+"""From a fleet file and the command line to what is to run, and from one spec to the next."""
 
 import subprocess
 import sys
@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 
 from fleet.fleetfile.fleet_file import parse_fleet
-from fleet.supervisor.reload import change
+from fleet.supervisor.reload import compare
 from fleet.supervisor.spec import (
     SIMULATED,
-    Asked,
     CarProcessSpec,
     FleetSpec,
+    UpOptions,
+    build_spec,
     coordinator_command,
     gateway_command,
     recorder_command,
     simulator_command,
-    wanted,
 )
 
 FILE = """
@@ -34,20 +34,20 @@ cars:
 
 
 def test_a_file_says_it_all(tmp_path: Path) -> None:
-    wish = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), Asked())
-    assert (wish.fleet, wish.endpoint, wish.record) == ("lab", "tcp/127.0.0.1:7999", False)
-    assert wish.recordings == tmp_path / "kept"
-    assert [(car.name, car.link, car.platform) for car in wish.cars.values()] == [
+    spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions())
+    assert (spec.fleet, spec.endpoint, spec.record) == ("lab", "tcp/127.0.0.1:7999", False)
+    assert spec.recordings == tmp_path / "kept"
+    assert [(car.name, car.link, car.platform) for car in spec.cars.values()] == [
         ("ann", "/dev/ttyUSB0", "stm32+imu"),
         ("bob", "tcp://192.168.1.7:8888", "auto"),
     ]
-    assert not wish.simulated
+    assert not spec.simulated
 
 
 def test_the_command_line_wins(tmp_path: Path) -> None:
-    asked = Asked(plan=Path("p.yaml"), record=True, out=Path("o"), connect="tcp/127.0.0.1:7000", fleet="x")
-    wish = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), asked)
-    assert (wish.fleet, wish.endpoint, wish.record, wish.recordings, wish.plan) == (
+    asked = UpOptions(plan=Path("p.yaml"), record=True, out=Path("o"), connect="tcp/127.0.0.1:7000", fleet="x")
+    spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), asked)
+    assert (spec.fleet, spec.endpoint, spec.record, spec.recordings, spec.plan) == (
         "x",
         "tcp/127.0.0.1:7000",
         True,
@@ -57,33 +57,33 @@ def test_the_command_line_wins(tmp_path: Path) -> None:
 
 
 def test_simulated_are_first_the_files_cars_then_ours(tmp_path: Path) -> None:
-    wish = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), Asked(simulated=3))
-    assert [(car.name, car.platform) for car in wish.simulated] == [
+    spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions(simulated=3))
+    assert [(car.name, car.platform) for car in spec.simulated] == [
         ("ann", "stm32+imu"),
         ("bob", "arduino"),
         ("red", "arduino"),
     ]
-    one = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), Asked(simulated=1))
+    one = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions(simulated=1))
     assert [car.name for car in one.simulated] == ["ann"]
     assert one.cars["bob"].link == "tcp://192.168.1.7:8888"
 
 
 @pytest.mark.parametrize("count", [1, 8, 9, 50, 200])
 def test_any_number_of_cars_without_a_file(count: int) -> None:
-    wish = wanted(None, Asked(simulated=count))
-    assert len(wish.cars) == len(wish.simulated) == count
-    assert next(iter(wish.cars)) == "red"
+    spec = build_spec(None, UpOptions(simulated=count))
+    assert len(spec.cars) == len(spec.simulated) == count
+    assert next(iter(spec.cars)) == "red"
 
 
 def test_every_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
     """Argument parsers that know their arguments complain of the last one only."""
-    wish = wanted(parse_fleet(FILE, tmp_path / "fleet.yaml"), Asked(simulated=1))
+    spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions(simulated=1))
     endpoint = "tcp/127.0.0.1:1"
     commands = [
-        gateway_command(wish, wish.cars["bob"], "tcp://127.0.0.1:1", endpoint),
-        simulator_command(wish, tmp_path, endpoint),
-        recorder_command(wish, endpoint),
-        coordinator_command(wish, tmp_path / "plan.yaml", tmp_path / "fleet.yaml", endpoint),
+        gateway_command(spec, spec.cars["bob"], "tcp://127.0.0.1:1", endpoint),
+        simulator_command(spec, tmp_path, endpoint),
+        recorder_command(spec, endpoint),
+        coordinator_command(spec, tmp_path / "plan.yaml", tmp_path / "fleet.yaml", endpoint),
     ]
     for command in commands:
         assert command[0] == sys.executable
@@ -97,17 +97,17 @@ OLD = FleetSpec(cars=CARS | {"sim": CarProcessSpec("sim", SIMULATED, "arduino")}
 
 
 def test_nothing_new_is_no_change() -> None:
-    found = change(OLD, OLD)
-    assert (found.wish, found.gone, found.begun, found.words) == (OLD, (), (), ())
+    found = compare(OLD, OLD)
+    assert (found.spec, found.removed, found.restarted, found.words) == (OLD, (), (), ())
 
 
 def test_cars_come_go_and_change() -> None:
     cars = {name: car for name, car in OLD.cars.items() if name != "ann"}
     cars |= {"bob": CarProcessSpec("bob", "/dev/other"), "eve": CarProcessSpec("eve", "/dev/eve")}
-    found = change(OLD, replace(OLD, cars=cars))
-    assert found.gone == ("ann",)
-    assert found.begun == ("bob", "eve")
-    assert found.wish.cars == cars
+    found = compare(OLD, replace(OLD, cars=cars))
+    assert found.removed == ("ann",)
+    assert found.restarted == ("bob", "eve")
+    assert found.spec.cars == cars
     assert found.words == ("bob is begun anew", "eve is added", "ann is taken out")
 
 
@@ -125,6 +125,6 @@ def test_cars_come_go_and_change() -> None:
     ],
 )
 def test_what_the_processes_are_bound_to_stays_and_is_said(new: FleetSpec, words: str) -> None:
-    found = change(OLD, new)
-    assert found.wish == OLD
+    found = compare(OLD, new)
+    assert found.spec == OLD
     assert found.words == (f"{words} cannot be changed while running (fleet down, fleet up)",)

@@ -29,8 +29,9 @@ from gateway.control.commands import (
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from schemas import messages
+from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.topics import COMMANDS, PROTOBUF
+from schemas.topics import PROTOBUF
 
 NOW = 1_800_000_000_000_000_000
 
@@ -101,8 +102,8 @@ def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> N
     assert (command.age_s, command.ttl_s) == (None, 0.5 if verb == "drive" else 2.0)
     assert len(command.id) == 32
     if payload is not None:
-        message: Any = messages.message_class(COMMANDS[verb])(**payload)
-        for encoding in (PROTOBUF, messages.encoding_of(COMMANDS[verb])):
+        message: Any = messages.message_class(COMMANDS[verb].message)(**payload)
+        for encoding in (PROTOBUF, messages.encoding_of(COMMANDS[verb].message)):
             assert ask(verb, message.SerializeToString(), encoding).what == what
 
 
@@ -276,7 +277,7 @@ VALUES = st.recursive(
     max_leaves=6,
 )
 FIELDS = sorted(
-    {field for name in COMMANDS.values() for field in messages.message_class(name).DESCRIPTOR.fields_by_name}
+    {field for row in COMMANDS.values() for field in messages.message_class(row.message).DESCRIPTOR.fields_by_name}
 )
 JSONS = st.one_of(VALUES, st.dictionaries(st.sampled_from(FIELDS), VALUES)).map(
     lambda value: json.dumps(value).encode()

@@ -7,7 +7,8 @@ from typing import Any
 from mcap.writer import Writer
 
 from schemas import messages
-from schemas.topics import CAR_TOPICS, COMMANDS, SERVICE_TOPICS
+from schemas.commands import COMMANDS
+from schemas.topics import CAR_TOPICS, SERVICE_TOPICS
 from tests.fleet.replay.make_session import START_NS
 
 EACH = 4
@@ -62,7 +63,7 @@ def keys_and_types() -> dict[str, str]:
     return {
         **{f"fleet/red/{topic.name}": topic.message for topic in CAR_TOPICS},
         **{f"fleet/{topic.name}": topic.message for topic in SERVICE_TOPICS},
-        "fleet/red/@cmd/drive": COMMANDS["drive"],
+        "fleet/red/@cmd/drive": COMMANDS["drive"].message,
     }
 
 

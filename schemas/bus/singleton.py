@@ -1,0 +1,51 @@
+"""Makes sure that there is only one service of a kind, such as one gateway per car.
+
+Each service answers queries of its status. At its start, a service queries the others and gives up if one answers. Of
+two that start at the same moment, the one with the higher boot id yields: it queries again after both have declared.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from schemas.bus.replies import BUSY
+from schemas.bus.sample import Failure
+from schemas.bus.session import Bus
+
+
+class Singleton:
+    """The check of one service. `describe` returns the error for the status message of another one."""
+
+    def __init__(self, bus: Bus, status_key: str, describe: Callable[[Any], Exception], timeout_s: float = 2.0) -> None:
+        self._bus = bus
+        self._status_key = status_key
+        self._describe = describe
+        self._timeout_s = timeout_s
+
+    def others(self) -> list[Any]:
+        """Return the status messages of all other services of this kind. It blocks until they have answered."""
+        found: list[Any] = []
+        deadline, busy = time.monotonic() + self._timeout_s, True
+        while busy and time.monotonic() < deadline:
+            busy = False
+            for answer in self._bus.query(self._status_key, timeout_s=self._timeout_s):
+                if isinstance(answer, Failure):
+                    busy = busy or answer.words == BUSY  # there is one, and it will answer soon
+                    continue
+                status: Any = answer.message()
+                if status.boot_id != self._bus.boot_id:
+                    found.append(status)
+        return found
+
+    def check_alone(self) -> None:
+        """Raise the error if there is another service."""
+        for other in self.others():
+            raise self._describe(other)
+
+    def check_first(self) -> bool:
+        """Raise the error if another service has a lower boot id. Return True if there is another one, which yields."""
+        others = self.others()
+        for other in others:
+            if other.boot_id < self._bus.boot_id:
+                raise self._describe(other)
+        return bool(others)

@@ -1,0 +1,26 @@
+"""Files are replaced whole or not at all."""
+
+from pathlib import Path
+
+import pytest
+
+from schemas.atomic_file import write_atomically
+
+
+@pytest.mark.parametrize("sync", [False, True])
+def test_a_file_is_replaced_and_keeps_its_mode(tmp_path: Path, sync: bool) -> None:
+    path = tmp_path / "state.json"
+    write_atomically(path, b"old", sync=sync)
+    path.chmod(0o600)
+    write_atomically(path, b"new", sync=sync)
+    assert path.read_bytes() == b"new"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_after_an_error_the_old_file_is_there_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    path.mkdir()
+    with pytest.raises(OSError, match=r"state\.json"):
+        write_atomically(path, b"new")
+    assert list(tmp_path.iterdir()) == [path]
