@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final
 
-MAX_SENDERS: Final = 16
+MAX_TRACKED_SOURCES: Final = 16
 """Maximum senders to remember per key: each `fleet drive` is a new one."""
 MAX_OPEN_GAPS: Final = 256
 """Maximum gaps of one sender that a backfill may close. Older ones are only counted."""
@@ -119,7 +119,7 @@ class SequenceTracker:
 
     def _begin(self, sender: Hashable, number: int) -> None:
         """Add a sender. Its first number does not show how many messages came before."""
-        if len(self.last) >= MAX_SENDERS:
+        if len(self.last) >= MAX_TRACKED_SOURCES:
             oldest = next(iter(self.last))
             self._forget(oldest)
             del self.last[oldest]

@@ -28,7 +28,7 @@ SUBSCRIPTIONS: Final = (
 )
 MAX_QUEUED_SAMPLES: Final = 8192
 """Maximum number of queued messages: some seconds of a hundred cars."""
-MAX_QUEUED_QUERIES: Final = 64
+MAX_SUPERVISOR_QUERIES: Final = 64
 SUPERVISOR_COMMANDS: Final = {"down": "fleet.v1.DownCommand", "reload": "fleet.v1.ReloadCommand"}
 """The supervisor's commands, with the message type of the payload."""
 
@@ -84,7 +84,7 @@ class SupervisorService:
                 reply_value(query, self._key("status"), message.SerializeToString(), SUPERVISOR_STATUS)
 
         samples: Handover[Sample] = Handover(loop, take, limit=MAX_QUEUED_SAMPLES)
-        questions: Handover[zenoh.Query] = Handover(loop, answer, limit=MAX_QUEUED_QUERIES)
+        questions: Handover[zenoh.Query] = Handover(loop, answer, limit=MAX_SUPERVISOR_QUERIES)
         work: set[asyncio.Task[None]] = set()
 
         def command(query: zenoh.Query) -> None:
@@ -92,7 +92,7 @@ class SupervisorService:
             work.add(task)
             task.add_done_callback(work.discard)
 
-        commands: Handover[zenoh.Query] = Handover(loop, command, limit=MAX_QUEUED_QUERIES)
+        commands: Handover[zenoh.Query] = Handover(loop, command, limit=MAX_SUPERVISOR_QUERIES)
         self.bus.queryable(self._key("status"), questions)
         self.bus.queryable(self._key("@cmd/*"), commands)
         self.bus.token(keys.car_token(self.fleet, keys.SUPERVISOR))

@@ -44,7 +44,7 @@ class Owner(Protocol):
         ...
 
 
-class SimLink(Protocol):
+class SimEndpoint(Protocol):
     """The interface of both kinds of links."""
 
     @property
@@ -81,7 +81,7 @@ class SimLink(Protocol):
         ...
 
 
-class PtySimLink:
+class PtyEndpoint:
     """A pseudo terminal; POSIX only."""
 
     def __init__(self, owner: Owner, path: str | None) -> None:
@@ -235,7 +235,7 @@ class PtySimLink:
         self._next = None
 
 
-class TcpSimLink:
+class TcpEndpoint:
     """A listening port with one host at a time."""
 
     def __init__(self, owner: Owner, host: str, port: int) -> None:
@@ -354,7 +354,7 @@ class TcpSimLink:
 class _Client(asyncio.BufferedProtocol):
     """One TCP connection, read in small pieces so that a firehose can be paused early."""
 
-    def __init__(self, link: TcpSimLink) -> None:
+    def __init__(self, link: TcpEndpoint) -> None:
         self._link = link
         self._piece = bytearray(READ_SIZE)
         self._transport: asyncio.Transport | None = None

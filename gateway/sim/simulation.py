@@ -10,7 +10,7 @@ from math import inf
 from typing import Final, Protocol
 
 from gateway.sim.car_spec import CarSpec, PtyPath, ReplaySpec
-from gateway.sim.endpoints import EndpointError, PtySimLink, SimLink, TcpSimLink
+from gateway.sim.endpoints import EndpointError, PtyEndpoint, SimEndpoint, TcpEndpoint
 from gateway.sim.faults import Fault, FaultKind, Press, targets
 from gateway.sim.model.capture_car import CaptureCar
 from gateway.sim.model.factory import build
@@ -95,11 +95,11 @@ class SimCar:
         """Called at the end of a capture that does not loop."""
         self.on_failed: Callable[[SimCar, EndpointError], None] = lambda *_: None
         """Called when a link cannot return."""
-        self._link: SimLink
+        self._link: SimEndpoint
         if isinstance(spec.link, PtyPath):
-            self._link = PtySimLink(self, spec.link.path)
+            self._link = PtyEndpoint(self, spec.link.path)
         else:
-            self._link = TcpSimLink(self, spec.link.host, spec.link.port)
+            self._link = TcpEndpoint(self, spec.link.host, spec.link.port)
 
     @property
     def url(self) -> str:
@@ -193,7 +193,7 @@ class SimCar:
         if self._truth != before:
             for watcher in self.watchers:
                 watcher(self)
-        if was_alive and not self._alive and isinstance(self._link, TcpSimLink):
+        if was_alive and not self._alive and isinstance(self._link, TcpEndpoint):
             # The program's sockets die with it: the connection ends and a new one is refused.
             self._later(self._link.down())
         if isinstance(self.firmware, CaptureCar) and self.firmware.done and not self._ended:
@@ -264,7 +264,7 @@ class SimCar:
         self._pump()
 
     async def _brown_out(self) -> None:
-        if isinstance(self.firmware, RaspberryPiCar) and isinstance(self._link, TcpSimLink):
+        if isinstance(self.firmware, RaspberryPiCar) and isinstance(self._link, TcpEndpoint):
             # The whole machine goes down with its sockets, before the program starts without a client.
             await self._drop(PI_BOOT_S)
         if isinstance(self.firmware, Firmware):

@@ -33,7 +33,10 @@ class BadVector(Exception):
 
 
 def stretch(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterator[Item]:
-    """What belongs to a stretch, of items in order that begin `BEFORE_NS` before it: frames, and what was known."""
+    """Yield the frames of a time range, after what was known at its start.
+
+    The items are in order and begin `BEFORE_NS` before the range.
+    """
     known: dict[type, Item] = {}
     begun = False
     for item in items:
@@ -54,7 +57,7 @@ def stretch(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterato
 
 
 def lines(items: Iterable[Item], start_ns: int, car: str, source: str) -> Iterator[str]:
-    """A vector, line by line."""
+    """Yield the lines of a test vector."""
     head = {"format": FORMAT, "source": source, "car": car, "began": time_spec.iso(start_ns)}
     yield json.dumps(head)
     before: dict[type, Any] = {}
@@ -85,7 +88,7 @@ def _told(item: Item) -> dict[str, Any]:
 
 
 def read(path: Path) -> tuple[str, list[Item]]:
-    """The car of a vector, and what happened; raises BadVector and OSError."""
+    """Return the car of a vector and its items; raises BadVector and OSError."""
     objects = []
     try:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):

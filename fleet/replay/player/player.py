@@ -22,7 +22,7 @@ from schemas.topics import Qos, Topic
 
 LOOP_PAUSE_NS: Final = 1_000_000_000
 """Pause between two rounds of a loop."""
-MAX_DELAY_S: Final = 0.25
+MAX_LATENESS_S: Final = 0.25
 _HUB_POLL_INTERVAL_S: Final = 0.1
 _HUB_RESTART_DELAY_S: Final = 0.5
 _MAX_LISTED_TOKENS: Final = 4
@@ -46,7 +46,7 @@ class Player:
     """True if the fleet may have a live coordinator and recorder, because the recorded ones are not replayed."""
     published: int = 0
     late: int = 0
-    """Messages published over MAX_DELAY_S late: this machine or the bus was too slow for the rate."""
+    """Messages published over MAX_LATENESS_S late: this machine or the bus was too slow for the rate."""
     _cars: list[str] = field(default_factory=list)
     _polled_s: float = 0.0
     _hub_keeper: HubKeeper = field(init=False)
@@ -107,7 +107,7 @@ class Player:
             self.wait(at_s, ended)
             if ended():
                 return
-            if time.monotonic() - at_s > MAX_DELAY_S:
+            if time.monotonic() - at_s > MAX_LATENESS_S:
                 self.late += 1
             self._publish(message)
             progress(message)

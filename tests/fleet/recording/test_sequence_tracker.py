@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.recording.sequence_tracker import MAX_SENDERS, SequenceTracker
+from fleet.recording.sequence_tracker import MAX_TRACKED_SOURCES, SequenceTracker
 
 
 def live(numbers: SequenceTracker, *given: int, sender: str = "a") -> list[bool]:
@@ -85,10 +85,10 @@ def test_the_wrap_is_no_gap() -> None:
 
 def test_of_many_senders_the_oldest_are_forgotten_and_their_gaps_are_not() -> None:
     numbers = SequenceTracker()
-    for sender in range(MAX_SENDERS * 3):
+    for sender in range(MAX_TRACKED_SOURCES * 3):
         live(numbers, 1, 3, sender=str(sender))
-    assert numbers.missing == MAX_SENDERS * 3
-    assert len(numbers.last) == MAX_SENDERS
+    assert numbers.missing == MAX_TRACKED_SOURCES * 3
+    assert len(numbers.last) == MAX_TRACKED_SOURCES
 
 
 @given(st.sets(st.integers(1, 60)), st.integers(0, 2**32))

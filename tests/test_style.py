@@ -1,0 +1,138 @@
+"""Rules of names and imports that no linter has. CONTRIBUTING.md explains them."""
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PRODUCT = ("gateway", "fleet", "schemas")
+PACKAGES = (*PRODUCT, "tests")
+GENERATED = ROOT / "schemas" / "gen"
+
+TWINS = frozenset({"Fleet", "Car", "Lease", "Watch"})
+"""Classes of the SDK that have an asyncio twin of the same name in fleet/aio.py."""
+
+LAZY_IMPORTS = 133
+"""Maximum number of imports inside functions. Each is there so that a command line starts fast; no more come in."""
+
+NO_MODULE_NAMES = re.compile(
+    r"(asking|asked|hearing|heard|telling|told|saying|said|keeping|kept|waiting|wanted|known|seen|shown|found|begun|given"
+    r"|looking|making|acting|showing|reading_out|before|after|company|desk|doors|ear|wall|crew|farewell|tape|walk|salvage"
+    r"|sound|things|who|what|why|how)"
+)
+"""Participles, metaphors and question words: a module is a noun of the field."""
+
+
+def source_files(*packages: str) -> Iterator[Path]:
+    for package in packages:
+        yield from (path for path in sorted((ROOT / package).rglob("*.py")) if GENERATED not in path.parents)
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def test_a_class_name_stands_for_one_class() -> None:
+    places: dict[str, list[str]] = defaultdict(list)
+    for path in source_files(*PACKAGES):
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(module_name(path))
+    for name in TWINS:
+        places[name] = [each for each in places[name] if each != "fleet.aio"]
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+def test_a_module_is_named_after_a_noun_of_the_field() -> None:
+    names = {module_name(path).rpartition(".")[2]: path for path in source_files(*PRODUCT)}
+    assert [str(path) for name, path in names.items() if NO_MODULE_NAMES.fullmatch(name)] == []
+
+
+def number(node: ast.expr) -> float | None:
+    """The value of a literal number, also of a negated one."""
+    try:
+        value = ast.literal_eval(node)
+    except ValueError:
+        return None
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def constants(path: Path) -> Iterator[tuple[str, float]]:
+    for node in parsed(path).body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
+            value = number(node.value)
+            if node.target.id.isupper() and value is not None:
+                yield node.target.id.lstrip("_"), value
+
+
+def test_constants_of_one_name_have_one_value() -> None:
+    values: dict[str, dict[str, float]] = defaultdict(dict)
+    for path in source_files(*PRODUCT):
+        for name, value in constants(path):
+            values[name][module_name(path)] = value
+    assert {name: where for name, where in values.items() if len(set(where.values())) > 1} == {}
+
+
+def imports(path: Path, *, lazy: bool) -> Iterator[ast.Import | ast.ImportFrom]:
+    """The import statements of a module: those at its top, or those inside functions. Not those for type checkers."""
+    tree = parsed(path)
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    typing_only = [
+        node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+    ]
+    inside = {id(node) for function in functions for node in ast.walk(function)}
+    left_out = {id(node) for block in typing_only for node in ast.walk(block)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom) and id(node) not in left_out and (id(node) in inside) == lazy:
+            yield node
+
+
+def imported(path: Path) -> Iterator[str]:
+    """The names of all modules that a module may import at its top."""
+    for node in imports(path, lazy=False):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    files = {module_name(path): path for path in source_files(*PRODUCT)}
+    # A package imports its modules to export their names: that is no circle.
+    packages = {name for name, path in files.items() if path.name == "__init__.py"}
+    graph = {
+        name: {each for each in imported(path) if each in files and each not in packages and each != name}
+        for name, path in files.items()
+    }
+    done: set[str] = set()
+
+    def visit(name: str, way: tuple[str, ...]) -> None:
+        if name in way:
+            pytest.fail("imports in a circle: " + " -> ".join((*way[way.index(name) :], name)))
+        if name not in done:
+            for each in sorted(graph[name]):
+                visit(each, (*way, name))
+            done.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+def test_no_more_imports_are_lazy() -> None:
+    lazy = [
+        f"{module_name(path)}:{node.lineno}: {ast.unparse(node)}"
+        for path in source_files(*PRODUCT)
+        for node in imports(path, lazy=True)
+    ]
+    assert len(lazy) <= LAZY_IMPORTS, "\n".join(lazy)
