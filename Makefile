@@ -31,7 +31,7 @@ demo: .venv/.ready ## three simulated cars do a job, recorded, checked, ready fo
 	@mkdir -p .tmp
 	$(BIN)/fleet demo
 
-test: .venv/.ready ## the test suite (under ten minutes)
+test: .venv/.ready ## the test suite (under seven minutes on two processors)
 	@mkdir -p .tmp
 	$(BIN)/python -m pytest $(TESTS) -m 'not soak' -n auto --dist loadgroup
 
