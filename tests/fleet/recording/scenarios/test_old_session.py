@@ -1,0 +1,59 @@
+"""A session that an earlier version recorded opens, verifies, replays and decodes as it did then.
+
+`tests/vectors/session-0.1` was recorded and cut on 2026-11-22 by commit 9c9c14b, before all modules were renamed. The
+expected words are what that commit printed.
+"""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+import rerun.chunk as rrc
+
+from fleet.recording import open_session
+from tests.support.in_process import fleet
+
+SESSION = Path(__file__).parents[3] / "vectors" / "session-0.1"
+MESSAGES = 1023
+
+
+def test_it_is_whole_and_has_all_messages() -> None:
+    done = fleet("sessions", "verify", SESSION)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"whole, {MESSAGES} messages" in done.stdout
+    session = open_session(SESSION)
+    assert sum(1 for _ in session.messages()) == MESSAGES
+    assert len(list(session.messages(keys=["fleet/green/frame/rx"]))) == 201
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("redecode", "212 frames and 287 readings of green, red: no difference"),
+        ("replan", "6 decisions from 5.2 s to 7.1 s: no difference"),
+    ],
+)
+def test_todays_decoder_and_policy_do_with_it_as_they_did(command: str, words: str) -> None:
+    done = fleet(command, SESSION)
+    assert done.returncode == 0, done.stderr
+    assert words in done.stdout
+
+
+def test_it_gives_the_same_tables(tmp_path: Path) -> None:
+    done = fleet("sessions", "export", SESSION, "--csv", tmp_path / "tables")
+    assert done.returncode == 0, done.stderr
+    tables = sorted((tmp_path / "tables").iterdir())
+    assert len(tables) == 22
+    digest = hashlib.sha256()
+    for table in tables:
+        digest.update(table.name.encode() + table.read_bytes())
+    assert digest.hexdigest()[:16] == "537d284ce68eb381"
+
+
+def test_rerun_shows_it(tmp_path: Path) -> None:
+    out = tmp_path / "old.rrd"
+    done = fleet("replay", SESSION, "--save", out)
+    assert done.returncode == 0, done.stderr
+    entities = {str(chunk.entity_path) for chunk in rrc.RrdReader(out).store().stream()}
+    assert any("green" in each for each in entities)
+    assert any("red" in each for each in entities)
