@@ -19,7 +19,14 @@ from datetime import UTC, datetime
 from typing import Any, Final, Self
 
 from fleet.client import history
-from fleet.client.command_tracker import ANSWER_TIMEOUT_S, CLOSED, PendingCommand, PresenceChange, QueryEnded
+from fleet.client.command_tracker import (
+    ANSWER_TIMEOUT_S,
+    CLOSED,
+    PendingCommand,
+    PresenceChange,
+    QueryEnded,
+    SupervisedCars,
+)
 from fleet.client.commands import CarCommands, CommandRequest, estop_request, resume_request, stop_request
 from fleet.client.condition import KeyCondition
 from fleet.client.lease import Lease
@@ -210,11 +217,17 @@ class Fleet:
         """
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._filled(request)
-        command = PendingCommand(request, self.cars(), named, lambda: self.bus.hubs)
+        payload = message.SerializeToString()
+
+        def send_again(car: str) -> None:
+            self._pool.submit(self._query, car, command, payload)
+
+        command = PendingCommand(request, self.cars(), named, lambda: self.bus.hubs, send_again)
         self._pending[command_id] = command
         try:
-            payload = message.SerializeToString()
             futures = [self._pool.submit(self._query, target, command, payload) for target in command.targets]
+            if command.is_stop:
+                self._pool.submit(self._query_supervisor, command)
             command.wait()
             for future in futures:
                 if future.done():
@@ -251,6 +264,22 @@ class Fleet:
                     words = "" if answer.words == "Timeout" else answer.words
         finally:
             command.inbox.put((time.monotonic(), QueryEnded(target, words)))
+
+    def _query_supervisor(self, command: PendingCommand) -> None:
+        """Query the names of the cars that a supervisor starts gateways for. Runs on a thread of the pool."""
+        names: set[str] = set()
+        try:
+            key = keys.topic_key(self.name, keys.SUPERVISOR, "status")
+            for answer in self.bus.query(key, timeout_s=ANSWER_TIMEOUT_S, qos=Qos.STATE):
+                if isinstance(answer, Sample):
+                    status: Any = answer.message()
+                    names |= {
+                        each.name for each in status.processes if each.kind == "gateway" and each.state != "ended"
+                    }
+        except messages.BadPayload as error:
+            log.warning("a supervisor's status is unreadable: %s", error)
+        finally:
+            command.inbox.put((time.monotonic(), SupervisedCars(frozenset(names), frozenset(self.cars()))))
 
     def _on_gateway(self, token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
         """Handle a change of a gateway's presence. Runs on a Zenoh thread."""

@@ -10,6 +10,7 @@ from fleet.client.commands import CommandRequest
 from fleet.client.outcome import Outcome, Progress
 from schemas import keys, messages, topics
 from schemas.bus import Sample
+from schemas.commands import STOPS
 
 ANSWER_TIMEOUT_S: Final = 2.0
 """Timeout for a gateway's answer on a machine that is not overloaded, whatever its car does."""
@@ -35,19 +36,39 @@ class PresenceChange:
         self.alive = alive
 
 
+class SupervisedCars:
+    """The cars whose gateways a supervisor runs (none without a supervisor), and those on the bus at that time."""
+
+    def __init__(self, names: frozenset[str], present: frozenset[str]) -> None:
+        self.names = names
+        self.present = present
+
+
 CLOSED: Final = QueryEnded("", "")
 
 Item = tuple[float, Any]
-"""Time of receipt (monotonic s), and a Sample (an answer), a CommandEvent, a QueryEnded or a PresenceChange."""
+"""Time of receipt (monotonic s), and an answer (Sample), a CommandEvent or one of the classes above."""
 
 
 class PendingCommand:
     """One command to some cars. `wait` runs on the caller's thread, other threads fill the inbox."""
 
+    # A stop must not miss a car whose gateway hangs: 2 s later its token is gone, and a plain wildcard query passes it
+    # by. Therefore a stop also concerns the cars that a supervisor knows, and is sent again to their new gateways.
+
     def __init__(
-        self, request: CommandRequest, present: list[str], named: list[str] | None, hubs: Callable[[], tuple[str, ...]]
+        self,
+        request: CommandRequest,
+        present: list[str],
+        named: list[str] | None,
+        hubs: Callable[[], tuple[str, ...]],
+        send_again: Callable[[str], None],
     ) -> None:
         self.request = request
+        self.is_stop = request.verb in STOPS
+        self._send_again = send_again
+        self._present = set(present)
+        self._named = named
         self._hubs = hubs
         self._hubs_then = hubs()
         self.inbox: queue.Queue[Item] = queue.Queue(_MAX_QUEUED_ITEMS)
@@ -58,10 +79,10 @@ class PendingCommand:
         self._progress: dict[str, Progress] = {}
         for car in present if named is None else named:
             self._of(car)
-            if car not in present:
+            if car not in present and not self.is_stop:
                 self._progress[car].on_missing(present, self._asked_at)
         self.targets = ["*"] if named is None else [car for car in named if car in present]
-        self._open = len(self.targets)
+        self._open = len(self.targets) + self.is_stop
 
     def outcomes(self) -> list[Outcome]:
         """Return the outcomes, sorted by car."""
@@ -93,8 +114,8 @@ class PendingCommand:
             self._take(item, at)
 
     def concerns(self, car: str) -> bool:
-        """Return True if the command is for this car. May run on any thread."""
-        return car in self._progress
+        """Return True if the command is, or may be, for this car. May run on any thread."""
+        return car in self._progress or self.is_stop
 
     def _warn_of_missing_answers(self, waiting: list[Progress]) -> None:
         if late := sorted(progress.car for progress in waiting if not progress.answered):
@@ -121,17 +142,48 @@ class PendingCommand:
             if key is not None:
                 self._on_answer(self._of(key.car), item, at)
         elif isinstance(item, PresenceChange):
-            if item.car in self._progress:
-                self._progress[item.car].on_presence(at, alive=item.alive)
+            self._on_presence(item, at)
+        elif isinstance(item, SupervisedCars):
+            self._open -= 1
+            self._on_supervised(item, at)
         else:
             self._of(item.car).on_event(item.phase, item.reason, item.words, item.worst_case_s, at, item.basis)
+
+    def _on_presence(self, change: PresenceChange, at: float) -> None:
+        (self._present.add if change.alive else self._present.discard)(change.car)
+        progress = self._progress.get(change.car)
+        if progress is None:
+            return
+        was_awaited = progress.is_awaited
+        progress.on_presence(at, alive=change.alive)
+        if change.alive and was_awaited:
+            self._stop_again(progress)
+
+    def _on_supervised(self, supervised: SupervisedCars, at: float) -> None:
+        """Wait for the new gateways of these cars. Give up named cars that nobody knows."""
+        queried = set(self._progress) if self._named is None else set(self.targets)
+        present = self._present | supervised.present
+        for car in supervised.names if self._named is None else self._named:
+            progress = self._of(car)
+            if car in supervised.names:
+                progress.on_supervised(at, present=car in present)
+            elif car not in present:
+                progress.on_missing(sorted(present), at)
+            if car in present and car not in queried:
+                self._stop_again(progress)
+
+    def _stop_again(self, progress: Progress) -> None:
+        """Send the stop to a gateway that joined the bus after the first query."""
+        if self.is_stop and not progress.answered and progress.outcome is None:
+            self._open += 1
+            self._send_again(progress.car)
 
     def _on_answer(self, progress: Progress, item: Sample, at: float) -> None:
         """Handle one car's answer. A malformed answer must not affect the other cars."""
         try:
             answer: Any = messages.parse(topics.RESULT, item.payload, item.encoding)
         except messages.BadPayload as error:
-            progress.on_query_failed(f"what answered for {progress.car} is no gateway of this fleet: {error}", at)
+            progress.on_unusable_answer(f"what answered for {progress.car} is no gateway of this fleet: {error}", at)
             return
         progress.on_answer(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
 

@@ -16,6 +16,8 @@ OUTCOME_MARGIN_S: Final = 5.0
 STOP_EVIDENCE_S: Final = 12.0  # gateway.control.stops.stopping: time for a car to show a stop after its worst case
 GATEWAY_RETURN_TIMEOUT_S: Final = 1.0
 """Timeout for a gateway to rejoin the bus: it tries twice a second."""
+GATEWAY_RESTART_TIMEOUT_S: Final = 15.0
+"""Timeout for the new gateway of a car, where a supervisor starts one: it takes 4 s to notice a hang."""
 OVERLOAD_ANSWER_TIMEOUT_S: Final = 10.0
 """Timeout for an answer on an overloaded machine. The token shows much earlier that a gateway has gone."""
 LATE_ANSWER_S: Final = 2.0
@@ -94,6 +96,12 @@ class Progress:
         self._queued = False
         self._sent_event = False
         self._gone_at: float | None = None
+        self._is_supervised = False
+
+    @property
+    def is_awaited(self) -> bool:
+        """True if the gateway is gone and may come back."""
+        return self.outcome is None and self._gone_at is not None
 
     @property
     def _joined(self) -> bool:
@@ -105,7 +113,7 @@ class Progress:
     def deadline(self) -> float:
         """The time to give up, on the clock of `asked_at`."""
         if self._gone_at is not None:
-            return self._gone_at + GATEWAY_RETURN_TIMEOUT_S
+            return self._gone_at + (GATEWAY_RESTART_TIMEOUT_S if self._is_supervised else GATEWAY_RETURN_TIMEOUT_S)
         if not self.answered:
             return self._asked_at + OVERLOAD_ANSWER_TIMEOUT_S + OUTCOME_MARGIN_S
         if self._joined:
@@ -148,8 +156,21 @@ class Progress:
         words = f"no car {self.car} on the bus, so whether it moves is not known; {there}"
         self._end(NO_ANSWER, "", words, at, ok=False)
 
+    def on_supervised(self, at: float, *, present: bool) -> None:
+        """Wait longer for a gateway that is gone: a supervisor starts a new one."""
+        self._is_supervised = True
+        if not present:
+            self.on_presence(at, alive=False)
+
     def on_query_failed(self, words: str, at: float) -> None:
-        """Give up if the query has ended without an answer."""
+        """Give up if the query has ended without an answer. Where a supervisor starts a new gateway, wait for that."""
+        if self._is_supervised and not self.answered:
+            self.on_presence(at, alive=False)
+        else:
+            self.on_unusable_answer(words, at)
+
+    def on_unusable_answer(self, words: str, at: float) -> None:
+        """Give up, unless the gateway has answered or sent an event."""
         if not self.answered:
             self._end(NO_ANSWER, "", words, at, ok=False)
 
@@ -160,7 +181,8 @@ class Progress:
             if self._gone_at is None
             else f"is not on the bus, so whether {self.car} moves is not known"
         )
-        self.on_query_failed(f"no answer after {at - self._asked_at:.0f} s; its gateway {there}", at)
+        if self._gone_at is None or not self._is_supervised:
+            self.on_unusable_answer(f"no answer after {at - self._asked_at:.0f} s; its gateway {there}", at)
 
     def on_presence(self, at: float, *, alive: bool) -> None:
         """Note that the gateway's token came back, or disappeared: the gateway was killed or lost its bus."""

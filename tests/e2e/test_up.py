@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from fleet.supervisor.service import ask_status
-from schemas import bus
+from schemas import bus, keys
 from tests.support.ports import free_endpoint, free_port
 from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, wait_for
 from tests.support.up import Up, fleet_command
@@ -78,6 +79,23 @@ def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
     assert up.state(name).words.startswith("hung: not heard for")
     for car in ("red", "green"):
         up.ready(car)
+
+
+@pytest.mark.parametrize("token_is_gone", [True, False])
+def test_a_stop_of_all_reaches_the_new_gateway_of_one_that_hangs(up: Up, token_is_gone: bool) -> None:
+    """Its token is gone 2 s later, the supervisor replaces it after 4 s: it was left out meanwhile, and had no hold."""
+    pid = up.running("green")
+    os.kill(pid, signal.SIGSTOP)
+    if token_is_gone:
+        wait_for(lambda: not up.bus.tokens(keys.car_token("fleet", "green")), "its token is gone")
+    done = up.fleet("stop")
+    # The new gateway may not have opened the link yet: it stops the car when it has.
+    ended = re.search("^green: (complete|sent|not carried out: link_down)", done.stdout + done.stderr, re.MULTILINE)
+    assert ended, done.stdout + done.stderr
+    up.running("green", but=pid)
+    for car in ("red", "green"):
+        assert up.get(f"{car}/state/safety").HasField("hold"), f"{car} is on hold"
+    assert up.fleet("resume", "red", "green").returncode == 0
 
 
 def test_a_hub_that_hangs_is_replaced_by_ours_or_by_a_gateways(tmp_path: Path) -> None:

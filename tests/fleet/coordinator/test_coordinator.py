@@ -268,6 +268,7 @@ def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Car
     process = coordinator(cars, tmp_path / "plan.yaml", TEAM)
     Lines(process).until("red", "tracking", "role scout")
     wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    wait_for(lambda: cars.state("mode", "red").verdict == "confirmed", "its gateway knows")  # or it is asked again
     asked: list[bus.Sample] = []
     cars.bus.subscribe("fleet/*/event/command", asked.append)
     process.kill()
@@ -286,7 +287,7 @@ def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Car
         return [each for each in events if not each.sender.endswith(f"-{process.pid}")]
 
     wait_for(told, "the stop is heard here, too")
-    assert {each.verb for each in told()} == {"stop"}
+    assert {(each.car, each.verb) for each in told()} == {("blue", "stop")}
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
         assert client.car("blue").resume().ok
     assert truth(cars, "red") == "tracking"
