@@ -78,7 +78,7 @@ def line(decision: Decision) -> str:
     """Return a decision as text for a person."""
     readings = f" ({', '.join(decision.readings)})" if decision.readings else ""
     return (
-        f"{decision.subject}: {decision.decided}, because of {decision.why}{readings}; "
+        f"{decision.subject}: {decision.decided}, because: {decision.why}{readings}; "
         f"would change with: {decision.would_change}"
     )
 

@@ -80,15 +80,17 @@ def print_errors(error: BadFile, *, as_json: bool = False) -> None:
         click.echo(str(error), err=True)
 
 
-def _served(fleet: FleetFile) -> dict[str, tuple[str, str]]:
-    """Return state and reason of the link of every car with a running gateway. Empty if no fleet is running."""
+def _served(fleet: FleetFile) -> dict[str, tuple[str, str, str]]:
+    """Return state, reason and URL of the link of every running gateway. Empty if no fleet is running."""
     from fleet.client.client import Fleet
 
     with cli_errors():
         if not bus.accepts(bus.resolve_endpoint(fleet.endpoint)):
             return {}
         with Fleet(fleet.endpoint, fleet.name, kind="person") as client:
-            return {each.value.car: (each.value.state, each.value.reason) for each in client.get("*/state/link")}
+            urls = {each.value.car: each.value.link for each in client.get("*/state/health")}
+            links = [each.value for each in client.get("*/state/link")]
+            return {link.car: (link.state, link.reason, urls.get(link.car, "")) for link in links}
 
 
 @click.command("schema", epilog="\b\nexample:\n  fleet schema > fleet.schema.json")

@@ -116,7 +116,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     raise SystemExit(2 if answer.status == "rejected" else 0)
 
 
-@click.command(epilog="\b\nexamples:\n  fleet logs red\n  fleet logs hub --follow\n  fleet logs red --json")
+@click.command(epilog="\b\nexamples:\n  fleet logs red\n  fleet logs recorder --follow\n  fleet logs red --json")
 @click.argument("name", metavar="CAR")
 @click.option("--follow", is_flag=True, help="Go on until Ctrl-C.")
 @json_option

@@ -49,7 +49,7 @@ def _describe(reading: Reading) -> str:
     at = datetime.fromtimestamp(since_s).astimezone().strftime("%H:%M:%S")
     lasting = timedelta(seconds=max(0, int(time.time() - since_s)))
     lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})"]
-    lines.append(f"  because of {decision.why}")
+    lines.append(f"  because:   {decision.why}")
     lines += [f"  with       {each}" for each in decision.readings]
     lines.append(f"  changes by {decision.would_change}")
     return "\n".join(lines)

@@ -201,7 +201,7 @@ def _describe(each: "DecisionDifference", origin_ns: int) -> str:
         if decision is None:
             lines.append(f"  {name}: nothing was decided")
             continue
-        lines.append(f"  {name}: {decision}, because of {decision.why}")
+        lines.append(f"  {name}: {decision}, because: {decision.why}")
         lines += [f"        with {reading}" for reading in decision.readings]
         if decision.would_change:
             lines.append(f"        would change with {decision.would_change}")

@@ -240,7 +240,7 @@ def recover(session: Path, out: Path | None) -> None:
     out = out or found.path.resolve().with_name(f"{found.name}-recovered")
     with _session_errors(out):
         count, words = make(found, out, watched("recover", total(found)))
-    click.echo(f"{out}: {count} messages{f'; could not be saved: {words}' if words else ', no message was damaged'}")
+    click.echo(f"{out}: {count} messages{f'; lost: {words}' if words else ', no message was damaged'}")
 
 
 @sessions.command(

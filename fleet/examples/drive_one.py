@@ -3,6 +3,7 @@
 import sys
 
 from fleet import Fleet, NotCarriedOut
+from schemas.bus import BusError
 
 
 def main(name: str) -> None:
@@ -17,5 +18,5 @@ def main(name: str) -> None:
 if __name__ == "__main__":
     try:
         main(*sys.argv[1:])
-    except NotCarriedOut as error:  # the text names the car and the reason
+    except (NotCarriedOut, BusError) as error:  # the text names the car, or the missing fleet, and the reason
         sys.exit(str(error))

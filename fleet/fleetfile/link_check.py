@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from fleet.fleetfile.fleet_file import FleetCar
-from fleet.links import FleetLink, SimLink, parse_fleet_link
+from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link
 from gateway.protocol.platforms import Platform
 from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
 
@@ -41,15 +41,24 @@ class LinkCheck:
     words: str
 
 
-def check_link(car: FleetCar, served: Mapping[str, tuple[str, str]]) -> LinkCheck:
-    """Check a car's link within HOST_TIMEOUT_S. `served`: state and reason of the links of cars with a gateway."""
+def check_link(car: FleetCar, served: Mapping[str, tuple[str, str, str]]) -> LinkCheck:
+    """Check a car's link within HOST_TIMEOUT_S. `served`: state, reason and URL of the links of running gateways."""
     if car.name in served:
-        state, reason = served[car.name]
+        state, reason, url = served[car.name]
+        if url and not _is_same(url, car.link):
+            words = f"a running gateway of this name has another link: {url}"
+            return LinkCheck(car.name, car.link, ok=False, words=words)
         ok = state in ("online", "quiet")
         words = f"its gateway runs, the link is {state}" + (f": {reason}" if reason and not ok else "")
         return LinkCheck(car.name, car.link, ok, words)
     ok, words = _check(parse_fleet_link(car.link), car.platform)
     return LinkCheck(car.name, car.link, ok, words)
+
+
+def _is_same(url: str, link: str) -> bool:
+    """Return True if a gateway with this URL may serve the car with this link. A simulated car's URL is temporary."""
+    expected = parse_fleet_link(link)
+    return isinstance(expected, SimLink) or may_be_same(parse_fleet_link(url), expected)
 
 
 def _check(link: FleetLink, platform: str) -> tuple[bool, str]:

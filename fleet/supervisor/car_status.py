@@ -1,5 +1,6 @@
 """The status of one car from its messages, and the changes that deserve a line. Pure: time is an argument."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC
@@ -84,9 +85,10 @@ class CarStatus:
             self._counted = (now, frames)
 
     def _change(self, what: str, words: str) -> str:
-        """Return the words if they are news. Normal values are no news in the first message."""
-        before, self._reported[what] = self._reported.get(what), words
-        return "" if words == before or (before is None and words in _AT_FIRST) else words
+        """Return the words if they are news. A growing time is no news, nor are normal values in the first message."""
+        essence = _SECONDS.sub("", words)
+        before, self._reported[what] = self._reported.get(what), essence
+        return "" if essence == before or (before is None and words in _AT_FIRST) else words
 
     def as_dict(self) -> Mapping[str, object]:
         """Return the status as JSON values."""
@@ -120,5 +122,6 @@ def _date(stamp: Any) -> str:
     return f"{stamp.ToDatetime(UTC):%Y-%m-%d %H:%M} UTC"
 
 
+_SECONDS: Final = re.compile(r"[\d.]+ s\b")
 _OPEN: Final = frozenset({"online", "quiet", "stale"})
 _AT_FIRST: Final = frozenset({"not on hold", "battery ok", "motion stop", "motion unknown"})

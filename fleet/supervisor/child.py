@@ -110,10 +110,12 @@ class Child:
         command: Sequence[str],
         environment: Mapping[str, str],
         log: Log,
-        on_line: Callable[[str], None],
+        on_line: Callable[[str], bool | None],
         on_exit: Callable[[int], None],
     ) -> "Child":
-        """Start a process. on_line: called with each line of stdout. on_exit: called with the exit code.
+        """Start a process. on_exit: called with the exit code.
+
+        on_line: called with each line of stdout; returns False for a line that is not to be logged.
 
         Raises OSError.
         """
@@ -149,7 +151,7 @@ class Child:
         if self._process.stdin is not None and not self._process.stdin.is_closing():
             self._process.stdin.write(line.encode() + b"\n")
 
-    async def _follow(self, on_line: Callable[[str], None], on_exit: Callable[[int], None]) -> None:
+    async def _follow(self, on_line: Callable[[str], bool | None], on_exit: Callable[[int], None]) -> None:
         assert self._process.stdout is not None
         assert self._process.stderr is not None
         pumps = asyncio.gather(
@@ -170,7 +172,7 @@ class Child:
         elif logged["level"] in ("ERROR", "CRITICAL"):
             self.last = logged["words"]
 
-    async def _pump(self, stream: asyncio.StreamReader, take: Callable[[str], None]) -> None:
+    async def _pump(self, stream: asyncio.StreamReader, take: Callable[[str], bool | None]) -> None:
         rest = b""
         while data := await stream.read(4096):
             *whole, rest = (rest + data).split(b"\n")
@@ -180,8 +182,7 @@ class Child:
         if rest:
             self._line(rest, take)
 
-    def _line(self, line: bytes, take: Callable[[str], None]) -> None:
+    def _line(self, line: bytes, take: Callable[[str], bool | None]) -> None:
         text = line.decode("utf-8", "replace").rstrip()
-        if text:
+        if text and take(text) is not False:
             self.log.add(text, time.time())
-            take(text)

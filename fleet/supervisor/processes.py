@@ -73,7 +73,7 @@ class ProcessSet:
     def __init__(
         self,
         on_event: Callable[[str, str], None],
-        on_line: Callable[[ManagedProcess, str], None],
+        on_line: Callable[[ManagedProcess, str], bool],
         on_exit: Callable[[ManagedProcess, bool], None],
     ) -> None:
         self._processes: dict[str, ManagedProcess] = {}
@@ -184,8 +184,8 @@ class ProcessSet:
                 await task
 
     async def _start(self, process: ManagedProcess) -> None:
-        def on_line(line: str) -> None:
-            self._on_line(process, line)
+        def on_line(line: str) -> bool:
+            return self._on_line(process, line)
 
         def on_exit(code: int) -> None:
             self._ended(process, code)

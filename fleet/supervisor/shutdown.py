@@ -155,7 +155,7 @@ class GatewayShutdown:
     def _replace(self, process: ManagedProcess, why: str) -> None:
         tried = self._tries[process.name] = self._tries.get(process.name, 0) + 1
         until = "" if tried == 1 else " until Ctrl-C is pressed or fleet down is called again"
-        self._on_result(process.name, f"{why}. A fresh gateway tries to stop the car{until}.")
+        self._on_result(process.name, f"{why.rstrip('.')}. A fresh gateway tries to stop the car{until}.")
         self._awaited.add(process.name)
         process.urgent = True
         process.status.schedule(self._processes.now, 0.0 if tried == 1 else delay_s(tried, 0.5))

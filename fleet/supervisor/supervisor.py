@@ -367,25 +367,28 @@ class Supervisor:
             if topic == "event/log":
                 self._say("log", car, row.event)
 
-    def _on_line(self, process: ManagedProcess, line: str) -> None:
-        """Handle a line of a process's stdout."""
+    def _on_line(self, process: ManagedProcess, line: str) -> bool:
+        """Handle a line of a process's stdout. Return False if it is a heartbeat, which no log needs."""
         try:
             values = json.loads(line)
         except ValueError:
-            return  # plain text, it is in the log
+            return True  # plain text
         if process.kind is ProcessKind.RECORDER:
             self._say("process", RECORDER, _describe_recording(values))
         elif process.kind is ProcessKind.COORDINATOR:
-            self._say("decision", values["subject"], f"{values['decided']}, because {values['why']}")
+            self._say("decision", values["subject"], f"{values['decided']}, because: {values['why']}")
         if process.kind is not ProcessKind.SIMULATOR:
-            return
+            return True
         self.processes.on_heartbeat(SIMULATOR_PROCESS)
         if "link" in values and values.get("car") in self._spec.cars:
             self._sim_links[values["car"]] = values["link"]
             if not self._shutdown_requested.is_set():
                 self._add_car(self._spec.cars[values["car"]])
-        elif "ok" in values and self._sim_asked and self._sim_asked.popleft():
+        elif "ok" in values and self._sim_asked:
+            if not self._sim_asked.popleft():
+                return False
             self._say("simulator", SIMULATOR_PROCESS, line)
+        return True
 
     async def _heartbeats(self, service: SupervisorService) -> None:
         """Query simulator and coordinator, which send no heartbeats, and publish the status."""

@@ -107,7 +107,7 @@ def parse(request: ParsedRequest) -> Command:
 def _stop_anyway(command: Command, words: str, request: ParsedRequest) -> Command:
     """Return the stop of an invalid stop or e-stop: the car stops whatever the error is."""
     what = Stop() if request.verb == "stop" else _readable_estop(request)
-    return replace(command, what=what, note=f"stopped, though: {words}")
+    return replace(command, what=what, note=f"the stop is carried out all the same: {words}")
 
 
 def _id(request: ParsedRequest) -> str:

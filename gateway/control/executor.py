@@ -281,6 +281,8 @@ class Executor:
                 words = "its time is over"
                 if held.began_at is not None and held.began_at > held.pending.received_at + LATE_DRIVE_S:
                     words += f", of which {car} was driven for {now - held.began_at:.2f} s: it was busy before"
+                # No frame of the car shows that a drive moved it.
+                words += f"; nothing shows that {car} moved"
                 self.release(Phase.COMPLETE, None, words, now)
             else:
                 self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy until its time was over", now)

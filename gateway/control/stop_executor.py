@@ -114,8 +114,9 @@ class StopExecutor:
         """Fail the commands of the running stop: the link is down."""
         self.renewal.suspend()
         running, self.running = self.running, None
+        words = f"{reason}. The gateway stops {self.model.name} when the link is back. Look whether it moves."
         for pending in running.commands if running else ():
-            self._log.record(pending, Phase.FAILED, now, reason=cause, words=reason)
+            self._log.record(pending, Phase.FAILED, now, reason=cause, words=words)
         if self.shutting_down and running is not None:
             self._end_unstopped(f"cannot be reached ({reason})", now)
 

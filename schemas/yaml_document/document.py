@@ -93,13 +93,16 @@ def read_text(path: Path, source: str | None = None) -> str:
     """Read the text of a file; raises BadFile if it cannot be read, is too large, or is not UTF-8."""
     source = str(path) if source is None else source
     try:
-        if kind := name_special_file(path):
-            raise _bad_file(source, f"is a {kind}, not a file: save the text as a file, and give that")
-        with path.open("rb") as file:
-            data = file.read(MAX_YAML_BYTES + 1)
+        kind = name_special_file(path)
+        data = b""
+        if not kind:
+            with path.open("rb") as file:
+                data = file.read(MAX_YAML_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         words = error.strerror if isinstance(error, OSError) else None
         raise _bad_file(source, f"cannot be read: {words or error}") from None
+    if kind:
+        raise _bad_file(source, f"is a {kind}, not a file: save the text as a file, and give that")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

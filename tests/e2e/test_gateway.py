@@ -286,7 +286,7 @@ def test_bad_commands_are_answered_and_nothing_dies(fleet: FleetProcesses, tcp_c
     answers = list(fleet.bus.query("fleet/*/@cmd/stop", payload=b"[" * 5_000_000, timeout_s=5.0))
     (result,) = [json.loads(one.payload) for one in answers if isinstance(one, bus.Sample)]
     assert result["status"] in TAKEN
-    assert result["words"].startswith("stopped, though: a payload of 5000000 bytes is too large")
+    assert result["words"].startswith("the stop is carried out all the same: a payload of 5000000 bytes is too large")
     wait_for(lambda: len(frames_of("stop", told)) == 3, "the stop")
     wait_for(lambda: fleet.state("safety").motors == "off", "it stands")
     assert len(frames_of("stop", told)) == 3, "and nothing else"

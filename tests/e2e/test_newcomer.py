@@ -76,7 +76,7 @@ def walk(clone: Path, tmp_path: Path) -> None:
     said = dict(told)
     assert [line.split()[0] for line in said["fleet list"].splitlines()[1:]] == ["blue", "green", "red"]
     before, after = (text for command, text in told if command == "fleet why red")
-    assert re.search(r"because of role (guide \(1 of 1\)|patrol \(2 of 2\))", before), before
+    assert re.search(r"because:   role (guide \(1 of 1\)|patrol \(2 of 2\))", before), before
     assert "is on hold by" in after
     assert "complete" in said["fleet stop red"]
     assert "red: stopped" in said["fleet down"]

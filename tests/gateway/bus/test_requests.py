@@ -172,7 +172,7 @@ def test_what_is_no_command_is_refused_with_words(verb: str, payload: Any, reaso
 def test_a_stop_is_a_stop_whatever_is_wrong_with_its_words(payload: Any, words: str) -> None:
     stop = ask("stop", payload)
     assert stop.what == Stop()
-    assert stop.note.startswith("stopped, though: stop: ")
+    assert stop.note.startswith("the stop is carried out all the same: stop: ")
     assert words in stop.note
     assert ask("estop", payload).what == EmergencyStop()
 
@@ -181,7 +181,7 @@ def test_a_stop_is_a_stop_whatever_is_wrong_with_its_words(payload: Any, words: 
 def test_an_e_stop_in_which_something_is_wrong_keeps_its_scope_and_its_reason(wrong: dict[str, Any]) -> None:
     stop = ask("estop", {"why": "smoke", "scope": "fleet", **wrong})
     assert stop.what == EmergencyStop("smoke", fleet_wide=True)
-    assert "stopped, though" in stop.note
+    assert "the stop is carried out all the same" in stop.note
     as_message = pb.EstopCommand(why="smoke", scope="fleet", kind="boss").SerializeToString()
     assert ask("estop", as_message, f"{PROTOBUF};fleet.v1.EstopCommand").what == EmergencyStop("smoke", fleet_wide=True)
 
@@ -315,5 +315,5 @@ def test_what_was_not_read_is_refused_and_a_stop_is_obeyed() -> None:
     error = refused("drive", None, unread="it is too large")
     assert (error.reason, error.words) == (Reason.BAD_VALUE, "drive: it is too large")
     stop = ask("stop", None, unread="it is too large")
-    assert (stop.what, stop.note) == (Stop(), "stopped, though: it is too large")
+    assert (stop.what, stop.note) == (Stop(), "the stop is carried out all the same: it is too large")
     assert ask("estop", None, unread="it is too large", by_wildcard=True).what == EmergencyStop()

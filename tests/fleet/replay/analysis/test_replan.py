@@ -121,7 +121,7 @@ def test_another_plan_shows_where_and_why(recorded: Path, tmp_path: Path) -> Non
     assert (first["now"]["kind"], first["now"]["decided"]) == ("role", "tracking")
     told = run("replan", recorded, "--plan", plan).output
     assert (
-        "  then: rule light_seeking (role track), because of rule spinning: green: motion.motion == 'spin_left'" in told
+        "  then: rule light_seeking (role track), because: rule spinning: green: motion.motion == 'spin_left'" in told
     )
 
 
