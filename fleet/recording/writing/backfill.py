@@ -1,8 +1,7 @@
 """Requests messages that a recorder missed from the caches of their publishers. session_writer.py drops duplicates.
 
 Publishers cache ten seconds at the rate of their topic, at least a hundred publications (`Topic.cache_size`): minutes
-of a
-state, hours of an event. The recorder queries them after a reconnect to the hub, after a gap in their sequence
+of a state, hours of an event. The recorder queries them after a reconnect to the hub, after a gap in their sequence
 numbers, and when it continues an interrupted session.
 """
 
