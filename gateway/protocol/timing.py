@@ -1,8 +1,7 @@
 """The speed of the wire and the time for which each frame blocks a car.
 
-Every number is a row of docs/reference/protocol.md#blocking-times unless a comment names another section. The times of
-the
-modes are in `modes`.
+Every number is a row of docs/reference/protocol.md#blocking-times unless a comment names another section.
+`modes` has the times of the modes.
 """
 
 from typing import Final
