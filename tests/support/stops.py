@@ -308,17 +308,6 @@ def half(*whats: Drive | OneShot | SetMode) -> Load:
     return load
 
 
-def within(what: OneShot | SetMode, block_s: float) -> Load:
-    """The link is cut in the block of a frame that the car has read."""
-
-    def load(pair: Pair, moments: random.Random) -> None:
-        pair.ask(what)
-        pair.until(lambda: pair.car.truth.blocked and pair.control.model.motors == "off", 12.0)
-        pair.run(block_s * moments.random())
-
-    return load
-
-
 def cut_off(before: Load) -> Load:
     """And the link is lost, comes back after a moment, and a stop is asked for while it recovers."""
 
