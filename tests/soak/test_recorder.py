@@ -32,6 +32,7 @@ def test_the_hub_killed_twenty_times(tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         told = hub_killed(fleet, tmp_path / "sessions", cars=CARS, times=20, chance=random.Random())
+        assert told.recovered, "no message was missed at first: the test tries nothing"
     finally:
         fleet.close()
     print(f"\n{told.published} published over 20 kills of the hub, {told.recovered} had again; none lost, none twice")
