@@ -32,6 +32,7 @@ from fleet.client.condition import KeyCondition
 from fleet.client.lease import Lease
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome
 from fleet.client.reading import Reading, Watch, reading_of
+from fleet.client.supervision import ask_status
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages, topics
 from schemas.bus import Bus, Failure, Sample, canon
@@ -269,13 +270,8 @@ class Fleet:
         """Query the names of the cars that a supervisor starts gateways for. Runs on a thread of the pool."""
         names: set[str] = set()
         try:
-            key = keys.topic_key(self.name, keys.SUPERVISOR, "status")
-            for answer in self.bus.query(key, timeout_s=ANSWER_TIMEOUT_S, qos=Qos.STATE):
-                if isinstance(answer, Sample):
-                    status: Any = answer.message()
-                    names |= {
-                        each.name for each in status.processes if each.kind == "gateway" and each.state != "ended"
-                    }
+            for status in ask_status(self.bus, self.name, ANSWER_TIMEOUT_S):
+                names |= {each.name for each in status.processes if each.kind == "gateway" and each.state != "ended"}
         except messages.BadPayload as error:
             log.warning("a supervisor's status is unreadable: %s", error)
         finally:

@@ -75,7 +75,6 @@ class PendingCommand:
         self._asked_at = time.monotonic()
         self._late_at: float | None = self._asked_at + ANSWER_TIMEOUT_S
         """Time of the warning about missing answers. None after the warning."""
-        self._open = 0
         self._progress: dict[str, Progress] = {}
         for car in present if named is None else named:
             self._of(car)

@@ -10,9 +10,10 @@ from typing import IO, Any, Final
 import click
 
 from fleet.client.client import default_sender
+from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
 from fleet.commands.options import bus_options, json_option
 from fleet.supervisor.child import parse_log_line, runs_directory
-from fleet.supervisor.service import SUPERVISOR_STATUS, ask_service, ask_status
+from fleet.supervisor.service import ask_service
 from fleet.supervisor.shutdown import NOT_STOPPED
 from schemas import keys, messages
 from schemas.bus import Bus, BusError, resolve_endpoint

@@ -14,12 +14,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from fleet.fleetfile.fleet_file import FleetCar
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link
 from gateway.protocol.platforms import Platform
 from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
+
+if TYPE_CHECKING:
+    from serial.tools.list_ports_common import ListPortInfo
 
 HOST_TIMEOUT_S: Final = 3.0
 """Timeout for the reply of a host."""
@@ -78,7 +81,7 @@ def _check(link: FleetLink, platform: str) -> tuple[bool, str]:
 def check_device(path: str) -> tuple[bool, str]:
     """Return whether a serial port exists, is permitted and is free, with the words. Nothing is opened."""
     if os.name != "posix":
-        is_listed = path.upper() in map(str.upper, _list_ports())
+        is_listed = path.upper() in (str(port.device).upper() for port in _list_ports())
         return is_listed, "the port is there; not opened" if is_listed else "there is no such port: plug the car in"
     try:
         file_stat = Path(path).stat()
@@ -123,17 +126,14 @@ def _lock_holder(file_stat: os.stat_result) -> str | None:
     return None
 
 
-def _list_ports() -> list[str]:
+def _list_ports() -> "list[ListPortInfo]":
     from serial.tools import list_ports
 
-    return [str(port.device) for port in list_ports.comports()]
+    return list(list_ports.comports())
 
 
 def _check_usb(link: UsbUrl) -> tuple[bool, str]:
-    from serial.tools import list_ports
-
-    ports = list_ports.comports()
-    matching = [str(port.device) for port in ports if link.fits(port.vid, port.pid, port.serial_number)]
+    matching = [str(port.device) for port in _list_ports() if link.fits(port.vid, port.pid, port.serial_number)]
     if not matching:
         return False, "no such USB device is plugged in: plug the car in, or bind it again (fleet bind)"
     if len(matching) > 1:

@@ -20,7 +20,7 @@ class Debounced:
     otherwise_since: float | None = None
 
 
-def debounce(before: Debounced | None, value: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001
+def debounce(before: Debounced | None, value: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001 - the value itself
     """Follow a condition: on after `for_s`, None after HYSTERESIS_S of false or UNKNOWN_TIMEOUT_S of unknown."""
     if before is None or not before.on:
         if not value:
@@ -43,7 +43,7 @@ class Settled:
     other_since: float | None = None
 
 
-def settle(before: Settled | None, value: bool | None, now: float) -> Settled | None:  # noqa: FBT001
+def settle(before: Settled | None, value: bool | None, now: float) -> Settled | None:  # noqa: FBT001 - the value itself
     """Follow a boolean. The first value counts at once; unknown leaves the value as it was."""
     if value is None or before is None:
         return before if value is None else Settled(value)

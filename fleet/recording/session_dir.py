@@ -23,6 +23,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, Final, Self
 
+from fleet.recording.time_spec import format_utc
 from schemas.atomic_file import write_atomically
 
 SESSION_FILE: Final = "session.json"
@@ -153,15 +154,10 @@ def _is_valid(values: Mapping[str, Any]) -> bool:
     )
 
 
-def iso(now: datetime) -> str:
-    """Return a time in the format of `session.json`."""
-    return now.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
 def plan(root: Path, fleet: str, now: datetime) -> tuple[Path, SessionInfo]:
     """Return the path and description of a new session without creating it."""
     stem = f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{fleet}"
-    return _unused(root / stem), SessionInfo(fleet, iso(now), socket.gethostname(), versions())
+    return _unused(root / stem), SessionInfo(fleet, format_utc(now), socket.gethostname(), versions())
 
 
 def create(directory: Path, description: SessionInfo) -> Path:

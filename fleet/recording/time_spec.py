@@ -26,6 +26,11 @@ def at_ns(text: str, start_ns: int, end_ns: int) -> int:
     return whole * 1_000_000_000 + when.microsecond * 1000
 
 
+def format_utc(when: datetime, timespec: str = "milliseconds") -> str:
+    """Return a time in ISO 8601, UTC; timespec as for `datetime.isoformat`."""
+    return when.astimezone(UTC).isoformat(timespec=timespec).replace("+00:00", "Z")
+
+
 def iso(ns: int) -> str:
     """Return a time in ISO 8601, UTC, with milliseconds."""
     try:

@@ -28,7 +28,7 @@ class Curve:
 
 
 class Derivation(StrEnum):
-    """What a lens derives from a field."""
+    """The value that a lens derives from a field."""
 
     TEXT_OR_NOTHING = "text_or_nothing"
     """A text, or no state if it is empty."""

@@ -9,13 +9,13 @@ from typing import Any, Final
 
 import zenoh
 
+from fleet.client.supervision import SUPERVISOR_STATUS
 from schemas import keys, messages, topics
 from schemas.bus import Bus, Failure, Handover, Sample, Singleton, is_json_wanted, reply_message, reply_value
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos
 
-SUPERVISOR_STATUS: Final = topics.TOPICS[f"{keys.SUPERVISOR}/status"]
 SECOND_CHECK_DELAY_S: Final = 0.3
 """Time after which two supervisors that start at the same moment have both declared."""
 SERVICE_QUERY_TIMEOUT_S: Final = 2.0
@@ -163,12 +163,6 @@ class SupervisorService:
             f"fleet {self.fleet} is up already: process {other.pid} on {other.host} "
             f"({other.fleet_file or 'simulated cars'}); end that first (fleet down), or name this one with --fleet"
         )
-
-
-def ask_status(bus: Bus, fleet: str, timeout_s: float = 2.0) -> list[Any]:
-    """Return the fleet.v1.Supervision of every supervisor that answers."""
-    answers = bus.query(f"{fleet}/{SUPERVISOR_STATUS.name}", timeout_s=timeout_s, qos=Qos.STATE)
-    return [answer.message() for answer in answers if isinstance(answer, Sample)]
 
 
 def ask_service(bus: Bus, fleet: str, verb: str, sender: str, timeout_s: float = 30.0) -> Any:

@@ -18,7 +18,7 @@ from gateway.control.commands import Answer, Command, EmergencyStop, Phase
 from gateway.control.controller import Controller
 from gateway.control.events import Level, LogRecord
 from gateway.control.safety import PersistedSafety
-from schemas import bus, keys, messages, topics
+from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb
 
 _LOGGING_LEVELS: Final = {
@@ -142,10 +142,7 @@ class CommandHandler:
             worst_case_s=answer.worst_case_s or None,  # only a stop has one
         )
         with pending.query as query:
-            if pending.as_json:
-                bus.reply(query, pending.key, messages.to_json(result).encode(), messages.JSON)
-            else:
-                bus.reply(query, pending.key, result.SerializeToString(), messages.encoding_of("fleet.v1.Result"))
+            bus.reply_message(query, pending.key, result, as_json=pending.as_json)
 
     def flush(self) -> None:
         """Publish records, save the safety state, answer the pending queries."""

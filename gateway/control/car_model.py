@@ -40,7 +40,7 @@ class CarModel:
     evidence: StopEvidence = field(default_factory=StopEvidence)
     trust: TrustState = field(default_factory=TrustState)
     rest: StopCase = StopCase.SOFT
-    """What the claim of rest rests on if its basis is `sent`."""
+    """The case of the stop, if the claim of rest has the basis `sent`."""
     left_at: float = float("-inf")
     left_until: float = float("-inf")
     """When the last frame that leaves a mode was written, and when the car has left the mode at the latest."""

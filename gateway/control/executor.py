@@ -39,7 +39,7 @@ class Executor:
         """A mode command whose effect was not seen yet, and when its frame was written."""
         self._log = log
         self._source: StopInProgress | HeldMotion | Pending | None = None
-        """What the last frame of `poll` belongs to; None for a repetition."""
+        """The stop, motion or command of the last frame of `poll`; None for a repetition."""
 
     # ------------------------------------------------------------------ the link
 

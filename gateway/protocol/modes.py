@@ -14,7 +14,7 @@ EVERY_MEASUREMENT: Final = frozenset(field.measurement for field in SENSOR_FIELD
 
 @dataclass(frozen=True, slots=True)
 class ModeRow:
-    """What docs/reference/protocol.md#modes says about one mode.
+    """The facts of docs/reference/protocol.md#modes about one mode.
 
     `digit` is the x of `MODE<x><y>`. `open_s` is the time for which opening the mode blocks the car. `turn_s` is the
     longest block of one turn of the mode's own loop. `rate_hz` is the maximum of sensors frames per second.
@@ -70,7 +70,7 @@ _SIGNED: Final = tuple((mode, row, row.signature) for mode, row in MODES.items()
 
 # The control code looks at one event several times: the cache makes all but the first look free.
 @lru_cache(maxsize=8)
-def matching_modes(raw: bytes, terminated: bool, by_silence: bool) -> tuple[Mode, ...]:  # noqa: FBT001
+def matching_modes(raw: bytes, terminated: bool, by_silence: bool) -> tuple[Mode, ...]:  # noqa: FBT001 - two facts of a frame
     """Return the modes whose sensors frame has this text, by its filler; never empty, in order of digit."""
     found = [(mode, row) for mode, row, signature in _SIGNED if signature.fullmatch(raw)]
     if not found:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.supervisor.service import ask_status
+from fleet.client.supervision import ask_status
 from schemas import bus, keys
 from tests.support.ports import free_endpoint, free_port
 from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, wait_for

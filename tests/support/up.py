@@ -14,7 +14,7 @@ from typing import Any, Self
 import pytest
 
 from fleet import cli
-from fleet.supervisor.service import ask_status
+from fleet.client.supervision import ask_status
 from schemas import messages
 from schemas.bus import Bus, BusError, Sample
 from tests.support.processes import GatewayProcess, wait_for

@@ -55,7 +55,7 @@ def _without(node: Node, names: frozenset[str], *, wanted: bool) -> Node:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Whether a condition can be true. never: why not, empty if it can. only: the only cars of which, empty: any."""
+    """If a condition can be true. never: the reason if not, else empty. only: the only cars for it, if not any car."""
 
     never: str = ""
     only: str = ""

@@ -8,10 +8,11 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, Final
 
 from fleet.client.reading import Reading
+from fleet.recording.time_spec import format_utc
 from schemas import topics
 
 _OMITTED_FIELDS: Final = frozenset({"stamp", "timestamp", "boot_id"})
@@ -31,7 +32,7 @@ def table(readings: Sequence[Reading], topic: topics.Topic) -> str:
 
 def iso(time: datetime) -> str:
     """Return a time in ISO 8601, UTC, with microseconds."""
-    return time.astimezone(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return format_utc(time, "microseconds")
 
 
 def _fields(readings: Sequence[Reading]) -> Iterable[tuple[str, int | None]]:

@@ -17,6 +17,7 @@ import zenoh
 
 from fleet.recording import session_dir
 from fleet.recording.sequence_tracker import SequenceTracker
+from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume, retention
 from fleet.recording.writing.segment_writer import Segment
 from schemas.bus import sequence_of
@@ -279,7 +280,7 @@ class SessionWriter:
 
     def mark(self, text: str, by: str, now_ns: int) -> None:
         """Add a mark and exempt the session from the quota; raises OSError."""
-        marks = [*self.description.marks, {"time": session_dir.iso(_utc(now_ns)), "text": text, "by": by}]
+        marks = [*self.description.marks, {"time": format_utc(_utc(now_ns)), "text": text, "by": by}]
         self.description.marks, self.description.kept = marks, True
         if self._made:
             self.description.write(self.path)
@@ -540,7 +541,7 @@ class SessionWriter:
     def _write_info(self, now_ns: int | None, *, closed: bool) -> None:
         description = self.description
         if now_ns is not None:
-            description.ended, description.closed = session_dir.iso(_utc(now_ns)), closed
+            description.ended, description.closed = format_utc(_utc(now_ns)), closed
         description.messages = self._written
         description.drops, description.missed = dict(self.drops), self.missed
         description.recovered = dict(self.recovered)

@@ -194,7 +194,7 @@ def _encoding(message: Recorded) -> str:
 
 
 def _subject(topic: Topic, payload: bytes) -> str:
-    """Return the subject of a decision, of which each has its own latest value; empty for other messages."""
+    """Return the subject of a decision: each has its own latest value. Empty for other messages."""
     if topic.message != "fleet.v1.Decision":
         return ""
     try:

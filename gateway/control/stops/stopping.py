@@ -117,7 +117,7 @@ class StopInProgress:
     """True if the car had shown that it stands before it fell silent. Send it general stops only: unlike a named frame,
     a general stop that loses bytes cannot start the motors."""
     case: StopCase = StopCase.MANUAL
-    """What the stop rests on if the car does not show it."""
+    """The case of the stop, if the car does not show it."""
 
     @property
     def frames_sent(self) -> bool:
