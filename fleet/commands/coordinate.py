@@ -22,7 +22,7 @@ from schemas.yaml_document.document import read_text
 @click.command(
     epilog="""\b
 example:
-  fleet coordinate --plan deploy/plan.yaml
+  fleet coordinate --plan plan.yaml
 
 \b
 a plan:

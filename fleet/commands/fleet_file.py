@@ -39,7 +39,7 @@ seconds_option = click.option(
     epilog="""\b
 examples:
   fleet check
-  fleet check deploy/fleet.mixed.yaml --json
+  fleet check lab.yaml --json
 
 Exit codes: 0 all is well, 1 a car cannot be reached as it stands, 2 the file is wrong."""
 )

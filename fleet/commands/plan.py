@@ -55,7 +55,7 @@ def _describe(reading: Reading) -> str:
     return "\n".join(lines)
 
 
-@click.group(epilog="\b\nexamples:\n  fleet plan check deploy/plan.yaml --fleet-file fleet.yaml\n  fleet plan restart")
+@click.group(epilog="\b\nexamples:\n  fleet plan check plan.yaml --fleet-file fleet.yaml\n  fleet plan restart")
 def plan() -> None:
     """Check a plan, or restart the plan in force."""
 
@@ -63,7 +63,7 @@ def plan() -> None:
 @plan.command(
     epilog="""\b
 example:
-  fleet plan check deploy/plan.yaml --fleet-file fleet.yaml
+  fleet plan check plan.yaml --fleet-file fleet.yaml
 
 Exit codes: 0 nothing that can never work, 1 something, 2 no plan."""
 )

@@ -35,7 +35,7 @@ _Write = Callable[[SupervisorEvent], None]
     epilog="""\b
 examples:
   fleet up
-  fleet up deploy/fleet.yaml --plan deploy/plan.yaml
+  fleet up lab.yaml --plan plan.yaml
   fleet up --sim 8
 
 Without FILE and --sim it takes ./fleet.yaml. With --sim and --json, lines on stdin go to the simulator (gateway sim

@@ -1,1 +1,6 @@
-"""Example programs, each under thirty lines. CI runs each of them against simulated cars. Nothing imports them."""
+"""Example programs, fleet files, plans and worlds. Tests run each program against simulated cars."""
+
+from pathlib import Path
+from typing import Final
+
+EXAMPLES: Final = Path(__file__).parent

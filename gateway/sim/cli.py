@@ -52,7 +52,7 @@ infrared remote, which only an Arduino or STM32 car in mode remote_control obeys
 spin_left, spin_right, stop, whistle, faster, slower; a motion holds until the next button:
   --ir red:forward@5                    or on stdin {"car": "red", "ir": "forward"}
 worlds: lamps that light sensors see, things to bump into and to follow, cars that see each other and are in each
-other's way come from a file; deploy/world.follow.yaml has a comment for each field. On stdin:
+other's way come from a file; `fleet example copy follow` writes one with a comment for each field. On stdin:
   {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (of a carried one: ahead, left)
   {"thing": "cart", "x_m": 1, "y_m": 0} stays there, off its path; or "speed_m_s" along it
 what is so:
@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="WORLD",
         default="room",
         help="room: walls and a line to track; open: nothing, so no ranging has an echo; or a file with lamps, things "
-        "and cars that meet, such as deploy/world.follow.yaml (default: room)",
+        "and cars that meet, as `fleet example show follow` prints (default: room)",
     )
     parser.add_argument(
         "--fault",

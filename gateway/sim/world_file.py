@@ -1,7 +1,7 @@
 """Reads a world file (YAML 1.2): checks its fields, their ranges, and contradictions between them. Pure.
 
-Distances in meters, speeds in m/s, angles in degrees counter-clockwise from x. deploy/world.follow.yaml has a comment
-for each field.
+Distances in meters, speeds in m/s, angles in degrees counter-clockwise from x. The example world
+`follow` (fleet/examples/worlds/follow.yaml) has a comment for each field.
 """
 
 from collections.abc import Mapping, Sequence

@@ -11,27 +11,29 @@ from pathlib import Path
 import pytest
 
 from fleet.commands.fleet_file import schema_text
+from fleet.examples import EXAMPLES
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
 from fleet.supervisor.shutdown import CAR_LINK_TIMEOUT_S, GATEWAY_START_TIMEOUT_S
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, RECORDER_EXIT_TIMEOUT_S, SERVICE_EXIT_TIMEOUT_S
 
 DEPLOY = Path(__file__).parent.parent.parent / "deploy"
-FILES = sorted(DEPLOY.glob("fleet.*.yaml"))
+SCHEMA = "https://raw.githubusercontent.com/zenoh-car-fleet/zenoh-car-fleet/main/deploy/fleet.schema.json"
+FILES = sorted((EXAMPLES / "fleets").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_a_fleet_file_is_one(path: Path) -> None:
     fleet = read_fleet(path)
     assert len(fleet.cars) >= 3
-    assert path.read_text().startswith("# yaml-language-server: $schema=fleet.schema.json\n")
+    assert path.read_text().startswith(f"# yaml-language-server: $schema={SCHEMA}\n")
     links = {name: car.link.partition(":")[0] for name, car in fleet.cars.items()}
     wanted = {"sim": {"sim"}, "bluetooth": {"ble"}, "mixed": {"serial", "tcp", "ble", "/dev/fleet/green"}}
-    assert set(links.values()) == wanted[path.name.split(".")[1]]
+    assert set(links.values()) == wanted[path.stem]
 
 
 def test_there_is_one_for_each_start() -> None:
-    assert [path.name for path in FILES] == ["fleet.bluetooth.yaml", "fleet.mixed.yaml", "fleet.sim.yaml"]
+    assert [path.name for path in FILES] == ["bluetooth.yaml", "mixed.yaml", "sim.yaml"]
 
 
 def test_the_schema_is_up_to_date() -> None:
@@ -60,7 +62,7 @@ def test_udev_rules_give_each_car_a_name_of_its_own() -> None:
         assert any(operator == "==" and key.startswith("ENV{ID_") for key, operator, _ in found), line
         names += [value for key, operator, value in found if (key, operator) == ("SYMLINK", "+=")]
     assert names == ["fleet/red", "fleet/green"]
-    assert f"/dev/{names[1]}" in (DEPLOY / "fleet.mixed.yaml").read_text()
+    assert f"/dev/{names[1]}" in (EXAMPLES / "fleets" / "mixed.yaml").read_text()
     # 60-serial.rules must have told the ids before, 73-seat-late.rules acts on the tag after.
     assert "60" < rules.name[:2] < "73"
     udevadm = shutil.which("udevadm")

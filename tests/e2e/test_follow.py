@@ -1,13 +1,12 @@
 """A plan of ours finds the leader by light and lets the others follow, in the simulated world; judged by true poses."""
 
 from math import dist
-from pathlib import Path
 
 import pytest
 
+from fleet.examples import EXAMPLES
 from tests.support.processes import FleetProcesses, GatewayProcess, wait_for
 
-DEPLOY = Path(__file__).parents[2] / "deploy"
 ROW = ("red", "green", "blue")
 MODES = {"red": "light_seeking", "green": "following", "blue": "following"}
 
@@ -19,13 +18,15 @@ def _truth(sim: GatewayProcess) -> dict[str, tuple[str, tuple[float, float]]]:
 
 @pytest.mark.timeout(240)
 def test_who_sees_the_lamp_leads_and_the_others_follow(fleet: FleetProcesses) -> None:
-    sim, links = fleet.simulate(*(f"{car}:arduino:pty" for car in ROW), world=str(DEPLOY / "world.follow.yaml"))
+    sim, links = fleet.simulate(*(f"{car}:arduino:pty" for car in ROW), world=str(EXAMPLES / "worlds" / "follow.yaml"))
     for car, link in zip(ROW, links, strict=True):
         fleet.gateway(link, car=car)
     for car in ROW:
         fleet.ready(car)
     began = _truth(sim)
-    coordinator = fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(DEPLOY / "plan.follow.yaml"), "--json")
+    coordinator = fleet.start(
+        "-m", "fleet.cli", "coordinate", "--plan", str(EXAMPLES / "plans" / "3-leader.yaml"), "--json"
+    )
     wait_for(lambda: {car: mode for car, (mode, _) in _truth(sim).items()} == MODES, "red leads, the others follow")
     roles = {role.name: list(role.cars) for role in fleet.get("fleet/@coordinator/assignment")[0].roles}
     assert roles == {"leader": ["red"], "follower": ["blue", "green"]}

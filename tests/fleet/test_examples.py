@@ -7,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-import fleet.examples
 from fleet import Fleet
+from fleet.examples import EXAMPLES
 from tests.fleet.conftest import Cars, asked
 from tests.support.processes import LONG_S, driving, wait_for
 
-EXAMPLES = Path(fleet.examples.__file__).parent
+PROGRAMS = EXAMPLES / "programs"
 LINES = 30
 
 
 def run(cars: Cars, name: str, *arguments: str) -> list[str]:
     """Run one to its end; what it printed."""
-    process = cars.start("-u", "-m", f"fleet.examples.{name}", *arguments)
+    process = cars.start("-u", "-m", f"fleet.examples.programs.{name}", *arguments)
     assert process.wait() == 0, process.stderr
     return process.lines()
 
@@ -29,7 +29,7 @@ def code(notebook: Path) -> list[str]:
     return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.[pi]*")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted(PROGRAMS.glob("*.[pi]*")), ids=lambda path: path.name)
 def test_each_is_under_thirty_lines(path: Path) -> None:
     text = "\n".join(code(path)) if path.suffix == ".ipynb" else path.read_text(encoding="utf-8")
     assert len(text.splitlines()) < LINES
@@ -45,7 +45,7 @@ def test_drive_one(cars: Cars) -> None:
 
 def test_drive_one_says_who_has_the_car(cars: Cars) -> None:
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia, mia.car("red").lease():
-        process = cars.start("-m", "fleet.examples.drive_one", "red")
+        process = cars.start("-m", "fleet.examples.programs.drive_one", "red")
         assert process.wait() == 1
     assert process.stderr.startswith("red is driven by mia (person)"), process.stderr
     assert len(process.stderr.splitlines()) == 1
@@ -60,7 +60,7 @@ def test_read_all(cars: Cars) -> None:
 
 def test_follow_the_leader(cars: Cars) -> None:
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
-        process = cars.start("-m", "fleet.examples.follow_the_leader", "red", "blue")
+        process = cars.start("-m", "fleet.examples.programs.follow_the_leader", "red", "blue")
         wait_for(lambda: cars.state("safety", "blue").HasField("lease"), "blue is the example's")
         asked(lambda: mia.car("red").drive("forward", LONG_S, wait=False)).check()
         wait_for(lambda: driving(cars.sim, "blue"), "blue does as red does")
@@ -77,7 +77,7 @@ def test_follow_the_leader(cars: Cars) -> None:
 def test_custom_policy(cars: Cars) -> None:
     """Red alone can avoid obstacles; when a person has stopped it, the policy leaves it alone."""
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
-        process = cars.start("-m", "fleet.examples.custom_policy")
+        process = cars.start("-m", "fleet.examples.programs.custom_policy")
         wait_for(lambda: cars.state("mode").asked == "obstacle_avoidance", "red avoids obstacles")
         mia.stop(["red"])
         assert process.wait() == 0, process.stderr
@@ -100,7 +100,7 @@ def test_notebook(cars: Cars) -> None:
         "    exec(compile(ast.Module(first, []), 'cell', 'exec'), space)\n"
         "    print(json.dumps(repr(eval(compile(ast.Expression(last.value), 'cell', 'eval'), space))))\n"
     )
-    cells = code(EXAMPLES / "notebook.ipynb")
+    cells = code(PROGRAMS / "notebook.ipynb")
     process = cars.start("-c", run_cells)
     assert process.popen.stdin is not None
     process.popen.stdin.write(json.dumps(cells))

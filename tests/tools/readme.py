@@ -102,7 +102,8 @@ def any_client() -> str:
 
 def sdk() -> str:
     """The first example; tests/fleet/test_examples.py runs it."""
-    return "```python\n" + (ROOT / "fleet" / "examples" / "drive_one.py").read_text(encoding="utf-8").strip() + "\n```"
+    program = ROOT / "fleet" / "examples" / "programs" / "drive_one.py"
+    return "```python\n" + program.read_text(encoding="utf-8").strip() + "\n```"
 
 
 _STATES = {

@@ -17,8 +17,8 @@ from schemas import bus, keys
 PATH = Path(client.__file__).parent.parent.parent / "fleet/REFERENCE.md"
 _HEAD = """# The SDK
 
-Generated from the docstrings by `make readme`; examples that run are in [examples](examples). Times are seconds,
-distances meters, angles degrees unless a name says otherwise; what was not measured is None.
+Generated from the docstrings by `make readme`; examples that run are in [examples](examples/programs). Times are
+seconds, distances meters, angles degrees unless a name says otherwise; what was not measured is None.
 
 ```python
 from fleet import Fleet, LeaseLost, NotCarriedOut

@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet.examples import EXAMPLES
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
@@ -490,12 +490,12 @@ def test_gone_is_gone() -> None:
     assert step(FIXED, FleetSnapshot({"red": GONE}), PolicyState(started_at=-9.0), 0.0).asks == ()
 
 
-DEPLOYED = parse((Path(__file__).parents[3] / "deploy" / "plan.yaml").read_text(encoding="utf-8"))
+EXAMPLE = parse((EXAMPLES / "plans" / "2-line-guide.yaml").read_text(encoding="utf-8"))
 LINE = dict.fromkeys(("left_outer", "left_inner", "right_inner", "right_outer"), False)
 
 
 def test_the_starting_plans_guide_stands_while_it_sees_no_line() -> None:
-    run = PolicyRun(DEPLOYED, "blue", "green", "red")
+    run = PolicyRun(EXAMPLE, "blue", "green", "red")
     for car in run.cars:
         run.sees(car, battery={"voltage_v": 7.9, "level": "ok"})
     run.until(2.0)
@@ -511,7 +511,7 @@ def test_the_starting_plans_guide_stands_while_it_sees_no_line() -> None:
 
 
 def test_the_starting_plan_shows_which_car_is_too_weak() -> None:
-    run = PolicyRun(DEPLOYED, "blue", "red")
+    run = PolicyRun(EXAMPLE, "blue", "red")
     run.sees("blue", battery={"voltage_v": 7.9, "level": "ok"})
     asked = []
     while run.now < 8.0:

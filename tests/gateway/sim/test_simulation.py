@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 import serial
 
+from fleet.examples import EXAMPLES
 from gateway.sim.car_spec import parse_cars
 from gateway.sim.endpoints import EndpointError, Taken
 from gateway.sim.faults import Fault, FaultKind
@@ -392,7 +393,7 @@ def test_the_cars_go_on_without_streams(closed: str, tmp_path: Path) -> None:
 
 def test_lamps_are_switched_and_things_moved_while_it_runs(started: list[SimProcess]) -> None:
     cars = [word for name in ("red", "green", "blue") for word in ("--car", f"{name}:arduino:pty")]
-    sim = SimProcess(*cars, "--no-truth", "--world", str(Path(__file__).parents[3] / "deploy" / "world.follow.yaml"))
+    sim = SimProcess(*cars, "--no-truth", "--world", str(EXAMPLES / "worlds" / "follow.yaml"))
     started.append(sim)
     red, _, _ = (sim.line() for _ in range(3))
     with serial.Serial(red["link"].removeprefix("serial://"), timeout=PATIENCE) as port:
@@ -530,7 +531,7 @@ def test_the_truth_is_on_the_bus_when_a_hub_comes_also_later(started: list[SimPr
 
 def test_lamps_and_things_are_on_the_bus_too(started: list[SimProcess]) -> None:
     endpoint = free_endpoint()
-    world = str(Path(__file__).parents[3] / "deploy" / "world.follow.yaml")
+    world = str(EXAMPLES / "worlds" / "follow.yaml")
     sim = SimProcess("--car", "red:arduino:pty", "--world", world, "--connect", endpoint)
     started.append(sim)
     sim.line()

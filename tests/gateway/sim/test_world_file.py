@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet.examples import EXAMPLES
 from gateway.sim.model.car_body import CarBody
 from gateway.sim.model.firmware import Pose
 from gateway.sim.model.objects import Lamp, MovingObject
@@ -18,7 +19,7 @@ from gateway.sim.model.world import RADIUS_M, World
 from gateway.sim.world_file import WorldSpec, read_world
 from gateway.sim.yaml_reader import MAX_WORLD_BYTES, BadWorld
 
-DEPLOY = Path(__file__).parents[3] / "deploy"
+WORLDS = EXAMPLES / "worlds"
 EVERYTHING = """\
 room: {width_m: 6, depth_m: 0x04}
 boxes:
@@ -68,20 +69,20 @@ def test_every_field() -> None:
 
 
 def test_the_room_of_the_file_is_the_room() -> None:
-    spec, room = read_world((DEPLOY / "world.room.yaml").read_text(), "room"), World.room()
+    spec, room = read_world((WORLDS / "room.yaml").read_text(), "room"), World.room()
     world = spec.world()
     assert (world.walls, world.line, world.lively) == (room.walls, room.line, False)
     assert [world.start_pose(index, "red") for index in range(9)] == [room.start_pose(index) for index in range(9)]
 
 
 def test_the_follow_world_begins_with_room_for_all() -> None:
-    spec = read_world((DEPLOY / "world.follow.yaml").read_text(), "follow", ["red", "green", "blue"])
+    spec = read_world((WORLDS / "follow.yaml").read_text(), "follow", ["red", "green", "blue"])
     assert list(spec.starts) == ["red", "green", "blue"]
     assert spec.cars_meet
 
 
 def test_cars_without_a_place_begin_where_there_is_room_before_those_that_have_one() -> None:
-    text = (DEPLOY / "world.follow.yaml").read_text()
+    text = (WORLDS / "follow.yaml").read_text()
     text += "\nboxes: [{x_m: 0, y_m: 0, width_m: 1, depth_m: 1}]\n"
     world = read_world(text, "follow").world()
     bodies: list[CarBody] = []

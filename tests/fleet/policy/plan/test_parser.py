@@ -4,19 +4,18 @@ from pathlib import Path
 
 import pytest
 
+from fleet.examples import EXAMPLES
 from fleet.policy.plan.lint import check
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Quantifier
 from gateway.protocol.enums import Mode
 from schemas.yaml_document.document import BadFile
 
-DEPLOY = Path(__file__).parents[4] / "deploy"
 
-
-@pytest.mark.parametrize("path", sorted(DEPLOY.glob("plan*.yaml")), ids=lambda path: path.name)
-def test_the_plans_in_deploy_are_some(path: Path) -> None:
+@pytest.mark.parametrize("path", sorted((EXAMPLES / "plans").glob("*.yaml")), ids=lambda path: path.name)
+def test_the_example_plans_are_plans(path: Path) -> None:
     plan = parse(path.read_text(encoding="utf-8"))
-    assert plan.rules
+    assert plan.roles
     assert check(plan) == ()
 
 

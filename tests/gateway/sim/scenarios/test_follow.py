@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from itertools import pairwise
 from math import hypot
-from pathlib import Path
 
 import pytest
 
+from fleet.examples import EXAMPLES
 from gateway.control.commands import SetMode, Stop
 from gateway.control.estimate.mode import Verdict
 from gateway.protocol.enums import Mode
@@ -16,7 +16,7 @@ from gateway.sim.world_file import WorldSpec, read_world
 from tests.support.virtual import Pair
 
 ROW = ("red", "green", "blue")
-WORLD = (Path(__file__).parents[4] / "deploy" / "world.follow.yaml").read_text()
+WORLD = (EXAMPLES / "worlds" / "follow.yaml").read_text()
 NEAR_M = 0.45
 """Beyond 0.42 m between their middles a follower's infrared has lost the one before it."""
 LOOK_S = 0.1
@@ -25,7 +25,7 @@ STEP_S = 0.01
 
 
 def spec() -> WorldSpec:
-    return read_world(WORLD, "world.follow.yaml", ROW)
+    return read_world(WORLD, "follow.yaml", ROW)
 
 
 class Row:

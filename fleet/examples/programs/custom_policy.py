@@ -1,6 +1,6 @@
 """A custom policy: the car with most room ahead avoids obstacles, the others rest; 3 rounds of 5 s.
 
-`python -m fleet.examples.custom_policy`
+`python -m fleet.examples.programs.custom_policy`
 """
 
 import time

@@ -1,4 +1,4 @@
-"""Drive one car in a square: `python -m fleet.examples.drive_one red`."""
+"""Drive one car in a square: `python -m fleet.examples.programs.drive_one red`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""A car does what another does, until Ctrl-C: `python -m fleet.examples.follow_the_leader red blue`."""
+"""A car does what another does, until Ctrl-C: `python -m fleet.examples.programs.follow_the_leader red blue`."""
 
 import asyncio
 import sys

@@ -1,0 +1,1 @@
+"""Example programs, each under thirty lines."""
