@@ -195,8 +195,8 @@ class Progress:
         """End with an unknown outcome: the deadline has passed."""
         if self._gone_at is not None:
             words = (
-                f"its gateway went away, so whether {self.car} moves is not known and nothing stops it: "
-                "look; a gateway that is started for it stops it first (fleet up, gateway run)"
+                f"{self.car} may be moving and nothing can stop it from here: its gateway is gone. Go to the car. "
+                "Restarting the gateway (`fleet up`) stops it."
             )
             self._end(self._phase, "", words, at, ok=False)
             return

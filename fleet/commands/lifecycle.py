@@ -81,7 +81,10 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         for car, words in sorted(results.items()):
             click.echo(f"{car}: {words}", err=car in bad)
     if not ended:
-        raise click.ClickException("the supervisor is gone without a last word: see fleet logs, and fleet list")
+        raise click.ClickException(
+            "`fleet up` ended without reporting. Cars may still be moving: check them. "
+            "Then `fleet status` and `fleet logs recorder`."
+        )
     raise SystemExit(1 if bad else 0)
 
 

@@ -91,11 +91,20 @@ class CarMonitor:
             self.lost_frames += 1
             if not self._not_obeyed_logged:
                 self._not_obeyed_logged = True
-                words = f"{name} did not react to MODE00. The link may be losing frames. Stopping it again."
-                self._log.log(Level.WARNING, "not_obeyed", words, now)
+                self._log.log(Level.WARNING, "not_obeyed", self._not_obeyed(), now)
         elif finding is Finding.SHOWN and self._not_obeyed_logged:
             self._not_obeyed_logged = False
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
+
+    def _not_obeyed(self) -> str:
+        """Return what it means that a stop did not arrive, and where to look."""
+        name = self.model.name
+        if self.model.evidence.obeyed_at is None:
+            return (
+                f"{name} does not react to commands (readings arrive, stops do not work). "
+                f"Check the wire to its RX pin. Until this clears, `fleet stop` cannot stop {name}."
+            )
+        return f"{name} did not get a stop: its link loses commands, while readings arrive. The gateway stops it again."
 
     def _apply_platform(self, now: float) -> None:
         """Use the profile of the detected platform, but never during a stop: each stop is for one platform."""
@@ -144,8 +153,8 @@ class CarMonitor:
         if silent_s <= MANUAL_SILENCE_S:
             return
         words = (
-            f"{model.name} was not heard for {silent_s:.1f} s: whether it moves is not known "
-            "(off, out of reach, its fan on, or its link stuck). The gateway goes on stopping it."
+            f"{model.name} may be moving: no reading for {silent_s:.1f} s. Is it on, in range, its fan off? "
+            "The gateway keeps stopping it."
         )
         self._log.log(Level.WARNING, "unheard", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
@@ -158,7 +167,7 @@ class CarMonitor:
 
     def _on_contact(self, now: float) -> None:
         """Stop the car when it reports again: a stuck link may deliver all frames of that time at once."""
-        words = f"{self.model.name} is heard again: it is stopped first"
+        words = f"{self.model.name} sends readings again. The gateway stops it first."
         self._log.log(Level.INFO, "answers_again", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self.model.learn(TrustEvent.HEARD, now, words)

@@ -254,24 +254,39 @@ class Controller:
         sender, latched = command.sender, command.note
         if isinstance(command.what, EmergencyStop):
             estop = Estop(command.id, sender.name, command.what.why, command.asked_ns, command.what.fleet_wide)
-            until = f"latched as {self.safety.latch(estop).id} until it is resumed"
+            until = f"e-stop {self.safety.latch(estop).id} lasts until `fleet resume {self.car} --estops`"
             why = f": {estop.why}" if estop.why else ""
-            self._log.log(Level.ERROR, "estop", f"{self.car}: e-stop by {sender.name}{why}; {until}", now)
+            self._log.log(Level.ERROR, "estop", f"{self.car} is emergency-stopped by {sender.name}{why}; {until}", now)
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not SenderKind.COORDINATOR:
             self.safety.put_on_hold(sender.name, command.asked_ns)
         self._executor.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
         if not self.model.link_open or self.stops.shutting_down:
-            why = "its gateway is ending" if self.stops.shutting_down else self.model.link_reason
-            words = f"{self.car} cannot be reached: {why}; it is stopped first when its link is back"
+            words = self._not_stopped()
             return self._reject(pending, Reason.LINK_DOWN, f"{words} ({latched})" if latched else words, now)
         if not self.model.is_heard:
-            silent = f"{self.car} was not heard for {self.model.mode.unheard_s(now):.0f} s: it may not get this stop"
-            latched = f"{silent}; {latched}" if latched else silent
+            silent_s = self.model.mode.unheard_s(now)
+            silent = f"{self.car} may not get this stop: it has been silent for {silent_s:.0f} s. Look at the car."
+            latched = f"{silent} ({latched})" if latched else silent
         worst = self.stops.worst_s(now)
         self._log.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
         self.stops.begin(self.stops.full(now), FrameOrigin.STOP, now, pending)
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
+
+    def _not_stopped(self) -> str:
+        """Return what a stop that cannot be sent means for the car, and who stops it now."""
+        car, ending = self.car, self.stops.shutting_down
+        if self.model.link_open:
+            return f"NOT CONFIRMED: the gateway of {car} is shutting down and stops {car} itself. Look at the car."
+        then = (
+            "Its gateway is ending; a new one stops it (`fleet up`)"
+            if ending
+            else "It is stopped when its link is back"
+        )
+        return (
+            f"NOT STOPPED: {car} is unreachable ({self.model.link_reason}). "
+            f"If it was driving, it still is: go to the car. {then}."
+        )
 
     def _may_drive(self, command: Command, drive: Drive, now: float) -> bool:
         release = drive.motion is Motion.STOP

@@ -114,18 +114,21 @@ class StopExecutor:
         """Fail the commands of the running stop: the link is down."""
         self.renewal.suspend()
         running, self.running = self.running, None
-        words = f"{reason}. The gateway stops {self.model.name} when the link is back. Look whether it moves."
+        words = (
+            f"NOT CONFIRMED: {self.model.name} became unreachable during the stop ({reason}). Look at the car. "
+            "The gateway stops it as soon as the link is back."
+        )
         for pending in running.commands if running else ():
             self._log.record(pending, Phase.FAILED, now, reason=cause, words=words)
         if self.shutting_down and running is not None:
-            self._end_unstopped(f"cannot be reached ({reason})", now)
+            self._end_unstopped(f"is unreachable ({reason})", now)
 
     def shut_down(self, now: float) -> None:
         """Stop the car for the last time."""
         self.shutting_down = True
         self._shutdown_until = now + SHUTDOWN_S
         if not self.model.link_open:
-            self._end_unstopped(f"cannot be reached ({self.model.link_reason})", now)
+            self._end_unstopped(f"is unreachable ({self.model.link_reason})", now)
         elif not (self.model.at_rest and self.model.trust.shown) or self.running is not None:
             self.begin(self.full(now), FrameOrigin.SHUTDOWN, now)
 
@@ -148,7 +151,7 @@ class StopExecutor:
     def _end_unstopped(self, why: str, now: float) -> None:
         car = self.model.name
         self.not_stopped = why
-        self._log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at it.", now)
+        self._log.log(Level.ERROR, "not_stopped", f"{car} may still be moving: {car} {why}. Look at the car.", now)
 
     # ------------------------------------------------------------------ tries
 
@@ -200,7 +203,7 @@ class StopExecutor:
     def fail_late(self, running: StopInProgress, now: float) -> None:
         """Fail the commands that have waited too long for evidence. The stop goes on."""
         car = self.model.name
-        words = f"{car} has not shown that it stopped. The gateway goes on stopping it. Look whether it moves."
+        words = f"NOT CONFIRMED: {car} has not reacted to the stop yet. Look at the car. The gateway keeps stopping it."
         waiting: list[Pending] = []
         for pending in running.commands:
             if now < pending.received_at + running.timeout_s:
@@ -214,14 +217,14 @@ class StopExecutor:
                 self.model.learn(TrustEvent.NOT_SHOWN, now)
                 self._log.log(Level.ERROR, "not_shown", words, now)
             elif self.model.trust.state is not CarTrust.UNHEARD:
-                words = f"{car} was not heard since the stop began. The gateway goes on stopping it."
+                words = f"{car} may still be moving: silent since the stop began. The gateway keeps stopping it."
                 self.model.learn(TrustEvent.SILENT, now, words)
                 self._log.log(Level.WARNING, "unheard", words, now)
 
     def give_way(self, now: float) -> None:
         """End an overdue stop: a new drive takes its place."""
         running, self.running = self.running, None
-        words = f"{self.model.name} was driven before it showed that it stopped"
+        words = f"NOT CONFIRMED: {self.model.name} was driven again before it reacted to the stop"
         for pending in running.commands if running is not None else ():
             self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
 

@@ -112,7 +112,9 @@ def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() ->
     progress.give_up(104.0)
     assert progress.outcome is not None
     assert (progress.outcome.ok, progress.outcome.phase) == (False, "sent")
-    assert progress.outcome.words.startswith("its gateway went away, so whether red moves is not known")
+    assert progress.outcome.words.startswith(
+        "red may be moving and nothing can stop it from here: its gateway is gone."
+    )
 
 
 def test_a_drive_that_only_prolonged_another_is_over_when_its_time_is() -> None:

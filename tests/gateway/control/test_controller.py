@@ -675,8 +675,22 @@ def test_a_shutdown_without_a_link_is_over_at_once_and_says_that_nothing_was_sto
     assert desk.control.stops.finished
     desk.take()
     assert [(entry.code, entry.words) for entry in desk.logs] == [
-        ("not_stopped", "red may still be moving: red cannot be reached (unplugged). Look at it.")
+        ("not_stopped", "red may still be moving: red is unreachable (unplugged). Look at the car.")
     ]
+
+
+def test_a_stop_during_the_shutdown_says_who_stops_the_car(desk: Workbench) -> None:
+    desk.ask(Drive(Motion.FORWARD, 5.0))
+    desk.run(0.5)
+    desk.control.shut_down(desk.now)
+    assert desk.ask(Stop()).words == (
+        "NOT CONFIRMED: the gateway of red is shutting down and stops red itself. Look at the car."
+    )
+    desk.control.link_down("unplugged", desk.now)
+    assert desk.ask(Stop()).words == (
+        "NOT STOPPED: red is unreachable (unplugged). If it was driving, it still is: go to the car. "
+        "Its gateway is ending; a new one stops it (`fleet up`)."
+    )
 
 
 def test_a_shutdown_before_there_was_a_link_says_that_the_car_was_not_reached() -> None:

@@ -49,7 +49,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT)
     answer = desk.ask(EmergencyStop("smoke"), PERSON, identity="e1")
     assert answer.status is QUEUED
-    assert "latched as e1" in answer.words
+    assert answer.words == "e-stop e1 lasts until `fleet resume red --estops`"
     assert answer.worst_case_s > 0
     desk.run(600.0)
     assert desk.frames == [RUN, *SHOWN_STOP]
@@ -80,7 +80,10 @@ def test_an_e_stop_of_a_car_out_of_reach_is_latched_all_the_same(desk: Workbench
     desk.control.link_down("unplugged", desk.now)
     answer = desk.ask(EmergencyStop(), PERSON, identity="e1")
     assert (answer.status, answer.reason) == (REJECTED, Reason.LINK_DOWN)
-    assert "it is stopped first when its link is back (latched as e1" in answer.words
+    assert answer.words == (
+        "NOT STOPPED: red is unreachable (unplugged). If it was driving, it still is: go to the car. "
+        "It is stopped when its link is back. (e-stop e1 lasts until `fleet resume red --estops`)"
+    )
     desk.control.link_up(desk.now)
     desk.run(10.0)
     assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED

@@ -92,7 +92,7 @@ def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
     wire.stuck = True
     pair.until(lambda: pair.control.model.motors == "unknown", 6.0)
     answer = pair.ask(Stop(), identity="stop")
-    assert "was not heard for" in answer.words
+    assert answer.words.startswith("red may not get this stop: it has been silent for ")
     pair.until(lambda: pair.last_of("stop") is not None, ENDS_S)
     failed = pair.last_of("stop")
     assert failed is not None
@@ -174,6 +174,9 @@ def test_a_stop_that_is_lost_on_the_way_is_never_said_to_be_complete_and_goes_on
         last = pair.last_of("stop")
         assert last is not None
         assert (last.phase, last.reason) == (Phase.FAILED, Reason.NOT_SHOWN)
+        assert last.words.startswith("NOT CONFIRMED: red has not reacted to the stop yet. Look at the car.")
+        lost = next(log.words for log in pair.logs if log.code == "not_obeyed")
+        assert lost.startswith("red did not get a stop: its link loses commands")
         codes = [log.code for log in pair.logs]
         assert codes.count("not_obeyed") == codes.count("not_shown") == 1, "said once"
         assert (pair.control.model.motors, pair.control.model.basis) == ("unknown", None)
@@ -198,6 +201,10 @@ def test_a_deaf_car_is_told_for_ever_with_pauses_that_grow_to_ten_seconds_at_mos
     codes = [log.code for log in pair.logs]
     assert codes.count("not_obeyed") == codes.count("not_shown") == 1, "said once"
     assert len(pair.logs) < 5
+    assert next(log.words for log in pair.logs if log.code == "not_obeyed") == (
+        "red does not react to commands (readings arrive, stops do not work). Check the wire to its RX pin. "
+        "Until this clears, `fleet stop` cannot stop red."
+    )
 
 
 def test_a_deaf_car_that_somebody_drives_all_the_same_is_stopped_again_and_never_claimed() -> None:
