@@ -11,90 +11,140 @@ from typing import Final
 
 import click
 
+from fleet.commands.group import CommandGroup, connect_option, fleet_option
 from schemas.process import startup, stdio
 
 COMMANDS: Final = {
-    "up": ("fleet.commands.up:up", "Start a fleet from its file, or simulated cars, and keep it running."),
-    "down": ("fleet.commands.lifecycle:down", "End a fleet that is up: every car is stopped first."),
-    "status": ("fleet.commands.lifecycle:status", "Show the processes of a fleet that is up."),
-    "reload": ("fleet.commands.lifecycle:reload", "Read the fleet file of a fleet that is up again."),
-    "logs": ("fleet.commands.lifecycle:logs", "Show the log of a car's gateway."),
-    "list": ("fleet.commands.observe:list_cars", "List the cars on the bus with their states."),
-    "get": ("fleet.commands.observe:get", "Print the latest value of every matching reading, or its history."),
-    "watch": ("fleet.commands.observe:watch", "Print readings as they come, until Ctrl-C."),
-    "wait": ("fleet.commands.observe:wait", "Wait until a condition holds of a reading."),
-    "keys": ("fleet.commands.observe:list_keys", "List every key in use with type, unit, rate and age."),
-    "drive": ("fleet.commands.drive:drive", "Hold a motion for a time, then stop."),
-    "mode": ("fleet.commands.drive:mode", "Bring cars into a mode."),
-    "stop": ("fleet.commands.drive:stop", "Stop cars (all, if none is named) and hold them against the coordinator."),
-    "estop": ("fleet.commands.drive:estop", "Emergency stop of cars, or of the fleet."),
-    "resume": ("fleet.commands.drive:resume", "End the hold or the e-stops of cars."),
-    "led": ("fleet.commands.actuators:led", "Set the color LED."),
-    "light": ("fleet.commands.actuators:light", "Set the light."),
-    "servo": ("fleet.commands.actuators:servo", "Move a servo."),
-    "arm": ("fleet.commands.actuators:arm", "Move the arm's six joints."),
-    "whistle": ("fleet.commands.actuators:whistle", "Sound once."),
-    "speed": ("fleet.commands.actuators:speed", "Change the speed by one step."),
-    "fan": ("fleet.commands.actuators:fan", "Toggle the fan."),
-    "find": ("fleet.commands.actuators:find", "Make cars blink and beep, without moving."),
-    "coordinate": ("fleet.commands.coordinate:coordinate", "Keep a plan true: roles, rules, phases; until Ctrl-C."),
-    "why": ("fleet.commands.plan:why", "Explain the coordinator's last decisions and what would change them."),
-    "plan": ("fleet.commands.plan:plan", "Check a plan for parts that can never work, or restart the plan in force."),
-    "init": ("fleet.commands.fleet_file:init", "Write a fleet file: look for cars, ask for their names."),
-    "check": (
-        "fleet.commands.fleet_file:check",
-        "Check a fleet file and whether its cars' ports exist; opens none.",
-    ),
-    "bind": ("fleet.commands.bind:bind", "Find out which car is at which link: each blinks, you say which it was."),
-    "schema": ("fleet.commands.fleet_file:print_schema", "Print the JSON Schema of fleet files, for editors."),
-    "record": ("fleet.commands.record:record", "Record everything of the fleet to MCAP, until Ctrl-C."),
-    "mark": ("fleet.commands.record:mark", "Write a mark into the running recording."),
-    "sessions": ("fleet.commands.sessions:sessions", "List, verify, recover, cut and export recordings."),
-    "replay": ("fleet.commands.replay:replay", "Open a recorded session in Rerun, or play it on the bus again."),
-    "view": ("fleet.commands.view:view", "Show the fleet live in Rerun."),
-    "replan": ("fleet.commands.replan:replan", "Replay a session through a plan and list decisions that differ."),
-    "redecode": ("fleet.commands.redecode:redecode", "Decode a session's raw frames again and list differences."),
-    "demo": ("fleet.demo:demo", "Run a job with three simulated cars, record and check it."),
+    "Start here": {
+        "demo": ("fleet.demo:demo", "Three simulated cars do a job. No hardware needed."),
+        "scan": ("fleet.commands.gateway_tools:scan", "Look for cars on Bluetooth and serial ports."),
+        "init": ("fleet.commands.fleet_file:init", "Create fleet.yaml: find the cars and name them."),
+        "check": ("fleet.commands.fleet_file:check", "Check fleet.yaml and the ports of its cars for mistakes."),
+        "schema": ("fleet.commands.fleet_file:print_schema", "Print the JSON Schema of fleet files, for editors."),
+        "bind": (
+            "fleet.commands.bind:bind",
+            "Find out which car is which: each blinks, you type its name.",
+        ),
+    },
+    "Run a fleet": {
+        "up": ("fleet.commands.up:up", "Connect all cars, record, run the plan. Ctrl-C stops every car."),
+        "down": ("fleet.commands.lifecycle:down", "Stop every car and end `fleet up`."),
+        "list": (
+            "fleet.commands.observe:list_cars",
+            "The cars: link, mode, motion, who is in control, battery.",
+        ),
+        "status": ("fleet.commands.lifecycle:status", "Processes, session and hub at a glance."),
+        "reload": ("fleet.commands.lifecycle:reload", "Apply changes in fleet.yaml without a restart."),
+        "logs": ("fleet.commands.lifecycle:logs", "What a car's gateway or a service has logged."),
+        "sim": ("fleet.commands.gateway_tools:sim", "Simulated cars alone, with faults: test your own programs."),
+    },
+    "Drive": {
+        "drive": (
+            "fleet.commands.drive:drive",
+            "Move for a time, then stop: fleet drive red forward --for 2s",
+        ),
+        "mode": (
+            "fleet.commands.drive:mode",
+            "Let cars act by themselves: tracking, obstacle_avoidance, ...",
+        ),
+        "stop": (
+            "fleet.commands.drive:stop",
+            "Stop now (no name: all cars). The plan leaves them alone until `resume`.",
+        ),
+        "estop": (
+            "fleet.commands.drive:estop",
+            "Emergency stop: cars refuse everything until `resume --estops`.",
+        ),
+        "resume": ("fleet.commands.drive:resume", "Let the plan use stopped cars again."),
+        "identify": ("fleet.commands.actuators:identify", "Blink and beep, without moving."),
+    },
+    "Lights and parts": {
+        "light": ("fleet.commands.actuators:light", "Light up in a color: fleet light red cyan"),
+        "led": ("fleet.commands.actuators:led", "Set the color LED: fleet led red '#ff8000'"),
+        "whistle": ("fleet.commands.actuators:whistle", "Sound once."),
+        "servo": ("fleet.commands.actuators:servo", "Move a servo."),
+        "arm": ("fleet.commands.actuators:arm", "Move the six joints of the arm."),
+        "fan": ("fleet.commands.actuators:fan", "Switch the fan."),
+        "speed": ("fleet.commands.actuators:speed", "Go faster or slower by one step."),
+    },
+    "Sensors": {
+        "get": ("fleet.commands.observe:get", "Latest value, or history (--last, --since, --csv)."),
+        "watch": ("fleet.commands.observe:watch", "New values as they come (--when CONDITION)."),
+        "wait": ("fleet.commands.observe:wait", "Wait until a condition is true."),
+        "keys": (
+            "fleet.commands.observe:list_keys",
+            "Everything that is being published, with rate and age.",
+        ),
+    },
+    "Plans": {
+        "plan": ("fleet.commands.plan:plan", "What the cars do together: check, restart."),
+        "coordinate": ("fleet.commands.coordinate:coordinate", "Run a plan until Ctrl-C."),
+        "replan": ("fleet.commands.replan:replan", "Replay a session through a plan."),
+        "why": (
+            "fleet.commands.plan:why",
+            "Why a car does what it does, and what would change it.",
+        ),
+    },
+    "Sessions": {
+        "record": (
+            "fleet.commands.record:record",
+            "Record without `fleet up`; start and stop a session.",
+        ),
+        "mark": ("fleet.commands.record:mark", "Add a note to the session, now."),
+        "view": ("fleet.commands.view:view", "The fleet live in Rerun."),
+        "replay": ("fleet.commands.replay:replay", "A session in Rerun."),
+        "play": ("fleet.commands.play:play", "Publish a session again, for your own programs."),
+        "sessions": ("fleet.commands.sessions:sessions", "List, verify, repair, cut and export."),
+    },
 }
-"""Subcommands: function and line in `fleet --help`."""
+"""Subcommands by heading: function and line in `fleet --help`."""
 
+_FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (where, _) in section.items()}
 
 _PACKAGES: Final = {"rerun": "rerun-sdk", "rerun_cli": "rerun-sdk", "yaml": "pyyaml", "zenoh": "eclipse-zenoh"}
 """Packages by module, where the names differ."""
 
 
-class _Lazy(click.Group):
-    """A group whose commands are imported when they are called."""
+class _LazyGroup(CommandGroup):
+    """A group whose commands are imported when they are called, with a heading for each section of the table."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        return list(COMMANDS)
+        return list(_FUNCTIONS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
-        if cmd_name not in COMMANDS:
+        if cmd_name not in _FUNCTIONS:
             return None
-        module, _, name = COMMANDS[cmd_name][0].partition(":")
+        module, _, name = _FUNCTIONS[cmd_name].partition(":")
         command: click.Command = getattr(importlib.import_module(module), name)
         startup.interruptible()
         return command
 
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands first: they are what one looks for."""
+        self.format_commands(ctx, formatter)
+        click.Command.format_options(self, ctx, formatter)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's signature
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, words) for name, (_, words) in COMMANDS.items()])
+        width = max(map(len, _FUNCTIONS))
+        for section, commands in COMMANDS.items():
+            with formatter.section(section):
+                formatter.write_dl([(name.ljust(width), words) for name, (_, words) in commands.items()])
 
 
 @click.group(
-    cls=_Lazy,
-    epilog="""\b
-examples:
-  fleet list
-  fleet get red/sensor/range
-  fleet drive red,blue forward --for 2s
-  fleet stop
+    cls=_LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="""`fleet COMMAND --help` shows examples.
 
 Exit codes: 0 carried out, 1 not carried out, 2 wrong use, 130 Ctrl-C.""",
 )
-def cli() -> None:
-    """Drive, watch, record and replay a fleet of small robot cars."""
+@click.version_option(
+    package_name="zenoh-car-fleet", prog_name="fleet", message="%(prog)s %(version)s", help="Show the version."
+)
+@connect_option("The bus of the fleet. Also accepted after the command.")
+@fleet_option
+def cli(connect: str | None, fleet: str) -> None:
+    """Drive, watch and record small robot cars."""
 
 
 def main() -> None:

@@ -34,6 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="gateway", description="Connects one robot car to the Zenoh bus.", epilog=_EPILOG
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
     subparsers = {name: commands.add_parser(name, help=words) for name, (_, words) in COMMANDS.items()}
@@ -43,6 +44,16 @@ def main() -> None:
     command = importlib.import_module(COMMANDS[called][0])
     command.add_arguments(subparsers[called])
     sys.exit(command.run(_parse_arguments(parser)))
+
+
+class _Version(argparse.Action):
+    """Prints the version. Imports the metadata of packages only then: a gateway starts faster without them."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"gateway {version('zenoh-car-fleet')}\n")
+        parser.exit()
 
 
 def _parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:

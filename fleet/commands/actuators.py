@@ -1,4 +1,4 @@
-"""`fleet led, light, servo, arm, whistle, speed, fan, find`: actions of a car without a duration."""
+"""`fleet led, light, servo, arm, whistle, speed, fan, identify`: actions of a car without a duration."""
 
 import re
 from typing import Any, Final
@@ -164,10 +164,10 @@ def fan(client: Fleet, cars: tuple[str, ...], state: str | None, *, take: bool, 
     carry_out(client, fan_request(state), cars, take=take, as_json=as_json)
 
 
-@click.command(epilog="\b\nexample:\n  fleet find red")
+@click.command(epilog="\b\nexample:\n  fleet identify red")
 @cars_argument
 @json_option
 @with_client
-def find(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
+def identify(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
     """Make cars blink and beep, without moving."""
     carry_out(client, find_request(), cars, as_json=as_json)

@@ -12,6 +12,7 @@ import click
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
 from fleet.client.outcome import Outcome
+from fleet.commands.group import connect_option, fleet_option
 from schemas import keys
 from schemas.bus import BadEndpoint, BusError
 
@@ -27,10 +28,8 @@ json_option = click.option("--json", "as_json", is_flag=True, help="One JSON obj
 def bus_options(function: _Function) -> _Function:
     """Add --connect and --fleet. Errors of the bus and of names become one line."""
 
-    @click.option(
-        "--connect", metavar="ENDPOINT", help="The bus, tcp/HOST:PORT (default: FLEET_ENDPOINT, or loopback port 7447)."
-    )
-    @click.option("--fleet", default=keys.DEFAULT_FLEET, show_default=True, help="Name of the fleet.")
+    @connect_option()
+    @fleet_option
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> Any:
         with cli_errors():

@@ -1,14 +1,16 @@
-"""`fleet replay SESSION --to-bus`: plays a session on the bus."""
+"""`fleet play`: publishes a session again."""
 
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from fleet.commands.group import connect_option
+from fleet.commands.options import CarNames, cli_errors, from_option, to_option
 from schemas import keys
 from schemas.process import signals
 
@@ -19,49 +21,32 @@ if TYPE_CHECKING:
 PROGRESS_INTERVAL_S: Final = 0.5
 INITIAL_VALUES_NS: Final = 300_000_000_000
 """Time before the start from which latest values are loaded, such as a plan or a battery voltage."""
-_DEFAULTS: Final = {"name": None, "rate": 1.0, "loop": False, "offset": None, "skip_gaps": None, "connect": None}
-_ONLY: Final = {
-    "name": "--as",
-    "rate": "--rate",
-    "loop": "--loop",
-    "offset": "--offset",
-    "skip_gaps": "--skip-gaps",
-    "cars_only": "--cars-only",
-    "connect": "--connect",
-}
 
 
-def to_bus_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `to_bus`."""
-    for option in (
-        click.option(
-            "--connect", metavar="ENDPOINT", help="With --to-bus: the bus (default: FLEET_ENDPOINT, or loopback)."
-        ),
-        click.option(
-            "--cars-only", is_flag=True, help="Leave out the messages of coordinator, recorder and supervisor."
-        ),
-        click.option("--skip-gaps", metavar="TIME", help="Shorten longer pauses to this time, such as 5s."),
-        click.option("--offset", metavar="TIME", help="Start at this time; with --loop in the first round only."),
-        click.option("--loop", is_flag=True, help="Repeat until Ctrl-C."),
-        click.option("--rate", default=1.0, type=click.FloatRange(0.01, 1000.0), help="Speed factor."),
-        click.option(
-            "--as", "name", metavar="NAME", help="Name of the replayed fleet (default: the recorded name with -replay)."
-        ),
-        click.option("--to-bus", is_flag=True, help="Play it on the bus as a fleet of another name, until Ctrl-C."),
-    ):
-        function = option(function)
-    return function
+@click.command(
+    epilog="""\b
+examples:
+  fleet play sessions/20260314T151617Z-fleet
+  fleet play sessions/20260314T151617Z-fleet --as rehearsal --rate 4 --loop
+  fleet play sessions/20260314T151617Z-fleet --car red --from=-60s
 
-
-def refuse_without(options: dict[str, Any]) -> None:
-    """Reject options that need --to-bus."""
-    given = [_ONLY[name] for name, value in options.items() if value != _DEFAULTS.get(name, False)]
-    if given:
-        raise click.UsageError(f"{', '.join(given)}: only with --to-bus")
-
-
-def to_bus(
-    path: Path,
+Look at it with `fleet list --fleet fleet-replay`, or run your own program on it."""
+)
+@click.argument("session", type=click.Path(path_type=Path))
+@click.option("--car", "cars", type=CarNames(), default=(), help="Only these cars, and the services.")
+@from_option
+@to_option
+@click.option(
+    "--as", "name", metavar="NAME", help="Name of the replayed fleet (default: the recorded name with -replay)."
+)
+@click.option("--rate", default=1.0, type=click.FloatRange(0.01, 1000.0), metavar="FACTOR", help="Speed factor.")
+@click.option("--loop", is_flag=True, help="Repeat until Ctrl-C.")
+@click.option("--offset", metavar="TIME", help="Start at this time; with --loop in the first round only.")
+@click.option("--skip-gaps", metavar="TIME", help="Shorten longer pauses to this, such as 5s.")
+@click.option("--cars-only", is_flag=True, help="Leave out the messages of coordinator, recorder and supervisor.")
+@connect_option()
+def play(
+    session: Path,
     cars: tuple[str, ...],
     start: str | None,
     end: str | None,
@@ -74,8 +59,7 @@ def to_bus(
     cars_only: bool,
     connect: str | None,
 ) -> None:
-    """Play a session on the bus."""
-    from fleet.commands.options import cli_errors
+    """Publish SESSION again as a fleet of another name, with the original timing. No car moves."""
     from fleet.commands.sessions import part_of
     from fleet.recording import time_spec
     from fleet.recording.reading.session import NoSession, Session
@@ -88,9 +72,9 @@ def to_bus(
     signals.calls(stop.set)
     with cli_errors():
         try:
-            session = Session.open(path)
-            part = part_of(session, start, end, cars)
-            about = of_session(session)
+            found = Session.open(session)
+            part = part_of(found, start, end, cars)
+            about = of_session(found)
             begin_ns = about.start_ns if part.start_ns is None else part.start_ns
             end_ns = about.end_ns if part.end_ns is None else part.end_ns
             first_ns = begin_ns if offset is None else _time("--offset", offset, begin_ns, end_ns)
@@ -100,7 +84,7 @@ def to_bus(
             gap_ns = None if skip_gaps is None else _time("--skip-gaps", skip_gaps, 0, 0)
             if gap_ns is not None and gap_ns <= 0:
                 raise click.UsageError(f"--skip-gaps {skip_gaps}: a pause is longer than 0, as 5s")
-            fleets = _fleets(session, about)
+            fleets = _fleets(found, about)
             name = keys.check_name(name or f"{fleets[0]}-replay", "fleet name (--as)")
             if name in fleets:
                 raise click.UsageError(
@@ -110,31 +94,31 @@ def to_bus(
         except NoSession as error:
             raise click.ClickException(str(error)) from None
         if not any(keys.parse(key) for key in about.keys):
-            raise click.ClickException(f"{path} holds nothing that is a fleet's: no FLEET/CAR/... key")
+            raise click.ClickException(f"{session} holds nothing that is a fleet's: no FLEET/CAR/... key")
         expressions = _key_expressions(cars, cars_only=cars_only)
         there = cars or tuple(about.cars)
-        words = f"fleet {name} is a replay of {session.name}: nothing in it takes commands"
+        words = f"fleet {name} is a replay of {found.name}: nothing in it takes commands"
         schedule = Schedule(rate, gap_ns)
         with Bus.open(connect, start_hub=True) as bus:
             player = Player(bus, name, words, cars_only)
             try:
-                player.begin(session.name, there)
+                player.begin(found.name, there)
             except NameTaken as error:
                 raise click.UsageError(str(error)) from None
             click.echo(
-                f"{session.name} as fleet {name} at {bus.endpoint}, {rate:g} times as fast: "
+                f"{found.name} as fleet {name} at {bus.endpoint}, {rate:g} times as fast: "
                 f"{', '.join(there) or 'no car'}; Ctrl-C ends"
             )
-            player.remember(session.messages(expressions, first_ns - INITIAL_VALUES_NS, first_ns))
+            player.remember(found.messages(expressions, first_ns - INITIAL_VALUES_NS, first_ns))
             # The earliest time is not the first message's if the clock went back.
             from_ns = part.start_ns if offset is None else first_ns
             progress = _Progress((end_ns - begin_ns) / 1e9)
             origin_s = time.monotonic()
             while not stop.is_set():
-                recorded = session.messages(expressions, from_ns, part.end_ns)
+                recorded = found.messages(expressions, from_ns, part.end_ns)
                 player.play(_counted_from(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, progress)
                 if not player.published and not stop.is_set():
-                    raise click.ClickException(f"{path} holds nothing there that is published again")
+                    raise click.ClickException(f"{session} holds nothing there that is published again")
                 if not loop or stop.is_set():
                     break
                 schedule.again(LOOP_PAUSE_NS)
@@ -149,8 +133,8 @@ def to_bus(
     for note, count in notes.items():
         if count:
             click.echo(f"{count} {note}", err=True)
-    if session.damage:
-        click.echo(f"what is whole was published: {session.damage_words}", err=True)
+    if found.damage:
+        click.echo(f"what is whole was published: {found.damage_words}", err=True)
 
 
 def _counted_from(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:

@@ -12,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 from fleet.client.client import default_sender
+from fleet.commands.group import connect_option, fleet_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import DurationType
 from schemas import keys, messages
@@ -102,8 +103,8 @@ The quota does not remove marked sessions.""",
 )
 @click.option("--fleet-file", type=_FILE, help="Copy this file into the session as fleet.yaml.")
 @click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
-@click.option("--connect", metavar="ENDPOINT", help="The fleet's bus, e.g. tcp/127.0.0.1:7447.")
-@click.option("--fleet", default=keys.DEFAULT_FLEET, show_default=True, help="Name of the fleet.")
+@connect_option()
+@fleet_option
 @click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object per line: when ready, and at the end.")
 @click.pass_context

@@ -1,4 +1,4 @@
-"""`fleet redecode` and `fleet sessions vector`: decodes recorded frames again, and cuts test vectors."""
+"""`fleet sessions redecode` and `fleet sessions vector`: decodes recorded frames again, and cuts test vectors."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 @click.command(
     epilog="""\b
 examples:
-  fleet redecode sessions/20260314T151617Z-fleet
-  fleet redecode tests/vectors/recorded/tracking.jsonl
+  fleet sessions redecode sessions/20260314T151617Z-fleet
+  fleet sessions redecode tests/vectors/recorded/tracking.jsonl
 Exit codes: 0 no difference, 1 some, or nothing to decode."""
 )
 @click.argument("session", type=click.Path(path_type=Path))
@@ -62,7 +62,7 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
 
 
 class _RedecodeReport:
-    """One run of `fleet redecode`: the source of the frames, and the result."""
+    """One run of `fleet sessions redecode`: the source of the frames, and the result."""
 
     def __init__(self, path: Path, cars: tuple[str, ...], platform: str | None) -> None:
         from fleet.replay.analysis.recorded_frames import SkippedMessages
@@ -190,7 +190,7 @@ example:
 def vector(session: Path, car: str, start: str | None, end: str | None, out: Path, source: str | None) -> None:
     """Write a stretch of SESSION as a test vector: raw frames with their times, and what they are decoded to.
 
-    `fleet redecode FILE.jsonl` holds it against today's decoder; tests/vectors/recorded has some.
+    `fleet sessions redecode FILE.jsonl` holds it against today's decoder; tests/vectors/recorded has some.
     """
     from fleet.commands.sessions import part_of
     from fleet.recording.reading.session import NoSession, Session

@@ -6,14 +6,12 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from fleet.commands.options import CarNames, from_option
+from fleet.commands.options import CarNames, from_option, to_option
 from fleet.commands.output import progress_bar
-from fleet.commands.play import refuse_without, to_bus_options
-from fleet.commands.play import to_bus as play_to_bus
 from schemas.process import startup
 
 if TYPE_CHECKING:
@@ -25,37 +23,26 @@ if TYPE_CHECKING:
     epilog="""\b
 examples:
   fleet replay sessions/20260314T151617Z-fleet
-  fleet replay sessions/20260314T151617Z-fleet --car red --from=-60s --save red.rrd
-  fleet replay sessions/20260314T151617Z-fleet --to-bus --as rehearsal --rate 4 --loop"""
+  fleet replay sessions/20260314T151617Z-fleet --car red --from=-60s --save red.rrd"""
 )
 @click.argument("session", type=click.Path(path_type=Path))
-@click.option("--car", "--cars", "cars", type=CarNames(), default=(), help="Only these cars, and the services.")
+@click.option("--car", "cars", type=CarNames(), default=(), help="Only these cars, and the services.")
 @from_option
-@click.option("--to", "end", metavar="TIME", help="Likewise; messages from then on are left out.")
+@to_option
 @click.option(
     "--save",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="OUT.rrd",
     help="Write a file that carries its layout instead of opening the viewer: `rerun OUT.rrd` shows it.",
 )
-@to_bus_options
 def replay(
     session: Path,
     cars: tuple[str, ...],
     start: str | None,
     end: str | None,
     save: Path | None,
-    *,
-    to_bus: bool,
-    **bus_options: Any,
 ) -> None:
-    """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun, or play it on the bus again."""
-    if to_bus:
-        if save is not None:
-            raise click.UsageError("--save and --to-bus: give one of them")
-        play_to_bus(session, cars, start, end, **bus_options)
-        return
-    refuse_without(bus_options)
+    """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun."""
     from fleet.recording.reading.session import NoSession, Session
     from fleet.replay.rerun.viewer import has_display
 

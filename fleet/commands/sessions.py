@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
+from fleet.commands.group import CommandGroup, did_you_mean
 from fleet.commands.options import CarNames, from_option, json_option, to_option
 from fleet.commands.output import progress_bar
-from fleet.commands.redecode import vector
+from fleet.commands.redecode import redecode, vector
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
@@ -22,13 +23,16 @@ _PROGRESS_STEP: Final = 1024
 T = TypeVar("T")
 
 
-class _DefaultCommandGroup(click.Group):
+class _DefaultCommandGroup(CommandGroup):
     """A group for which `fleet sessions` and `fleet sessions DIR` mean `fleet sessions list`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        if not args or (args[0] not in self.commands and args[0] != "--help"):
+        if not args or not (args[0] in {*self.commands, "-h", "--help"} or self._is_misspelled(args[0])):
             args = ["list", *args]
         return super().parse_args(ctx, args)
+
+    def _is_misspelled(self, word: str) -> bool:
+        return bool(did_you_mean(word, self.commands)) and not Path(word).exists()
 
 
 @click.group(
@@ -45,6 +49,7 @@ def sessions() -> None:
     """List, inspect, verify, recover, cut and export recordings. Without a command, list those of a directory."""
 
 
+sessions.add_command(redecode)
 sessions.add_command(vector)
 
 session_argument = click.argument("session", type=click.Path(path_type=Path))

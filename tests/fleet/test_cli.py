@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from fleet import cli
 from tests.fleet.conftest import Cars, running
@@ -59,7 +60,9 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ("frob", "No such command 'frob'. (see fleet --help)"),
+        ("frob", 'There is no command "frob". (see fleet --help)'),
+        ("drvie red forward", 'There is no command "drvie". Did you mean drive? (see fleet --help)'),
+        ("sessions vrify", 'There is no command "vrify". Did you mean verify? (see fleet sessions --help)'),
         ("drive", "Missing argument 'CAR[,CAR...]'. (see fleet drive --help)"),
         ("drive red", "Missing argument"),
         ("drive red up", "'up' is not one of 'stop', 'forward'"),
@@ -143,11 +146,12 @@ def test_a_fifo_as_a_file_is_refused_and_not_waited_for(
     assert f"{tmp_path / 'fifo'}:1:1: is a FIFO, not a file" in capsys.readouterr().err
 
 
-OF_FILES = ("init", "check", "bind", "schema", "plan", "sessions", "replay", "replan", "redecode")
+OF_FILES = ("scan", "sim", "init", "check", "bind", "schema", "plan", "sessions", "replay", "play", "replan")
 """Subcommands that look at no bus, or at that of the file."""
+NAMES = [name for section in cli.COMMANDS.values() for name in section]
 
 
-@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if name not in ("demo", "record")])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("demo", "record")])
 def test_every_help_has_an_example(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,13 +166,29 @@ def test_every_help_has_an_example(
         assert "--fleet" in said
 
 
-@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if name not in ("demo", "record")])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("demo", "record")])
 def test_every_help_of_a_commands_commands_has_an_example(name: str) -> None:
     context = click.Context(cli.cli)
     command = cli.cli.get_command(context, name)
     assert command is not None
     for sub, each in getattr(command, "commands", {}).items():
         assert f"  fleet {name} {sub}" in (each.epilog or ""), sub
+
+
+@pytest.mark.parametrize(("before", "after"), [("-e", ""), ("--endpoint", ""), ("", "--connect"), ("--connect", "-e")])
+def test_the_bus_may_be_named_before_and_after_the_command(before: str, after: str) -> None:
+    nowhere, endpoint = free_endpoint(), free_endpoint()
+    group = [before, nowhere if after else endpoint] if before else []
+    result = CliRunner().invoke(cli.cli, [*group, "--fleet", "lab", "list", *([after, endpoint] if after else [])])
+    assert result.exit_code == 1
+    assert endpoint in result.output
+
+
+def test_both_programs_tell_their_version_and_help() -> None:
+    for program in ("fleet", "gateway"):
+        for option, words in (("--version", f"{program} 0."), ("-h", "sage: ")):
+            done = subprocess.run([sys.executable, "-m", program, option], capture_output=True, text=True, check=True)
+            assert words in done.stdout
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -180,7 +200,8 @@ def test_help_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == "[]\n"
-    assert all(f"  {name} " in done.stdout for name in cli.COMMANDS)
+    assert all(f"  {name} " in done.stdout for name in NAMES)
+    assert all(f"{section}:\n" in done.stdout for section in cli.COMMANDS)
 
 
 def test_no_fleet_running_is_a_failure_that_says_what_to_do() -> None:

@@ -108,10 +108,12 @@ def test_a_session_says_what_is_otherwise_and_a_vector_of_it_says_the_same(tmp_p
     """The made session's line readings are not those of its frames, but for one frame here and there."""
     session = tmp_path / "made.mcap"
     make(session, seconds=12)
-    result = run("redecode", session)
+    result = run("sessions", "redecode", session)
     assert result.exit_code == 1
     assert "+4.000s $4WD,CSB0,PV8,GS0,LF0110,HW00,GM00#: sensor/line " not in result.output.splitlines()[0]
-    lines = [json.loads(line) for line in run("redecode", session, "--json", "--car", "red").output.splitlines()]
+    lines = [
+        json.loads(line) for line in run("sessions", "redecode", session, "--json", "--car", "red").output.splitlines()
+    ]
     summary = lines.pop()
     assert summary["frames"] == 40
     assert summary["readings"] == 40
@@ -121,7 +123,7 @@ def test_a_session_says_what_is_otherwise_and_a_vector_of_it_says_the_same(tmp_p
 
     out = tmp_path / "v.jsonl"
     assert run("sessions", "vector", session, "--car", "red", "--from", "5s", "--to", "7s", "--out", out).exit_code == 0
-    of_it = [json.loads(line) for line in run("redecode", out, "--json").output.splitlines()]
+    of_it = [json.loads(line) for line in run("sessions", "redecode", out, "--json").output.splitlines()]
     assert of_it[-1]["frames"] == 20
     within = [each for each in lines if 5 <= each["at_s"] < 7]
     assert [(each["what"], round(each["at_s"], 3)) for each in of_it[:-1]] == [
@@ -133,7 +135,7 @@ def test_a_session_that_was_cut_off_is_decoded_as_far_as_it_goes(tmp_path: Path)
     session = tmp_path / "made.mcap"
     make(session)
     session.write_bytes(session.read_bytes()[:-9000])
-    result = run("redecode", session, "--json")
+    result = run("sessions", "redecode", session, "--json")
     summary = json.loads(result.output.splitlines()[-1])
     assert result.exit_code == 1  # its readings differ
     assert "made.mcap" in summary["damage"]
@@ -150,8 +152,8 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     made.put("fleet/@coordinator/plan", pb.Plan(text="cars: {red: manual}"), 1.0)
     made.put("fleet/red/state/mode", pb.Mode(asked="manual"), 1.0)
     made.close()
-    assert "holds no raw frames" in run("redecode", no_frames).output
-    assert "there are red" in run("redecode", no_frames, "--car", "blue").output
+    assert "holds no raw frames" in run("sessions", "redecode", no_frames).output
+    assert "there are red" in run("sessions", "redecode", no_frames, "--car", "blue").output
     assert (
         "holds no raw frames of red there"
         in run("sessions", "vector", no_frames, "--car", "red", "--out", tmp_path / "x.jsonl").output
@@ -163,9 +165,9 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     made.close()
     assert (
         "does not say what red was treated as (no state/health of it): give --platform"
-        in run("redecode", unknown).output
+        in run("sessions", "redecode", unknown).output
     )
-    result = run("redecode", unknown, "--platform", "arduino")
+    result = run("sessions", "redecode", unknown, "--platform", "arduino")
     assert result.exit_code == 0
     assert "1 readings were published and are not in the recording" in result.output
 
@@ -175,9 +177,9 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
         writer.start()
         writer.add_message(writer.register_channel("/odom", "json", 0), 5, b"{}", 5)
         writer.finish()
-    assert "holds no raw frames" in run("redecode", foreign).output
-    assert run("redecode", tmp_path / "none").exit_code == 1
-    assert run("redecode", unknown, "--platform", "tank").exit_code == 2
+    assert "holds no raw frames" in run("sessions", "redecode", foreign).output
+    assert run("sessions", "redecode", tmp_path / "none").exit_code == 1
+    assert run("sessions", "redecode", unknown, "--platform", "tank").exit_code == 2
 
     for text, words in (
         ("", "is no vector"),
@@ -190,7 +192,7 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     ):
         path = tmp_path / "bad.jsonl"
         path.write_text(text)
-        result = run("redecode", path)
+        result = run("sessions", "redecode", path)
         assert result.exit_code == 1
         assert words in result.output
     path = tmp_path / "there.jsonl"

@@ -126,7 +126,7 @@ def test_another_plan_shows_where_and_why(recorded: Path, tmp_path: Path) -> Non
 
 
 def test_its_frames_are_decoded_as_they_were(recorded: Path) -> None:
-    result = run("redecode", recorded)
+    result = run("sessions", "redecode", recorded)
     assert result.exit_code == 0, result.output
 
 

@@ -55,7 +55,7 @@ def session(tmp_path: Path) -> Path:
 
 
 def play(fleet: FleetProcesses, session: Path, *more: str) -> GatewayProcess:
-    return fleet.start("-m", "fleet.cli", "replay", str(session), "--to-bus", *more)
+    return fleet.start("-m", "fleet.cli", "play", str(session), *more)
 
 
 def test_a_schedule_has_one_origin() -> None:
@@ -239,7 +239,7 @@ def test_a_hub_that_is_killed_is_replaced(fleet: FleetProcesses, session: Path) 
         (("--offset", "9h"), "is not within what is played"),
         (("--skip-gaps", "soon"), "--skip-gaps: 'soon' is not a time"),
         (("--skip-gaps", "0s"), "a pause is longer than 0"),
-        (("--save", "x.rrd"), "--save and --to-bus: give one of them"),
+        (("--save", "x.rrd"), "--save"),
         (("--rate", "0"), "--rate"),
         (("--car", "nobody"), "nobody is not in"),
     ],
@@ -251,9 +251,3 @@ def test_wrong_use_is_told_in_a_line(
     assert player.wait() == 2
     assert words in player.stderr
     assert len(player.stderr.splitlines()) == 1
-
-
-def test_its_options_are_for_it_only(fleet: FleetProcesses, session: Path) -> None:
-    process = fleet.start("-m", "fleet.cli", "replay", str(session), "--loop", "--as", "again")
-    assert process.wait() == 2
-    assert "--as, --loop: only with --to-bus" in process.stderr or "--loop, --as: only" in process.stderr

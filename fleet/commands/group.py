@@ -1,0 +1,52 @@
+"""What the group of commands and the commands share. Imports neither a command nor the bus, so that help is fast."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+from schemas.keys import DEFAULT_FLEET
+
+_Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+def did_you_mean(wrong: str, names: Iterable[str]) -> str:
+    """Return a question with the likely name. Empty if no name is near."""
+    import difflib
+
+    near = difflib.get_close_matches(wrong.lower(), list(names), n=1)
+    return f"Did you mean {near[0]}?" if near else ""
+
+
+class CommandGroup(click.Group):
+    """A group that proposes the likely command after a typing error."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that the arguments name. Fail with the likely name."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.exceptions.NoSuchCommand:
+            near = did_you_mean(args[0], self.list_commands(ctx))
+            raise click.UsageError(f'There is no command "{args[0]}". {near}'.rstrip(), ctx) from None
+
+
+def _from_group(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+    """Return the value of the option, or the value that was given before the command: `fleet -e ENDPOINT list`."""
+    name = param.name or ""
+    at = ctx
+    while at.parent is not None and at.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
+        at = at.parent
+    return value if at is ctx or at.get_parameter_source(name) is not ParameterSource.COMMANDLINE else at.params[name]
+
+
+def connect_option(words: str = "The bus, tcp/HOST:PORT (default: FLEET_ENDPOINT, or port 7447).") -> _Decorator:
+    """Return the option --connect with this help."""
+    return click.option("-e", "--connect", "--endpoint", metavar="ENDPOINT", callback=_from_group, help=words)
+
+
+fleet_option = click.option(
+    "--fleet", metavar="NAME", default=DEFAULT_FLEET, show_default=True, callback=_from_group, help="Name of the fleet."
+)
