@@ -19,6 +19,7 @@ COMMANDS: Final = {
         "demo": ("fleet.demo:demo", "Three simulated cars do a job. No hardware needed."),
         "scan": ("fleet.commands.gateway_tools:scan", "Look for cars on Bluetooth and serial ports."),
         "init": ("fleet.commands.fleet_file:init", "Create fleet.yaml: find the cars and name them."),
+        "example": ("fleet.commands.example:example", "Fleet files, plans, worlds and programs to start from."),
         "check": ("fleet.commands.fleet_file:check", "Check fleet.yaml and the ports of its cars for mistakes."),
         "schema": ("fleet.commands.fleet_file:print_schema", "Print the JSON Schema of fleet files, for editors."),
         "bind": (

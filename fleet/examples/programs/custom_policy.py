@@ -1,6 +1,6 @@
-"""A custom policy: the car with most room ahead avoids obstacles, the others rest; 3 rounds of 5 s.
+"""Let the car with most room ahead avoid obstacles.
 
-`python -m fleet.examples.programs.custom_policy`
+The others rest; three rounds of 5 s: `python -m fleet.examples.programs.custom_policy`.
 """
 
 import time

@@ -1,4 +1,7 @@
-"""Drive one car in a square: `python -m fleet.examples.programs.drive_one red`."""
+"""Drive one car in a square.
+
+`python -m fleet.examples.programs.drive_one red`
+"""
 
 import sys
 

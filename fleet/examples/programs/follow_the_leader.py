@@ -1,4 +1,7 @@
-"""A car does what another does, until Ctrl-C: `python -m fleet.examples.programs.follow_the_leader red blue`."""
+"""Let a car do what another does, until Ctrl-C.
+
+`python -m fleet.examples.programs.follow_the_leader red blue`
+"""
 
 import asyncio
 import sys

@@ -1,4 +1,7 @@
-"""Read every car: the latest values, then 20 readings as they come: `python -m fleet.examples.programs.read_all`."""
+"""Read every car: the latest values, then 20 readings.
+
+`python -m fleet.examples.programs.read_all`
+"""
 
 from itertools import islice
 

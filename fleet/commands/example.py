@@ -1,0 +1,111 @@
+"""`fleet example list | show | copy`: the programs, fleet files, plans and worlds that come with the package."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from click.shell_completion import CompletionItem
+
+from fleet.commands.group import CommandGroup
+from fleet.commands.options import json_option
+from fleet.commands.output import show_table
+from fleet.examples import EXAMPLES
+from schemas.yaml_document.messages import suggest
+
+_KINDS: Final = ("programs", "fleets", "plans", "worlds")
+_SUFFIXES: Final = (".py", ".ipynb", ".yaml")
+# A fleet file names its plan and world in the folders beside its own. All copies lie in one folder.
+_OTHER_FILE: Final = re.compile(r"\.\./((?:plans|worlds)/[\w.-]+\.yaml)")
+
+
+def examples() -> dict[str, Path]:
+    """Return the examples by name: the name of the file without its suffix."""
+    files = (path for kind in _KINDS for path in sorted((EXAMPLES / kind).iterdir()))
+    return {path.stem: path for path in files if path.suffix in _SUFFIXES and path.name != "__init__.py"}
+
+
+def summary(path: Path) -> str:
+    """Return the first line of an example, which describes it."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".ipynb":
+        text = "".join(json.loads(text)["cells"][0]["source"])
+    lines = (line for line in text.splitlines() if not line.startswith("# yaml-language-server"))
+    return next(lines).strip('#". ')
+
+
+class ExampleName(click.ParamType[Path]):
+    """The name of an example: `1-patrol`, or the file's: `1-patrol.yaml`, `plans/1-patrol.yaml`."""
+
+    name = "NAME"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the path of the example. Fail with the likely name if there is none."""
+        if isinstance(value, Path):
+            return value
+        known = examples()
+        name = Path(str(value)).stem
+        if name not in known:
+            near = suggest(name, known) or "; `fleet example list` shows all"
+            self.fail(f"there is no example {name!r}{near}", param, ctx)
+        return known[name]
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's signature
+        """Complete the name."""
+        return [CompletionItem(name) for name in examples() if name.startswith(incomplete)]
+
+
+name_argument = click.argument("path", type=ExampleName(), metavar="NAME")
+
+
+@click.group(
+    cls=CommandGroup,
+    epilog="\b\nexamples:\n  fleet example list\n  fleet example show 1-patrol\n  fleet example copy 1-patrol",
+)
+def example() -> None:
+    """Show and copy example programs, fleet files, plans and worlds."""
+
+
+@example.command("list", epilog="\b\nexamples:\n  fleet example list\n  fleet example list --json")
+@json_option
+def list_examples(*, as_json: bool) -> None:
+    """List the examples with their kind."""
+    rows = [
+        {"name": name, "kind": path.parent.name.removesuffix("s"), "about": summary(path)}
+        for name, path in examples().items()
+    ]
+    if as_json:
+        for row, path in zip(rows, examples().values(), strict=True):
+            click.echo(json.dumps({**row, "file": str(path)}))
+    else:
+        show_table(("name", "kind", "about"), rows)
+
+
+@example.command(epilog="\b\nexample:\n  fleet example show 1-patrol")
+@name_argument
+def show(path: Path) -> None:
+    """Print an example."""
+    click.echo(path.read_text(encoding="utf-8"), nl=False)
+
+
+@example.command(epilog="\b\nexamples:\n  fleet example copy 1-patrol\n  fleet example copy sim lab --force")
+@name_argument
+@click.argument("directory", default=Path(), type=click.Path(path_type=Path, file_okay=False), metavar="[DIR]")
+@click.option("--force", is_flag=True, help="Overwrite existing files.")
+def copy(path: Path, directory: Path, *, force: bool) -> None:
+    """Copy an example into DIR (default: here), with the plan and the world that a fleet file names."""
+    text = path.read_text(encoding="utf-8")
+    copies = {directory / path.name: _OTHER_FILE.sub(lambda match: Path(match[1]).name, text)}
+    for other in _OTHER_FILE.findall(text) if path.parent.name == "fleets" else ():
+        copies[directory / Path(other).name] = (EXAMPLES / other).read_text(encoding="utf-8")
+    for target in copies:
+        if target.exists() and not force:
+            raise click.UsageError(f"{target} exists already: give --force to overwrite it, or another directory")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for target, content in copies.items():
+            target.write_text(content, encoding="utf-8")
+            click.echo(f"wrote {target}")
+    except OSError as error:
+        raise click.ClickException(f"{error.filename} cannot be written: {error.strerror}") from None
