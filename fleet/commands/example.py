@@ -8,11 +8,10 @@ from typing import Any, Final
 import click
 from click.shell_completion import CompletionItem
 
-from fleet.commands.group import CommandGroup
+from fleet.commands.group import CommandGroup, did_you_mean
 from fleet.commands.options import json_option
 from fleet.commands.output import show_table
 from fleet.examples import EXAMPLES
-from schemas.yaml_document.messages import suggest
 
 _KINDS: Final = ("programs", "fleets", "plans", "worlds")
 _SUFFIXES: Final = (".py", ".ipynb", ".yaml")
@@ -40,15 +39,15 @@ class ExampleName(click.ParamType[Path]):
 
     name = "NAME"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:  # noqa: ARG002 - click's signature
         """Return the path of the example. Fail with the likely name if there is none."""
         if isinstance(value, Path):
             return value
         known = examples()
         name = Path(str(value)).stem
         if name not in known:
-            near = suggest(name, known) or "; `fleet example list` shows all"
-            self.fail(f"there is no example {name!r}{near}", param, ctx)
+            near = did_you_mean(name, known) or "`fleet example list` shows all."
+            raise click.UsageError(f'There is no example "{name}". {near}', ctx)
         return known[name]
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's signature

@@ -146,7 +146,7 @@ def test_a_fifo_as_a_file_is_refused_and_not_waited_for(
     assert f"{tmp_path / 'fifo'}:1:1: is a FIFO, not a file" in capsys.readouterr().err
 
 
-OF_FILES = ("scan", "sim", "init", "check", "bind", "schema", "plan", "sessions", "replay", "play", "replan")
+OF_FILES = ("scan", "sim", "example", "init", "check", "bind", "schema", "plan", "sessions", "replay", "play", "replan")
 """Subcommands that look at no bus, or at that of the file."""
 NAMES = [name for section in cli.COMMANDS.values() for name in section]
 

@@ -55,7 +55,7 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
 def test_wrong_names_and_places(tmp_path: Path) -> None:
     done = fleet("example", "show", "patrol")
     assert done.returncode == 2
-    assert "did you mean '1-patrol'?" in done.stderr
+    assert done.stderr.startswith('fleet: There is no example "patrol". Did you mean 1-patrol?')
     assert "`fleet example list` shows all" in fleet("example", "copy", "xyz").stderr
     (tmp_path / "file").touch()
     done = fleet("example", "copy", "room", "file/lab", cwd=tmp_path)
