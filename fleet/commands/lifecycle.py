@@ -151,7 +151,8 @@ def _directory(connect: str | None, fleet: str) -> Path:
     except BusError:
         pass  # nothing is up: the logs are files
     place = runs_directory(fleet, resolve_endpoint(connect))
-    newest = sorted(each for each in place.iterdir() if each.is_dir()) if place.is_dir() else []
+    # A run that was refused has no logs.
+    newest = sorted(each for each in place.iterdir() if any(each.glob("*.log"))) if place.is_dir() else []
     if not newest:
         raise click.ClickException(f"fleet {fleet} has never been up here: there is nothing in {place}")
     return newest[-1]

@@ -17,6 +17,7 @@ from fleet.client.wait import NotInTime
 from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.output import json_text, line, show_table
 from fleet.commands.params import DurationType, describe_available, warn_if_missing, written_out
+from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
 from schemas.bus import Sample, intersects
@@ -297,29 +298,50 @@ def _cells(alive: KeyInfo) -> dict[str, str]:
 @click.command(
     epilog="\b\nexamples:\n  fleet wait red/sensor/range 'range_m < 0.3' --timeout 10s\n"
     "  fleet wait '*/sensor/light' 'left or right' --for 2s\n"
-    "  fleet wait red/state/link \"state == 'online'\" --timeout 1m && fleet drive red forward\n\n\b\n"
-    "Exit codes: 0 it holds, 1 time-out or no fleet, 2 wrong use, 130 Ctrl-C."
+    "  fleet wait red/state/link \"state == 'online'\" --timeout 1m && fleet drive red forward\n"
+    "  fleet wait --ready && fleet drive all forward\n\n\b\n"
+    "Exit codes: 0 it is true, 1 time-out or no fleet, 2 wrong use, 130 Ctrl-C."
 )
-@click.argument("keyexpr")
-@click.argument("condition", metavar="CONDITION")
-@click.option("--timeout", "timeout_s", type=DurationType(_DAY_S), help="Give up after this time (default: never).")
-@click.option("--for", "for_s", type=DurationType(_DAY_S), help="Minimum time for which the condition must hold.")
+@click.argument("words", nargs=-1, metavar="KEY CONDITION | --ready [CAR...]")
+@click.option("--ready", is_flag=True, help="Wait until these cars are ready, or all cars, recorder and plan.")
+@click.option(
+    "--timeout",
+    "timeout_s",
+    type=DurationType(_DAY_S),
+    help=f"Give up after this time (default: never; with --ready: {READY_WAIT_S:g}s).",
+)
+@click.option(
+    "--for",
+    "for_s",
+    type=DurationType(_DAY_S),
+    help="Minimum time for which the condition must be true. With --ready: the same as --timeout.",
+)
 @json_option
 @bus_options
 def wait(
-    keyexpr: str,
-    condition: str,
+    words: tuple[str, ...],
     *,
+    ready: bool,
     timeout_s: float | None,
     for_s: float | None,
     as_json: bool,
     connect: str | None,
     fleet: str,
 ) -> None:
-    """Wait until CONDITION holds of a fresh reading of KEYEXPR, and print that reading. The current one counts.
+    """Wait until CONDITION is true for KEY and print the reading. A current reading counts if it is fresh.
 
-    With a wildcard any key will do. CONDITION is as in `fleet watch --when`.
+    With a wildcard any key will do. CONDITION is as in `fleet watch --when`. With --ready, wait for cars instead: a car
+    is ready when its link is open and the state of its motors is known.
     """
+    if ready:
+        cars = [car for word in words for car in word.split(",") if car != "all"]
+        for name in (fleet, *cars):
+            keys.check_name(name)
+        wait_ready(connect, fleet, cars, timeout_s or for_s or READY_WAIT_S, as_json=as_json)
+        return
+    if len(words) != 2:
+        raise click.UsageError("give a KEY and one CONDITION in quotes, as: red/sensor/range 'range_m < 0.3'")
+    keyexpr, condition = words
     written = written_out(keyexpr, fleet)
     KeyCondition.of(condition, written)
     if for_s is not None and timeout_s is not None and for_s >= timeout_s:

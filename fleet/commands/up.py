@@ -1,12 +1,13 @@
-"""`fleet up`: runs the supervisor of a fleet from its file, or of simulated cars, until Ctrl-C."""
+"""`fleet up`: runs the supervisor of a fleet from its file, or of simulated cars, until Ctrl-C or detached."""
 
 import asyncio
 import json
 import os
 import signal
 import stat
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,10 +22,10 @@ from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.supervisor.service import AnotherSupervisor
 from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, build_spec, coordinator_fleet_file
-from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, Supervisor, SupervisorEvent
+from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Supervisor, SupervisorEvent
 from schemas import keys
 from schemas.bus import accepts, check_listening, resolve_endpoint
-from schemas.process import signals
+from schemas.process import signals, startup
 from schemas.yaml_document.document import BadFile, read_text
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
@@ -37,10 +38,16 @@ examples:
   fleet up
   fleet up lab.yaml --plan plan.yaml
   fleet up --sim 8
+  fleet up --detach && fleet drive red forward --for 1s; fleet down
 
-Without FILE and --sim it takes ./fleet.yaml. With --sim and --json, lines on stdin go to the simulator (gateway sim
---help). If a car cannot be stopped at the end, fresh gateways try again until the next Ctrl-C.
-Exit codes: 0 every car was stopped, 1 one was not or nothing came up, 2 wrong use."""
+Without FILE and --sim it takes ./fleet.yaml. The start ends with one line: all cars are ready, or who is missing and
+why. With --sim and --json, lines on stdin go to the simulator (gateway sim --help). If a car cannot be stopped at the
+end, fresh gateways try again until the next Ctrl-C.
+
+--detach returns when all cars are ready, or when no further car has become ready for 30 s (10 s if only links cannot be
+opened). The fleet runs on in both cases: `fleet logs supervisor` shows its log, `fleet down` ends it.
+
+Exit codes: 0 every car was stopped (--detach: all are ready), 1 one was not or nothing came up, 2 wrong use."""
 )
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--sim", "simulated", type=click.IntRange(1, MAX_SIMULATED_CARS), metavar="N",
@@ -63,6 +70,8 @@ Exit codes: 0 every car was stopped, 1 one was not or nothing came up, 2 wrong u
 )
 @click.option("--fleet", help="Name of the fleet (default: the file's, or fleet).")
 @click.option("--insecure-lan", is_flag=True, help="Open the bus to a network: everyone there can drive the cars.")
+@click.option("--detach", is_flag=True, help="Return when the cars are ready. The fleet runs until `fleet down`.")
+@click.option("--detached", is_flag=True, hidden=True, help="Run as the process that --detach has started.")
 def up(
     file: Path | None,
     simulated: int | None,
@@ -75,6 +84,8 @@ def up(
     connect: str | None,
     fleet: str | None,
     insecure_lan: bool,
+    detach: bool,
+    detached: bool,
 ) -> None:
     """Start all processes of a fleet, show its cars, restart crashed processes. Ctrl-C stops every car, then exits."""
     if file is None and simulated is None:
@@ -83,6 +94,8 @@ def up(
                 "there is no fleet.yaml here: name a file, make one with fleet init, or give --sim 3"
             )
         file = DEFAULT_FILE
+    if detach:
+        raise SystemExit(_run_detached(_own_arguments(), as_json=as_json))
     options = UpOptions(simulated or 0, plan, world, record, out, connect, fleet, insecure_lan)
     with cli_errors():
         if fleet is not None:
@@ -96,7 +109,7 @@ def up(
         if not accepts(endpoint):  # the hub will be ours
             check_listening(endpoint, insecure_lan=insecure_lan)
         try:
-            stopped = asyncio.run(_serve(spec, file, options, as_json=as_json))
+            stopped = asyncio.run(_serve(spec, file, options, as_json=as_json, detached=detached))
         except AnotherSupervisor as error:
             raise click.ClickException(str(error)) from None
         except OSError as error:
@@ -131,13 +144,92 @@ def _with_plan(spec: FleetSpec, text: str) -> FleetSpec:
     return replace(spec, plan_text=text, warnings=tuple(f"{spec.plan}: {each}" for each in found.warnings))
 
 
-async def _serve(spec: FleetSpec, file: Path | None, options: UpOptions, *, as_json: bool) -> bool:
+def _own_arguments() -> list[str]:
+    """Return this command's arguments, without --detach."""
+    context = click.get_current_context()
+    words = []
+    for param in context.command.params:
+        value = context.params[param.name or ""]
+        if param.name in ("detach", "as_json") or value in (None, False):
+            continue
+        if isinstance(param, click.Option):
+            words.append(param.opts[0])
+        if value is not True:
+            words.append(str(value))
+    if context.params["record"] is False:
+        words.append("--no-record")
+    return words
+
+
+def _run_detached(arguments: Iterable[str], *, as_json: bool) -> int:
+    """Run `fleet up` in a process of its own until its start has ended. Return the exit code."""
+    command = [sys.executable, "-m", "fleet.cli", "up", *arguments, "--detached"]
+    with signals.held_back():
+        child = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=os.name == "posix",  # the end of the terminal must not end it
+            creationflags=getattr(subprocess, "DETACHED_PROCESS", 0)
+            | getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+        )
+    try:
+        code = _follow_start(child, as_json=as_json)
+    except KeyboardInterrupt:
+        child.terminate()  # it stops every car first
+        _follow_start(child, as_json=as_json)
+        raise SystemExit(startup.INTERRUPTED) from None
+    child.returncode = child.poll() or 0  # it outlives this process
+    return code
+
+
+def _follow_start(child: "subprocess.Popen[str]", *, as_json: bool) -> int:
+    """Print what a detached process has to say until its start has ended. Return the exit code."""
+    assert child.stdout is not None
+    with child.stdout as output:
+        for line in output:
+            try:
+                event = json.loads(line)
+                what, words = event["what"], event["words"]
+            except (ValueError, KeyError, TypeError):  # an error of its arguments
+                click.echo(line, nl=False, err=True)
+                continue
+            ended = what in (READY, MISSING)
+            if as_json and ended:
+                click.echo(line, nl=False)
+            elif ended:
+                click.echo(f"{words} `fleet down` ends it.", err=what == MISSING)
+            elif what in ("hold", "end"):
+                click.echo(f"{event['name']}: {words}", err=True)
+            if ended:
+                return 0 if what == READY else 1
+    return child.wait() or 1
+
+
+def _append_output_to(path: Path) -> None:
+    """Append stdout and stderr to this file: nobody reads the pipe any more."""
+    sys.stdout.flush()
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(file, stream.fileno())
+    os.close(file)
+
+
+async def _serve(
+    spec: FleetSpec, file: Path | None, options: UpOptions, *, as_json: bool, detached: bool = False
+) -> bool:
     loop = asyncio.get_running_loop()
-    write = _json if as_json else _plain
+    write = _json if as_json or detached else _plain
     live = sys.stdout.isatty() and not as_json
 
     def tell(event: SupervisorEvent) -> None:
+        if detached and not supervisor.starting:  # the event is in the supervisor's log
+            return
         _written(write, event) if table is None else table.on_event(event)
+        if detached and event.what in (READY, MISSING):
+            _append_output_to(supervisor.log_path)
 
     supervisor = Supervisor(spec, str(file) if file else "", lambda: read(file, options), tell)
     table = None
@@ -206,4 +298,5 @@ def _json(event: SupervisorEvent) -> None:
 
 
 def _plain(event: SupervisorEvent) -> None:
-    click.echo(f"{datetime.now(UTC):%H:%M:%S} {event.name}: {event.words}")
+    name = "" if event.what in (READY, MISSING) else f"{event.name}: "
+    click.echo(f"{datetime.now(UTC):%H:%M:%S} {name}{event.words}")

@@ -1,11 +1,17 @@
 """The status of one car from its messages, and the changes that deserve a line. Pure: time is an argument."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
+MAX_LISTED: Final = 8
+"""Maximum number of cars that one line lists."""
+READY_TIMEOUT_S: Final = 30.0
+"""Time without another ready car after which a start ends, although somebody is missing."""
+LINK_OPEN_TIMEOUT_S: Final = 10.0
+"""The same time if everything runs, and only links of cars cannot be opened."""
 RATE_WINDOW_S: Final = 2.0
 """Minimum time over which the frame rate is measured."""
 
@@ -94,6 +100,49 @@ class CarStatus:
         """Return the status as JSON values."""
         names = ("car", "link", "reason", "mode", "verdict", "motion", "hold", "estop", "lease", "battery")
         return {name: getattr(self, name) for name in (*names, "rate_hz", "event")}
+
+
+@dataclass(slots=True)
+class StartProgress:
+    """The progress of a start: the fewest missing cars and services so far, and the time since when."""
+
+    fewest: int | None = None
+    since: float = 0.0
+
+    def has_ended(self, missing: int, now: float, *, unreachable: bool) -> bool:
+        """Return True if nobody is missing, or if nobody has become ready for a while.
+
+        unreachable: True if only links of cars cannot be opened.
+        """
+        if self.fewest is None or missing < self.fewest:
+            self.fewest, self.since = missing, now
+        return not missing or now - self.since >= (LINK_OPEN_TIMEOUT_S if unreachable else READY_TIMEOUT_S)
+
+
+def describe_missing(row: CarStatus) -> str:
+    """Return why a car is not ready, an empty string if it is: its link is open and the state of its motors known."""
+    if not row.link:
+        return "its gateway is starting"
+    if row.link == "lost":
+        return f"link lost: {row.reason}" if row.reason else "link lost"
+    if row.link == "stale":
+        return "silent: is it switched on?"
+    return "" if row.motors in ("off", "on") else "not in a known state yet"
+
+
+def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str) -> str:
+    """Describe the end of a start in one line: all cars are ready, or who is missing and why."""
+    ready = [car for car in cars if car not in missing]
+    if missing:
+        first = [f"{name.lstrip('@')} ({why.rstrip('.')})" for name, why in list(missing.items())[:MAX_LISTED]]
+        more = f" and {len(missing) - MAX_LISTED} more" if len(missing) > MAX_LISTED else ""
+        words = f"{len(ready)} of {len(cars)} cars ready. Missing: {', '.join(first)}{more}."
+    elif len(cars) == 1:
+        words = f"{cars[0]} is ready."
+    else:
+        names = f": {', '.join(cars)}" if len(cars) <= MAX_LISTED else ""
+        words = f"All {len(cars)} cars are ready{names}."
+    return f"{words} Recording to {session}." if session else words
 
 
 def describe_old_stops(car: str, safety: Any, began_s: float, options: str = "") -> str:

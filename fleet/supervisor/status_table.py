@@ -46,8 +46,9 @@ class Table:
 
     def on_event(self, event: "SupervisorEvent") -> None:
         """Print an event above the table, unless the car's row shows it."""
-        if event.what in ("process", "hold", "end"):
-            line = Text(f"{datetime.now(UTC):%H:%M:%S} {event.name}: {event.words}")
+        if event.what in ("process", "hold", "end", "ready", "missing"):
+            name = "" if event.what in ("ready", "missing") else f"{event.name}: "
+            line = Text(f"{datetime.now(UTC):%H:%M:%S} {name}{event.words}")
             self._safely(lambda: self._console.print(line))
 
     async def draw(self) -> None:

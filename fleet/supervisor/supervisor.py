@@ -13,16 +13,17 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
+from pathlib import Path
 from typing import Any, Final
 
 from fleet.supervisor import spec
-from fleet.supervisor.car_status import CarStatus, describe_old_stops
-from fleet.supervisor.child import new_run, remove_links, write_copy
+from fleet.supervisor.car_status import CarStatus, StartProgress, describe_missing, describe_old_stops, describe_start
+from fleet.supervisor.child import Log, new_run, remove_links, write_copy
 from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import compare
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, RunState
 from fleet.supervisor.service import ReloadRefused, SupervisorService
-from fleet.supervisor.shutdown import GatewayShutdown
+from fleet.supervisor.shutdown import NOT_TRIED, GatewayShutdown
 from fleet.supervisor.spec import (
     COORDINATOR,
     HUB,
@@ -51,9 +52,17 @@ RECORDER_EXIT_TIMEOUT_S: Final = 30.0
 """Timeout for the recorder's exit: it still writes its buffers."""
 
 
+READY: Final = "ready"
+"""The event that ends a start: all cars and services are ready."""
+MISSING: Final = "missing"
+"""The event that ends a start of which somebody is missing."""
+_LOGGED_ELSEWHERE: Final = ("log", "decision", "simulator")
+"""Events that are in the logs of other processes."""
+
+
 @dataclass(frozen=True, slots=True)
 class SupervisorEvent:
-    """An event that deserves a line. what: `process`, `car`, `hold`, `log`, `decision`, ..."""
+    """An event that deserves a line. what: `process`, `car`, `hold`, `log`, `decision`, READY, MISSING, ..."""
 
     what: str
     name: str
@@ -97,6 +106,10 @@ class Supervisor:
         """Pending queries to the simulator, in order. True for a user's query."""
         self._sim_links: dict[str, str] = {}
         self._shown: object = None
+        self._session = ""
+        self.starting = True
+        self._progress = StartProgress()
+        self._log: Log | None = None
 
     def end(self, why: str, tries_s: float = inf) -> None:
         """Start the shutdown. At the second call, list the pending processes and stop retrying.
@@ -124,6 +137,7 @@ class Supervisor:
     async def run(self) -> bool:
         """Supervise until `end`. Raises AnotherSupervisor, BusError, and OSError if the logs cannot be written."""
         self.processes.directory = await asyncio.to_thread(new_run, self._spec.fleet, self.endpoint, time.time())
+        self._log = Log(self.log_path)
         try:
             bus = await self._bus()
             if bus is None:
@@ -138,6 +152,7 @@ class Supervisor:
             try:
                 while not self._shutdown_requested.is_set():
                     await self._turn()
+                    self._follow_start(self.processes.now)
                     with suppress(TimeoutError):
                         await asyncio.wait_for(self._shutdown_requested.wait(), SUPERVISOR_POLL_INTERVAL_S)
                 await self._end_all(service)
@@ -149,7 +164,43 @@ class Supervisor:
             await asyncio.sleep(SUPERVISOR_POLL_INTERVAL_S)  # `fleet down` waits for this status
         finally:
             await self._leave()
+            self._log.close()
         return not self._shutdown.not_stopped
+
+    @property
+    def log_path(self) -> Path:
+        """The file of the supervisor's own log."""
+        return self.processes.directory / f"{SELF}.log"
+
+    def missing(self) -> dict[str, str]:
+        """Return the cars and services that are not ready, each with the reason."""
+        result = {}
+        for name in self._spec.cars:
+            process, row = self.processes.get(name), self.rows.get(name)
+            if process is None or row is None:
+                result[name] = "its simulator is starting"
+            elif process.status.state is not RunState.RUNNING:
+                result[name] = process.status.words or "its gateway is starting"
+            elif why := describe_missing(row):
+                result[name] = why
+        for process in self.processes:
+            up = process.status.state in (RunState.RUNNING, RunState.ELSEWHERE)
+            if process.kind is not ProcessKind.GATEWAY and not up:
+                result[process.name] = process.status.words or str(process.status.state)
+        return result
+
+    def _follow_start(self, now: float) -> None:
+        """Report the end of the start once: all are ready, or nobody has become ready for a while."""
+        if not self.starting:
+            return
+        missing = self.missing()
+        rows = [self.rows.get(name) for name in missing]
+        unreachable = all(row is not None and row.link == "lost" and row.reason != NOT_TRIED for row in rows)
+        if not self._progress.has_ended(len(missing), now, unreachable=unreachable):
+            return
+        words = describe_start(list(self._spec.cars), missing, self._session)
+        self._say(MISSING if missing else READY, SELF, words)
+        self.starting = False
 
     # ------------------------------------------------------------------ the bus
 
@@ -374,6 +425,7 @@ class Supervisor:
         except ValueError:
             return True  # plain text
         if process.kind is ProcessKind.RECORDER:
+            self._session = values["session"]
             self._say("process", RECORDER, _describe_recording(values))
         elif process.kind is ProcessKind.COORDINATOR:
             self._say("decision", values["subject"], f"{values['decided']}, because: {values['why']}")
@@ -455,6 +507,8 @@ class Supervisor:
             fleet_file=self._source,
             directory=str(self.processes.directory),
             became=self._shutdown.results,
+            missing=self.missing(),
+            session=self._session,
         )
         for process in self.processes:
             life = process.status
@@ -506,6 +560,8 @@ class Supervisor:
         return "\n".join([*(words or ["nothing has changed"]), *found.spec.warnings])
 
     def _say(self, what: str, name: str, words: str) -> None:
+        if self._log is not None and what not in _LOGGED_ELSEWHERE:
+            self._log.add(f"{name}: {words}", time.time())
         self._on_event(SupervisorEvent(what, name, words))
 
 

@@ -32,8 +32,8 @@ STARTS_S = 10.0
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
     """Two simulated cars, which need nothing but the clone."""
     with Up(tmp_path_factory.mktemp("up"), free_endpoint(), "--sim", "2") as started:
-        for name in ("@hub", "@recorder", "@simulator", "red", "green"):
-            started.running(name)
+        words = started.until("ready", "@supervisor", "All 2 cars are ready: red, green. Recording to ")["words"]
+        assert words.endswith(f"{started.status().session}.")
         yield started
 
 
@@ -124,10 +124,11 @@ def test_one_that_sleeps_itself_blames_nobody(up: Up) -> None:
 
 
 def test_a_second_one_refuses_and_names_the_first(up: Up) -> None:
-    second = up.fleet("up", "--sim", "1", "--no-record")
-    assert second.returncode == 1
-    assert second.stderr.startswith(f"fleet: fleet fleet is up already: process {up.process.pid} on ")
-    assert second.stderr.count("\n") == 1
+    for more in ((), ("--detach",)):
+        second = up.fleet("up", "--sim", "1", "--no-record", *more)
+        assert second.returncode == 1
+        assert second.stderr.startswith(f"fleet: fleet fleet is up already: process {up.process.pid} on ")
+        assert second.stderr.count("\n") == 1
 
 
 def test_status_and_logs_say_what_runs(up: Up) -> None:
@@ -181,10 +182,20 @@ def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
 
 def test_a_hold_of_an_earlier_run_is_told_at_the_start_with_how_to_end_it(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    with Up(tmp_path, endpoint, "--sim", "1", "--no-record") as started:
-        started.ready("red")
-        assert started.ask("stop", "red", sender="mia", kind="person")["status"] in TAKEN
-        assert started.fleet("down").returncode == 0
+    environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(tmp_path / "state")}
+    try:
+        begun = fleet_command("up", "--sim", "1", "--no-record", "--detach", environment=environment)
+        assert (begun.returncode, begun.stdout) == (0, "red is ready. `fleet down` ends it.\n"), begun.stderr
+        assert fleet_command("wait", "--ready", environment=environment).stdout == "red is ready.\n"
+        assert "| @supervisor: red is ready." in fleet_command("logs", "supervisor", environment=environment).stdout
+        with bus.Bus.open(endpoint) as client:
+            payload = b'{"sender": "mia", "kind": "person"}'
+            (answer,) = client.query("fleet/red/@cmd/stop?format=json", payload=payload, timeout_s=5.0)
+            assert isinstance(answer, bus.Sample)
+    finally:
+        ended = fleet_command("down", environment=environment)
+    assert (ended.returncode, ended.stdout) == (0, "red: stopped\n")
+    assert "| red: on hold by mia" in fleet_command("logs", "supervisor", environment=environment).stdout
     with Up(tmp_path, endpoint, "--sim", "1", "--no-record") as started:
         said = started.until("hold", "red", "on hold by mia since ")
         assert said["words"].endswith(" no plan moves red. To end that: fleet resume red")
@@ -253,6 +264,10 @@ def test_a_car_that_is_off_holds_up_nobody_and_costs_no_restart(fleet: FleetProc
         started.ready("red")
         pid = started.running("blue")
         wait_for(lambda: (state := started.get("blue/state/link")) and state.state == "lost", "blue's gateway tries")
+        late = started.fleet("wait", "--ready", "--for", "100ms")
+        assert late.returncode == 1
+        assert late.stderr.startswith("1 of 2 cars ready. Missing: blue (")
+        assert started.fleet("wait", "--ready", "red").returncode == 0
         late = fleet.start("-m", "gateway.cli", "sim", "--no-truth", "--car", f"blue:arduino:{off}")
         late.line()
         started.ready("blue")

@@ -8,7 +8,15 @@ import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
 from rich.console import Console
 
-from fleet.supervisor.car_status import CarStatus, describe_old_stops
+from fleet.supervisor.car_status import (
+    LINK_OPEN_TIMEOUT_S,
+    READY_TIMEOUT_S,
+    CarStatus,
+    StartProgress,
+    describe_missing,
+    describe_old_stops,
+    describe_start,
+)
 from fleet.supervisor.child import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
 from fleet.supervisor.restart_policy import RunState
 from fleet.supervisor.spec import FleetSpec, ProcessKind
@@ -28,6 +36,51 @@ def test_a_row_says_what_is_new_once() -> None:
     assert row.take("state/motion", pb.Motion(motion="back", owner="ann"), 2.0) == "motion back by ann"
     assert row.take("state/motion", pb.Motion(motion="stop"), 3.0) == "motion stop"
     assert row.take("sensor/battery", pb.Battery(voltage_v=6.5, level="critical"), 3.0) == "battery critical"
+
+
+@pytest.mark.parametrize(
+    ("link", "motors", "why"),
+    [
+        (pb.Link(), "", "its gateway is starting"),
+        (pb.Link(state="lost", reason="no such port"), "unknown", "link lost: no such port"),
+        (pb.Link(state="stale", reason="open"), "unknown", "silent: is it switched on?"),
+        (pb.Link(state="online"), "stopping", "not in a known state yet"),
+        (pb.Link(state="online"), "off", ""),
+        (pb.Link(state="quiet"), "on", ""),
+    ],
+)
+def test_a_car_is_ready_when_its_link_is_open_and_its_motors_are_known(link: pb.Link, motors: str, why: str) -> None:
+    row = CarStatus("red")
+    row.take("state/link", link, 0.0)
+    row.take("state/safety", pb.Safety(motors=motors), 0.0)
+    assert describe_missing(row) == why
+
+
+@pytest.mark.parametrize(
+    ("names", "missing", "words"),
+    [
+        (["red"], {}, "red is ready. Recording to s."),
+        (["red", "blue"], {}, "All 2 cars are ready: red, blue. Recording to s."),
+        ([f"car{n}" for n in range(9)], {}, "All 9 cars are ready. Recording to s."),
+        (
+            ["red", "blue"],
+            {"blue": "link lost: no such port.", "@coordinator": "starting"},
+            "1 of 2 cars ready. Missing: blue (link lost: no such port), coordinator (starting). Recording to s.",
+        ),
+    ],
+)
+def test_a_start_ends_with_one_line(names: list[str], missing: dict[str, str], words: str) -> None:
+    assert describe_start(names, missing, "s") == words
+
+
+def test_a_start_ends_when_nobody_has_become_ready_for_a_while() -> None:
+    progress = StartProgress()
+    assert not progress.has_ended(3, 100.0, unreachable=False)
+    assert not progress.has_ended(2, 100.0 + READY_TIMEOUT_S, unreachable=False), "another car is ready"
+    assert not progress.has_ended(2, 100.0 + READY_TIMEOUT_S + LINK_OPEN_TIMEOUT_S, unreachable=False)
+    assert progress.has_ended(2, 100.0 + READY_TIMEOUT_S + LINK_OPEN_TIMEOUT_S, unreachable=True)
+    assert progress.has_ended(2, 100.0 + 2 * READY_TIMEOUT_S, unreachable=False)
+    assert StartProgress().has_ended(0, 0.0, unreachable=False)
 
 
 def test_a_row_shows_hold_and_e_stop() -> None:

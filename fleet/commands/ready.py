@@ -1,0 +1,79 @@
+"""`fleet wait --ready`: waits until the cars of the fleet are ready, and names those that are not."""
+
+import json
+import time
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import Any, Final
+
+import click
+
+from fleet.client.supervision import ask_status
+from fleet.supervisor.car_status import CarStatus, describe_missing, describe_start
+from schemas import keys
+from schemas.bus import Bus, BusError, Sample
+from schemas.topics import Qos
+
+READY_WAIT_S: Final = 30.0
+"""Default timeout of `fleet wait --ready`."""
+_POLL_S: Final = 0.2
+_STATES: Final = ("state/link", "state/safety")
+
+
+def wait_ready(connect: str | None, fleet: str, cars: Sequence[str], timeout_s: float, *, as_json: bool) -> None:
+    """Wait until the cars are ready (none: all cars and services). Exit with code 1 after the timeout."""
+    deadline = time.monotonic() + timeout_s
+    bus: Bus | None = None
+    try:
+        while True:
+            found: tuple[list[str], dict[str, str]] | None = None
+            try:
+                bus = bus or Bus.open(connect)
+                found = _missing(bus, fleet)
+            except BusError:
+                if time.monotonic() >= deadline:
+                    raise
+            known, missing = found or ([], {})
+            wanted = list(cars or known)
+            missing |= {car: _unknown(car, known) for car in cars if car not in known}
+            if cars:
+                missing = {car: missing[car] for car in cars if car in missing}
+            if wanted and not missing:
+                break
+            if time.monotonic() >= deadline:
+                break
+            time.sleep(_POLL_S)
+    finally:
+        if bus is not None:
+            bus.close()
+    ok = bool(wanted) and not missing
+    if as_json:
+        click.echo(json.dumps({"ready": ok, "cars": wanted, "missing": missing}))
+    elif not wanted:
+        raise click.ClickException("The fleet is not running. Start it with `fleet up`.")
+    else:
+        click.echo(describe_start(wanted, missing, ""), err=not ok)
+    raise SystemExit(0 if ok else 1)
+
+
+def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
+    """Return the cars, and those cars and services that are not ready with the reason."""
+    for status in ask_status(bus, fleet):
+        cars = [process.name for process in status.processes if not process.name.startswith("@")]
+        missing = dict(status.missing)
+        cars += [name for name in missing if name not in cars and not name.startswith("@")]
+        if status.state != "running":
+            return cars, dict.fromkeys(cars, f"the fleet is {status.state}")
+        return cars, missing
+    rows = {key.rpartition("/")[2]: CarStatus(key.rpartition("/")[2]) for key in bus.tokens(keys.car_token(fleet, "*"))}
+    for topic in _STATES:
+        for answer in bus.query(f"{fleet}/*/{topic}", qos=Qos.STATE):
+            key = keys.parse(answer.key) if isinstance(answer, Sample) else None
+            if key is not None and isinstance(answer, Sample) and key.car in rows:
+                rows[key.car].take(topic, answer.message(), time.monotonic())
+    return sorted(rows), {car: why for car, row in sorted(rows.items()) if (why := describe_missing(row))}
+
+
+def _unknown(car: str, known: Sequence[str]) -> Any:
+    near = get_close_matches(car, known, 1)
+    return f"no such car{f', did you mean {near[0]}?' if near else ''}"
