@@ -264,9 +264,9 @@ def test_a_car_that_is_off_holds_up_nobody_and_costs_no_restart(fleet: FleetProc
         started.ready("red")
         pid = started.running("blue")
         wait_for(lambda: (state := started.get("blue/state/link")) and state.state == "lost", "blue's gateway tries")
-        late = started.fleet("wait", "--ready", "--for", "100ms")
-        assert late.returncode == 1
-        assert late.stderr.startswith("1 of 2 cars ready. Missing: blue (")
+        not_yet = started.fleet("wait", "--ready", "--for", "100ms")
+        assert not_yet.returncode == 1
+        assert not_yet.stderr.startswith("1 of 2 cars ready. Missing: blue (")
         assert started.fleet("wait", "--ready", "red").returncode == 0
         late = fleet.start("-m", "gateway.cli", "sim", "--no-truth", "--car", f"blue:arduino:{off}")
         late.line()
