@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
-MAX_LISTED: Final = 8
+MAX_CARS_LISTED: Final = 8
 """Maximum number of cars that one line lists."""
 READY_TIMEOUT_S: Final = 30.0
 """Time without another ready car after which a start ends, although somebody is missing."""
@@ -134,13 +134,13 @@ def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str
     """Describe the end of a start in one line: all cars are ready, or who is missing and why."""
     ready = [car for car in cars if car not in missing]
     if missing:
-        first = [f"{name.lstrip('@')} ({why.rstrip('.')})" for name, why in list(missing.items())[:MAX_LISTED]]
-        more = f" and {len(missing) - MAX_LISTED} more" if len(missing) > MAX_LISTED else ""
+        first = [f"{name.lstrip('@')} ({why.rstrip('.')})" for name, why in list(missing.items())[:MAX_CARS_LISTED]]
+        more = f" and {len(missing) - MAX_CARS_LISTED} more" if len(missing) > MAX_CARS_LISTED else ""
         words = f"{len(ready)} of {len(cars)} cars ready. Missing: {', '.join(first)}{more}."
     elif len(cars) == 1:
         words = f"{cars[0]} is ready."
     else:
-        names = f": {', '.join(cars)}" if len(cars) <= MAX_LISTED else ""
+        names = f": {', '.join(cars)}" if len(cars) <= MAX_CARS_LISTED else ""
         words = f"All {len(cars)} cars are ready{names}."
     return f"{words} Recording to {session}." if session else words
 
