@@ -16,7 +16,7 @@ from schemas.topics import Qos
 
 READY_WAIT_S: Final = 30.0
 """Default timeout of `fleet wait --ready`."""
-_READY_POLL_S: Final = 0.2
+_WAIT_POLL_S: Final = 0.2
 _STATES: Final = ("state/link", "state/safety")
 
 
@@ -42,7 +42,7 @@ def wait_ready(connect: str | None, fleet: str, cars: Sequence[str], timeout_s: 
                 break
             if time.monotonic() >= deadline:
                 break
-            time.sleep(_READY_POLL_S)
+            time.sleep(_WAIT_POLL_S)
     finally:
         if bus is not None:
             bus.close()
