@@ -5,7 +5,6 @@ Subcommands are imported when they are called, so that `fleet --help` is fast.
 
 import importlib
 import os
-import re
 import sys
 from typing import Final
 
@@ -102,8 +101,12 @@ COMMANDS: Final = {
 
 _FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (where, _) in section.items()}
 
-_PACKAGES: Final = {"rerun": "rerun-sdk", "rerun_cli": "rerun-sdk", "yaml": "pyyaml", "zenoh": "eclipse-zenoh"}
-"""Packages by module, where the names differ."""
+_EXTRAS: Final = {
+    **dict.fromkeys(("rerun", "rerun_cli", "numpy", "PIL"), "[view]"),
+    **dict.fromkeys(("pyarrow", "pandas", "matplotlib"), "[analysis]"),
+    "bleak": "[ble]",
+}
+"""The extra that installs a module."""
 
 
 class _LazyGroup(CommandGroup):
@@ -183,15 +186,8 @@ def _missing(error: ModuleNotFoundError) -> str:
     module = (error.name or "").partition(".")[0]
     if module in ("", "fleet", "gateway", "schemas"):
         raise error
-    from importlib import metadata
-
-    package = _PACKAGES.get(module, module)
-    try:
-        requirements = [each.partition(";")[0].strip() for each in metadata.requires("zenoh-car-fleet") or ()]
-    except metadata.PackageNotFoundError:  # a clone that was never installed
-        requirements = []
-    exact = next((each for each in requirements if re.match(rf"{re.escape(package)}(?![\w.-])", each)), package)
-    return f"{package} is not installed, and this command needs it: pip install '{exact}'"
+    needed = f"zenoh-car-fleet{_EXTRAS.get(module, '')}"
+    return f"this command needs {module}, which is not installed. Type: pip install '{needed}'"
 
 
 def _no_output(error: OSError) -> int:

@@ -5,6 +5,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,6 +44,7 @@ def replay(
     save: Path | None,
 ) -> None:
     """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun."""
+    quiet_rerun()
     from fleet.recording.reading.session import NoSession, Session
     from fleet.replay.rerun.viewer import has_display
 
@@ -84,7 +86,6 @@ def refuse_target(save: Path, segments: Iterable[Path] = ()) -> None:
 
 
 def _part(session: "Session", cars: tuple[str, ...], start: str | None, end: str | None) -> "Part":
-    quiet_rerun()
     from fleet.replay.rerun.export import WHOLE_SESSION, Part
 
     if not cars and start is None and end is None:
@@ -106,8 +107,10 @@ def _rescue(session: "Session", out: Path) -> "Session":
 
 
 def quiet_rerun() -> None:
-    """Turn off Rerun's log, which would mix with our output. Rerun reads the variable when it is imported."""
-    os.environ.setdefault("RUST_LOG", "off")
+    """Turn off Rerun's log, which would mix with our output. Raises ModuleNotFoundError if Rerun is not installed."""
+    os.environ.setdefault("RUST_LOG", "off")  # read when Rerun is imported
+    if find_spec("rerun") is None:
+        raise ModuleNotFoundError(name="rerun")
 
 
 def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) -> None:

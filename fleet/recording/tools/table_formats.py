@@ -99,7 +99,7 @@ class ParquetSink:
             import pyarrow.parquet as pq  # type: ignore[import-untyped]  # likewise
         except ImportError:
             raise FormatMissing(
-                "Parquet needs pyarrow, which is not installed: pip install 'zenoh-car-fleet[parquet]', or use --csv"
+                "Parquet needs pyarrow. Type: pip install 'zenoh-car-fleet[analysis]', or use --csv"
             ) from None
         kinds = {
             ColumnKind.FLOAT: pa.float64(),

@@ -244,7 +244,7 @@ def test_parquet_without_its_package_says_how_to_have_it(
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     done = CliRunner().invoke(cli, ["sessions", "export", str(session), "--parquet", str(tmp_path / "p")])
     assert done.exit_code == 1
-    assert "pip install 'zenoh-car-fleet[parquet]'" in done.output
+    assert "pip install 'zenoh-car-fleet[analysis]'" in done.output
     assert not (tmp_path / "p").exists()
 
 
