@@ -250,7 +250,7 @@ class Fleet:
     def _query(self, target: str, command: PendingCommand, payload: bytes) -> None:
         """Query one car, or all. Runs on a thread of the pool."""
         verb = command.request.verb
-        words = f"{target} gave no answer: its gateway went away or failed"
+        words = f"{target} may or may not do it: its gateway ended without an answer. Look at the car."
         try:
             answers = self.bus.query(
                 keys.command_key(self.name, target, verb),

@@ -118,9 +118,7 @@ class PendingCommand:
 
     def _warn_of_missing_answers(self, waiting: list[Progress]) -> None:
         if late := sorted(progress.car for progress in waiting if not progress.answered):
-            log.warning(
-                "no answer yet from %s: still waiting, the machine or the gateway may be overloaded", ", ".join(late)
-            )
+            log.warning("%s: no answer yet, still waiting. Computer or gateway may be overloaded.", ", ".join(late))
 
     def _take(self, item: Any, at: float) -> None:
         if item is CLOSED:
@@ -182,11 +180,19 @@ class PendingCommand:
         try:
             answer: Any = messages.parse(topics.RESULT, item.payload, item.encoding)
         except messages.BadPayload as error:
-            progress.on_unusable_answer(f"what answered for {progress.car} is no gateway of this fleet: {error}", at)
+            progress.on_unusable_answer(f"another program answered for {progress.car}: {error}", at)
             return
         progress.on_answer(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
 
     def _of(self, car: str) -> Progress:
         if car not in self._progress:
-            self._progress[car] = Progress(car, self.request.until, self._asked_at, self.request.duration_s)
+            request = self.request
+            self._progress[car] = Progress(
+                car,
+                request.until,
+                self._asked_at,
+                request.duration_s,
+                verb=request.effect_verb,
+                detail=request.detail,
+            )
         return self._progress[car]

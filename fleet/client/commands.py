@@ -35,6 +35,26 @@ class CommandRequest:
     take: bool = False
     """True if a person takes the car over from another person."""
 
+    @property
+    def effect_verb(self) -> str:
+        """The verb in `effects.EFFECTS`."""
+        return "release" if self.verb == "drive" and self.until is Until.STOPPED else self.verb
+
+    @property
+    def detail(self) -> str:
+        """The part of the request that the text of its outcome repeats."""
+        match self.verb:
+            case "drive":
+                return f"{self.duration_s:.1f} s" if self.duration_s >= 1 else f"{self.duration_s:g} s"
+            case "mode" | "light":
+                return str(getattr(self.message, self.verb))
+            case "speed":
+                return str(self.message.step)
+            case "fan":
+                return f"switched {self.message.state}" if self.message.state else "toggled"
+            case _:
+                return ""
+
 
 def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) -> CommandRequest:
     """Request a motion for `duration_s` (at most 10 s, or the gateway's limit). wait: wait for the end of the drive."""

@@ -122,7 +122,7 @@ class Lease:
         self._fleet.ask(lease_request(release=True), [self._name])
         if stopped.ok or stopped.reason in _STOP_NOT_NEEDED:
             return
-        words = f"{self._name} may still drive, its stop was not carried out: {stopped}"
+        words = f"{self._name} may still be driving: its stop failed. {stopped.effect}"
         if error is None:
             raise NotCarriedOut(stopped, words)
         error.add_note(words)

@@ -5,10 +5,14 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Self
 
+from fleet.client.effects import STOP_VERBS, describe, with_code
+
 QUEUED: Final = "queued"
 SENT: Final = "sent"
 COMPLETE: Final = "complete"
 NO_ANSWER: Final = "no_answer"
+NO_RESULT: Final = "no_result"
+"""The code of a command whose last event is missing."""
 _FAILED_PHASES: Final = frozenset({"superseded", "expired", "failed", "rejected"})
 
 OUTCOME_MARGIN_S: Final = 5.0
@@ -55,6 +59,15 @@ class Outcome:
     """Time from the request until the outcome was known."""
     basis: str = ""
     """For a stop: `shown` if the car's readings show that it stands, `sent` if they cannot."""
+    effect: str = ""
+    """What the command did, in words: `LED set`, `stopped (1.2 s)`, `refused: ...`."""
+
+    @property
+    def code(self) -> str:
+        """The reason, or `no_answer` or `no_result`. Empty if the command was carried out."""
+        if self.ok or self.reason:
+            return self.reason
+        return self.phase if self.phase in (NO_ANSWER, *_FAILED_PHASES) else NO_RESULT
 
     def check(self) -> Self:
         """Return the outcome itself. Raises NotCarriedOut if the command was not carried out."""
@@ -63,15 +76,17 @@ class Outcome:
         return self
 
     def __str__(self) -> str:
-        details = (self.reason or ("" if self.phase == NO_ANSWER else self.phase), self.words)
-        return ": ".join((self.car, "carried out" if self.ok else "not carried out", *filter(None, details)))
+        text = self.effect or self.words or self.phase
+        if self.ok and self.basis == "sent" and self.worst_case_s is not None:
+            text += f"; motors off within {self.worst_case_s:.1f} s if the frames arrived"
+        return with_code(f"{self.car}: {text}", self.code)
 
 
 class NotCarriedOut(Exception):
     """A command was not carried out. `outcome` contains the car and the reason."""
 
     def __init__(self, outcome: Outcome, words: str = "") -> None:
-        super().__init__(words or str(outcome))
+        super().__init__(with_code(words, outcome.code) if words else str(outcome))
         self.outcome = outcome
 
 
@@ -82,8 +97,12 @@ class LeaseLost(NotCarriedOut):
 class Progress:
     """The progress of one command on one car. `outcome` is None until it is known."""
 
-    def __init__(self, car: str, until: Until, asked_at: float, duration_s: float = 0.0) -> None:
+    def __init__(
+        self, car: str, until: Until, asked_at: float, duration_s: float = 0.0, *, verb: str = "", detail: str = ""
+    ) -> None:
         self.car = car
+        self._verb = verb
+        self._detail = detail
         self.outcome: Outcome | None = None
         self._until = until
         self._asked_at = asked_at
@@ -152,8 +171,11 @@ class Progress:
 
     def on_missing(self, present: Sequence[str], at: float) -> None:
         """Give up: the car has no token."""
-        there = f"there are: {', '.join(present)}" if present else "there is none"
-        words = f"no car {self.car} on the bus, so whether it moves is not known; {there}"
+        words = f'No car named "{self.car}". ' + (
+            f"Connected: {', '.join(present)}." if present else "No car is connected."
+        )
+        if self._verb in STOP_VERBS:
+            words = f"NOT STOPPED: {words} If it moves, go to the car."
         self._end(NO_ANSWER, "", words, at, ok=False)
 
     def on_supervised(self, at: float, *, present: bool) -> None:
@@ -176,13 +198,14 @@ class Progress:
 
     def on_query_timeout(self, at: float) -> None:
         """Give up if the query has timed out without an answer."""
-        there = (
-            f"is on the bus (slow or hanging), so whether {self.car} does it is not known"
+        late = f"no answer after {at - self._asked_at:.0f} s"
+        words = (
+            f"It is unknown what {self.car} does: its gateway is overloaded or hangs ({late}). Look at the car."
             if self._gone_at is None
-            else f"is not on the bus, so whether {self.car} moves is not known"
+            else f"{self.car} may be moving: its gateway is gone ({late}). Look at the car."
         )
         if self._gone_at is None or not self._is_supervised:
-            self.on_unusable_answer(f"no answer after {at - self._asked_at:.0f} s; its gateway {there}", at)
+            self.on_unusable_answer(words, at)
 
     def on_presence(self, at: float, *, alive: bool) -> None:
         """Note that the gateway's token came back, or disappeared: the gateway was killed or lost its bus."""
@@ -201,11 +224,11 @@ class Progress:
             self._end(self._phase, "", words, at, ok=False)
             return
         if self._joined:
-            self._end(SENT, "", "it prolonged a drive", at, ok=True)
+            self._end(SENT, "", "the running drive was extended", at, ok=True)
             return
         words = (
-            f"not known what became of it after {at - self._asked_at:.1f} s: "
-            f"last heard was {self._phase!r}, {at - self._last_event_at:.1f} s ago"
+            f"It is unknown what {self.car} does: no result after {at - self._asked_at:.1f} s "
+            f"(last event: {self._phase}, {at - self._last_event_at:.1f} s ago). Look at the car."
         )
         self._end(self._phase, "", words, at, ok=False)
 
@@ -224,4 +247,14 @@ class Progress:
     def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
         if self.outcome is None:
             took_s = at - self._asked_at
-            self.outcome = Outcome(self.car, ok, phase, reason, words, self._worst_case_s or None, took_s, self._basis)
+            done = {"shown": "shown", "sent": "unconfirmed"}.get(self._basis, phase)
+            effect = describe(
+                self._verb,
+                (done, phase) if ok else (reason, phase if phase in _FAILED_PHASES else ""),
+                car=self.car,
+                detail="" if words and self._until is Until.OVER else self._detail,
+                words=words,
+                took_s=took_s,
+            )
+            worst_case_s = self._worst_case_s or None
+            self.outcome = Outcome(self.car, ok, phase, reason, words, worst_case_s, took_s, self._basis, effect)

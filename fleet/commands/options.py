@@ -110,16 +110,4 @@ def print_outcomes(outcomes: Iterable[Outcome], *, as_json: bool) -> None:
         if as_json:
             click.echo(json.dumps(asdict(outcome)))
         else:
-            click.echo(_words(outcome), err=not outcome.ok)
-
-
-def _words(outcome: Outcome) -> str:
-    if not outcome.ok:
-        # The command's sender is a person, so only another person can have the lease.
-        return f"{outcome}{' (--take)' if outcome.reason == 'leased' else ''}"
-    notes = [outcome.words] if outcome.words else []
-    if outcome.worst_case_s is not None:
-        notes.append(f"motors off within {outcome.worst_case_s:.2f} s if the frames arrived")
-    more = f" ({'; '.join(notes)})" if notes else ""
-    how = f", {outcome.basis}" if outcome.basis == "shown" else ", nothing shows it" if outcome.basis else ""
-    return f"{outcome.car}: {outcome.phase} after {outcome.took_s:.2f} s{how}{more}"
+            click.echo(str(outcome), err=not outcome.ok)

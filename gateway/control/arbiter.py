@@ -126,7 +126,10 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
     if isinstance(what, Stop | EmergencyStop):
         return None
     if command.age_s is not None and command.age_s > command.ttl_s:
-        return Reason.STALE, f"{command.age_s:.1f} s old on arrival, at most {command.ttl_s:g} s is allowed: ask again"
+        return (
+            Reason.STALE,
+            f"the command arrived {command.age_s:.1f} s late (maximum {command.ttl_s:g} s). Send it again.",
+        )
     unknown = _unknown(what, context)
     if unknown is not None:
         return Reason.UNSUPPORTED, unknown
@@ -141,7 +144,7 @@ def _unknown(what: Action, context: CommandContext) -> str | None:
     match what:
         case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
             known = ", ".join(sorted(profile.modes))
-            return f"a {profile.name} car does not know mode {mode}; it knows: {known}"
+            return f"{context.car} ({profile.name}) has no mode {mode}. It has: {known}."
         case OneShot(frame):
             return profile.refusal(frame)
         case ChangeSpeed(step):
@@ -149,14 +152,17 @@ def _unknown(what: Action, context: CommandContext) -> str | None:
             share = profile.speed.fraction(after)
             if after > context.speed and share > context.speed_max:
                 return (
-                    f"{context.car} would drive at about {share:.0%} of full speed, "
-                    f"and {context.speed_max:.0%} is allowed (--speed-max)"
+                    f"{context.car} would drive at about {share:.0%} of full speed. "
+                    f"Its maximum is {context.speed_max:.0%} (speed_max)."
                 )
             return profile.refusal(General(Motion.STOP, speed=step))
         case Fan(on):
             words = profile.refusal(General(Motion.STOP, fan=True))
             if words is None and on is not None and context.fan is None:
-                return f"whether {context.car}'s fan runs is not known: only a toggle is possible (leave the state out)"
+                return (
+                    f"{context.car}'s fan state is unknown, so on/off is not possible. "
+                    f"Toggle it: `fleet fan {context.car}`."
+                )
             return words
         case Drive(motion):
             return profile.refusal(General(motion))
@@ -166,11 +172,14 @@ def _unknown(what: Action, context: CommandContext) -> str | None:
 
 def _resume(resume: Resume, kind: SenderKind, context: CommandContext) -> Refusal | None:
     if kind is SenderKind.COORDINATOR:
-        return Reason.HELD, "a coordinator may not resume a car: a person or a script does"
+        return (
+            Reason.HELD,
+            f"{context.car} stays on hold: only a person or a script may resume it, not the coordinator.",
+        )
     in_force = [estop.id for estop in context.estops]
     if resume.ids and not set(resume.ids) & {*in_force, *context.ended}:
-        there = f"in force: {', '.join(in_force)}" if in_force else "none is in force"
-        return Reason.BAD_VALUE, f"{context.car} has no e-stop {', '.join(resume.ids)}; {there}"
+        there = f"In force: {', '.join(in_force)}." if in_force else "None is in force."
+        return Reason.BAD_VALUE, f"{context.car} has no e-stop {', '.join(resume.ids)}. {there}"
     return None
 
 
@@ -179,20 +188,19 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
     car, sender = context.car, command.sender
     if needed.not_estopped and context.estops:
         first = context.estops[0]
-        why = f": {first.why}" if first.why else ""
-        ids = " ".join(estop.id for estop in context.estops)
-        return Reason.ESTOPPED, f"{car} is e-stopped by {first.by}{why}; a person or script ends it: resume {ids}"
+        why = f': "{first.why}"' if first.why else ""
+        return (
+            Reason.ESTOPPED,
+            f"{car} is emergency-stopped ({first.by}{why}). Release it with `fleet resume {car} --estops`.",
+        )
     if needed.not_held and sender.kind is SenderKind.COORDINATOR and context.held_by is not None:
-        ends = "a drive, mode or resume by a person or script ends it"
-        return Reason.HELD, f"{car} is on hold ({context.held_by} stopped it): {ends}"
+        return Reason.HELD, f"{car} is on hold ({context.held_by} stopped it). End the hold with `fleet resume {car}`."
     lease, now = context.lease, context.now
     if needed.lease and lease is not None and lease.refuses(sender, now, take=command.take):
-        words = f"{car} is driven by {lease.holder.name} ({lease.holder.kind}), for {lease.until - now:.1f} s more"
+        words = f"{car} is driven by {lease.holder.name} ({lease.holder.kind}) for another {lease.until - now:.1f} s."
         if sender.kind is lease.holder.kind is SenderKind.PERSON:
-            return Reason.LEASED, f"{words}: wait, or take it"
-        return Reason.LEASED, f"{words}: wait" + (
-            ", or ask as a person" if sender.kind is not SenderKind.PERSON else ""
-        )
+            return Reason.LEASED, f"{words} Wait, or take the car over (--take)."
+        return Reason.LEASED, f"{words} Wait until the car is free."
     if needed.battery and context.battery:
         return Reason.BATTERY_LOW, context.battery
     if needed.link:
@@ -200,25 +208,30 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
         if refusal is not None:
             return refusal
     if needed.manual and context.asked not in (None, Mode.MANUAL):
-        # Name the stop first: a coordinator would open the mode again after a change to manual, but not after a stop.
-        helps = "stop it, or bring it to mode manual first"
-        return Reason.WRONG_MODE, f"{car} is in mode {context.asked}, where it ignores this: {helps}"
+        # Where a plan runs, only a stop lasts: the coordinator would open the mode again after a change to manual.
+        fix = f"`fleet mode {car} manual` (or `fleet stop {car}` if a plan runs)"
+        return (
+            Reason.WRONG_MODE,
+            f"{car} ignores {command.verb} commands while in mode {context.asked}. First: {fix}.",
+        )
     if needed.manual and context.contradicted:
-        return Reason.WRONG_MODE, f"{car} is not in the mode that it was asked for, and may ignore this: stop it first"
+        words = f"{car} may ignore this: its readings do not fit mode {context.asked}. First: `fleet stop {car}`."
+        return Reason.WRONG_MODE, words
     if needed.queue and context.queued >= MAX_QUEUED_COMMANDS:
-        return Reason.QUEUE_FULL, f"{context.queued} commands wait for {car} already: ask again in a second"
+        return Reason.QUEUE_FULL, f"{car} is busy: {context.queued} commands wait already. Try again in a second."
     return None
 
 
 def _unreachable(context: CommandContext, *, fan: bool) -> Refusal | None:
     car = context.car
     if context.closing:
-        return Reason.LINK_DOWN, f"the gateway of {car} is ending"
+        return Reason.LINK_DOWN, f"the gateway of {car} is shutting down."
     if not context.link_open:
-        return Reason.LINK_DOWN, f"{car} cannot be reached: {context.link_reason}"
+        return Reason.LINK_DOWN, f"{car} is unreachable: {context.link_reason}"
     if not context.answering and not (
         fan and context.fan is not False
     ):  # a running fan may be the cause of the silence
-        words = f"{car} does not answer: no reading for seconds; is it on, its fan off, and the platform right?"
+        checks = "Check: switched on? in range? fan off? `platform:` right?"
+        words = f"{car} is silent: no readings arrive. {checks} `gateway monitor` shows its bytes."
         return Reason.LINK_DOWN, words
     return None

@@ -112,7 +112,7 @@ class CarMonitor:
         if model.platform.profile is model.profile or not model.known or self._stops.running is not None:
             return
         model.treat_as(model.platform.profile)
-        words = f"{model.name} is treated as {model.profile.name} from now on: {model.platform.evidence[0]}"
+        words = f"{model.name} is a {model.profile.name} car: {model.platform.evidence[0]}"
         self._log.log(Level.INFO, "platform_settled", words, now)
 
     def _update_battery(self, voltage_v: float, now: float) -> None:
@@ -178,14 +178,14 @@ class CarMonitor:
         if gap_s > STALE_TIMES_S:
             self.model.evidence.reset_times()
         if gap_s > STALL_S and self._executor.queue.held is not None:
-            words = f"the gateway stalled for {gap_s:.1f} s with motion held: stopping"
+            words = f"{self.model.name} is stopped: its gateway stalled for {gap_s:.1f} s during a drive"
             self._log.log(Level.ERROR, "stalled", words, now)
             self._executor.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
 
     def _log_contradiction(self, before: Verdict, now: float) -> None:
         mode = self.model.mode
         if mode.verdict is not before and mode.verdict is Verdict.CONTRADICTED:
-            words = f"asked for mode {mode.asked}, but: {mode.evidence}"
+            words = f"{self.model.name} is not in mode {mode.asked} as commanded: {mode.evidence}"
             self._log.log(Level.WARNING, "mode_contradicted", words, now)
 
     def _record_effect(self, event: Sensors, now: float) -> None:

@@ -58,7 +58,7 @@ class CommandQueue:
 
     def expire(self, now: float) -> None:
         """Expire the commands that have waited too long for a busy car."""
-        words = f"waited {MAX_QUEUE_TIME_S:g} s for a busy car"
+        words = f"the car was busy for {MAX_QUEUE_TIME_S:g} s"
         while self.one_shots and now >= self.one_shots[0].received_at + MAX_QUEUE_TIME_S:
             self.log.record(self.one_shots.popleft(), Phase.EXPIRED, now, reason=Reason.EXPIRED, words=words)
         if self.mode_change is not None and now >= self.mode_change.received_at + MAX_QUEUE_TIME_S:

@@ -157,7 +157,7 @@ class Controller:
         """Refuse a command with a reason, or begin to carry it out. Record each of its transitions."""
         pending, what = Pending(command, now), command.what
         if self._log.has_accepted(command) and not isinstance(what, Stop | EmergencyStop):
-            words = f"a command with id {command.id} came already"
+            words = f"a command with id {command.id} was accepted before. Use a new id."
             if not command.streamed:  # the record under this id belongs to the first command
                 self._log.log(Level.WARNING, "duplicate", f"{command.verb} by {command.sender.name}: {words}", now)
                 return Answer(Phase.REJECTED, Reason.DUPLICATE, words)
@@ -172,7 +172,7 @@ class Controller:
         if refusal is not None:
             return self._reject(pending, *refusal, now)
         if halted:
-            words = f"{self.car} was stopped: let go for {STREAM_PAUSE_S:g} s (or send stop), then drive again"
+            words = f"{self.car} was just stopped. Send no drive command for {STREAM_PAUSE_S:g} s, then drive again."
             return self._reject(pending, Reason.HELD, words, now)
         busy = self._too_busy(what, now)
         if busy:  # before the lease and the hold: a refused command changes neither
@@ -238,11 +238,15 @@ class Controller:
         """Merge the fleet-wide e-stops, in force and ended, of another gateway of the fleet."""
         latched, removed = self.safety.merge(estops, ended)
         for estop in removed:
-            self._log.log(Level.WARNING, "estop_ended", f"e-stop {estop.id} has ended, as {source} shows", now)
+            words = f"e-stop {estop.id} of {self.car} was ended elsewhere (seen from {source})"
+            self._log.log(Level.WARNING, "estop_ended", words, now)
         if not latched:
             return
         why = f": {latched[0].why}" if latched[0].why else ""
-        words = f"e-stop {latched[0].id} by {latched[0].by} is in force in the fleet, as {source} shows{why}"
+        words = (
+            f"{self.car} is emergency-stopped with the whole fleet by {latched[0].by}{why} "
+            f"(e-stop {latched[0].id}, seen from {source})"
+        )
         self._log.log(Level.ERROR, "estop_joined", words, now)
         self._executor.halt(words, now)
         self.stops.begin_full(now)
@@ -296,7 +300,7 @@ class Controller:
         sender = pending.command.sender.name
         if ids:
             ended = " ".join(estop.id for estop in self.safety.end(ids))
-            words = f"e-stop {ended} was ended by {sender}" if ended else "ended already"
+            words = f"e-stop {ended} was ended by {sender}" if ended else "the e-stop had ended before"
             if ended:
                 self._log.log(Level.WARNING, "estop_ended", words, now)
         elif self.safety.hold is not None:
@@ -307,7 +311,7 @@ class Controller:
         if self.safety.estops:
             words += f"; still in force: e-stop {' '.join(estop.id for estop in self.safety.estops)}"
         elif self.safety.hold is not None:
-            words += f"; on hold (by {self.safety.hold.by}) until a person or script drives, sets a mode or resumes"
+            words += f"; still on hold (by {self.safety.hold.by}) until `fleet resume {self.car}` or a drive"
         return self._done(pending, words, now)
 
     def _grant_lease(self, command: Command, now: float) -> None:
@@ -336,7 +340,7 @@ class Controller:
     def _take_lease(self, pending: Pending, now: float, *, release: bool) -> Answer:
         sender = pending.command.sender
         if not release:
-            return self._done(pending, f"{self.car} is {sender.name}'s for {LEASE_S:g} s, and while it drives", now)
+            return self._done(pending, f"reserved for {sender.name} for {LEASE_S:g} s, and while it drives", now)
         if not self.safety.release(sender):
             return self._done(pending, f"{sender.name} had no lease of {self.car}", now)
         if self._queue.held is not None and self._queue.held.sender == sender:
@@ -362,8 +366,8 @@ class Controller:
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._queue.held = HeldMotion(drive.motion, pending, now + drive.duration_s)
         if held is not None and held.motion is drive.motion and held.pending.sent:
-            self._log.record_sent(pending, now, "the motion is held on")
-            return Answer(Phase.SENT, words="the motion is held on")
+            self._log.record_sent(pending, now, "the running drive was extended")
+            return Answer(Phase.SENT, words="the running drive was extended")
         running = self.stops.running
         if running is not None and running.sequence.rank == sequences.SOFT.rank:
             # The car moves again: the rest of the soft stop would only jerk it.
@@ -379,9 +383,13 @@ class Controller:
         if pending.command.streamed:
             return Answer(Phase.SENT if held.pending.sent else Phase.QUEUED)
         if held.pending.sent:
-            return self._done(pending, "the motion is held on", now)
+            return self._done(pending, "the running drive was extended", now)
         self._log.record(
-            held.pending, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words="asked again before it was sent"
+            held.pending,
+            Phase.SUPERSEDED,
+            now,
+            reason=Reason.SUPERSEDED,
+            words="the same drive was requested again before this one was sent",
         )
         pending.count = held.pending.count
         held.pending = pending
@@ -413,7 +421,7 @@ class Controller:
             self.model.known and self.stops.running is None and self.model.mode.verdict is not Verdict.CONTRADICTED
         )
         if settled and self.model.mode.asked is mode:
-            return self._done(pending, f"{self.car} is in {mode} already ({self.model.mode.verdict})", now)
+            return self._done(pending, f"{self.car} is in mode {mode} already ({self.model.mode.verdict})", now)
         self._queue.mode_change = pending
         return self._queued(pending, now)
 

@@ -262,7 +262,8 @@ class Executor:
         evidence = self.model.evidence
         deaf = self.model.can_show and evidence.obeyed_at is None and not evidence.without_echo
         if phase is Phase.COMPLETE and deaf:
-            words += f"; nothing shows that {self.model.name} moved: it has not reacted to any frame on this link"
+            doubt = f"{self.model.name} may not have moved: it has not reacted to any command since its link opened"
+            words = f"{words}; {doubt}" if words else doubt
             self.queue.close_held(Phase.SENT, reason, words, now, Basis.SENT)
         else:
             self.queue.close_held(phase, reason, words, now)
@@ -276,16 +277,15 @@ class Executor:
         if held is not None and now >= self.queue.held_until:
             if now < held.expires_at:
                 self.safety.mark_holder(held.sender.name, connected=False)
-                self.release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.name} is gone", now)
+                self.release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.name} disconnected", now)
             elif held.pending.sent:
-                words = "its time is over"
+                words = ""
                 if held.began_at is not None and held.began_at > held.pending.received_at + LATE_DRIVE_S:
-                    words += f", of which {car} was driven for {now - held.began_at:.2f} s: it was busy before"
-                # No frame of the car shows that a drive moved it.
-                words += f"; nothing shows that {car} moved"
+                    drove_s, asked_s = now - held.began_at, held.expires_at - held.pending.received_at
+                    words = f"only {drove_s:.2f} s of {asked_s:.2g} s: {car} was still busy with the previous command"
                 self.release(Phase.COMPLETE, None, words, now)
             else:
-                self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy until its time was over", now)
+                self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy for the whole duration of the drive", now)
         self.queue.expire(now)
 
     def next_at(self, now: float) -> float:

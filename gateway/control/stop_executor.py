@@ -66,7 +66,7 @@ class StopExecutor:
         if pending is not None and running.frames_sent and now >= running.closed_at + RECOVERY_SILENCE_S:
             running.begin_try(self.full(now), now)
         if running.first_at is not None and pending is not None:
-            self._log.record_sent(pending, now, f"joined the {running.sequence.name} stop under way")
+            self._log.record_sent(pending, now, f"joined the running {running.sequence.name} stop")
 
     def begin_full(self, now: float) -> None:
         """Begin a full stop, unless the link is down or the gateway shuts down."""
@@ -144,7 +144,7 @@ class StopExecutor:
     def give_up(self, running: StopInProgress, now: float) -> None:
         """End without a stop that the car showed."""
         self.running = None
-        self._end_unstopped("did not show that it stopped", now)
+        self._end_unstopped("has not reacted to the stop", now)
         for pending in running.commands:
             self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=self.not_stopped)
 
@@ -289,8 +289,8 @@ class StopExecutor:
         self.renewal.left_mode = model.left_at >= running.began_at
         model.learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
         if recovered:
-            how = "shown" if shown else f"sent: {words}"
-            known = f"{model.name} is in a known state: stopped ({how}), mode manual"
+            how = "confirmed" if shown else f"not confirmed: {words}"
+            known = f"{model.name} is stopped ({how}), mode manual"
             self._log.log(Level.INFO, "recovered", known, now)
         if not shown:
             self.renewal.restart(now)

@@ -109,14 +109,14 @@ def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None
 
     code, words = ended(refused)
     assert code == 1
-    assert words.startswith(f"red: not carried out: leased: red is driven by {row['driver']} (person), for ")
-    assert words.endswith("wait, or take it (--take)")
+    assert words.startswith(f"red: refused: red is driven by {row['driver']} (person) for another ")
+    assert words.endswith("Wait, or take the car over (--take). [leased]")
     assert drives(fleet, "ann@"), "a refusal changed who drives"
 
     bob = operator(fleet, "bob", "drive", "red", "back", "--for", LONG, "--take")
     code, words = ended(ann)
     assert code == 1
-    assert words.startswith("red: not carried out: superseded: back by bob@")
+    assert words.startswith("red: ended early: back by bob@")
     assert drives(fleet, "bob@")
     assert driving(sim), "between the two it was driven on"
     assert listed(fleet)["driver"].startswith("bob@")
@@ -124,7 +124,7 @@ def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None
     assert operator(fleet, "ann", "stop", "red").wait() == 0
     code, words = ended(bob)
     assert code == 1
-    assert words.startswith("red: not carried out: superseded: stop by ann@")
+    assert words.startswith("red: ended early: stop by ann@")
     assert not driving(sim)
     assert listed(fleet)["hold"].startswith("ann@")
 

@@ -90,7 +90,9 @@ def test_a_stop_of_all_reaches_the_new_gateway_of_one_that_hangs(up: Up, token_i
         wait_for(lambda: not up.bus.tokens(keys.car_token("fleet", "green")), "its token is gone")
     done = up.fleet("stop")
     # The new gateway may not have opened the link yet: it stops the car when it has.
-    ended = re.search("^green: (complete|sent|not carried out: link_down)", done.stdout + done.stderr, re.MULTILINE)
+    ended = re.search(
+        r"^green: (stopped|stop sent|NOT STOPPED: .*\[link_down\])", done.stdout + done.stderr, re.MULTILINE
+    )
     assert ended, done.stdout + done.stderr
     up.running("green", but=pid)
     for car in ("red", "green"):
@@ -177,7 +179,7 @@ def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
         gone = started.fleet("status")
         assert gone.returncode == 1
         assert "no fleet is running at" in gone.stderr
-        assert "is in a known state: stopped (shown)" in started.fleet("logs", "red").stdout
+        assert "is stopped (confirmed)" in started.fleet("logs", "red").stdout
 
 
 def test_a_hold_of_an_earlier_run_is_told_at_the_start_with_how_to_end_it(tmp_path: Path) -> None:

@@ -82,10 +82,13 @@ def test_custom_policy(cars: Cars) -> None:
         mia.stop(["red"])
         assert process.wait() == 0, process.stderr
         lines = process.lines()
-        assert lines.count("red: carried out: sent") == 1
-        assert len([line for line in lines if line.startswith("red: not carried out: held: red is on hold (mia")]) == 2
+        assert lines.count("red: switching to mode obstacle_avoidance") == 1
+        assert len([line for line in lines if line.startswith("red: refused: red is on hold (mia")]) == 2
         # In the first round only if it has more room than red.
-        assert len([line for line in lines if line.startswith("blue: not carried out: unsupported")]) in (2, 3)
+        assert len([line for line in lines if line.startswith("blue: refused: blue (raspberry_pi) has no mode")]) in (
+            2,
+            3,
+        )
         assert cars.state("mode").asked == "manual"
         assert mia.car("red").resume().ok
 

@@ -139,7 +139,7 @@ class Battery:
     def refusal(self) -> str:
         """Return why new drives and modes are refused; empty if they are allowed."""
         refuses = self.action in (BatteryReaction.REFUSE, BatteryReaction.STOP)
-        return f"{self.words}: charge it, then drive; manual, stop, whistle and light work" if refuses else ""
+        return f"{self.words}. Charge it before driving. Manual, stop, whistle and light still work." if refuses else ""
 
 
 _LEVEL_RANK: Final = {each: rank for rank, each in enumerate(BatteryLevel)}

@@ -47,7 +47,7 @@ class LinkHealth:
         self.reconnects += self._up_at is not None
         self._up_at = now
         self.last_rx_at = self.last_reading_at = None
-        self._set(LinkState.STALE, "open, nothing heard yet", now)
+        self._set(LinkState.STALE, "open, no reading yet", now)
 
     def on_lost(self, reason: str, now: float) -> None:
         """Record that the port is closed."""
@@ -92,16 +92,16 @@ class LinkHealth:
         has_reading = self.last_reading_at is not None
         silence_s = max(0.0, now - (self.last_reading_at if self.last_reading_at is not None else up_at))
         if is_heard and has_reading and silence_s <= (limit_s if limit_s is not None else STALE_S):
-            self._set(LinkState.ONLINE, "heard", now)
+            self._set(LinkState.ONLINE, "readings arrive", now)
         elif not is_heard:
-            self._set(LinkState.STALE, f"not heard for {silence_s:.1f} s: whether it moves is not known", now)
+            self._set(LinkState.STALE, f"silent for {silence_s:.1f} s: it may be moving", now)
         elif limit_s is None:
             self._set(LinkState.QUIET, why_quiet, now)
         elif min(silence_s, unheard_s) <= limit_s:
             if has_reading:
                 self._set(LinkState.QUIET, "the car is busy", now)
         else:
-            self._set(LinkState.STALE, f"nothing heard for {silence_s:.1f} s, expected every {limit_s:g} s", now)
+            self._set(LinkState.STALE, f"no reading for {silence_s:.1f} s, expected every {limit_s:g} s", now)
         return self.state is not before
 
     def _set(self, state: LinkState, reason: str, now: float) -> None:

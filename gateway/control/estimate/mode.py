@@ -45,7 +45,7 @@ class ModeEstimator:
     inferred: Mode | None = None
     """The only mode that fits the last readings or the silence; None if several or none fit."""
     verdict: Verdict = Verdict.ASSUMED
-    evidence: str = "nothing heard yet"
+    evidence: str = "no reading yet"
     evidence_at: float | None = None
     candidates: tuple[Mode, ...] = ()
     """Candidate modes. Empty if the car should report in every mode but is silent."""
@@ -86,7 +86,7 @@ class ModeEstimator:
         self._matches = self._mismatches = 0
         self._other_at = float("-inf")
         self.verdict = Verdict.ASSUMED
-        self.evidence = f"{mode} was asked, nothing heard since"
+        self.evidence = f"mode {mode} was commanded, no reading since"
         self.evidence_at = now
 
     def on_written(self, block_s: float, *, now: float) -> None:
@@ -125,7 +125,7 @@ class ModeEstimator:
             if at >= self._asked_at and (
                 self._matches >= CONTRADICTING_FRAMES or at > self._other_at + CORRUPTED_MATCH_S
             ):
-                self._conclude(Verdict.CONFIRMED, f"a reading with the shape of {self.asked}", at)
+                self._conclude(Verdict.CONFIRMED, f"a reading as in mode {self.asked}", at)
             return
         self._matches = 0
         self._other_at = at
@@ -134,7 +134,7 @@ class ModeEstimator:
         self._mismatches += 1
         if self._mismatches >= CONTRADICTING_FRAMES:
             shape = " or ".join(candidates)
-            self._conclude(Verdict.CONTRADICTED, f"{self._mismatches} readings running with the shape of {shape}", at)
+            self._conclude(Verdict.CONTRADICTED, f"{self._mismatches} consecutive readings as in mode {shape}", at)
 
     def on_silence(self, *, now: float, fan: bool) -> None:
         """Update the estimate with the silence. Some modes, our blocks and the fan make a car silent."""
@@ -148,13 +148,13 @@ class ModeEstimator:
         if silent_s > MANUAL_SILENCE_S:
             self._set_candidates(self._silent_modes)
         if silent_s > limit:
-            words = f"silent for {silent_s:.1f} s, {self.asked} reports at least every {limit:g} s"
+            words = f"silent for {silent_s:.1f} s, but mode {self.asked} reports at least every {limit:g} s"
             if not self._silent_modes:
-                words += ", and the car knows no silent mode: it is off, out of reach, or its program has ended"
+                words += "; the car has no silent mode, so it is off, out of range, or its program has ended"
             self._conclude(Verdict.CONTRADICTED, words, now)
         elif (own_s := self._silence_s(self._own_at, now)) > limit:
             shape = " or ".join(self.candidates)
-            words = f"no reading with the shape of {self.asked} for {own_s:.1f} s, the last has that of {shape}"
+            words = f"no reading as in mode {self.asked} for {own_s:.1f} s, the last one is as in mode {shape}"
             self._conclude(Verdict.CONTRADICTED, words, now)
 
     @property
@@ -170,7 +170,7 @@ class ModeEstimator:
         since_s = now - max(self.evidence_at or self._own_at, self._excused_at)
         blocked_s = sum(block_s for at, block_s in self._blocks if at > now - since_s)
         if self.inferred is None or since_s > limit + blocked_s + MODE_CLOSE_S:
-            self._conclude(Verdict.ASSUMED, f"no reading with the shape of {self.asked} for {since_s:.1f} s", now)
+            self._conclude(Verdict.ASSUMED, f"no reading as in mode {self.asked} for {since_s:.1f} s", now)
 
     def unheard_s(self, now: float) -> float:
         """Return the time without a reading beyond the blocks of our frames, s; never negative."""

@@ -118,7 +118,7 @@ class PlatformDetector:
             self._options |= {option}
             self._apply_evidence()
             return ()
-        words = f"{option} frames, which {self.profile.name} cars do not send: is it {self.profile.name}+{option}?"
+        words = f"{option} frames, which {self.profile.name} cars do not send. Is it {self.profile.name}+{option}?"
         self._extra_options.add(words)
         self._against[words] = _PlatformEvidence(holds=True)
         return (words,)

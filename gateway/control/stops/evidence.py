@@ -99,7 +99,7 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
         "full or recovery, in mode 0 without an echo",
         "",
         "`sent` after a report; four more `MODE00` within 18 s, then a general stop every 6 s",
-        "{car} has no sonar echo, so its reports show no pause",
+        "{car} has no sonar echo, so its readings cannot show a stop",
     ),
     StopCase.FAN: EvidenceRow(
         "full or recovery, the fan runs (not Raspberry Pi)",
@@ -111,25 +111,25 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
         "soft (a drive's end, or its sender lost)",
         "",
         "`sent`; a general stop every 6 s",
-        "a general stop shows nothing; `fleet stop` shows it",
+        "readings do not show the end of a drive; `fleet stop {car}` checks it",
     ),
     StopCase.ACTED: EvidenceRow(
         "none: a light, servo, whistle or LED frame at a rest that was shown",
         "",
         "`sent`; a general stop every 6 s",
-        "a frame went out since {car} showed that it stands; a link that loses bytes may make a motion of it",
+        "{car} got another frame after its confirmed stop; a link that loses bytes can turn it into a motion",
     ),
     StopCase.RASPBERRY_PI: EvidenceRow(
         "any, Raspberry Pi",
         "",
         "`sent` after a report; a general stop every 6 s",
-        "a Raspberry Pi car shows nothing of a stop",
+        "a Raspberry Pi car never confirms a stop",
     ),
     StopCase.UNKNOWN_PLATFORM: EvidenceRow(
         "full or recovery, platform unknown",
         "as for the other platforms",
         "`sent` if it reports on in mode 0, as a Raspberry Pi does; then as without an echo",
-        "{car} reports on in mode 0, as a Raspberry Pi car does, which shows nothing of a stop",
+        "{car} keeps reporting in mode 0 like a Raspberry Pi car, which never confirms a stop",
     ),
 }
 

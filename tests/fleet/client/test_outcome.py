@@ -2,7 +2,9 @@
 
 import pytest
 
+from fleet.client.effects import EFFECTS
 from fleet.client.outcome import STOP_EVIDENCE_S, Progress, Until
+from schemas.commands import COMMANDS
 
 # Each step: ("answer" | "event", phase, worst case); at 1, 2, 3 ... s after asking at 100.
 Steps = list[tuple[str, str, float]]
@@ -71,8 +73,8 @@ def test_what_is_waited_for_after_a_late_answer_is_counted_from_it() -> None:
 @pytest.mark.parametrize(
     ("alive", "words"),
     [
-        (True, "its gateway is on the bus (slow or hanging), so whether red does it is not known"),
-        (False, "its gateway is not on the bus, so whether red moves is not known"),
+        (True, "It is unknown what red does: its gateway is overloaded or hangs"),
+        (False, "red may be moving: its gateway is gone"),
     ],
 )
 def test_no_answer_says_whether_there_is_a_gateway(alive: bool, words: str) -> None:
@@ -80,7 +82,10 @@ def test_no_answer_says_whether_there_is_a_gateway(alive: bool, words: str) -> N
     progress.on_presence(109.5, alive=alive)
     progress.on_query_timeout(110.0)
     assert progress.outcome is not None
-    assert (progress.outcome.phase, progress.outcome.words) == ("no_answer", f"no answer after 10 s; {words}")
+    assert (progress.outcome.phase, progress.outcome.words) == (
+        "no_answer",
+        f"{words} (no answer after 10 s). Look at the car.",
+    )
 
 
 def test_a_car_whose_records_come_is_not_without_an_answer() -> None:
@@ -97,7 +102,9 @@ def test_giving_up_says_what_was_heard_last() -> None:
     progress.give_up(115.0)
     assert progress.outcome is not None
     assert not progress.outcome.ok
-    assert progress.outcome.words == "not known what became of it after 15.0 s: last heard was 'queued', 14.0 s ago"
+    assert progress.outcome.words == (
+        "It is unknown what red does: no result after 15.0 s (last event: queued, 14.0 s ago). Look at the car."
+    )
 
 
 def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() -> None:
@@ -114,6 +121,65 @@ def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() ->
     assert (progress.outcome.ok, progress.outcome.phase) == (False, "sent")
     assert progress.outcome.words.startswith(
         "red may be moving and nothing can stop it from here: its gateway is gone."
+    )
+
+
+@pytest.mark.parametrize(
+    ("verb", "detail", "event", "text"),
+    [
+        ("stop", "", ("complete", "", "", "shown"), "stopped (1.0 s)"),
+        (
+            "stop",
+            "",
+            ("sent", "", "no sonar echo", "sent"),
+            "stop sent, which red cannot confirm (no sonar echo); motors off within 0.5 s if the frames arrived",
+        ),
+        ("stop", "", ("failed", "not_shown", "NOT CONFIRMED: x", ""), "stop sent, NOT CONFIRMED: x [not_shown]"),
+        ("stop", "", ("rejected", "link_down", "NOT STOPPED: x", ""), "NOT STOPPED: x [link_down]"),
+        ("estop", "", ("complete", "", "", "shown"), "emergency-stopped (1.0 s) until `fleet resume red --estops`"),
+        ("release", "", ("sent", "", "red is at rest", ""), "stopped (red is at rest)"),
+        ("drive", "1.0 s", ("complete", "", "", ""), "drove 1.0 s, then stopped"),
+        ("drive", "1.0 s", ("complete", "", "only 0.3 s", ""), "drove, then stopped (only 0.3 s)"),
+        ("drive", "1.0 s", ("superseded", "superseded", "stop by mia", ""), "ended early: stop by mia [superseded]"),
+        ("drive", "1.0 s", ("rejected", "held", "", ""), "refused [held]"),
+        ("drive", "1.0 s", ("expired", "expired", "red was busy", ""), "not done: red was busy [expired]"),
+        ("mode", "tracking", ("sent", "", "", ""), "switching to mode tracking"),
+        ("led", "", ("sent", "", "", ""), "LED set"),
+        ("light", "cyan", ("sent", "", "", ""), "light set to cyan"),
+        ("servo", "", ("sent", "", "", ""), "servo set"),
+        ("arm", "", ("sent", "", "", ""), "arm set"),
+        ("whistle", "", ("sent", "", "", ""), "whistled"),
+        ("speed", "up", ("sent", "", "", ""), "speed one step up"),
+        ("fan", "toggled", ("sent", "", "", ""), "fan toggled"),
+        ("fan", "switched on", ("failed", "write_failed", "cable", ""), "failed: cable [write_failed]"),
+        ("find", "", ("sent", "", "", ""), "blinked and beeped"),
+        ("resume", "", ("sent", "", "the hold by mia has ended", ""), "resumed (the hold by mia has ended)"),
+        ("lease", "", ("sent", "", "", ""), "done"),
+    ],
+)
+def test_the_text_of_each_outcome(verb: str, detail: str, event: tuple[str, str, str, str], text: str) -> None:
+    until = {"drive": Until.OVER, "stop": Until.STOPPED, "estop": Until.STOPPED, "release": Until.STOPPED}
+    progress = Progress("red", until.get(verb, Until.SENT), 100.0, 1.0, verb=verb, detail=detail)
+    phase, reason, words, basis = event
+    progress.on_event(phase, reason, words, 0.5, 101.0, basis)
+    if progress.outcome is None:  # the car is at rest: only an answer without a worst case ends it
+        progress = Progress("red", Until.STOPPED, 100.0, verb=verb)
+        progress.on_answer(phase, reason, words, 0.0, 101.0)
+    assert str(progress.outcome) == f"red: {text}"
+
+
+def test_each_verb_has_a_text() -> None:
+    assert set(EFFECTS) == {*COMMANDS, "release", "*"}
+
+
+def test_a_command_without_a_result_has_a_code_of_its_own() -> None:
+    progress = told(Until.SENT, [("answer", "queued", 0.0)])
+    progress.give_up(115.0)
+    assert str(progress.outcome).endswith(" ago). Look at the car. [no_result]")
+    progress = Progress("red", Until.STOPPED, 100.0, verb="stop")
+    progress.on_missing(["blue"], 100.0)
+    assert str(progress.outcome) == (
+        'red: NOT STOPPED: No car named "red". Connected: blue. If it moves, go to the car. [no_answer]'
     )
 
 

@@ -28,8 +28,8 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 def test_a_row_says_what_is_new_once() -> None:
     row = CarStatus("red")
-    online = pb.Link(state="online", reason="heard")
-    assert row.take("state/link", online, 0.0) == "link online: heard"
+    online = pb.Link(state="online", reason="readings arrive")
+    assert row.take("state/link", online, 0.0) == "link online: readings arrive"
     assert row.take("state/link", online, 1.0) == ""
     assert row.take("state/mode", pb.Mode(asked="tracking", verdict="assumed"), 1.0) == "mode tracking, assumed"
     assert row.take("state/motion", pb.Motion(motion="stop"), 1.0) == "", "as it should be at first"

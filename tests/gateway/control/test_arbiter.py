@@ -218,4 +218,4 @@ def test_no_step_beyond_the_speed_that_is_allowed(
     assert (refusal is not None) is refused
     if refusal is not None:
         assert refusal[0] is Reason.UNSUPPORTED
-        assert f"{limit:.0%} is allowed" in refusal[1]
+        assert f"Its maximum is {limit:.0%}" in refusal[1]

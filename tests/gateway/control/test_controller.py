@@ -107,9 +107,9 @@ def test_an_opened_mode_is_seen_when_its_reading_comes(desk: Workbench) -> None:
     assert desk.life("it")[-1] is SENT
     desk.hear(TRACKING)
     record = desk.records[-1]
-    assert (record.phase, record.evidence) == (Phase.EFFECT_SEEN, ("a reading with the shape of tracking",))
+    assert (record.phase, record.evidence) == (Phase.EFFECT_SEEN, ("a reading as in mode tracking",))
     again = desk.ask(SetMode(Mode.TRACKING))
-    assert (again.status, again.words) == (SENT, "red is in tracking already (confirmed)")
+    assert (again.status, again.words) == (SENT, "red is in mode tracking already (confirmed)")
 
 
 # ---------------------------------------------------------------------- motion is a state
@@ -192,7 +192,7 @@ def test_a_drive_expires_and_stops_softly(desk: Workbench) -> None:
     desk.ask(Drive(Motion.BACK, 0.7), identity="it")
     desk.run(3.0)
     assert [(round(at - began, 3), data) for at, data, _ in desk.sent] == [(0.0, BACK), (0.7, STOP), (1.8, STOP)]
-    assert desk.records[-1].words == "its time is over; nothing shows that red moved"
+    assert desk.records[-1].words == ""
     assert (desk.control.model.motors, desk.control.model.basis) == ("off", Basis.SENT)
 
 
@@ -222,7 +222,7 @@ def test_a_drive_that_had_to_wait_says_how_long_the_car_was_driven(desk: Workben
     desk.run(8.0)
     (words,) = [record.words for record in desk.records if record.phase is Phase.COMPLETE and record.words]
     assert re.fullmatch(
-        r"its time is over, of which red was driven for [23]\.\d\d s: it was busy before; nothing shows that red moved",
+        r"only [23]\.\d\d s of 4\.5 s: red was still busy with the previous command",
         words,
     )
 
@@ -259,7 +259,7 @@ def test_a_drive_released_by_hand(desk: Workbench) -> None:
     assert desk.end("it") == (COMPLETE, None)
     assert desk.life("off") == [ASKED, QUEUED, SENT, SENT]
     last = desk.records[-1]
-    assert (last.basis, last.words) == (Basis.SENT, EVIDENCE[StopCase.SOFT].words)
+    assert (last.basis, last.words) == (Basis.SENT, EVIDENCE[StopCase.SOFT].words.format(car="red"))
     assert desk.control.safety.hold is None, "a release is no stop"
 
 
@@ -280,7 +280,7 @@ def test_a_sender_that_is_away_for_a_second_is_lost(desk: Workbench) -> None:
     desk.run(3.0)
     assert [(round(at - gone, 3), data) for at, data, _ in desk.sent[2:]] == [(1.0, STOP), (2.1, STOP)]
     assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
-    assert desk.records[-1].words == "its sender mia is gone"
+    assert desk.records[-1].words == "its sender mia disconnected"
 
 
 def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) -> None:
@@ -293,7 +293,7 @@ def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) 
     desk.run(3.0)
     assert round(desk.sent[-2][0] - gone, 3) == 1.0
     assert desk.frames[-2:] == [STOP, STOP]
-    assert desk.records[-1].words == "its sender mia is gone"
+    assert desk.records[-1].words == "its sender mia disconnected"
 
 
 def test_a_sender_without_a_token_is_not_watched(desk: Workbench) -> None:
@@ -436,10 +436,10 @@ def test_in_another_mode_the_car_would_ignore_it(desk: Workbench, what: Action) 
     desk.ask(SetMode(Mode.TRACKING))
     desk.run(3.0)
     answer = desk.ask(what)
-    assert (answer.reason, answer.words) == (
-        Reason.WRONG_MODE,
-        "red is in mode tracking, where it ignores this: stop it, or bring it to mode manual first",
-    )
+    assert answer.reason is Reason.WRONG_MODE
+    words = " while in mode tracking. First: `fleet mode red manual` (or `fleet stop red` if a plan runs)."
+    assert answer.words.startswith("red ignores ")
+    assert answer.words.endswith(words)
     assert desk.ask(Drive(Motion.STOP)).status is QUEUED
     desk.run(4.0)
     assert desk.frames == [b"$4WD,MODE21#", MODE00, STOP], "where a soft stop is not safe it is a full one"
@@ -566,7 +566,7 @@ def test_a_recovery_that_nobody_answers_goes_on_for_ever_with_growing_pauses() -
     assert desk.control.model.trust.state is CarTrust.UNHEARD
     assert [log.code for log in desk.logs].count("unheard") == 1
     assert desk.end("it") == (Phase.FAILED, Reason.NOT_SHOWN)
-    assert "red does not answer" in desk.ask(FORWARD).words
+    assert "red is silent: no readings arrive" in desk.ask(FORWARD).words
     assert desk.ask(Stop(), identity="again").status is QUEUED, "a stop is always tried"
     desk.run(60.0, reports=False)
     assert desk.end("again") == (Phase.FAILED, Reason.NOT_SHOWN)
@@ -663,9 +663,9 @@ def test_a_shutdown_that_hears_nothing_ends_in_time_and_says_that_nothing_was_st
         desk.run(0.01, reports=False)
     desk.take()
     assert desk.now - began == pytest.approx(SHUTDOWN_S, abs=0.02)
-    assert desk.control.stops.not_stopped == "did not show that it stopped"
+    assert desk.control.stops.not_stopped == "has not reacted to the stop"
     assert desk.logs[-1].code == "not_stopped"
-    assert desk.logs[-1].words.startswith("red may still be moving: red did not show that it stopped")
+    assert desk.logs[-1].words.startswith("red may still be moving: red has not reacted to the stop")
     assert desk.control.model.basis is None
 
 

@@ -163,7 +163,7 @@ def test_a_policy_may_stop_or_only_warn() -> None:
     assert (warns.action, warns.refusal) == (BatteryReaction.WARN, "")
     refuses = Battery(BatteryPolicy(low=BatteryReaction.REFUSE))
     hear(refuses, *[6.9] * 6)
-    assert refuses.refusal.startswith("battery low: 6.90 V, charge 25% +- 15%: charge it")
+    assert refuses.refusal.startswith("battery low: 6.90 V, charge 25% +- 15%. Charge it")
 
 
 def test_the_hold_outlasts_a_few_readings() -> None:

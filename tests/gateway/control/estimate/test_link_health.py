@@ -22,9 +22,9 @@ def test_from_lost_to_online_to_stale_and_back(start: float) -> None:
     health = LinkHealth(since=start)
     assert (judged(health, start + 9), health.reason) == (LinkState.LOST, "not connected yet")
     health.on_open(start + 10)
-    assert (judged(health, start + 12), health.reason) == (LinkState.STALE, "open, nothing heard yet")
+    assert (judged(health, start + 12), health.reason) == (LinkState.STALE, "open, no reading yet")
     judged(health, start + 14)
-    assert health.reason == "nothing heard for 4.0 s, expected every 3 s"
+    assert health.reason == "no reading for 4.0 s, expected every 3 s"
     health.on_bytes(10, start + 14)
     assert judged(health, start + 14) is LinkState.STALE, "bytes that are no reading"
     health.on_reading(start + 15)
@@ -45,7 +45,7 @@ def test_opened_at_the_origin_of_the_clock() -> None:
     health = LinkHealth()
     health.on_open(0.0)
     judged(health, 5.0)
-    assert health.reason == "nothing heard for 5.0 s, expected every 3 s"
+    assert health.reason == "no reading for 5.0 s, expected every 3 s"
 
 
 def test_in_a_silent_mode_what_is_heard_counts_and_silence_is_quiet() -> None:
@@ -74,7 +74,7 @@ def test_a_link_is_not_online_while_the_car_counts_as_unheard(limit_s: float | N
     health.on_open(1.0)
     health.on_reading(2.0)
     assert judged(health, 2.5, limit_s=limit_s, is_heard=False) is LinkState.STALE
-    assert health.reason == "not heard for 0.5 s: whether it moves is not known"
+    assert health.reason == "silent for 0.5 s: it may be moving"
     assert judged(health, 2.6, limit_s=limit_s) is LinkState.ONLINE
 
 
@@ -84,7 +84,7 @@ def test_no_time_is_negative() -> None:
     health.on_open(1.0)
     health.on_reading(7.0)
     judged(health, 2.0, is_heard=False)
-    assert health.reason.startswith("not heard for 0.0 s")
+    assert health.reason.startswith("silent for 0.0 s")
 
 
 def test_counters() -> None:

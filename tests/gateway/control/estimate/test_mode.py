@@ -37,7 +37,7 @@ def asked(mode: Mode) -> ModeEstimator:
     truth.on_reading(reading(SHAPES[before], -0.1))
     assert truth.confirmed is before
     truth.on_mode_sent(mode, now=0.0, block_s=BLOCK_S)
-    assert (truth.verdict, truth.evidence) == (ASSUMED, f"{mode} was asked, nothing heard since")
+    assert (truth.verdict, truth.evidence) == (ASSUMED, f"mode {mode} was commanded, no reading since")
     return truth
 
 
@@ -54,7 +54,7 @@ def test_its_own_shape_confirms_a_mode(mode: Mode) -> None:
     truth = asked(mode)
     truth.on_reading(reading(SHAPES[mode], 3.0))
     assert (truth.verdict, truth.inferred, truth.confirmed, truth.candidates) == (CONFIRMED, mode, mode, (mode,))
-    assert (truth.evidence, truth.evidence_at) == (f"a reading with the shape of {mode}", 3.0)
+    assert (truth.evidence, truth.evidence_at) == (f"a reading as in mode {mode}", 3.0)
 
 
 def test_a_shape_of_two_modes_confirms_neither_and_speaks_against_neither() -> None:
@@ -73,7 +73,7 @@ def test_three_readings_running_of_another_mode_contradict(mode: Mode) -> None:
         assert truth.verdict is ASSUMED
         truth.on_reading(reading(SHAPES[Mode.TRACKING], 4.0 + number))
     assert (truth.verdict, truth.inferred, truth.confirmed) == (CONTRADICTED, Mode.TRACKING, None)
-    assert truth.evidence == "3 readings running with the shape of tracking"
+    assert truth.evidence == "3 consecutive readings as in mode tracking"
     if mode in SHAPES:
         truth.on_reading(reading(SHAPES[mode], 9.0))
         assert truth.verdict is CONFIRMED, "it is believed again"
@@ -121,7 +121,7 @@ def test_silence_contradicts_a_mode_that_talks(mode: Mode, limit_s: float) -> No
     assert truth.verdict is CONFIRMED
     truth.on_silence(now=10.01 + limit_s, fan=False)
     assert truth.verdict is CONTRADICTED
-    assert truth.evidence == f"silent for {limit_s:.1f} s, {mode} reports at least every {limit_s:g} s"
+    assert truth.evidence == f"silent for {limit_s:.1f} s, but mode {mode} reports at least every {limit_s:g} s"
     truth.on_silence(now=13.5, fan=False)
     assert (truth.candidates, truth.inferred) == (SILENT, None)
     truth.on_reading(reading(SHAPES[mode], 20.0))
@@ -178,14 +178,14 @@ def test_a_mode_without_its_own_readings_is_contradicted_as_by_silence() -> None
     assert truth.verdict is CONFIRMED
     truth.on_silence(now=11.0, fan=False)
     assert truth.verdict is CONTRADICTED
-    assert truth.evidence == "no reading with the shape of tracking for 1.1 s, the last has that of manual"
+    assert truth.evidence == "no reading as in mode tracking for 1.1 s, the last one is as in mode manual"
 
 
 @pytest.mark.parametrize("mode", SILENT)
 def test_silence_never_confirms(mode: Mode) -> None:
     truth = asked(mode)
     truth.on_silence(now=3.4, fan=False)
-    assert truth.evidence == f"{mode} was asked, nothing heard since"
+    assert truth.evidence == f"mode {mode} was commanded, no reading since"
     truth.on_silence(now=12.0, fan=False)
     assert (truth.verdict, truth.evidence) == (ASSUMED, "silent for 12 s, as expected")
     assert (truth.candidates, truth.inferred) == (SILENT, None)

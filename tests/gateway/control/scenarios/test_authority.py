@@ -57,7 +57,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
     for what in (FORWARD, SetMode(Mode.MANUAL), OneShot(ColorLed(1, 2, 3)), TakeLease(), Drive(Motion.STOP)):
         refused = desk.ask(what, PERSON)
         assert (refused.status, refused.reason) == (REJECTED, Reason.ESTOPPED)
-        assert "red is e-stopped by mia: smoke; a person or script ends it: resume e1" in refused.words
+        assert 'red is emergency-stopped (mia: "smoke"). Release it with `fleet resume red --estops`.' in refused.words
     assert desk.ask(Stop(), SCRIPT).status is QUEUED
     assert desk.ask(Resume(("e2",)), PERSON).reason is Reason.BAD_VALUE
     assert "still in force: e-stop e1" in desk.ask(Resume(), PERSON).words, "without ids it ends the hold"
@@ -105,7 +105,7 @@ def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Workbench) ->
     assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert desk.logs[0].code == "estop_joined"
-    assert "as blue shows: smoke" in desk.logs[0].words
+    assert "with the whole fleet by mia: smoke (e-stop e1, seen from blue)" in desk.logs[0].words
     desk.sent.clear()
     desk.control.merge_estops([estop], [], "green", desk.now)
     desk.run(3.0)
@@ -128,7 +128,7 @@ def test_who_drives_has_the_car_and_two_seconds_more(desk: Workbench) -> None:
     other = Sender("other")
     refused = desk.ask(Drive(Motion.LEFT), other)
     assert (refused.status, refused.reason) == (REJECTED, Reason.LEASED)
-    assert "red is driven by script (script), for 5.0 s more: wait, or ask as a person" in refused.words
+    assert "red is driven by script (script) for another 5.0 s. Wait until the car is free." in refused.words
     desk.run(4.9)
     assert desk.ask(Drive(Motion.STOP), other).reason is Reason.LEASED, "whose idle stick would stop another's car"
     assert desk.ask(OneShot(ColorLed(1, 2, 3)), other).status is QUEUED
@@ -186,7 +186,7 @@ def test_a_person_outranks_a_script_and_the_loser_is_told_by_whom(desk: Workbenc
 
 def test_between_persons_the_holder_keeps_it_unless_it_is_taken(desk: Workbench) -> None:
     desk.ask(FORWARD, PERSON, identity="d")
-    assert desk.ask(FORWARD, BOB).words.endswith("wait, or take it")
+    assert desk.ask(FORWARD, BOB).words.endswith("Wait, or take the car over (--take).")
     assert desk.ask(Drive(Motion.BACK, 1.0), BOB, take=True).status is QUEUED
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert desk.ask(FORWARD, PERSON).reason is Reason.LEASED
@@ -236,7 +236,7 @@ def test_a_stick_that_is_leaned_on_after_anothers_stop_does_not_drive_on(desk: W
     desk.ask(Stop(), PERSON, identity="s")
     for _ in range(50):
         refused = desk.ask(stick, SCRIPT, streamed=True)
-        assert (refused.reason, "let go" in refused.words) == (Reason.HELD, True)
+        assert (refused.reason, "was just stopped" in refused.words) == (Reason.HELD, True)
         desk.run(0.1)
     assert desk.frames == [RUN, *SHOWN_STOP]
     assert desk.control.safety.hold is not None, "what was refused ends no hold"

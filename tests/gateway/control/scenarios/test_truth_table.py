@@ -18,14 +18,14 @@ LONG_S = 15.0
 """Longer than any time of the table."""
 TALKING = frozenset({Mode.MANUAL, Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING})
 BY = {
-    "3 readings": ("3 readings running",),
+    "3 readings": ("3 consecutive readings",),
     "silence of 3 s": ("silent for 3.",),
     "3 readings, or silence of 3 s": (
-        "3 readings running",
+        "3 consecutive readings",
         "silent for 3.",
-        "no reading with the shape of manual for 3.",
+        "no reading as in mode manual for 3.",
     ),
-    "1 s without a reading of its own": ("silent for 1.", "no reading with the shape of"),
+    "1 s without a reading of its own": ("silent for 1.", "no reading as in mode"),
 }
 
 Row = dict[str, str]

@@ -346,8 +346,8 @@ ROWS = [
     (StopCase.MANUAL, driven, "2 pauses in its reports"),
     (StopCase.NO_ECHO, lambda: driven(world=World.open_field()), "no sonar echo"),
     (StopCase.FAN, fan, "while its fan runs"),
-    (StopCase.RASPBERRY_PI, lambda: driven("raspberry_pi"), "a Raspberry Pi car shows nothing of a stop"),
-    (StopCase.UNKNOWN_PLATFORM, lambda: driven("raspberry_pi", told="unknown"), "reports on in mode 0"),
+    (StopCase.RASPBERRY_PI, lambda: driven("raspberry_pi"), "a Raspberry Pi car never confirms a stop"),
+    (StopCase.UNKNOWN_PLATFORM, lambda: driven("raspberry_pi", told="unknown"), "keeps reporting in mode 0"),
 ]
 
 
@@ -367,7 +367,7 @@ def test_a_row_of_the_table(case: StopCase, situation: Callable[[], Pair], words
 def test_a_soft_stop_shows_nothing() -> None:
     """The row `soft`: the drive's own end is complete, and the rest after it is only sent."""
     pair = driven()
-    assert ended(pair, Drive(Motion.STOP)) == (Phase.SENT, Basis.SENT, EVIDENCE[StopCase.SOFT].words)
+    assert ended(pair, Drive(Motion.STOP)) == (Phase.SENT, Basis.SENT, EVIDENCE[StopCase.SOFT].words.format(car="red"))
     assert (pair.control.model.motors, pair.control.model.basis) == ("off", Basis.SENT)
     assert pair.control.model.rest is StopCase.SOFT
 

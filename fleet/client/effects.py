@@ -1,0 +1,65 @@
+"""The texts of outcomes: what a command did, by verb and result. Pure."""
+
+from typing import Final
+
+_ANY: Final = "*"
+_ESTOP_LASTS: Final = "until `fleet resume {car} --estops`"
+
+EFFECTS: Final[dict[str, dict[str, str]]] = {
+    "drive": {
+        "complete": "drove{detail}, then stopped",
+        "unconfirmed": "drive sent, NOT CONFIRMED",
+        "sent": "driving{detail}",
+    },
+    "release": {"shown": "stopped", "unconfirmed": "stop sent", "sent": "stopped"},
+    "stop": {
+        "shown": "stopped ({took_s:.1f} s)",
+        "complete": "stopped ({took_s:.1f} s)",
+        "unconfirmed": "stop sent, which {car} cannot confirm",
+        "sent": "stopped",
+    },
+    "estop": {
+        "shown": f"emergency-stopped ({{took_s:.1f}} s) {_ESTOP_LASTS}",
+        "complete": f"emergency-stopped ({{took_s:.1f}} s) {_ESTOP_LASTS}",
+        "unconfirmed": f"emergency stop sent, which {{car}} cannot confirm; in force {_ESTOP_LASTS}",
+        "sent": f"emergency-stopped {_ESTOP_LASTS}",
+    },
+    "mode": {"sent": "switching to mode{detail}"},
+    "led": {"sent": "LED set"},
+    "light": {"sent": "light set to{detail}"},
+    "servo": {"sent": "servo set"},
+    "arm": {"sent": "arm set"},
+    "whistle": {"sent": "whistled"},
+    "speed": {"sent": "speed one step{detail}"},
+    "fan": {"sent": "fan{detail}"},
+    "find": {"sent": "blinked and beeped"},
+    "resume": {"sent": "resumed"},
+    "lease": {"sent": "done"},
+    _ANY: {
+        "complete": "done",
+        "sent": "sent",
+        "rejected": "refused: {words}",
+        "superseded": "ended early: {words}",
+        "expired": "not done: {words}",
+        "failed": "failed: {words}",
+    },
+}
+"""What a command did, by verb and result. `release` is a drive with motion stop."""
+
+_STOP_FAILURES: Final = {"not_shown": "stop sent, {words}", "rejected": "{words}", "failed": "{words}"}
+"""The gateway's words of a stop that failed begin with the fact for the car."""
+STOP_VERBS: Final = frozenset({"stop", "estop", "release"})
+
+
+def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, words: str, took_s: float) -> str:
+    """Return what a command did. results: the most specific one first, such as reason and phase."""
+    tables = [EFFECTS.get(verb, {}), *([_STOP_FAILURES] if verb in STOP_VERBS else ()), EFFECTS[_ANY]]
+    template = next((table[result] for result in results for table in tables if result in table), "{words}")
+    shown = f" {detail}" if detail else ""
+    text = template.format(car=car, detail=shown, words=words, took_s=took_s).removesuffix(": ")
+    return f"{text} ({words})" if words and "{words}" not in template else text
+
+
+def with_code(text: str, code: str) -> str:
+    """Append a reason code in brackets, so that a person can search for it."""
+    return f"{text} [{code}]" if code else text
