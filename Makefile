@@ -16,7 +16,7 @@ export FLEET_STATE_DIR := $(CURDIR)/.state
 # Tests start hundreds of Python processes. Each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test stress soak lint bench vectors proto pictures readme clean
+.PHONY: help demo test stress soak lint bench vectors proto pictures pages docs clean
 help: ## what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
@@ -54,18 +54,25 @@ bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in 
 	@mkdir -p .tmp
 	$(BIN)/python -m tests.bench
 
-vectors: .venv/.ready ## write tests/vectors/stops.tsv, the distribution of stops of which the README tells
+vectors: .venv/.ready ## write tests/vectors/stops.tsv, the distribution of stops in docs/reference/stopping-times.md
 	$(BIN)/python -m tests.tools.vectors
 
 proto: .venv/.ready ## generate schemas/gen from schemas/proto
 	$(BIN)/python -m schemas.generate
 
-pictures: .venv/.ready ## the README's pictures, of the newest session (needs a Vulkan driver, which may be software)
+pictures: .venv/.ready ## the pictures of README and docs, of the newest session (needs a Vulkan driver, which may be software)
 	$(BIN)/python -m tests.tools.screenshots "$$(ls -td sessions/*/ | head -n 1)" .github
 
-readme: .venv/.ready ## generate the README's tables and help texts, docs/reference and the SDK's reference
-	$(BIN)/python -m tests.tools.readme
-	$(BIN)/python -m tests.tools.reference
+pages: .venv/.ready ## generate the pages and tables of docs/reference, and the numbers in other pages
+	$(BIN)/python -m tests.tools.pages
+
+.venv/.docs: .venv/.ready
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
+docs: .venv/.docs ## build the site into .cache/docs/site, and fail on broken links
+	$(BIN)/python -m tests.tools.site .cache/docs
+	$(BIN)/zensical build -f .cache/docs/zensical.toml --strict
 
 clean: ## remove everything that is not tracked
 	rm -rf .venv .cache .tmp .state .hypothesis .pytest_cache .mypy_cache .ruff_cache sessions

@@ -13,7 +13,7 @@ class CommandType:
     verb: str
     about: str
     ttl_s: float = 2.0
-    """Default of the maximum age at arrival (docs/reference/messages.md#commands)."""
+    """Default of the maximum age at arrival (docs/reference/commands.md#payload)."""
     wildcard: bool = False
     """True if one query may address several cars (docs/reference/keys.md#command-keys)."""
     stops: bool = False

@@ -1,23 +1,36 @@
-"""Citations of pages in the code and links between pages resolve, and the prose of docs/ stays short.
+"""Citations of pages in the code, links between pages and the navigation are whole, and the prose stays short.
 
 The code cites a page by its path from the root, with the anchor of a heading where it means one:
-docs/reference/protocol.md#blocking-times. Pages link to each other with relative links.
+docs/reference/protocol.md#blocking-times. Pages of docs/ link to each other with relative links, and to other files of
+the repository with the address of its `main`. README.md has addresses only: package indexes show it, too.
 """
 
 import re
+import tomllib
+from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from statistics import mean
-from typing import Final
+from typing import Any, Final
 
 import pytest
 
+from tests.tools.site import CONFIGURATION, FROM_TOP
+
 ROOT: Final = Path(__file__).parent.parent
 PACKAGES: Final = ("gateway", "fleet", "schemas", "tests", "deploy")
-PAGES: Final = tuple(sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "fleet").rglob("*.md")]))
+PAGES: Final = tuple(sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / ".github").rglob("*.md")]))
+README: Final = ROOT / "README.md"
+CLI: Final = ROOT / "docs/reference/cli"
+CLI_INDEX: Final = ROOT / "docs/reference/cli/index.md"
+REPOSITORY: Final = re.compile(
+    r"https://(?:github\.com/zenoh-car-fleet/zenoh-car-fleet/(?:blob|tree)|raw\.githubusercontent\.com/zenoh-car-fleet/zenoh-car-fleet)/main/(.+)"
+)
 DOCS: Final = tuple(page for page in PAGES if page.is_relative_to(ROOT / "docs"))
 TEXT_SUFFIXES: Final = frozenset({".py", ".proto", ".yaml", ".toml", ".service", ".rules", ".tsv", ".ipynb", ".sh"})
 
+GENERATORS: Final = ROOT / "tests/tools/pages"
 CITATION: Final = re.compile(r"(?<![\w./-])((?:[\w.-]+/)*[\w-]+\.md)\b(?:#([\w-]+))?")
 LINK: Final = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 CODE_PATH: Final = re.compile(r"`((?:gateway|fleet|schemas|tests|deploy)/[\w./-]+\.\w+)`")
@@ -25,13 +38,18 @@ FENCE: Final = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 MEAN_WORDS: Final = 18
 MAX_WORDS: Final = 32
+README_WORDS: Final = 30
+README_LINES: Final = 200
+INTERNAL: Final = ("hub", "token", "consolidation", "lease", "protobuf", "liveliness", "frame", "chunk")
 
 
+@cache
 def prose(page: Path) -> str:
     """Return the text of a page without its code blocks."""
     return FENCE.sub("", page.read_text(encoding="utf-8"))
 
 
+@cache
 def anchors(page: Path) -> set[str]:
     """Return the anchors of the headings of a page, as GitHub makes them."""
     found: set[str] = set()
@@ -81,29 +99,105 @@ def test_each_link_and_path_on_a_page_resolves(page: Path) -> None:
     faults = faults_of(LINK.sub("", text), page.name)
     for link in LINK.findall(text):
         path, _, anchor = link.partition("#")
-        if re.match(r"[a-z]+:", path):
+        if ours := REPOSITORY.fullmatch(path):
+            target = ROOT / ours[1]
+        elif re.match(r"[a-z]+:", path):
             continue
-        if why := fault((page.parent / path).resolve() if path else page, anchor):
+        else:
+            target = (page.parent / path).resolve() if path else page
+        if page in DOCS and not ours and not target.is_relative_to(ROOT / "docs"):
+            faults.append(f"{link}: leads out of docs/, where the site ends")
+        elif why := fault(target, anchor):
             faults.append(f"{link}: {why}")
     if page in DOCS:
         faults += [f"no file {path}" for path in CODE_PATH.findall(text) if not (ROOT / path).exists()]
     assert not faults, "\n".join(faults)
 
 
+def navigation(part: Any) -> Iterator[str]:
+    """Yield the pages of the navigation, at any depth."""
+    for entry in part:
+        for below in entry.values():
+            yield from (below,) if isinstance(below, str) else navigation(below)
+
+
+def test_the_navigation_is_complete() -> None:
+    """Every page is in it once. The pages of commands are listed by an index of their own."""
+    with (ROOT / "docs" / CONFIGURATION).open("rb") as file:
+        found = Counter(navigation(tomllib.load(file)["project"]["nav"]))
+    index = (CLI_INDEX).read_text(encoding="utf-8")
+    listed = {str(page.relative_to(ROOT / "docs")) for page in CLI.glob("*.md") if f"]({page.name})" in index}
+    assert {page for page, times in found.items() if times > 1} == set()
+    assert {str(page.relative_to(ROOT / "docs")) for page in DOCS} | set(FROM_TOP.values()) == set(found) | listed
+
+
+def test_docs_holds_only_what_is_published() -> None:
+    texts = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    for path in sorted((ROOT / "docs").rglob("*")):
+        if path.is_file() and path.suffix != ".md" and path.name != CONFIGURATION:
+            assert path.parent.name == "pictures", path
+            assert f"pictures/{path.name}" in texts, f"{path.name} is shown nowhere"
+
+
 def sentences(page: Path) -> list[str]:
     """Return the sentences of a page, without tables, headings and the targets of links."""
-    lines = [line for line in prose(page).splitlines() if not line.startswith(("|", "#", "<!--"))]
-    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", "\n".join(lines))
-    paragraphs = re.split(r"\n\s*\n|^\s*- ", text, flags=re.MULTILINE)
-    split = (each for paragraph in paragraphs for each in re.split(r"(?<=[.!?])\s+", " ".join(paragraph.split())))
+    lines = [
+        line.removeprefix("> ") for line in prose(page).splitlines() if not line.startswith(("|", "#", "<!--", "[!"))
+    ]
+    text = re.sub(r"<!--.*?-->", "", "\n".join(lines))
+    text = re.sub(r"\[([^\[\]]*)\]\([^)]*\)", r"\1", text)
+    paragraphs = re.split(r"\n\s*\n|^\s*(?:- |\d+\. )", text, flags=re.MULTILINE)
+    split = (each for paragraph in paragraphs for each in re.split(r"(?<=[.!?])\s+| · ", " ".join(paragraph.split())))
     return [each for each in split if each]
 
 
-@pytest.mark.parametrize("page", DOCS, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [README, *DOCS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_sentences_are_short(page: Path) -> None:
     lengths = {each: len(each.split()) for each in sentences(page)}
-    assert not [each for each, words in lengths.items() if words > MAX_WORDS]
+    assert not [each for each, words in lengths.items() if words > (README_WORDS if page == README else MAX_WORDS)]
     assert mean(lengths.values()) <= MEAN_WORDS
+
+
+GLOSSARY: Final = ROOT / "docs/reference/glossary.md"
+NOUNS: Final = re.compile(
+    r"\b(?:the|a|an|of|what (?:is|was)) (?:heard|told|asked|said|shown|kept|held|given|begun|wanted|found)\b"
+    r"(?= (?:is|was|and|or|of)\b|[.,;:])"
+)
+"""Participles as nouns: rule 10 of words."""
+BRITISH: Final = re.compile(r"(?i)\b(?:colour\w*|metres?|behaviour|neighbour\w*|grey|licence)\b")
+
+
+@pytest.mark.parametrize("page", [README, *DOCS], ids=lambda page: str(page.relative_to(ROOT)))
+def test_words_are_plain(page: Path) -> None:
+    """No participle stands as a noun, and no synonym stands for a word of the glossary."""
+    glossary = GLOSSARY.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| [^|]+ \| [^|]+ \| ([^|]+?) ?\|$", glossary, re.MULTILINE)
+    refused = {word.strip() for row in rows for word in row.split(",")} - {"", "instead of"}
+    assert "kill switch" in refused
+    text = prose(page) if page != GLOSSARY else ""
+    faults = [match[0] for match in NOUNS.finditer(text)]
+    faults += [word for word in refused if re.search(rf"\b{re.escape(word)}s?\b", text, re.IGNORECASE)]
+    if "<!-- begin" not in page.read_text(encoding="utf-8") and page.parent != CLI:
+        faults += BRITISH.findall(text)
+    assert faults == []
+
+
+# The README.
+
+
+def test_the_readme_is_short_and_its_links_work_anywhere() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= README_LINES
+    links = LINK.findall(FENCE.sub("", text)) + re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", text))
+    assert [link for link in links if not link.startswith(("https://", "#"))] == []
+    assert "<!--" not in text, "a generated part"
+    for target in ("make demo", "make test"):
+        assert text.index(target) < text.index("## Drive your own car")
+
+
+def test_the_readme_has_no_word_of_the_inside_above_how_it_works() -> None:
+    above = README.read_text(encoding="utf-8").partition("## How it works")[0]
+    assert re.findall(rf"(?i)\b(?:{'|'.join(INTERNAL)})s?\b", above) == []
 
 
 def test_a_page_or_a_heading_that_is_not_there_is_found() -> None:

@@ -2,7 +2,7 @@
 
 The car acknowledges nothing (docs/reference/protocol.md#evidence-of-a-stop). A car shows in three ways that it obeyed
 `MODE00`. It leaves a mode that it reported. It leaves a silent mode that was opened from a shown rest. Or its reports
-pause. Docs and README print `EVIDENCE`; `tests/tools/readme.py` writes them.
+pause. The docs print `EVIDENCE` (docs/reference/stop-evidence.md).
 """
 
 from dataclasses import dataclass

@@ -270,13 +270,6 @@ def test_only_fleet_files_know_simulated_links() -> None:
         parse_url("sim")
 
 
-def test_the_one_in_the_readme_is_right() -> None:
-    readme = (Path(__file__).parents[3] / "README.md").read_text(encoding="utf-8")
-    section = readme.partition("### The fleet file")[2]
-    fleet = _fleet(section.partition("```yaml\n")[2].partition("```")[0])
-    assert {name: car.platform for name, car in fleet.cars.items()} == {"red": "arduino+arm", "blue": "raspberry_pi"}
-
-
 def test_the_schema_is_one_for_editors() -> None:
     made = schema()
     assert made["required"] == ["cars"]

@@ -1,4 +1,4 @@
-"""fleet/REFERENCE.md: the SDK's public names with their docstrings; `python -m tests.tools.reference` writes it.
+"""The page docs/reference/python.md: the public names with their docstrings.
 
 Made of what the code says of itself: a docstring that is wrong there is wrong here, and mended in one place.
 """
@@ -6,7 +6,6 @@ Made of what the code says of itself: a docstring that is wrong there is wrong h
 import inspect
 import re
 from collections.abc import Callable
-from pathlib import Path
 
 from fleet import LeaseLost, NotCarriedOut, Outcome, Reading, aio, conditions
 from fleet.client import client, reading, wait
@@ -14,17 +13,17 @@ from fleet.client.commands import CarCommands
 from fleet.client.lease import Lease
 from schemas import bus, keys
 
-PATH = Path(client.__file__).parent.parent.parent / "fleet/REFERENCE.md"
-_HEAD = """# The SDK
+_HEAD = """# Python
 
-Generated from the docstrings by `make readme`; examples that run are in [examples](examples/programs). Times are
-seconds, distances meters, angles degrees unless a name says otherwise; what was not measured is None.
+This page has every name of the Python client. Times are in seconds, distances in meters and angles in degrees, unless
+a name says otherwise. A value that was not measured is None.
 
 ```python
 from fleet import Fleet, LeaseLost, NotCarriedOut
 ```
 
-`from fleet.aio import Fleet` has the same names for asyncio, each call awaited.
+`from fleet.aio import Fleet` has the same names for asyncio, and each call is awaited.
+The guide "Drive from Python" has examples.
 """
 _CLASSES: tuple[tuple[str, type], ...] = (
     ("Fleet", client.Fleet),
@@ -140,7 +139,3 @@ def _async(name: str) -> str:
     verbs = ["every command"] if issubclass(each, CarCommands) else []
     extra = f" Awaited: {', '.join(awaited + verbs)}." if awaited or verbs else ""
     return f"- `{name}`: {' '.join(_text(each).split())}{extra}"
-
-
-if __name__ == "__main__":
-    PATH.write_text(reference(), encoding="utf-8")

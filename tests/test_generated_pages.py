@@ -1,0 +1,18 @@
+"""What the pages of docs/ show is what the code says."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.tools.pages.build import ROOT, expected, stale_pages
+
+EXPECTED = expected()
+
+
+@pytest.mark.parametrize("page", EXPECTED, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_generated_pages_are_up_to_date(page: Path) -> None:
+    assert page.read_text(encoding="utf-8") == EXPECTED[page], "run `make pages`"
+
+
+def test_no_page_of_a_command_that_is_gone() -> None:
+    assert stale_pages() == [], "run `make pages`"

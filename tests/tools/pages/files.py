@@ -1,0 +1,97 @@
+"""The fields of fleet files, plans and worlds, from the JSON Schemas that `fleet schema` prints."""
+
+from typing import Any
+
+from fleet.fleetfile import models as fleet_models
+from fleet.policy.plan import models as plan_models
+from tests.tools.pages.command_line import escape
+
+
+def schema_tables(schema: dict[str, Any]) -> str:
+    """Return a table of fields for the file and for each kind of entry in it."""
+    definitions = schema.get("$defs", {})
+    parts = []
+    for name, part in {"": schema, **definitions}.items():
+        if "properties" not in part:
+            continue
+        words = " ".join(str(part.get("description", "")).split())
+        rows = ["| field | value | default | what it is |", "|---|---|---|---|"]
+        required = set(part.get("required", ()))
+        for field, each in part["properties"].items():
+            rows.append(
+                f"| `{field}` | {_value(each, definitions)} | {_default(each, field in required)} | {_about(each)} |"
+            )
+        heading = f"## {_title(name)}\n\n" if name else ""
+        parts.append(f"{heading}{escape(words)}\n\n" + "\n".join(rows))
+    return "\n\n".join(parts)
+
+
+def _title(name: str) -> str:
+    return name.removesuffix("Entry")
+
+
+def _value(each: dict[str, Any], definitions: dict[str, Any]) -> str:
+    """Return what a field takes, in a few words."""
+    if "$ref" in each:
+        name = each["$ref"].rpartition("/")[2]
+        target = definitions.get(name, {})
+        return (
+            _value(target, definitions) if "properties" not in target else f"[{_title(name)}](#{_title(name).lower()})"
+        )
+    if "allOf" in each:
+        return _value(each["allOf"][0], definitions)
+    if "anyOf" in each or "oneOf" in each:
+        kinds = [kind for kind in each.get("anyOf", each.get("oneOf", [])) if kind.get("type") != "null"]
+        return " or ".join(dict.fromkeys(_value(kind, definitions) for kind in kinds))
+    if "enum" in each:
+        return ", ".join(f"`{word}`" for word in each["enum"])
+    if "const" in each:
+        return f"`{each['const']}`"
+    kind = each.get("type", "")
+    if kind == "array":
+        items = each.get("items", each.get("prefixItems", [{}])[0] if each.get("prefixItems") else {})
+        return f"list of {_value(items, definitions)}"
+    if kind == "object" and isinstance(each.get("additionalProperties"), dict):
+        return f"by name: {_value(each['additionalProperties'], definitions)}"
+    return f"{ {'string': 'text', 'boolean': 'true, false', 'integer': 'whole number'}.get(kind, kind) }{_bounds(each)}"
+
+
+def _bounds(each: dict[str, Any]) -> str:
+    low = each.get("minimum", each.get("exclusiveMinimum"))
+    high = each.get("maximum", each.get("exclusiveMaximum"))
+    if low is None and high is None:
+        return ""
+    above = "more than " if "exclusiveMinimum" in each else ""
+    return (
+        f", {above}{low:g} to {high:g}"
+        if low is not None and high is not None
+        else f", from {low if low is not None else high:g}"
+    )
+
+
+def _default(each: dict[str, Any], required: bool) -> str:
+    if required:
+        return "required"
+    default = each.get("default")
+    return (
+        f"`{str(default).lower() if isinstance(default, bool) else default}`"
+        if default not in (None, [], {}, "")
+        else ""
+    )
+
+
+def _about(each: dict[str, Any]) -> str:
+    words = each.get("description") or next(
+        (kind["description"] for kind in each.get("anyOf", []) if "description" in kind), ""
+    )
+    return escape(" ".join(words.split())).replace("|", "\\|")
+
+
+def fleet_fields() -> str:
+    """Return the fields of a fleet file."""
+    return schema_tables(fleet_models.schema())
+
+
+def plan_fields() -> str:
+    """Return the fields of a plan."""
+    return schema_tables(plan_models.PlanEntry.model_json_schema())

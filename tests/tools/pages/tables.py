@@ -1,0 +1,229 @@
+"""The generated tables of docs/: topics, commands, stops, evidence, modes and platforms; and the numbers in prose."""
+
+import csv
+import inspect
+import re
+from itertools import chain
+from typing import Any
+
+from google.protobuf.descriptor import FieldDescriptor
+
+from fleet.conditions.fields import LAST, fields_of
+from gateway.bus.requests import DEFAULT_MAX_DRIVE_S
+from gateway.control.car_monitor import STALL_S
+from gateway.control.estimate.trust import TRANSITIONS, CarTrust, TrustEvent, TrustState
+from gateway.control.senders import SENDER_GONE_S, STREAM_PAUSE_S
+from gateway.control.stop_executor import SHUTDOWN_S
+from gateway.control.stop_renewal import RENEWAL_INTERVALS_S
+from gateway.control.stops.evidence import EVIDENCE
+from gateway.control.stops.sequences import REPEAT_INTERVAL_S
+from gateway.protocol.enums import Mode
+from gateway.protocol.modes import MODES
+from gateway.protocol.platforms import Platform, Profile, parse_platform
+from schemas import messages, topics
+from schemas.commands import COMMANDS
+from tests.support import vectors
+from tests.tools.vectors import STOPS
+
+_COMMON = {"sender", "kind", "id", "asked", "take", "ttl_s"}
+
+
+def key_table() -> str:
+    """Return the table of topics with how each is published, kept and shown."""
+    rows = [
+        "| key | message | what | units | rate | stale after | class | history | cache | Rerun entity |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for topic in topics.TOPICS.values():
+        units = ", ".join(f"{name} {unit}" for name, unit in topic.units.items())
+        cells = (
+            f"`<fleet>/{topic.name if topic.name.startswith('@') else f'<car>/{topic.name}'}`",
+            topic.message,
+            topic.about,
+            units,
+            f"{topic.rate_hz:g}/s" if topic.rate_hz else "",
+            f"{topic.stale_after_s:g} s" if topic.stale_after_s is not None else "",
+            topic.qos,
+            str(topic.history_size or ""),
+            str(topic.cache_size),
+            f"`{topic.entity}`" if topic.entity else "",
+        )
+        rows.append(f"| {' | '.join(cell or '-' for cell in cells)} |")
+    return "\n".join(rows)
+
+
+def verb_table() -> str:
+    """The table of commands, with the fields of each message."""
+    rows = ["| verb | fields | what |", "|---|---|---|"]
+    for verb, row in COMMANDS.items():
+        fields: Any = messages.message_class(row.message).DESCRIPTOR.fields
+        own = [_field(field) for field in fields if field.name not in _COMMON]
+        rows.append(f"| `{verb}` | {', '.join(own) or '-'} | {row.about} |")
+    return "\n".join(rows)
+
+
+def _field(field: FieldDescriptor) -> str:
+    return f"`{field.name}`" + ("..." if field.is_repeated else "")
+
+
+_STATES = {
+    "manual, nothing unread": "driving or at rest",
+    "manual, a frame may be unread": "the same, just after another command",
+    "manual, in a block of ours": "a whistle or a servo is under way",
+    "in a mode that reads pins": "tracking, light seeking, following, infrared remote",
+    "in color_led": "color LED mode",
+    "in obstacle_avoidance": "obstacle avoidance, in a pen at worst",
+    "opening": "a mode is being opened (the longest)",
+    "link just restored": "the link has just come back, after half of any frame",
+    "raspberry_pi": "a Raspberry Pi car (the longest)",
+    "unknown platform": "a car whose platform is not known (the longest)",
+}
+"""What the states of the distribution of stops are called here; of several rows that begin so it is the longest."""
+
+
+def stops() -> list[dict[str, str]]:
+    """Return the distribution of stops that `make vectors` wrote."""
+    with STOPS.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file, delimiter="\t"))
+
+
+def _rows(name: str) -> list[dict[str, str]]:
+    """Return the rows of this name."""
+    grouped = name in ("opening", "raspberry_pi", "unknown platform")
+    named = [row for row in stops() if row["state"] == name]
+    begun = [row for row in stops() if row["state"].startswith(name)]
+    return [row for row in begun if not row["state"].endswith(("restored", "under way"))] if grouped else named
+
+
+def _longest(name: str, column: str) -> float:
+    """Return the longest of the rows of this name; 0 if no stop of theirs has such a time."""
+    times = [float(row[column]) for row in _rows(name)]
+    return max((each for each in times if each != float("inf")), default=0.0)
+
+
+def _shown_after(name: str) -> str:
+    """Return when the car had shown its stop, and how often it showed none."""
+    rows = _rows(name)
+    stops_shown, asked = sum(int(row["shown"]) for row in rows), sum(int(row["stops"]) for row in rows)
+    if not stops_shown:
+        return "never"
+    middle, worst = _longest(name, "shown_p50_s"), _longest(name, "shown_worst_s")
+    return f"{middle:.1f} s, at worst {worst:.1f} s ({100 * stops_shown / asked:.0f} % of stops)"
+
+
+def stop_table() -> str:
+    """How long a stop takes, by what the car is doing."""
+    rows = ["| the car is | in the middle | worst seen | longest announced | shown after |", "|---|---|---|---|---|"]
+    for name, words in _STATES.items():
+        middle, worst, announced = (_longest(name, column) for column in ("p50_s", "worst_s", "announced_s"))
+        rows.append(f"| {words} | {middle:.2f} s | {worst:.2f} s | {announced:.2f} s | {_shown_after(name)} |")
+    return "\n".join(rows)
+
+
+def evidence_table() -> str:
+    """Return the table of what shows a stop, from the table that the gateway runs on."""
+    rows = ["| stop | shown by | otherwise |", "|---|---|---|"]
+    rows += [f"| {row.stop} | {row.shown_by or 'nothing'} | {row.otherwise} |" for row in EVIDENCE.values()]
+    return "\n".join(rows)
+
+
+def trust_table() -> str:
+    """Return the states of trust, with the words that stand below each in the code."""
+    about = dict(re.findall(r'^    [A-Z_]+ = "(\w+)"\n    """(.+?)"""', inspect.getsource(CarTrust), re.MULTILINE))
+    rows = ["| trust | motors | what the gateway believes |", "|---|---|---|"]
+    rows += [f"| `{state}` | {TrustState(state).motors} | {about[state]} |" for state in CarTrust]
+    return "\n".join(rows)
+
+
+def transition_table() -> str:
+    """Return where each event leads from each state. A dot stands for no change."""
+    rows = [f"| what happens | {' | '.join(f'`{state}`' for state in CarTrust)} |", "|---" * (len(CarTrust) + 1) + "|"]
+    for event in TrustEvent:
+        to = [TRANSITIONS[state, event] for state in CarTrust]
+        cells = ["·" if new is state else str(new) for state, new in zip(CarTrust, to, strict=True)]
+        rows.append(f"| {event} | {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def mode_table() -> str:
+    """Which pairs of mode asked and true mode are told apart, and how soon."""
+    groups: dict[tuple[str, str, str], dict[str, list[str]]] = {}
+    for row in vectors.rows("mode_truth"):
+        key = (row["verdict"], row["by"], row["within_s"])
+        groups.setdefault(key, {}).setdefault(row["asked"], []).append(row["true"])
+    everything = {each["true"] for each in vectors.rows("mode_truth")}
+    rows = ["| asked | in truth | verdict | by | within |", "|---|---|---|---|---|"]
+    for (verdict, by, within), pairs in groups.items():
+        alike: dict[tuple[str, ...], list[str]] = {}
+        for asked, true in pairs.items():
+            every = set(true) == everything - {asked}
+            others = ("any other",) if every else tuple("the same" if each == asked else each for each in true)
+            alike.setdefault(others, []).append(asked)
+        for others, named in alike.items():
+            limit = (
+                "never" if within == "-" and verdict == "assumed" else "its first" if within == "-" else f"{within} s"
+            )
+            rows.append(f"| {', '.join(named)} | {', '.join(others)} | {verdict} | {by} | {limit} |".replace("_", " "))
+    return "\n".join(rows)
+
+
+def numbers() -> dict[str, str]:
+    """Return the numbers that pages have in their prose, from the code and from the distribution of stops."""
+    middle, worst = (_longest("manual, nothing unread", column) for column in ("p50_s", "worst_s"))
+    return {
+        "stop_middle": f"{middle:.2f} s",
+        "stop_worst": f"{worst:.1f} s",
+        "restored_worst": f"{_longest('link just restored', 'worst_s'):.1f} s",
+        "repeat": f"{REPEAT_INTERVAL_S:g} s",
+        "renewals": f"{RENEWAL_INTERVALS_S[0]:g} s, {RENEWAL_INTERVALS_S[1]:g} s and then every "
+        f"{RENEWAL_INTERVALS_S[2]:g} s",
+        "stream_pause": f"{STREAM_PAUSE_S:g} s",
+        "longest_drive": f"{DEFAULT_MAX_DRIVE_S:g} s",
+        "sender_gone": f"{SENDER_GONE_S:g} s",
+        "stall": f"{STALL_S:g} s",
+        "shutdown": f"{SHUTDOWN_S:g} s",
+        "stops_per_row": str(max(int(row["stops"]) for row in stops())),
+    }
+
+
+def report_table() -> str:
+    """Return what a car reports in each mode."""
+    rows = ["| mode | number | what the car reports |", "|---|---|---|"]
+    for mode in Mode:
+        measured = sorted(MODES[mode].measures)
+        told = ", ".join(f"`sensor/{each}`" for each in measured) or "nothing"
+        rows.append(f"| `{mode}` | {MODES[mode].digit} | {told} |")
+    return "\n".join(rows)
+
+
+def platform_table() -> str:
+    """Return what each kind of car knows."""
+    profiles: dict[str, Profile] = {kind: parse_platform(kind) for kind in Platform}
+    rows = [f"| | {' | '.join(f'`{kind}`' for kind in profiles)} |", "|---" * (len(profiles) + 1) + "|"]
+    every = sorted(set(chain.from_iterable(each.capabilities for each in profiles.values())))
+    rows += [
+        f"| {word} | {' | '.join('yes' if word in each.capabilities else '-' for each in profiles.values())} |"
+        for word in every
+    ]
+    for title, names in (
+        ("modes", lambda each: each.modes),
+        ("lights", lambda each: each.lights),
+        ("servo actions", lambda each: each.servos),
+        ("constant readings", lambda each: [name for name, _ in each.constants]),
+        ("not observed on a running car", lambda each: each.not_observed),
+    ):
+        cells = [", ".join(sorted(str(name) for name in names(each))).replace("_", " ") for each in profiles.values()]
+        rows.append(f"| {title} | {' | '.join(cell or '-' for cell in cells)} |")
+    return "\n".join(rows)
+
+
+def condition_table() -> str:
+    """Return the fields that a condition may name, by topic."""
+    kinds = {float: "number", bool: "yes/no", str: "word"}
+    rows = ["| topic | fields |", "|---|---|"]
+    for topic in topics.CAR_TOPICS:
+        if topic.family in ("sensor", "state", "sim"):
+            fields = fields_of(messages.message_class(topic.message)).items()
+            told = [f"`{name}` {kinds[kind]}" for name, kind in fields if name not in LAST]
+            rows.append(f"| `{topic.name}` | {', '.join(told)} |")
+    return "\n".join(rows)
