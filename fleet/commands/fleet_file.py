@@ -13,7 +13,9 @@ from fleet.commands.options import cli_errors, json_option
 from fleet.fleetfile.fleet_file import PALETTE, FleetFile, parse_fleet, read_fleet
 from fleet.fleetfile.link_check import check_link
 from fleet.fleetfile.models import schema, validate_color, validate_link, validate_name, validate_platform
-from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, scan
+from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, format_new_plan, scan
+from fleet.links import LINK_SIM
+from fleet.supervisor.spec import MAX_SIMULATED_CARS
 from schemas import bus
 from schemas.atomic_file import write_atomically
 from schemas.yaml_document.document import BadFile
@@ -108,41 +110,62 @@ def schema_text() -> str:
     epilog="""\b
 examples:
   fleet init
+  fleet init --sim 3         simulated cars, and a first plan for them
   fleet init --yes --out lab.yaml
   fleet init --link /dev/ttyUSB0 --link tcp://192.168.1.7:8888"""
+)
+@click.option(
+    "--sim",
+    "simulated",
+    type=click.IntRange(1, MAX_SIMULATED_CARS),
+    metavar="N",
+    help="Write N simulated cars and plan.yaml. Look for no cars.",
 )
 @click.option("--yes", is_flag=True, help="Accept every detected car without asking.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
 @click.option("--out", default=DEFAULT_FILE, show_default=True, type=click.Path(path_type=Path, dir_okay=False))
 @link_option
 @seconds_option
-def init(*, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: float | None) -> None:
-    """Write a fleet file: look for cars, ask for their names."""
+def init(
+    *, simulated: int | None, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: float | None
+) -> None:
+    """Write a fleet file: look for cars and ask for their names, or simulate cars."""
+    if simulated and links:
+        raise click.UsageError("--sim and --link do not go together: name one")
     with cli_errors():
         for link in links:
             validate_link(link)
-    if out.exists() and not force:
-        if yes:
-            raise click.UsageError(f"{out} is there already: give --force to write over it, or --out for another")
-        click.confirm(f"{out} is there already. Write over it?", abort=True)
+    plan = out.with_name("plan.yaml")
+    for path in (out, plan) if simulated else (out,):
+        if path.exists() and not force:
+            if yes or simulated:
+                raise click.UsageError(f"{path} exists already: give --force to overwrite it, or --out for another")
+            click.confirm(f"{path} exists already. Overwrite it?", abort=True)
     if not out.absolute().parent.is_dir():
         raise click.UsageError(f"{out}: there is no such directory")
-    found = look_for(links, seconds)
-    cars = _likely_cars(found) if yes else _prompt_cars(found)
+    if simulated:
+        cars = [NewCar(_default_name(index), LINK_SIM, "arduino", _color(index)) for index in range(simulated)]
+        write(plan, format_new_plan(simulated))
+    else:
+        found = look_for(links, seconds)
+        cars = _likely_cars(found) if yes else _prompt_cars(found)
     if not cars:
         raise click.ClickException(
             "no car was found: switch one on, plug it in or pair it, and see what `gateway scan` shows; a car that is "
             "silent is asked for without --yes; a TCP car is named with --link tcp://HOST:8888; without cars there is "
             "`fleet up --sim 3`"
         )
-    text = format_new_file(cars, "fleet")
+    text = format_new_file(cars, plan=bool(simulated))
     try:
         parse_fleet(text, out)
     except BadFile as error:
         print_errors(error)
         raise click.ClickException("nothing was written: two links may be one port") from None
     write(out, text)
-    click.echo(f"wrote {out} with {', '.join(car.name for car in cars)}: fleet check {out}, then fleet up {out}")
+    names = ", ".join(car.name for car in cars)
+    click.echo(f"Wrote {out}{f' and {plan}' if simulated else ''} with {names}. Next, type:")
+    where = "" if out == DEFAULT_FILE else f" {out}"
+    click.echo(f"  fleet check{where}\n  fleet up{where}")
 
 
 def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:
@@ -163,13 +186,20 @@ def write(path: Path, text: str) -> None:
         raise click.ClickException(f"{path} cannot be written: {error.strerror}") from None
 
 
+def _default_name(index: int) -> str:
+    return DEFAULT_CAR_NAMES[index] if index < len(DEFAULT_CAR_NAMES) else f"car{index + 1}"
+
+
+def _color(index: int) -> str:
+    return PALETTE[index % len(PALETTE)]
+
+
 def _likely_cars(found: list[FoundLink]) -> list[NewCar]:
     likely = [each for each in found if each.verdict in LIKELY_VERDICTS]
-    cars = []
-    for index, each in enumerate(likely):
-        name = DEFAULT_CAR_NAMES[index] if index < len(DEFAULT_CAR_NAMES) else f"car{index + 1}"
-        cars.append(NewCar(name, each.url, each.platform, PALETTE[index % len(PALETTE)], each.words))
-    return cars
+    return [
+        NewCar(_default_name(index), each.url, each.platform, _color(index), each.words)
+        for index, each in enumerate(likely)
+    ]
 
 
 def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:

@@ -1,12 +1,14 @@
 """Runs `gateway scan` as a process, and writes a fleet file from its results."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from fleet.fleetfile.fleet_file import PALETTE
 from fleet.links import parse_fleet_link
 from gateway.protocol.platforms import AUTO, Platform
 from schemas.links import SerialUrl, UsbUrl
@@ -16,7 +18,7 @@ POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, "silent", "busy")
 """Verdicts on links that may be a car's: a scan receives nothing from a car that is off, silent or served already.
 
 `ble`: a Bluetooth device with the service of a car's module. `given`: typed by the user and not scanned."""
-SCHEMA_URL: Final = "fleet.schema.json"
+SCHEMA_URL: Final = "https://raw.githubusercontent.com/zenoh-car-fleet/zenoh-car-fleet/main/deploy/fleet.schema.json"
 
 
 class ScanFailed(Exception):
@@ -89,28 +91,49 @@ def format_key(name: str) -> str:
     return name if name[0].isalpha() and name not in ("null", "true", "false") else quote(name)
 
 
-def format_new_file(cars: Sequence[NewCar], name: str) -> str:
-    """Return the text of a fleet file with these cars."""
+def format_new_file(cars: Sequence[NewCar], *, plan: bool = False) -> str:
+    """Return the text of a fleet file with these cars. plan: True if `plan.yaml` lies beside it."""
     lines = [
         f"# yaml-language-server: $schema={SCHEMA_URL}",
-        "# A fleet of cars. `fleet check` looks whether it is right and the cars are there, `fleet up` starts it,",
-        "# `fleet schema > fleet.schema.json` lets an editor help.",
-        f"name: {quote(name)}",
-        "# plan: plan.yaml           # what the cars shall do; `fleet plan check plan.yaml`",
-        "# recordings: sessions      # where `fleet up` records; record: false to leave it",
-        "",
-        "defaults:                   # for every car; a car may say otherwise",
-        "  limits:",
-        "    longest_drive_s: 10     # a drive ends by then, whoever asked for it",
-        "    # on_battery_low: warn  # or refuse, stop",
-        "",
+        "# Your cars. `fleet check` looks for mistakes, `fleet up` connects them all.",
         "cars:",
     ]
-    for car in cars:
+    for index, car in enumerate(cars):
         about = car.words.partition(":")[0]
-        lines.append(f"  {format_key(car.name)}:" + (f"  # {about}" if about else ""))
-        lines.append(f"    link: {quote(car.link)}")
-        lines.append(f"    platform: {car.platform}" + ("  # its gateway finds out" if car.platform == AUTO else ""))
-        lines.append(f"    colour: {quote(car.colour)}")
-        lines.append("    # roles: [patrol]       # of the plan; left out: any")
+        key = f"  {format_key(car.name)}:"
+        lines.append(key if index else f"{key:<28}# the name that you use in commands")
+        lines.append(f"    link: {_scalar(car.link)}" + (f"  # {about}" if about else ""))
+        if car.platform != AUTO:
+            lines.append(f"    platform: {car.platform}")
+        if car.colour != PALETTE[index % len(PALETTE)]:
+            lines.append(f"    colour: {quote(car.colour)}")
+    lines += [
+        "",
+        "defaults:                   # for every car",
+        "  limits:",
+        "    longest_drive_s: 5      # no command drives longer than this",
+        "    on_battery_low: warn    # below 7.0 V: warn, refuse or stop",
+        "",
+        f"{'' if plan else '# '}{'plan: plan.yaml':<{28 if plan else 26}}# what the cars do together",
+        "# recordings: sessions      # where `fleet up` records; `record: false` records nothing",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _scalar(text: str) -> str:
+    """Format a link as a YAML scalar, without quotes if YAML reads it as text anyway."""
+    return text if re.fullmatch(r"(?!null|true|false)[A-Za-z/][\w/.:?&=-]*\w", text, re.ASCII) else quote(text)
+
+
+def format_new_plan(count: int) -> str:
+    """Return the text of a first plan for this number of cars."""
+    lines = [
+        "# What the cars do together. `fleet check plan.yaml` looks for mistakes, `fleet up` runs the plan.",
+        "roles:",
+    ]
+    if count > 1:
+        cars = "all others drive around and avoid" if count > 3 else "two cars drive around and avoid"
+        cars = "one car drives around and avoids" if count == 2 else cars
+        lines.append(f"  patrol: {{mode: obstacle_avoidance, count: {count - 1}}}  # {cars} obstacles")
+    lines.append("  guide: {mode: tracking}  # one car follows the line on the floor")
     return "\n".join(lines) + "\n"

@@ -15,9 +15,12 @@ from typing import Any
 
 import pytest
 
+from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.fleetfile.scan import NewCar, format_new_file
+from fleet.policy.plan.lint import find_faults
+from fleet.policy.plan.parser import parse as parse_plan
 from schemas.yaml_document.document import BadFile
 from tests.support import in_process
 from tests.support.ports import free_endpoint
@@ -220,7 +223,7 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
     told = [word for link in [*links, port.path, "tcp://pi:8888"] for word in ("--link", link)]
     done = command("init", "--yes", "--seconds", "5", *told)
     assert done.returncode == 0, done.stderr
-    assert "wrote fleet.yaml with red, green, blue" in done.stdout
+    assert "Wrote fleet.yaml with red, green, blue" in done.stdout
     written = (tmp_path / "fleet.yaml").read_text()
     assert written.startswith("# yaml-language-server: $schema=")
     fleet = read_fleet(tmp_path / "fleet.yaml")
@@ -229,7 +232,7 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
 
     done = command("init", "--yes", "--link", links[0])
     assert done.returncode == 2
-    assert "there already" in done.stderr
+    assert "exists already" in done.stderr
     assert (tmp_path / "fleet.yaml").read_text() == written
     done = command("init", "--yes", "--force", "--seconds", "5", "--link", links[1])
     assert done.returncode == 0, done.stderr
@@ -239,9 +242,35 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
 def test_any_name_and_any_word_of_a_device_make_a_right_file() -> None:
     cars = [NewCar(name, "COM1" if name == "red" else f"tcp://pi:{number}", "auto", "#000000", "a # 'car': \"x\"")
             for number, name in enumerate(("red", "10", "null", "true", "0x1", "on", "a-b"), 1)]  # fmt: skip
-    fleet = parse_fleet(format_new_file(cars, "null"), Path("f.yaml"))
-    assert [*fleet.cars] == [car.name for car in cars]
-    assert fleet.name == "null"
+    fleet = parse_fleet(format_new_file(cars), Path("f.yaml"))
+    assert [(car.name, car.link) for car in fleet.cars.values()] == [(car.name, car.link) for car in cars]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 9])
+def test_simulated_cars_are_written_with_a_plan_that_uses_all(command: Command, tmp_path: Path, count: int) -> None:
+    done = command("init", "--sim", str(count))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("Wrote fleet.yaml and plan.yaml with red")
+    for line in done.stdout.splitlines()[1:]:
+        assert line in ("  fleet check", "  fleet up")
+    fleet = read_fleet(tmp_path / "fleet.yaml")
+    assert {car.link for car in fleet.cars.values()} == {"sim"}
+    assert (len(fleet.cars), fleet.plan) == (count, tmp_path / "plan.yaml")
+    plan = parse_plan((tmp_path / "plan.yaml").read_text())
+    found = find_faults(plan, listed_cars(fleet))
+    assert (found.errors, found.warnings) == ((), ())
+    assert sum(role.count or 1 for role in plan.roles.values()) == count
+
+
+@pytest.mark.parametrize("name", ["fleet.yaml", "plan.yaml"])
+def test_simulated_cars_overwrite_nothing(command: Command, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine\n")
+    done = command("init", "--sim", "3")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"fleet: {name} exists already: give --force")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine\n")]
+    assert command("init", "--sim", "3", "--force").returncode == 0
+    assert read_fleet(tmp_path / "fleet.yaml").plan == tmp_path / "plan.yaml"
 
 
 def test_nothing_found_says_what_to_do(command: Command, port: Port, tmp_path: Path) -> None:
@@ -262,7 +291,7 @@ def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: An
     simulate("a")
     (tmp_path / "fleet.yaml").write_text("mine\n")
     init = terminal("init", "--seconds", "5", "--link", f"{tmp_path}/a.tty", "--link", port.path)
-    init.until("Write over it? [y/N]: ")
+    init.until("Overwrite it? [y/N]: ")
     init.type("y")
     init.until("its name (- to leave it out) [red]: ")
     init.type("Rosa")
@@ -278,7 +307,7 @@ def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: An
     init.until("silent")
     init.until("its name (- to leave it out) [-]: ")
     init.type("")
-    init.until("wrote fleet.yaml with rosa")
+    init.until("Wrote fleet.yaml with rosa")
     assert init.wait() == 0
     (rosa,) = read_fleet(tmp_path / "fleet.yaml").cars.values()
     assert (rosa.name, rosa.platform, rosa.colour) == ("rosa", "stm32+arm", "#ff00aa")
@@ -287,7 +316,7 @@ def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: An
 def test_who_does_not_want_it_written_over_keeps_it(terminal: Callable[..., Terminal], tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text("mine\n")
     init = terminal("init")
-    init.until("Write over it? [y/N]: ")
+    init.until("Overwrite it? [y/N]: ")
     init.type("")
     assert init.wait() == 130
     assert (tmp_path / "fleet.yaml").read_text() == "mine\n"
