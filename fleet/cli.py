@@ -164,8 +164,8 @@ def main() -> None:
         sys.stderr.write(f"fleet: {_one_line(error)} (see {where} --help)\n")
         code = error.exit_code
     except click.ClickException as error:
-        several = "\n" in error.message  # the errors of a file, one per line
-        sys.stderr.write(f"{error.message}\n" if several else f"fleet: {_one_line(error)}\n")
+        own_form = getattr(error, "own_form", False) or "\n" in error.message
+        sys.stderr.write(f"{error.message}\n" if own_form else f"fleet: {_one_line(error)}\n")
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = startup.INTERRUPTED

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 from fleet.client.reading import Reading
-from fleet.conditions import BadExpression, Expression, fields_of, parse, value_in
+from fleet.conditions import BadExpression, Expression, fields_of, parse, topic_aliases_of, value_in
 from fleet.conditions.expression import format_literal
 from fleet.conditions.fields import LAST
 from fleet.conditions.satisfiability import explain_impossible
@@ -48,7 +48,7 @@ class KeyCondition:
         short = {topic.message: topic.name.rpartition("/")[2] for topic in under}
         for message, fields in names.items():
             try:
-                found[message] = parse(text, fields)
+                found[message] = parse(text, fields, topic_aliases_of(short[message], fields))
                 never += filter(None, [explain_impossible(found[message], short[message])])
             except BadExpression:
                 if len(names) == 1:

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from fleet.client.client import Fleet, default_sender
-from fleet.commands.options import WrongFile, bus_options, json_option
+from fleet.commands.options import bus_options, json_option
 from fleet.coordinator.coordinator import SENDER, AnotherCoordinator, Coordinator
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import read_fleet
@@ -27,11 +27,11 @@ example:
 \b
 a plan:
   roles:
-    patrol: {mode: obstacle_avoidance, needs: battery.voltage_v > 7.0, count: 2}
-  cars:
-    blue: manual
+    patrol: {mode: obstacle_avoidance, needs: battery_v > 7.0, count: 2}
+  fixed:
+    blue: {mode: manual}
   rules:
-    - when: {car: red, is: range.range_m < 0.3, for_s: 0.5}
+    - when: {car: red, is: range_m < 0.3, for_s: 0.5}
       then: {who: blue, mode: tracking}"""
 )
 @click.option("--plan", "path", required=True, type=click.Path(path_type=Path, dir_okay=False), help="The plan, YAML.")
@@ -54,10 +54,9 @@ def coordinate(
     plan = parse(read_text(path), str(path))
     listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file, unbound=True))
     found = find_faults(plan, listed or None)
-    if found.errors:
-        raise WrongFile(found.refusal(str(path)))
+    found.raise_errors(str(path))
     for each in found.warnings:
-        click.echo(f"fleet: {path}: {each}", err=True)
+        click.echo(each.at(str(path)), err=True)
     stop = threading.Event()
 
     signals.calls(stop.set)

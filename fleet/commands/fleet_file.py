@@ -69,7 +69,7 @@ def read(file: Path, *, as_json: bool = False, unbound: bool = False) -> FleetFi
     except BadFile as error:
         print_errors(error, as_json=as_json)
         if not file.exists():
-            click.echo("fleet: make one with `fleet init`", err=True)
+            click.echo("`fleet init` creates one.", err=True)
         raise SystemExit(2) from None
 
 

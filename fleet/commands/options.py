@@ -54,6 +54,7 @@ class WrongFile(click.ClickException):
     """The errors of a file, one per line, each with its position."""
 
     exit_code = 2
+    own_form = True  # printed as it is: editors and CI read `FILE:LINE:COL: error: WORDS`
 
 
 @contextmanager

@@ -92,9 +92,19 @@ def check(file: Path, fleet_file: Path | None, *, as_json: bool) -> None:
     errors = [each for each in findings if each.severity is Severity.ERROR]
     for each in findings:
         if as_json:
-            click.echo(json.dumps({"gravity": each.severity, "part": each.part, "words": each.words}))
+            click.echo(
+                json.dumps(
+                    {
+                        "gravity": each.severity,
+                        "line": each.line,
+                        "column": each.column,
+                        "part": each.part,
+                        "words": each.words,
+                    }
+                )
+            )
         else:
-            click.echo(f"{file}: {each.severity}: {each}")
+            click.echo(each.at(str(file)))
     if errors:
         raise SystemExit(1)
     if not as_json:

@@ -26,7 +26,7 @@ from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Superv
 from schemas import keys
 from schemas.bus import accepts, check_listening, resolve_endpoint
 from schemas.process import signals, startup
-from schemas.yaml_document.document import BadFile, read_text
+from schemas.yaml_document.document import read_text
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
 _Write = Callable[[SupervisorEvent], None]
@@ -91,7 +91,7 @@ def up(
     if file is None and simulated is None:
         if not DEFAULT_FILE.exists():
             raise click.UsageError(
-                "there is no fleet.yaml here: name a file, make one with fleet init, or give --sim 3"
+                "There is no fleet.yaml here. `fleet init` creates one; `fleet up --sim 3` needs none."
             )
         file = DEFAULT_FILE
     if detach:
@@ -120,13 +120,10 @@ def up(
 def read(file: Path | None, options: UpOptions) -> FleetSpec:
     """Return the spec of the fleet file and the options, with a checked plan. Raises ValueError."""
     spec = build_spec(None if file is None else read_fleet(file, unbound=options.simulated > 0), options)
-    for path, what in ((spec.plan, "the plan"), (spec.world, "the world")):
+    for path in (spec.plan, spec.world):
         if path is None:
             continue
-        try:
-            text = read_text(path)
-        except BadFile as error:
-            raise ValueError(f"{what}: {error}") from None
+        text = read_text(path)
         if path is spec.plan:
             spec = _with_plan(spec, text)
     return spec
@@ -139,8 +136,7 @@ def _with_plan(spec: FleetSpec, text: str) -> FleetSpec:
         parse_fleet(coordinator_fleet_file(spec), Path("fleet.yaml"), unbound=True)
     )  # as the coordinator will
     found = find_faults(plan, cars)
-    if found.errors:
-        raise ValueError(f"the plan can never work:\n{found.refusal(str(spec.plan))}")
+    found.raise_errors(str(spec.plan))
     return replace(spec, plan_text=text, warnings=tuple(f"{spec.plan}: {each}" for each in found.warnings))
 
 

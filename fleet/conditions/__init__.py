@@ -6,8 +6,18 @@ and `satisfiability` (conditions that can never be true).
 """
 
 from fleet.conditions.expression import Expression, Lookup
-from fleet.conditions.fields import fields_of, value_in
+from fleet.conditions.fields import aliases_of, fields_of, topic_aliases_of, value_in
 from fleet.conditions.parser import BadExpression, parse
 from fleet.conditions.satisfiability import is_contradictory
 
-__all__ = ["BadExpression", "Expression", "Lookup", "fields_of", "is_contradictory", "parse", "value_in"]
+__all__ = [
+    "BadExpression",
+    "Expression",
+    "Lookup",
+    "aliases_of",
+    "fields_of",
+    "is_contradictory",
+    "parse",
+    "topic_aliases_of",
+    "value_in",
+]

@@ -3,7 +3,7 @@
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final, TypeAlias
 
@@ -48,9 +48,11 @@ class Name:
 
     name: str
     kind: ValueKind
+    written: str = field(default="", compare=False)
+    """The name as its author wrote it, if that is an alias."""
 
     def __str__(self) -> str:
-        return self.name
+        return self.written or self.name
 
 
 @dataclass(frozen=True, slots=True)

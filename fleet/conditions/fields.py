@@ -1,6 +1,6 @@
 """The fields of a message as names of a condition, with their types and values."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -15,6 +15,22 @@ _TYPES: Final[Mapping[int, type]] = {
 """By protobuf's type in C++; all others but messages are numbers."""
 LAST: Final = ("car", "seq", "boot_id")
 """Fields of every message; lists of names end with them."""
+
+SHORT_NAMES: Final = MappingProxyType({"distance_m": "range.range_m", "battery_v": "battery.voltage_v"})
+"""Everyday names of fields, each with topic and field."""
+
+
+def aliases_of(names: Collection[str]) -> dict[str, str]:
+    """Return other spellings of names with a topic: `range_m` for `range.range_m`, unless two topics have it."""
+    short = [name.partition(".")[2] for name in names]
+    unique = {name.partition(".")[2]: name for name in names if short.count(name.partition(".")[2]) == 1}
+    return unique | {alias: name for alias, name in SHORT_NAMES.items() if name in names}
+
+
+def topic_aliases_of(topic: str, fields: Collection[str]) -> dict[str, str]:
+    """Return other spellings of one message's fields: `range.range_m` for `range_m`."""
+    spelled = {f"{topic}.{name}": name for name in fields}
+    return spelled | {alias: spelled[name] for alias, name in SHORT_NAMES.items() if name in spelled}
 
 
 def fields_of(message_class: type[Message]) -> Mapping[str, type]:

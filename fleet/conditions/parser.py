@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final, Never
 
 from fleet.conditions.expression import (
@@ -32,7 +33,7 @@ MAX_CONDITION_LENGTH: Final = 1000
 """Maximum characters of a condition, as typed and as normalized."""
 MAX_PARENTHESES: Final = 32
 """Maximum depth of nested parentheses."""
-_MAX_NAMES_LISTED: Final = 16
+_MAX_NAMES_LISTED: Final = 6
 """Maximum names that an error lists."""
 
 
@@ -45,15 +46,18 @@ class BadExpression(ValueError):
         self.words = words
 
 
-def parse(text: str, names: Mapping[str, type]) -> Expression:
-    """Parse a condition over these names (of type float, int, str or bool); raises BadExpression."""
+def parse(text: str, names: Mapping[str, type], aliases: Mapping[str, str] = MappingProxyType({})) -> Expression:
+    """Parse a condition over these names (of type float, int, str or bool); raises BadExpression.
+
+    `aliases`: other spellings of names, each with the name that it stands for.
+    """
     if len(text) > MAX_CONDITION_LENGTH:
         raise BadExpression(
             text,
             MAX_CONDITION_LENGTH + 1,
             f"it is too long: {len(text)} characters, allowed are {MAX_CONDITION_LENGTH}",
         )
-    tree = Expression(_Parser(text, names).parse_all())
+    tree = Expression(_Parser(text, names, aliases).parse_all())
     if len(str(tree)) > MAX_CONDITION_LENGTH:
         raise BadExpression(
             text, 1, f"it is too long when its numbers are written out: allowed are {MAX_CONDITION_LENGTH} characters"
@@ -87,9 +91,10 @@ class _Parser:
     # `ast.parse` would save nothing: columns of parentheses and of missing operands, names with dots and words without
     # escapes need these tokens anyway.
 
-    def __init__(self, text: str, names: Mapping[str, type]) -> None:
+    def __init__(self, text: str, names: Mapping[str, type], aliases: Mapping[str, str]) -> None:
         self._text = text
         self._names = names
+        self._aliases = aliases
         self._tokens = list(self._tokenize())
         self._at = 0
         self._depth = 0
@@ -193,7 +198,8 @@ class _Parser:
         if token.kind == "name":
             if token.text in ("true", "false"):
                 return Literal(token.text == "true")
-            return Name(token.text, self._kind_of_name(token))
+            name = self._aliases.get(token.text, token.text)
+            return Name(name, self._kind_of_name(token, name), token.text if token.text != name else "")
         if token.text == "(":
             return self._parse_parentheses(token)
         before = f", before {token.text}" if token.text else f": {self._list_names()}"
@@ -219,24 +225,29 @@ class _Parser:
             self._fail(token, f"{token.text} is beyond what a number can be")
         return number
 
-    def _kind_of_name(self, token: _Token) -> ValueKind:
-        if token.text in self._names:
-            return KINDS[self._names[token.text]]
+    def _kind_of_name(self, token: _Token, name: str) -> ValueKind:
+        if name not in self._names:
+            self._fail_unknown(token)
+        return KINDS[self._names[name]]
+
+    def _fail_unknown(self, token: _Token) -> Never:
         if token.text in ("and", "or", "not"):
             self._fail(token, f"a field or a value is missing here, before {token.text}")
+        if self._expected_kind() is ValueKind.WORD:
+            self._fail(token, f"{token.text} is not a value. A word needs quotes: '{token.text}'")
         near = self._close_names(token.text)
-        meant = f"did you mean {' or '.join(near)}? " if near else ""
-        compared = self._at > 1 and self._tokens[self._at - 2].text in tuple(Op)
-        quoted = f"; a word is quoted, as '{token.text}'" if compared else ""
-        words = f"there is no {token.text}: {meant}{self._list_names(self._fitting_names())}{quoted}"
-        raise BadExpression(self._text, token.column, words)
+        listed = self._list_names(self._fitting_names())
+        hint = f"Did you mean {' or '.join(near)}?" if near else f"T{listed[1:]}"
+        self._fail(token, f"{token.text} is not a value. {hint}")
 
     def _close_names(self, text: str) -> list[str]:
         """Return likely names of the kind that is compared here, first those that have the text as a part."""
         expected, fitting = self._expected_kind(), self._fitting_names()
         parts = [name for name in fitting if text in name.split(".")]
-        others = fitting if expected not in (None, ValueKind.TRUTH) else [*fitting, *_KEYWORDS]
-        return list(dict.fromkeys([*parts, *difflib.get_close_matches(text, others, n=2)]))[:2]
+        words = [*fitting, *(() if expected not in (None, ValueKind.TRUTH) else _KEYWORDS)]
+        aliases = [alias for alias, name in self._aliases.items() if name in fitting]
+        near = [*parts, *difflib.get_close_matches(text, words, n=2)] or difflib.get_close_matches(text, aliases, n=2)
+        return list(dict.fromkeys(near))[:2]
 
     def _fitting_names(self) -> list[str]:
         """Return the names of the kind that fits here, or all names."""
@@ -253,7 +264,7 @@ class _Parser:
                     return ValueKind.NUMBER
                 if token.kind == "word":
                     return ValueKind.WORD
-                named = self._names.get(token.text)
+                named = self._names.get(self._aliases.get(token.text, token.text))
                 return ValueKind.TRUTH if token.text in ("true", "false") else None if named is None else KINDS[named]
         return ValueKind.TRUTH
 

@@ -41,7 +41,7 @@ def explain_impossible(expression: Expression, of: str = "") -> str:
     `of`: the last word of the topic, if the names are the fields of one message.
     """
     if is_contradictory(expression):
-        return f"{expression} is never so"
+        return f"{expression} is never true"
     for name in dict.fromkeys(names_in(expression.root)):
         words, limits = _DOMAINS.get(f"{of}.{name}" if of else str(name), ((), None))
         if words:
@@ -54,7 +54,7 @@ def explain_impossible(expression: Expression, of: str = "") -> str:
         else:
             continue
         if is_contradictory(expression & Expression(allowed)):
-            return f"{expression} is never so: {name} is {domain}"
+            return f"{expression} is never true: {name} is {domain}"
     return ""
 
 

@@ -172,8 +172,7 @@ def _find_contradictions(
     for name, car in cars.items():
         kind = car.get("type")
         if isinstance(kind, str) and kind not in types:
-            known = f"one of {', '.join(types)}" if types else "this file has no types"
-            yield ("cars", name, "type"), f"{quote_value(kind)} is not allowed: {known}{suggest(kind, types)}"
+            yield ("cars", name, "type"), f"there is no type {quote_value(kind)}. {suggest(kind, types)}"
         if "link" not in car and not unbound:
             words = "is missing: how the car is reached; `gateway scan` shows links, `fleet bind` finds out which it is"
             yield ("cars", name, "link"), words

@@ -70,7 +70,7 @@ class Candidates:
             return Barrier(f"{pinned[1]} leaves it {pinned[0]} only", f"the end of {pinned[1]}")
         if not self.plan.may(car, role):
             return Barrier("the plan does not give it to this car", "another plan")
-        if role.on_call and pinned is None and not any(name == other.fallback for other in self.plan.roles.values()):
+        if role.by_rules and pinned is None and not any(name == other.if_none for other in self.plan.roles.values()):
             return Barrier("only a rule gives it", "such a rule coming true")
         known = self.snapshot.cars.get(car, UNKNOWN_CAR)
         return find_barrier(known, role, self.now) or self._needy(car, role, known)
@@ -172,9 +172,9 @@ def allocate(candidates: Candidates) -> RoleAllocation:
             role = plan.roles[name]
             # A role for any number of cars lacks one only when it has none.
             lacks = max(0, (1 if role.count is None else more.get(name, 0)) - list(roles.values()).count(name))
-            if role.fallback is not None and name in more and lacks:
-                more[role.fallback] = more.get(role.fallback, 0) + lacks
-                stands_in[role.fallback] = name
+            if role.if_none is not None and name in more and lacks:
+                more[role.if_none] = more.get(role.if_none, 0) + lacks
+                stands_in[role.if_none] = name
         more = {name: max(count, places.get(name, 0)) for name, count in more.items()}
         if more == places:
             return RoleAllocation(
@@ -185,7 +185,7 @@ def allocate(candidates: Candidates) -> RoleAllocation:
 
 def _count_places(candidates: Candidates, role: Role, cars: int) -> int:
     count = cars if role.count is None else role.count
-    if not role.on_call:
+    if not role.by_rules:
         return count
     return min(count, sum(name == role.name for name, _ in candidates.pinned.values()))
 
@@ -195,7 +195,7 @@ def _fallback_order(plan: Plan) -> list[str]:
     depth = dict.fromkeys(plan.roles, 0)
     for name in plan.roles:
         at, steps = name, 0
-        while (after := plan.roles[at].fallback) is not None:
+        while (after := plan.roles[at].if_none) is not None:
             at, steps = after, steps + 1
             depth[at] = max(depth[at], steps)
     return sorted(plan.roles, key=lambda name: depth[name])
@@ -209,7 +209,7 @@ def _stand_in_ranks(plan: Plan) -> dict[str, tuple[int, bool, int]]:
     """Rank the places of each fallback just below the role that it stands in for."""
     result: dict[str, tuple[int, bool, int]] = {}
     for name in _fallback_order(plan):
-        after = plan.roles[name].fallback
+        after = plan.roles[name].if_none
         if after is not None:
             priority, _, depth = max(_rank(plan.roles[name]), result.get(name, _rank(plan.roles[name])))
             result[after] = max(result.get(after, (-1000, True, 0)), (priority, True, depth - 1))

@@ -10,7 +10,7 @@ from typing import Final
 from fleet.policy.allocation import Barrier, Candidates, RoleAllocation
 from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import LEFT_ALONE, Decision, DecisionKind
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanCondition, Quantifier, Role, Rule
+from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Quantifier, Role, Rule
 from fleet.policy.plan.reachability import describe_unmeasured
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
@@ -141,7 +141,7 @@ def _rules_for(car: str, known: CarSnapshot, role: Role, plan: Plan, phase: str)
     for rule in plan.rules:
         could = [effect for effect in rule.effects if _could(effect, rule, car, role, plan)]
         if could and (rule.during is None or phase in rule.during):
-            own = rule.when.car == car or all(effect.who == THAT for effect in could)
+            own = rule.when.car == car or all(effect.who == THIS_CAR for effect in could)
             unseen = describe_unmeasured(rule.when.expression, [(known, role.mode)]) if own else ""
             rules.append(f"{rule.name}: {rule.when.text}{unseen}")
     return rules[:_MAX_REASONS]
@@ -155,12 +155,12 @@ def _could(effect: Effect, rule: Rule, car: str, role: Role, plan: Plan) -> bool
         return False
     of = rule.when.car if rule.when.of is Quantifier.CAR else None
     match effect.who:
-        case who if who == THAT:
+        case who if who == THIS_CAR:
             return of in (None, car) and rule.when.role in (None, role.name)
-        case who if who == OTHERS:
+        case who if who == OTHER_CARS:
             return of != car
         case who:
-            return who in (ALL, car, role.name)
+            return who in (ALL_CARS, car, role.name)
 
 
 def explain_idle(car: str, candidates: Candidates, allocation: RoleAllocation) -> Decision:
@@ -241,7 +241,7 @@ def explain_vacancy(
     """Explain a role with fewer cars than it wants."""
     role, holders = candidates.plan.roles[name], allocation.holders(name)
     decided, others = _count(role, allocation), _list_others(name, candidates, allocation, barriers)
-    instead = f"; {role.fallback} gets the place" if role.fallback is not None else ""
+    instead = f"; {role.if_none} gets the place" if role.if_none is not None else ""
     if others.kinds:
         why = f"{'no car is left for it' if others.has_able else 'no other car can'}: {others.words}"
         change = "one of them being left for it, or able to" if others.has_able else "one of them being able to"

@@ -6,7 +6,17 @@ from types import MappingProxyType
 from typing import Final
 
 from fleet.policy.debounce import HYSTERESIS_S, Debounced, debounce
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanCondition, PlanPhase, Quantifier, Rule
+from fleet.policy.plan.plan import (
+    ALL_CARS,
+    OTHER_CARS,
+    THIS_CAR,
+    Effect,
+    Plan,
+    PlanCondition,
+    PlanPhase,
+    Quantifier,
+    Rule,
+)
 from fleet.policy.snapshot import FleetSnapshot
 
 PHASE_SETTLE_TIMEOUT_S: Final = 15.0
@@ -142,12 +152,12 @@ def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: 
     match effect.who:
         case "":
             return
-        case who if who == THAT:
+        case who if who == THIS_CAR:
             if state.that is not None:
                 yield state.that
-        case who if who == OTHERS:
+        case who if who == OTHER_CARS:
             yield from (car for car in subjects if car != state.that)
-        case who if who == ALL:
+        case who if who == ALL_CARS:
             yield from subjects
         case who if who in subjects:
             yield who

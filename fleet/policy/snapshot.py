@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from google.protobuf.descriptor import FieldDescriptor
 
-from fleet.conditions import Expression
+from fleet.conditions import Expression, aliases_of
 from gateway.protocol.platforms import Profile, parse_platform
 from schemas import messages, topics
 
@@ -39,6 +39,8 @@ def _fields() -> dict[str, tuple[str, str, type]]:
 _FIELDS: Final = _fields()
 NAMES: Final[Mapping[str, type]] = MappingProxyType({name: kind for name, (_, _, kind) in _FIELDS.items()})
 """The names that a plan's expressions may use (`battery.voltage_v`, `light.left`, `mode.asked`), with their types."""
+ALIASES: Final[Mapping[str, str]] = MappingProxyType(aliases_of(NAMES))
+"""Other spellings of NAMES: `voltage_v`, `battery_v`."""
 _STALE_S: Final = {
     topic: math.inf if (after_s := topics.TOPICS[topic].stale_after_s) is None else after_s
     for topic, _, _ in _FIELDS.values()

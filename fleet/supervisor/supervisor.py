@@ -37,6 +37,7 @@ from fleet.supervisor.spec import (
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.keys import DEFAULT_FLEET
+from schemas.yaml_document.document import BadFile
 
 STATUS_INTERVAL_S: Final = 1.0
 HUB_START_TIMEOUT_S: Final = 10.0
@@ -530,6 +531,8 @@ class Supervisor:
     async def _reload_alone(self, sender: str) -> str:
         try:
             new = await asyncio.to_thread(self._read)
+        except BadFile as error:
+            raise ReloadRefused(f"{error}\nNothing was changed.") from None
         except ValueError as error:
             raise ReloadRefused(f"nothing was changed: {error}") from None
         if self._shutdown_requested.is_set():

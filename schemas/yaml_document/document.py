@@ -43,18 +43,19 @@ class Problem:
     words: str
 
     def __str__(self) -> str:
-        return f"{self.line}:{self.column}: " + (f"{self.field}: " if self.field else "") + self.words
+        return f"{self.line}:{self.column}: error: " + (f"{self.field}: " if self.field else "") + self.words
 
 
 class BadFile(ValueError):
-    """A file that cannot be used; the text has one line per fault: `file:line:column: field: what, allowed`."""
+    """A file that cannot be used; the text has one line per fault: `file:line:column: error: field: what`."""
 
     def __init__(self, source: str, problems: Iterable[Problem]) -> None:
         self.source = source
         self.problems = tuple(sorted(set(problems)))
         lines = [f"{source}:{problem}" for problem in self.problems[:_MAX_PROBLEMS_LISTED]]
         if len(self.problems) > _MAX_PROBLEMS_LISTED:
-            lines.append(f"{source}: and {len(self.problems) - _MAX_PROBLEMS_LISTED} more")
+            rest = self.problems[_MAX_PROBLEMS_LISTED:]
+            lines.append(f"{source}:{rest[0].line}:{rest[0].column}: error: and {len(rest)} more")
         super().__init__("\n".join(lines))
 
 
@@ -100,7 +101,8 @@ def read_text(path: Path, source: str | None = None) -> str:
                 data = file.read(MAX_YAML_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         words = error.strerror if isinstance(error, OSError) else None
-        raise _bad_file(source, f"cannot be read: {words or error}") from None
+        missing = isinstance(error, FileNotFoundError)
+        raise _bad_file(source, "there is no such file" if missing else f"cannot be read: {words or error}") from None
     if kind:
         raise _bad_file(source, f"is a {kind}, not a file: save the text as a file, and give that")
     try:
@@ -127,6 +129,7 @@ class Document:
         self._places: dict[Where, tuple[yaml.Mark | None, yaml.Node]] = {}
         self._partial = PartialTree(None)
         self._values = 0
+        self.tree: Any = None
         if len(text.encode(errors="surrogatepass")) > MAX_YAML_BYTES:
             raise _bad_file(source, _TOO_LARGE)
         try:
@@ -205,8 +208,8 @@ class Document:
             head, allowed = describe_error(each["type"], each, where, schema)
             heads.setdefault((where, on_key, head), []).append(allowed)
         for (where, on_key, head), allowed_words in heads.items():
-            allowed = ", or ".join(dict.fromkeys(word for word in allowed_words if word))
-            self._problems.append(self._problem_at(where, f"{head}: {allowed}" if allowed else head, on_key=on_key))
+            allowed = " ".join(dict.fromkeys(word for word in allowed_words if word))
+            self._problems.append(self._problem_at(where, f"{head}. {allowed}" if allowed else head, on_key=on_key))
         self._faulty.update(where for where, _, _ in heads)
 
     def _locate(self, error: ValidationError) -> list[tuple[Where, bool, Any]]:
@@ -217,6 +220,7 @@ class Document:
             errors.append((where, on_key or each["type"] == "extra_forbidden", each))
         # A type error of a union's member is noise if another member has reported faults inside the value.
         inner = {where[:depth] for where, _, _ in errors for depth in range(len(where))}
+        inner |= {where for where, _, each in errors if not each["type"].endswith("_type")}
         return [each for each in errors if each[0] not in inner or not each[2]["type"].endswith("_type")]
 
     def _place_of(self, loc: Sequence[str | int], *, missing: bool) -> tuple[Where, bool]:
@@ -230,6 +234,11 @@ class Document:
             where = (*where, loc[-1])
         return where, bool(loc) and loc[-1] == "[key]"
 
+    def position(self, where: Where, *, on_key: bool = False) -> tuple[int, int]:
+        """Return line and column of a value, or of its key, from 1."""
+        mark = self._mark_of(self._partial.original(where), on_key=on_key)
+        return mark.line + 1, mark.column + 1
+
     def _mark_of(self, where: Where, *, on_key: bool) -> yaml.Mark:
         place = where
         while place not in self._places:
@@ -239,7 +248,7 @@ class Document:
 
     def _problem_at(self, where: Where, words: str, *, on_key: bool) -> Problem:
         mark = self._mark_of(where, on_key=on_key)
-        return Problem(mark.line + 1, mark.column + 1, format_place(where), words)
+        return Problem(mark.line + 1, mark.column + 1, format_place(where, self.tree), words)
 
     def _construct(self, where: Where, key: yaml.Mark | None, node: yaml.Node) -> Any:
         """Return plain data with all aliases expanded; raises BadFile if there is too much."""
@@ -323,10 +332,10 @@ def _syntax_problem(error: yaml.MarkedYAMLError) -> Problem:
     line, column = (1, 1) if mark is None else (mark.line + 1, mark.column + 1)
     problem = " ".join((error.problem or error.context or "it cannot be read").split())
     if "'\\t'" in problem:
-        problem = "a tab: YAML is indented with blanks"
+        problem = "a tab. YAML needs spaces"
     elif "single document" in (error.context or ""):
-        problem = "a second document (`---`): a file has one"
-    return Problem(line, column, "", f"is no YAML: {problem}")
+        problem = "a second document (`---`). A file has one"
+    return Problem(line, column, "", f"this is not YAML: {problem}")
 
 
 def _code_point(character: str | int) -> int:

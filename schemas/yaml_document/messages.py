@@ -4,7 +4,7 @@ The allowed values come from the model's JSON schema, which knows all members of
 """
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final
 
 _BOUNDS: Final = {
@@ -17,6 +17,9 @@ Where = tuple[str | int, ...]
 """The path to a value: names of fields, positions in lists."""
 
 _MAX_VALUE_LENGTH: Final = 60
+_MAX_WORDS_LISTED: Final = 12
+_ITEMS: Final = {"boxes": "box", "line": "point", "path": "point", "then": "effect"}
+"""Names of a list's items, if not the list's name without its s."""
 _TYPES: Final = {
     "string": "text",
     "integer": "a whole number",
@@ -28,22 +31,39 @@ _TYPES: Final = {
 }
 
 
-def format_place(where: Where) -> str:
-    """Format a place: `cars.red.limits`, `rules[2].when`."""
-    text = ""
+def format_place(where: Where, tree: object = None) -> str:
+    """Format a place: `cars.red.limits`, `rule 2, when`. Items of a list with a name in `tree` are called by it."""
+    segments, words = list[str](), list[str]()
     for part in where:
+        try:
+            tree = tree[part]  # type: ignore[index]  # None, or a scalar, has no parts
+        except (TypeError, KeyError, IndexError):
+            tree = None
         if isinstance(part, int):
-            text += f"[{part}]"
+            plural = words.pop() if words else "numbers"
+            name = tree.get("name") if isinstance(tree, dict) else None
+            segments += [".".join(words)] if words else []
+            item = name if isinstance(name, str) and name.isprintable() and name else part + 1
+            segments.append(f"{_ITEMS.get(plural, plural.removesuffix('s'))} {item}")
+            words = []
         else:
-            word = part if part.isprintable() and part and not set(part) & set(" .[]:") else quote_value(part)
-            text += f".{word}" if text else word
-    return text
+            words.append(part if part.isprintable() and part and not set(part) & set(" .[]:,") else quote_value(part))
+    return ", ".join([*segments, ".".join(words)] if words else segments)
 
 
 def suggest(word: str, allowed: Iterable[str]) -> str:
-    """Return `; did you mean 'red'?`, or nothing if no allowed word is close."""
-    near = difflib.get_close_matches(word, list(allowed), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    """Return `Did you mean red?`, or the allowed words if none of them is close."""
+    words = list(allowed)
+    lower = word.lower()
+    if near := difflib.get_close_matches(lower, words, n=1) or [each for each in words if each.startswith(lower)]:
+        return f"Did you mean {near[0]}?"
+    return f"There {'are' if len(words) > 1 else 'is only' if words else 'is'} {list_words(words)}."
+
+
+def list_words(words: Collection[str]) -> str:
+    """List words, the first ones if there are many."""
+    more = f" and {len(words) - _MAX_WORDS_LISTED} more" if len(words) > _MAX_WORDS_LISTED else ""
+    return ", ".join([*words][:_MAX_WORDS_LISTED]) + more if words else "none"
 
 
 def quote_value(value: object) -> str:
@@ -57,16 +77,16 @@ def quote_value(value: object) -> str:
 
 
 def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str, Any]) -> tuple[str, str]:
-    """Return what is wrong, and what is allowed (may be empty), for an error of pydantic of this kind."""
+    """Return what is wrong, and how to mend it (may be empty), for an error of pydantic of this kind."""
     definitions = schema.get("$defs", {})
     if kind == "extra_forbidden":
         allowed = sorted(
             {name for each in _schemas_at(schema, where[:-1], definitions) for name in each.get("properties", ())}
         )
-        return "there is no such field here", f"allowed are {', '.join(allowed)}{suggest(str(where[-1]), allowed)}"
+        return "there is no such field", suggest(str(where[-1]), allowed)
     here = _schemas_at(schema, where, definitions)
     if kind == "missing":
-        return "is missing", next((each["description"] for each in here if "description" in each), "")
+        return "is missing", next((_sentence(each["description"]) for each in here if "description" in each), "")
     value = error["input"]
     if kind in ("value_error", "assertion_error"):
         return str(error["ctx"]["error"]), ""
@@ -74,15 +94,35 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
     chosen = ["enum" in each or "const" in each for each in here]
     if kind in ("enum", "literal_error") and (all(chosen) or not any(chosen)):
         words = [str(word) for each in here for word in each.get("enum", [each["const"]] if "const" in each else [])]
-        listed = f"one of {', '.join(words)}" if words else str(error["ctx"]["expected"])
-        return head, listed + suggest(str(value), words)
+        return (head, suggest(str(value), words)) if words else (head, f"Write {error['ctx']['expected']}.")
+    if where and all(each.get("type") == "object" and "properties" in each for each in here) and here:
+        return (
+            head if value is None else "needs fields",
+            f"Write: `{where[-1]}: {_example(here[0], value, definitions)}`",
+        )
     allowed_here = [words for words in map(_describe_allowed, here) if words and words != "nothing"]
     kinds = ("_type", "_than", "_equal", "_parsing", "int_from_float", "enum", "literal_error")
     if allowed_here and kind.endswith(kinds):
-        quotes = " (write it in quotes)" if kind == "string_type" and isinstance(value, bool | int | float) else ""
-        return head, " or ".join(dict.fromkeys(allowed_here)) + quotes
+        quotes = " in quotes" if kind == "string_type" and isinstance(value, bool | int | float) else ""
+        return head, f"Write {' or '.join(dict.fromkeys(allowed_here))}{quotes}."
     message = str(error["msg"])
-    return head, message[:1].lower() + message[1:]
+    return head, _sentence(message)
+
+
+def _sentence(words: str) -> str:
+    return f"{words[:1].upper()}{words[1:]}."
+
+
+def _example(schema: Mapping[str, Any], value: object, definitions: Mapping[str, Any]) -> str:
+    """Return an example of a mapping with the fields that it needs; `value`: what stands there."""
+    names = schema.get("required") or [*schema["properties"]][:1]
+    parts = []
+    for name in names:
+        words = [
+            word for each in _resolve_members(schema["properties"][name], definitions) for word in each.get("enum", ())
+        ]
+        parts.append(f"{name}: {value if value in words else words[0] if words else '…'}")
+    return f"{{{', '.join(parts)}}}"
 
 
 def _describe_allowed(schema: Mapping[str, Any]) -> str:

@@ -18,8 +18,8 @@ PLAN = parse(
     )
     + "\nrules:\n"
     + "\n".join(
-        f"  - when: {{any: light.left and range.range_m < 0.{number + 10}, for_s: 1}}\n"
-        "    then: {who: that, mode: manual}"
+        f"  - when: {{any_car: light.left and range.range_m < 0.{number + 10}, for_s: 1}}\n"
+        "    then: {who: this_car, mode: manual}"
         for number in range(20)
     )
 )

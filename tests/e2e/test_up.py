@@ -519,20 +519,20 @@ def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(job: Up) -> None:
     (job.directory / "plan.yaml").write_text(bad)
     refused = job.fleet("reload")
     assert refused.returncode == 2
-    assert refused.stderr.startswith("nothing was changed: the plan can never work:\n")
-    assert "plan.yaml: role follow: no car can fill it" in refused.stderr
+    assert "plan.yaml:1:9: error: role follow: no car can fill it" in refused.stderr
+    assert refused.stderr.endswith("\nNothing was changed.\n")
     second = fleet_command("up", str(job.directory / "fleet.yaml"), environment={})
     assert second.returncode == 2
-    assert "plan.yaml: role follow: no car can fill it" in second.stderr
+    assert "plan.yaml:1:9: error: role follow: no car can fill it" in second.stderr
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), "there is no fleet.yaml here: name a file"),
+        ((), "There is no fleet.yaml here. `fleet init` creates one"),
         (("--sim", "0"), "0 is not in the range 1<=x<=200"),
         (("none.yaml",), "none.yaml"),
-        (("--sim", "1", "--plan", "none.yaml"), "the plan: none.yaml:1:1: cannot be read"),
+        (("--sim", "1", "--plan", "none.yaml"), "none.yaml:1:1: error: there is no such file"),
         (("--sim", "1", "--fleet", "Über"), "fleet name"),
         (("--sim", "1", "--connect", "here"), "endpoint 'here' is not allowed"),
         (("--sim", "1", "--connect", f"tcp/0.0.0.0:{free_port()}"), "accept it with --insecure-lan"),

@@ -111,7 +111,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("list --connect tcp/localhost", "endpoint 'tcp/localhost' is not allowed"),
         ("list --fleet A", "fleet name 'A' is not allowed"),
         ("coordinate", "Missing option '--plan'"),
-        ("coordinate --plan no/such.yaml", "no/such.yaml:1:1: cannot be read: No such file or directory"),
+        ("coordinate --plan no/such.yaml", "no/such.yaml:1:1: error: there is no such file"),
     ],
 )
 def test_wrong_use_is_one_line_and_exit_code_2(
@@ -124,7 +124,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     said = capsys.readouterr()
     assert ended.value.code == 2
     assert told in said.err
-    assert said.err.startswith("fleet: ")
+    assert said.err.startswith(("fleet: ", "no/such.yaml:1:1: error: "))
     assert said.err.count("\n") == 1
     assert said.out == ""
 
@@ -142,7 +142,7 @@ def test_a_fifo_as_a_file_is_refused_and_not_waited_for(
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 2
-    assert f"{tmp_path / 'fifo'}:1:1: is a FIFO, not a file" in capsys.readouterr().err
+    assert f"{tmp_path / 'fifo'}:1:1: error: is a FIFO, not a file" in capsys.readouterr().err
 
 
 OF_FILES = ("scan", "sim", "example", "init", "check", "bind", "schema", "plan", "sessions", "replay", "play", "replan")

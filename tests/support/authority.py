@@ -8,7 +8,7 @@ from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.processes import FleetProcesses, GatewayProcess, wait_for
 
-PLAN = "cars: {red: tracking}\n"
+PLAN = "fixed: {red: {mode: tracking}}\n"
 
 
 def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str]) -> list[float]:

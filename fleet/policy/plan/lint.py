@@ -5,16 +5,17 @@ against cars of any platform.
 """
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.plan.lint_conflicts import find_conflicts, implies
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanPhase, Role, Rule
+from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanPhase, Role, Rule
 from fleet.policy.plan.reachability import ModeReachability, Outlook, can_be_true, list_unmeasured
 from fleet.policy.snapshot import CarSnapshot
 from gateway.protocol.enums import Mode
+from schemas.yaml_document.document import BadFile, Problem
 from schemas.yaml_document.messages import suggest
 
 
@@ -29,14 +30,20 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlanFault:
-    """One fault of a plan: the part, what is wrong with it, and what to do."""
+    """One fault of a plan: the part, what is wrong with it, and what to do. line, column: where the part stands."""
 
     severity: Severity
     part: str
     words: str
+    line: int = 1
+    column: int = 1
 
     def __str__(self) -> str:
         return f"{self.part}: {self.words}"
+
+    def at(self, source: str) -> str:
+        """Return the fault as a line for a person, as `plan.yaml:4:3: error: rule 2: it never fires`."""
+        return f"{source}:{self.line}:{self.column}: {self.severity}: {self}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +54,13 @@ class Faults:
     warnings: tuple[PlanFault, ...] = ()
 
     def refusal(self, source: str = "plan") -> str:
-        """Return all errors, one per line, each with the plan's name; empty: the plan may be put in force."""
-        return "\n".join(f"{source}: {each}" for each in self.errors)
+        """Return all errors, one per line; empty: the plan may be put in force. `source`: its name or path."""
+        return "\n".join(each.at(source) for each in self.errors)
+
+    def raise_errors(self, source: str) -> None:
+        """Raise BadFile with all errors, if there are any."""
+        if self.errors:
+            raise BadFile(source, [Problem(each.line, each.column, each.part, each.words) for each in self.errors])
 
 
 def find_faults(
@@ -64,7 +76,7 @@ def find_faults(
     if cars is None and present is not None:
         listed = ", ".join(sorted(present)) or "no cars"
         warnings += [
-            PlanFault(Severity.WARNING, f"car {car}", f"it is not on the bus now, which has {listed}")
+            _placed(plan, PlanFault(Severity.WARNING, f"car {car}", f"it is not connected now. Connected: {listed}."))
             for car in sorted(_named(plan) - set(present))
         ]
     return Faults(tuple(each for each in findings if each.severity is Severity.ERROR), tuple(warnings))
@@ -76,7 +88,12 @@ def _named(plan: Plan) -> set[str]:
 
 def check(plan: Plan, fleet: Mapping[str, CarSnapshot] | None = None) -> tuple[PlanFault, ...]:
     """Return the faults of a plan; `fleet`: the cars of the fleet file, None: there is none."""
-    return tuple(_Check(plan, fleet).findings())
+    return tuple(_placed(plan, fault) for fault in _Check(plan, fleet).findings())
+
+
+def _placed(plan: Plan, fault: PlanFault) -> PlanFault:
+    line, column = plan.places.get(fault.part, (1, 1))
+    return replace(fault, line=line, column=column)
 
 
 class _Check:
@@ -96,14 +113,14 @@ class _Check:
     def _unknown_cars(self) -> Iterator[PlanFault]:
         for car in sorted(self._named):
             if self._known is not None and car not in self._known:
-                present = ", ".join(sorted(self._known)) or "none"
-                yield PlanFault(Severity.ERROR, f"car {car}", f"the fleet file has no such car; it has {present}")
+                words = f"the fleet file has no such car. {suggest(car, sorted(self._known))}"
+                yield PlanFault(Severity.ERROR, f"car {car}", words)
 
     def _unknown_roles(self) -> Iterator[PlanFault]:
         for car, known in sorted((self._known or {}).items()):
             for role in sorted((known.roles or set()) - set(self._plan.roles)):
-                present = f"there are {', '.join(self._plan.roles)}{suggest(role, self._plan.roles)}"
-                words = f"the fleet file lets it take role {role}, which this plan does not have: {present}"
+                words = f"the fleet file lets it take role {role}, which this plan does not have."
+                words = f"{words} {suggest(role, self._plan.roles)}"
                 yield PlanFault(Severity.WARNING, f"car {car}", words)
 
     # ------------------------------------------------------------------ roles
@@ -125,18 +142,18 @@ class _Check:
             ):
                 words = f"it wants {role.count} cars, and only {', '.join(sorted(can_have))} can have it"
                 yield PlanFault(Severity.WARNING, part, words)
-            if role.on_call and not self._is_called(role):
+            if role.by_rules and not self._is_called(role):
                 yield PlanFault(
                     Severity.ERROR,
                     part,
-                    "it is on_call, and no rule gives it to anyone, nor does it stand in for another",
+                    "no rule gives it to a car, and it says `given_by: rules`",
                 )
-            if not role.on_call and not self._in_some_phase(role):
+            if not role.by_rules and not self._in_some_phase(role):
                 yield PlanFault(Severity.WARNING, part, "no phase has it")
 
     def _is_called(self, role: Role) -> bool:
         is_given = any(effect.role == role.name for rule in self._plan.rules for effect in rule.effects)
-        return is_given or any(other.fallback == role.name for other in self._plan.roles.values())
+        return is_given or any(other.if_none == role.name for other in self._plan.roles.values())
 
     def _in_some_phase(self, role: Role, during: frozenset[str] | None = None) -> bool:
         phases = [phase for phase in self._plan.phases.values() if during is None or phase.name in during]
@@ -148,14 +165,14 @@ class _Check:
         for rule in self._plan.rules:
             out_of_phase = [*self._out_of_phase(rule)]
             yield from out_of_phase
-            for condition, word in ((rule.when, "fire"), (rule.until, "end by `until`")):
+            for condition, word in ((rule.when, "fires"), (rule.until, "ends by `until`")):
                 assess = Outlook() if condition is None or out_of_phase else self._reach.assess(condition, rule.during)
                 if assess.never:
-                    yield PlanFault(Severity.ERROR, rule.name, f"it can never {word}: {assess.never}")
+                    yield PlanFault(Severity.ERROR, rule.name, f"it never {word}. {assess.never}")
                 elif assess.only:
-                    yield PlanFault(Severity.WARNING, rule.name, f"it can {word} only by {assess.only}")
+                    yield PlanFault(Severity.WARNING, rule.name, f"it {word} only by {assess.only}")
             if rule.until is not None and implies(rule.when, rule.until):
-                words = f"it can never fire: {rule.until.text} ends it, and is so whenever it begins"
+                words = f"it never fires. Its `until` ({rule.until.text}) is true whenever it begins."
                 yield PlanFault(Severity.ERROR, rule.name, words)
             for effect in rule.effects:
                 yield from self._useless(rule, effect)
@@ -167,15 +184,13 @@ class _Check:
         for role in (rule.when.role, *(effect.role for effect in rule.effects)):
             if role is not None and not self._in_some_phase(self._plan.roles[role], rule.during):
                 where = f"phase {' or '.join(sorted(rule.during))}" if rule.during is not None else "any phase"
-                words = f"role {role} does not count in {where}"
-                yield PlanFault(
-                    Severity.ERROR, rule.name, f"it can never {'fire' if role == rule.when.role else 'help'}: {words}"
-                )
+                words = f"it {'never fires' if role == rule.when.role else 'has no effect'}."
+                yield PlanFault(Severity.ERROR, rule.name, f"{words} Role {role} does not count in {where}.")
 
     def _useless(self, rule: Rule, effect: Effect) -> Iterator[PlanFault]:
         """Report an effect that none of its cars can follow."""
-        who = effect.who if effect.who != THAT or rule.when.car is None else rule.when.car
-        if who == OTHERS and self._known is not None and len(self._known) < 2:
+        who = effect.who if effect.who != THIS_CAR or rule.when.car is None else rule.when.car
+        if who == OTHER_CARS and self._known is not None and len(self._known) < 2:
             yield PlanFault(
                 Severity.ERROR, rule.name, f"there are no others: the fleet file has {len(self._known)} car"
             )
@@ -213,17 +228,17 @@ class _Check:
             for effect in rule.effects:
                 mode = effect.mode or (self._plan.roles[effect.role].mode if effect.role is not None else None)
                 hits = (
-                    effect.who == "that"
-                    or effect.who == ALL
+                    effect.who == THIS_CAR
+                    or effect.who == ALL_CARS
                     or (rule.when.car is not None and effect.who == rule.when.car)
                 )
-                if mode is None or not hits or effect.who == OTHERS:
+                if mode is None or not hits or effect.who == OTHER_CARS:
                     continue
                 cars = [car for car in self._reach.cars if rule.when.car in (None, car)]
                 kinds = [profile for car in cars for profile in self._reach.profiles(car)]
                 if kinds and not any(can_be_true(rule.when.expression, profile, mode) for profile in kinds):
                     missing = ", ".join(list_unmeasured(rule.when.expression, kinds[0], mode))
-                    words = f"it ends itself: in mode {mode}, {missing} is not measured; give it until"
+                    words = f"it ends itself. In mode {mode} a car does not measure {missing}. Add `until`."
                     yield PlanFault(Severity.WARNING, rule.name, words)
 
     # ------------------------------------------------------------------ phases
@@ -256,15 +271,15 @@ class _Check:
         assess, jumps = self._reach.assess(phase.until, {phase.name}), self._jumps_out(phase)
         why = self._no_role(phase) or assess.never
         if phase.timeout_s is not None and phase.until.for_s >= phase.timeout_s:
-            why = why or f"until wants {phase.until.for_s:g} s, and timeout_s is {phase.timeout_s:g}"
+            why = why or f"Its `until` takes {phase.until.for_s:g} s, and timeout_s is {phase.timeout_s:g}."
         part = f"phase {phase.name}"
         if why and phase.timeout_s is None and not jumps:
-            yield PlanFault(Severity.ERROR, part, f"it never ends: {why}; or give it timeout_s")
+            yield PlanFault(Severity.ERROR, part, f"it never ends. {why} Or add timeout_s.")
         elif why:
-            other = " or ".join([*(["its time-out"] if phase.timeout_s is not None else []), *jumps])
-            yield PlanFault(Severity.WARNING, part, f"only {other} ends it: {why}")
+            other = " or ".join([*(["its timeout"] if phase.timeout_s is not None else []), *jumps])
+            yield PlanFault(Severity.WARNING, part, f"only {other} ends it. {why}")
         elif assess.only:
-            yield PlanFault(Severity.WARNING, part, f"it can end only by {assess.only}")
+            yield PlanFault(Severity.WARNING, part, f"it ends only by {assess.only}")
 
     def _jumps_out(self, phase: PlanPhase) -> list[str]:
         """List the rules that can end a phase."""
@@ -279,7 +294,7 @@ class _Check:
     def _no_role(self, phase: PlanPhase) -> str:
         role = None if phase.until is None else phase.until.role
         missing = role is not None and phase.roles is not None and role not in phase.roles
-        return f"role {role} does not count in it" if missing else ""
+        return f"Role {role} does not count in it." if missing else ""
 
     def _after(self, name: str) -> set[str]:
         phase = self._plan.phases.get(name)

@@ -6,8 +6,9 @@ from typing import Final
 
 from fleet.conditions import Expression, is_contradictory
 from fleet.conditions.expression import Compare, Literal, Name, Op, ValueKind
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanCondition, Quantifier, Rule
+from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Quantifier, Rule
 from gateway.protocol.enums import Mode
+from schemas.colors import format_color
 
 _REMEMBERED: Final = 4096
 """Maximum pairs of conditions whose contradiction is cached: the rules of a large plan, each against each."""
@@ -49,15 +50,17 @@ def find_conflicts(plan: Plan) -> Iterator[tuple[Rule, str, bool]]:
                     what = _contradiction(effect, other)
                     if not what or not _can_meet(plan, rule, effect, earlier, other):
                         continue
-                    whom = effect.who if effect.who not in (THAT, OTHERS, ALL) else "the same car"
+                    whom = effect.who if effect.who not in (THIS_CAR, OTHER_CARS, ALL_CARS) else "the same car"
                     if _always_meet(rule, effect, earlier, other):
-                        words = f"it fights {earlier.name}, which is true whenever it is and wants {whom} to be {what}"
-                        yield rule, f"{words}: the first counts", True
+                        words = (
+                            f"it contradicts {earlier.name}, which is true whenever it is and wants {whom} to be {what}"
+                        )
+                        yield rule, f"{words}. The first counts.", True
                     elif not implies(earlier.when, rule.when) and earlier.name not in possible:
                         possible.append(earlier.name)
         if possible:
             words = f"it may be true together with {', '.join(possible)}, and wants something else of the same car"
-            yield rule, f"{words}: the first counts", False
+            yield rule, f"{words}. The first counts.", False
         yield from _find_self_conflicts(plan, rule)
 
 
@@ -65,17 +68,17 @@ def _find_self_conflicts(plan: Plan, rule: Rule) -> Iterator[tuple[Rule, str, bo
     for index, effect in enumerate(rule.effects):
         for other in rule.effects[:index]:
             what = _contradiction(effect, other)
-            if what and (effect.who == other.who or (ALL in (effect.who, other.who) and effect.who and other.who)):
-                yield rule, f"it fights itself: of {effect.who} it wants {what}, too, and the first counts", True
+            if what and (effect.who == other.who or (ALL_CARS in (effect.who, other.who) and effect.who and other.who)):
+                yield rule, f"it contradicts itself: it also wants {effect.who} to be {what}. The first counts.", True
         mode = effect.mode or (plan.roles[effect.role].mode if effect.role is not None else None)
         if effect.led is not None and mode not in (None, Mode.MANUAL):
-            yield rule, f"its colour is never seen: a car obeys it in mode manual only, and gets mode {mode}", True
-        own = effect.who in (THAT, ALL) or (rule.when.car is not None and effect.who == rule.when.car)
+            yield rule, f"its color is never seen. A car shows it only in mode manual, and gets mode {mode}.", True
+        own = effect.who in (THIS_CAR, ALL_CARS) or (rule.when.car is not None and effect.who == rule.when.car)
         if not own or mode is None or rule.until is not None or "mode.asked" not in rule.when.expression.names:
             continue
         if _contradictory(rule.when.expression & _asked_for(mode)):
-            words = f"it undoes itself again and again: in mode {mode}, {rule.when.expression} is not so"
-            yield rule, f"{words}; give it until", True
+            words = f"it undoes itself again and again. In mode {mode}, {rule.when.expression} is false."
+            yield rule, f"{words} Add `until`.", True
 
 
 def _asked_for(mode: Mode) -> Expression:
@@ -88,8 +91,8 @@ def _contradiction(effect: Effect, other: Effect) -> str:
     wish, others = effect.mode or effect.role, other.mode or other.role
     if wish is not None and others is not None and (effect.mode, effect.role) != (other.mode, other.role):
         return str(others)
-    if effect.led is not None and other.led is not None and effect.led != other.led:
-        return f"of colour {list(other.led)}"
+    if effect.led is not None and other.led is not None and (effect.led, effect.blink_s) != (other.led, other.blink_s):
+        return format_color(other.led)
     return ""
 
 
@@ -108,7 +111,7 @@ def _can_meet(plan: Plan, rule: Rule, effect: Effect, earlier: Rule, other: Effe
 
 def _target(rule: Rule, effect: Effect) -> str:
     """Return the target of an effect, the car's name if it can be only one car."""
-    return rule.when.car if effect.who == THAT and rule.when.car is not None else effect.who
+    return rule.when.car if effect.who == THIS_CAR and rule.when.car is not None else effect.who
 
 
 def _always_meet(rule: Rule, effect: Effect, earlier: Rule, other: Effect) -> bool:
@@ -118,6 +121,6 @@ def _always_meet(rule: Rule, effect: Effect, earlier: Rule, other: Effect) -> bo
     if earlier.during is not None and not (rule.during is not None and rule.during <= earlier.during):
         return False
     one, two = _target(rule, effect), _target(earlier, other)
-    if two == ALL:
+    if two == ALL_CARS:
         return True
-    return one == two and (one not in (THAT, OTHERS) or implies(earlier.when, rule.when))
+    return one == two and (one not in (THIS_CAR, OTHER_CARS) or implies(earlier.when, rule.when))

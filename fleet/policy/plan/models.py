@@ -1,37 +1,75 @@
 """The models of a plan's file: names, types and ranges of its fields. plan.py says what they mean. Pure."""
 
+from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from gateway.protocol.enums import Mode
 from schemas import keys
+from schemas.colors import COLOR_PATTERN, parse_color
 from schemas.yaml_document.document import Entry
 
 _Name = Annotated[str, Field(description=keys.NAME_RULE)]
 """Only parser.py checks names. If pydantic refused a key, faults in its value would stay hidden."""
 _Seconds = Annotated[float, Field(ge=0, le=86_400)]
-_Byte = Annotated[int, Field(ge=0, le=255)]
+
+
+def _check_color(text: str) -> str:
+    parse_color(text)
+    return text
+
+
+_Color = Annotated[str, AfterValidator(_check_color), Field(json_schema_extra={"pattern": COLOR_PATTERN})]
+
+
+class GivenBy(StrEnum):
+    """Who gives a role to cars."""
+
+    PLAN = "plan"
+    RULES = "rules"
+
+
+class WithoutRole(StrEnum):
+    """What a car without a role does."""
+
+    MANUAL = "manual"
+    LEAVE_ALONE = "leave_alone"
 
 
 class ConditionEntry(Entry):
-    """A condition, and the cars of which it must be true: exactly one of any, all, car."""
+    """A condition, and the cars of which it must be true: exactly one of any_car, all_cars, car."""
 
-    any: str | None = Field(None, description="an expression that must be true of at least one car: light.left")
-    all: str | None = Field(None, description="an expression that must be true of every car")
+    any_car: str | None = Field(None, description="an expression that must be true of at least one car: light.left")
+    all_cars: str | None = Field(None, description="an expression that must be true of every car")
     car: _Name | None = Field(None, description="the car of which `is` must be true")
     is_: str | None = Field(None, alias="is", description="an expression over the readings of `car`")
-    role: _Name | None = Field(None, description="any, all: only of the cars that have this role")
+    with_role: _Name | None = Field(None, description="any_car, all_cars: only of the cars that have this role")
     for_s: _Seconds = Field(0.0, description="minimum time without a break, s")
+
+
+Condition = str | ConditionEntry
+"""A bare text is the expression of any_car."""
+
+
+class BlinkEntry(Entry):
+    """A blinking LED."""
+
+    color: _Color = Field(description='the color while it is on: red, or "#ff0000" in quotes')
+    blink_s: float = Field(0.5, ge=0.5, le=60, description="time on, and then the time off, s")
 
 
 class EffectEntry(Entry):
     """An effect of a rule on some cars."""
 
-    who: _Name | None = Field(None, description="that (the car that made the rule true), others, all, a car or a role")
+    who: _Name | None = Field(
+        None, description="this_car (the car that made the rule true), other_cars, all_cars, a car or a role"
+    )
     role: _Name | None = Field(None, description="the role that they take")
     mode: Mode | None = Field(None, description="the mode that they are in, whatever their role says")
-    led: tuple[_Byte, _Byte, _Byte] | None = Field(None, description="the colour LED, set once: [r, g, b]")
+    led: _Color | BlinkEntry | None = Field(
+        None, description='the color LED, set once: red, or "#ff0000"; it blinks with {color: red, blink_s: 0.5}'
+    )
     phase: _Name | None = Field(None, description="the phase that begins")
 
 
@@ -39,10 +77,19 @@ class RuleEntry(Entry):
     """Effects (`then`) that count while `when` is true; with `until`, from then on until that is true."""
 
     name: str = Field("", max_length=60, description="its name in explanations")
-    when: ConditionEntry = Field(description="the condition, as `{any: light.left, for_s: 1}`")
-    until: ConditionEntry | None = None
-    then: EffectEntry | list[EffectEntry] = Field(description="what follows, as `{who: that, role: rest}`, or a list")
+    when: Condition = Field(
+        description="the condition: a text, which must be true of any car, or `{any_car: light.left, for_s: 1}`"
+    )
+    until: Condition | None = Field(None, description="the condition that ends the rule; left out: `when` ends it")
+    then: EffectEntry | list[EffectEntry] = Field(description="what follows: `{who: this_car, role: rest}`, or a list")
     during: list[_Name] | None = Field(None, description="the phases in which it counts; all, if left out")
+
+
+class FixedEntry(Entry):
+    """The only role, or the only mode, of a certain car."""
+
+    role: _Name | None = Field(None, description="a role of this plan")
+    mode: Mode | None = Field(None, description="a mode, without a role")
 
 
 class RoleEntry(Entry):
@@ -55,27 +102,36 @@ class RoleEntry(Entry):
     cars: list[_Name] | None = Field(None, min_length=1, description="the only cars that may have it, best first")
     capabilities: list[str] = Field(default=[], description="capabilities that a car must have")
     platforms: list[str] | None = Field(None, min_length=1, description="the platforms that may have it")
-    fallback: _Name | None = Field(None, description="the role that gets a place for each that no car can take here")
-    on_call: bool = Field(default=False, description="only a rule gives it to a car")
+    if_none: _Name | None = Field(
+        None, description="the role that gets a place for each place here that no car can take"
+    )
+    given_by: GivenBy = Field(GivenBy.PLAN, description="plan: whoever fits best has it; rules: only a rule gives it")
 
 
 class PhaseEntry(Entry):
     """A part of the job: it lasts until a condition is true or its time is over."""
 
     roles: list[_Name] | None = Field(None, description="the roles that count; all, if left out")
-    until: ConditionEntry | None = None
-    timeout_s: float | None = Field(None, gt=0, le=86_400)
+    until: Condition | None = Field(None, description="the condition that ends it; then `next` begins")
+    timeout_s: float | None = Field(
+        None, gt=0, le=86_400, description="maximum duration once its cars are in their modes, s"
+    )
     next: _Name | None = Field(None, description="the phase after it")
-    on_timeout: _Name | None = Field(None, description="the phase after it when its time is over (next, if left out)")
+    on_timeout: _Name | None = Field(None, description="the phase after it when its time is over; left out: `next`")
 
 
 class PlanEntry(Entry):
-    """A plan: cars with a fixed role or mode, roles, rules, phases (the first one begins)."""
+    """A plan: roles for cars, cars with a fixed role or mode, rules, phases (the first one begins)."""
 
-    cars: dict[_Name, _Name] = Field(default={}, description="a role, or a mode, for a certain car: red: tracking")
     roles: dict[_Name, RoleEntry] = Field(default={}, description="the roles for cars, by name")
-    rules: list[RuleEntry] = Field(default=[], max_length=200)
+    fixed: dict[_Name, FixedEntry] = Field(
+        default={}, description="the only role, or the only mode, of a certain car: `blue: {mode: manual}`"
+    )
+    rules: list[RuleEntry] = Field(
+        default=[], max_length=200, description="what changes while a condition is true; the first counts"
+    )
     phases: dict[_Name, PhaseEntry] = Field(default={}, description="parts of the job, the first one begins")
-    idle: Literal["manual", "leave"] = Field(
-        "manual", description="the mode of a car without a role: manual, or the mode it has (leave)"
+    without_role: WithoutRole = Field(
+        WithoutRole.MANUAL,
+        description="manual: a car without a role goes to mode manual; leave_alone: it stays as it is",
     )

@@ -6,11 +6,22 @@ from typing import Final
 
 from fleet.conditions import BadExpression, Expression
 from fleet.conditions import parse as parse_expression
-from fleet.policy.plan.models import ConditionEntry, EffectEntry, PhaseEntry, PlanEntry, RoleEntry, RuleEntry
+from fleet.policy.plan.models import (
+    BlinkEntry,
+    Condition,
+    ConditionEntry,
+    EffectEntry,
+    GivenBy,
+    PhaseEntry,
+    PlanEntry,
+    RoleEntry,
+    RuleEntry,
+    WithoutRole,
+)
 from fleet.policy.plan.plan import (
-    OTHERS,
+    OTHER_CARS,
     RESERVED,
-    THAT,
+    THIS_CAR,
     Effect,
     Plan,
     PlanCondition,
@@ -19,10 +30,11 @@ from fleet.policy.plan.plan import (
     Role,
     Rule,
 )
-from fleet.policy.snapshot import NAMES
+from fleet.policy.snapshot import ALIASES, NAMES
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import OPTIONS, parse_platform
 from schemas import keys
+from schemas.colors import parse_color
 from schemas.yaml_document.document import BadFile, Document
 from schemas.yaml_document.messages import Where, suggest
 
@@ -31,7 +43,7 @@ BadPlan = BadFile
 CAPABILITIES: Final = frozenset(
     {*parse_platform("arduino").capabilities, *parse_platform("raspberry_pi").capabilities, *OPTIONS}
 )
-_MISSING: Final = {"mode": "manual", "when": {"any": "true"}, "then": []}
+_MISSING: Final = {"mode": "manual", "when": "true", "then": []}
 """Values for missing required fields, so that the rest of a file can be checked."""
 
 
@@ -53,45 +65,49 @@ class _PlanParser:
     def __init__(self, document: Document, entry: PlanEntry) -> None:
         self._document = document
         self._entry = entry
-        self._modes = tuple(Mode)
+        self._places: dict[str, tuple[int, int]] = {}
+        self._fixed = {car: each.role or str(each.mode or "") for car, each in entry.fixed.items()}
 
     def plan(self, text: str) -> Plan:
         entry = self._entry
-        if not entry.cars and not entry.roles:
-            words = "a plan has `cars:` or `roles:`, with one entry at least, as `cars: {red: tracking}`"
+        if not entry.fixed and not entry.roles:
+            words = "a plan needs roles. Write: `roles: {patrol: {mode: obstacle_avoidance}}`"
             self._report((), words, unless=())
-        for place, names in (("roles", entry.roles), ("cars", entry.cars), ("phases", entry.phases)):
+        for place, names in (("roles", entry.roles), ("fixed", entry.fixed), ("phases", entry.phases)):
             for name in names:
+                self._mark({"fixed": "car"}.get(place, place[:-1]), name, (place, name), on_key=True)
                 self._check_name((place, name), name, on_key=True)
                 if name in RESERVED:
                     self._report(
                         (place, name), f"{name} is a word of rules ({', '.join(sorted(RESERVED))})", on_key=True
                     )
         for name in entry.roles:
-            if name in entry.cars:
-                self._report(("roles", name), "a car has this name: a rule could mean either", on_key=True)
-            elif name in self._modes and any(role == name for role in entry.cars.values()):
-                self._report(("roles", name), "a mode has this name, and `cars` uses it", on_key=True)
+            if name in entry.fixed:
+                self._report(("roles", name), "a car in `fixed` has this name: a rule could mean either", on_key=True)
+            elif any(each.mode == name for each in entry.fixed.values()):
+                self._report(("roles", name), "a mode that `fixed` uses has this name: choose another", on_key=True)
         roles = {name: self._role(name, each) for name, each in entry.roles.items()}
-        for car, role in entry.cars.items():
-            if role in entry.roles or (role not in self._modes and self._is_faulty("roles", role)):
-                continue
-            if role not in self._modes:
-                self._report_unknown(("cars", car), role, [*entry.roles, *self._modes], "role or mode")
-                continue
-            same = tuple(other for other, each in entry.cars.items() if each == role)
-            roles[role] = Role(role, Mode(role), count=len(same), cars=same)
-        self._check_fallbacks()
+        for car, each in entry.fixed.items():
+            if (each.role is None) is (each.mode is None):
+                self._report(("fixed", car), "needs a role or a mode. Write: `{mode: manual}`", unless=("fixed", car))
+            elif each.role is not None:
+                self._check_role(("fixed", car, "role"), each.role)
+            elif each.mode is not None:
+                self._mark("role", each.mode, ("fixed", car), on_key=True)
+                same = tuple(other for other, mode in self._fixed.items() if mode == each.mode)
+                roles[each.mode] = Role(str(each.mode), each.mode, count=len(same), cars=same)
+        self._check_stand_ins()
         rules = tuple(self._rule(index, each) for index, each in enumerate(entry.rules))
         phases = {name: self._phase(name, each) for name, each in entry.phases.items()}
         self._check_circles()
         return Plan(
             MappingProxyType(roles),
-            MappingProxyType(dict(entry.cars)),
+            MappingProxyType(self._fixed),
             rules,
             MappingProxyType(phases),
-            Mode.MANUAL if entry.idle == "manual" else None,
+            Mode.MANUAL if entry.without_role is WithoutRole.MANUAL else None,
             text,
+            MappingProxyType(self._places),
         )
 
     def _role(self, name: str, entry: RoleEntry) -> Role:
@@ -111,11 +127,11 @@ class _PlanParser:
                     (*where, "platforms", index), f"{platform} cars do not know mode {entry.mode}; they know {known}"
                 )
         for index, car in enumerate(entry.cars or ()):
-            self._check_name((*where, "cars", index), car)
-            if car in self._entry.cars and self._entry.cars[car] != name:
-                self._report((*where, "cars", index), f"{car} has only role {self._entry.cars[car]}, says `cars`")
-        if entry.fallback is not None:
-            self._check_role((*where, "fallback"), entry.fallback)
+            self._check_car((*where, "cars", index), car)
+            if self._fixed.get(car, name) != name:
+                self._report((*where, "cars", index), f"`fixed` gives {car} only {self._fixed[car]}")
+        if entry.if_none is not None:
+            self._check_role((*where, "if_none"), entry.if_none)
         return Role(
             name,
             entry.mode,
@@ -125,23 +141,22 @@ class _PlanParser:
             None if entry.cars is None else tuple(dict.fromkeys(entry.cars)),
             frozenset(entry.capabilities),
             None if entry.platforms is None else tuple(entry.platforms),
-            entry.fallback,
-            entry.on_call,
+            entry.if_none,
+            entry.given_by is GivenBy.RULES,
         )
 
-    def _check_fallbacks(self) -> None:
+    def _check_stand_ins(self) -> None:
         for name in self._entry.roles:
             way = [name]
-            while (after := self._fallback(way[-1])) is not None and after not in way:
+            while (after := self._stand_in(way[-1])) is not None and after not in way:
                 way.append(after)
             if after == name:
-                self._report(
-                    ("roles", name, "fallback"), f"roles that stand in for each other: {' -> '.join([*way, name])}"
-                )
+                words = f"these roles stand in for each other: {' -> '.join([*way, name])}"
+                self._report(("roles", name, "if_none"), words)
 
-    def _fallback(self, name: str) -> str | None:
+    def _stand_in(self, name: str) -> str | None:
         role = self._entry.roles.get(name)
-        return None if role is None else role.fallback
+        return None if role is None else role.if_none
 
     def _rule(self, index: int, entry: RuleEntry) -> Rule:
         where: Where = ("rules", index)
@@ -149,8 +164,9 @@ class _PlanParser:
         effects = entry.then if isinstance(entry.then, list) else [entry.then]
         for place, phase in enumerate(entry.during or ()):
             self._check_phase((*where, "during", place), phase)
+        self._mark("rule", entry.name or str(index + 1), where)
         return Rule(
-            f"rule {entry.name}" if entry.name else f"rule {index + 1}",
+            f"rule {entry.name or index + 1}",
             self._condition((*where, "when"), entry.when),
             tuple(
                 self._effect((*where, "then", place) if several else (*where, "then"), each, entry.when)
@@ -160,30 +176,33 @@ class _PlanParser:
             None if entry.during is None else frozenset(entry.during),
         )
 
-    def _effect(self, where: Where, entry: EffectEntry, when: ConditionEntry) -> Effect:
+    def _effect(self, where: Where, entry: EffectEntry, when: Condition) -> Effect:
         actions = [name for name in ("role", "mode", "led") if getattr(entry, name) is not None]
         if entry.phase is not None:
             self._check_phase((*where, "phase"), entry.phase)
             if actions or entry.who is not None:
-                self._report(where, "phase stands alone: give who and what an entry of its own in `then`")
+                self._report(where, "phase stands alone. Write `then: [{phase: …}, {who: …}]`")
         elif entry.who is None or not actions or {"role", "mode"} <= set(actions):
-            self._report(where, "who with one of role and mode, or led, or both; or phase alone", unless=where)
+            self._report(where, "needs who and one of role, mode, led; or phase alone", unless=where)
         if entry.role is not None:
             self._check_role((*where, "role"), entry.role)
         if entry.who is not None and entry.who not in self._entry.roles:
-            self._check_name((*where, "who"), entry.who)
+            self._check_car((*where, "who"), entry.who)
         if entry.role is not None and entry.who in self._entry.roles:
-            self._report((*where, "who"), "a role takes no other role: name cars, that, others or all")
-        if entry.who in (THAT, OTHERS) and when.all is not None:
-            self._report((*where, "who"), f"with `all` there is no car that made it true, so no {entry.who}")
-        fixed = self._entry.cars.get(entry.who or "")
+            self._report((*where, "who"), "a role takes no other role: name a car, this_car, other_cars or all_cars")
+        if entry.who in (THIS_CAR, OTHER_CARS) and isinstance(when, ConditionEntry) and when.all_cars is not None:
+            self._report((*where, "who"), f"with `all_cars` no single car made it true, so there is no {entry.who}")
+        fixed = self._fixed.get(entry.who or "")
         if entry.role is not None and fixed not in (None, entry.role):
-            self._report((*where, "role"), f"{entry.who} has only role {fixed}, says `cars`")
-        return Effect(entry.who or "", entry.role, entry.mode, entry.led, entry.phase)
+            self._report((*where, "role"), f"`fixed` gives {entry.who} only {fixed}")
+        blink = entry.led if isinstance(entry.led, BlinkEntry) else None
+        color = entry.led.color if isinstance(entry.led, BlinkEntry) else entry.led
+        led = None if color is None else parse_color(color)
+        return Effect(entry.who or "", entry.role, entry.mode, led, blink.blink_s if blink else None, entry.phase)
 
     def _phase(self, name: str, entry: PhaseEntry) -> PlanPhase:
         where: Where = ("phases", name)
-        modes = {role for role in self._entry.cars.values() if role in self._modes}
+        modes = {str(each.mode) for each in self._entry.fixed.values() if each.mode is not None}
         for index, role in enumerate(entry.roles or ()):
             self._check_role((*where, "roles", index), role, modes)
         for field in ("next", "on_timeout"):
@@ -228,32 +247,44 @@ class _PlanParser:
                 words = f"a cycle of phases without a condition or a time-out: {circle}; give one until or timeout_s"
                 self._report(("phases", name), words, unless=("phases", name))
 
-    def _condition(self, where: Where, entry: ConditionEntry) -> PlanCondition:
+    def _condition(self, where: Where, entry: Condition) -> PlanCondition:
+        if isinstance(entry, str):
+            return PlanCondition(Quantifier.ANY, self._expression(where, entry))
         quantifiers = [name for name in Quantifier if getattr(entry, name) is not None]
         if len(quantifiers) != 1:
-            words = f"exactly one of {', '.join(Quantifier)}, as `any: light.left` or `car: red` with `is: light.left`"
+            words = (
+                "needs one of any_car, all_cars, car. Write: `{any_car: light.left}` or `{car: red, is: light.left}`"
+            )
             self._report(where, words, unless=where)
         of = quantifiers[0] if quantifiers else Quantifier.ANY
         if of is Quantifier.CAR and entry.is_ is None:
-            self._report(where, "car needs `is`: the expression that must be so of it", unless=where)
+            self._report(where, f"car needs `is`. Write: `{{car: {entry.car}, is: light.left}}`", unless=where)
         if of is not Quantifier.CAR and entry.is_ is not None:
-            self._report((*where, "is"), f"only with car; with {of} the expression stands there")
-        if entry.role is not None:
+            self._report((*where, "is"), f"stands only beside car. With {of} write the expression there")
+        if entry.with_role is not None:
             if of is Quantifier.CAR:
-                self._report((*where, "role"), "only with any or all")
+                self._report((*where, "with_role"), "stands only beside any_car or all_cars")
             else:
-                self._check_role((*where, "role"), entry.role)
+                self._check_role((*where, "with_role"), entry.with_role)
         if entry.car is not None:
-            self._check_name((*where, "car"), entry.car)
+            self._check_car((*where, "car"), entry.car)
         place, text = ((*where, "is"), entry.is_) if of is Quantifier.CAR else ((*where, of.value), getattr(entry, of))
-        return PlanCondition(of, self._expression(place, text or "false"), entry.car, entry.role, entry.for_s)
+        return PlanCondition(of, self._expression(place, text or "false"), entry.car, entry.with_role, entry.for_s)
 
     def _expression(self, where: Where, text: str) -> Expression:
         try:
-            return parse_expression(text, NAMES)
+            return parse_expression(text, NAMES, ALIASES)
         except BadExpression as error:
-            self._report(where, str(error))
+            self._report(where, error.words)
             return parse_expression("false", NAMES)
+
+    def _mark(self, what: str, name: str, where: Where, *, on_key: bool = False) -> None:
+        """Remember where a part stands, for the lint's findings; of a car the first place."""
+        self._places.setdefault(f"{what} {name}", self._document.position(where, on_key=on_key))
+
+    def _check_car(self, where: Where, name: str) -> None:
+        self._mark("car", name, where)
+        self._check_name(where, name)
 
     def _check_name(self, where: Where, name: str, *, on_key: bool = False) -> None:
         try:
@@ -275,8 +306,7 @@ class _PlanParser:
 
     def _report_unknown(self, where: Where, name: str, allowed: Iterable[str], what: str) -> None:
         names = list(allowed)
-        listed = f"there are {', '.join(names)}" if names else "there is none"
-        self._report(where, f"there is no {what} {name}: {listed}{suggest(name, names)}")
+        self._report(where, f"there is no {what} {name}. {suggest(name, names)}")
 
     def _report(self, where: Where, words: str, *, on_key: bool = False, unless: Where | None = None) -> None:
         """Report a fault. With `unless`, skip it if a field there is faulty, as it may only follow from that."""

@@ -11,20 +11,24 @@ from typing import Final
 
 from fleet.conditions import Expression
 from gateway.protocol.enums import Mode
+from schemas.colors import Rgb
 
-THAT: Final = "that"
-OTHERS: Final = "others"
-ALL: Final = "all"
-RESERVED: Final = frozenset({THAT, OTHERS, ALL, "any"})
+THIS_CAR: Final = "this_car"
+OTHER_CARS: Final = "other_cars"
+ALL_CARS: Final = "all_cars"
+RESERVED: Final = frozenset({THIS_CAR, OTHER_CARS, ALL_CARS, "all"})
 """Words of rules, not allowed as names of cars, roles or phases."""
 
 
 class Quantifier(StrEnum):
     """The cars of which a condition must be true."""
 
-    ANY = "any"
-    ALL = "all"
+    ANY = "any_car"
+    ALL = "all_cars"
     CAR = "car"
+
+
+_WORDS: Final = {Quantifier.ANY: "any car", Quantifier.ALL: "all cars"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +49,11 @@ class PlanCondition:
         object.__setattr__(self, "text", self._text())  # computed once: it is used ten times a second for each car
 
     def _text(self) -> str:
-        who = self.car if self.of is Quantifier.CAR else f"{self.of} {f'with role {self.role}' if self.role else 'car'}"
+        who = (
+            self.car
+            if self.of is Quantifier.CAR
+            else f"{_WORDS[self.of]}{f' with role {self.role}' if self.role else ''}"
+        )
         lasting = f" for {self.for_s:g} s" if self.for_s else ""
         return f"{who}: {self.expression}{lasting}"
 
@@ -64,8 +72,10 @@ class Role:
     """The only cars that may have it, best first; None: any."""
     capabilities: frozenset[str] = frozenset()
     platforms: tuple[str, ...] | None = None
-    fallback: str | None = None
-    on_call: bool = False
+    if_none: str | None = None
+    """The role that gets a place for each place here that no car can take."""
+    by_rules: bool = False
+    """True if only rules give it to cars."""
     needs_text: str = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -74,12 +84,14 @@ class Role:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """A role, mode or color that a rule gives (to that, others, all, a car, a role); or the phase that it begins."""
+    """A role, mode or color that a rule gives to some cars; or the phase that it begins."""
 
     who: str = ""
     role: str | None = None
     mode: Mode | None = None
-    led: tuple[int, int, int] | None = None
+    led: Rgb | None = None
+    blink_s: float | None = None
+    """Time for which the LED is on, and then off; None: it does not blink."""
     phase: str | None = None
 
 
@@ -119,6 +131,8 @@ class Plan:
     idle: Mode | None
     """The mode of a car without a role; None: the car is left alone."""
     text: str
+    places: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
+    """Line and column of each role, rule, phase and fixed car in the text, by its name in findings."""
 
     @property
     def version(self) -> str:
@@ -135,7 +149,7 @@ class Plan:
         """True if the plan may affect cars that it does not name."""
         if any(role.cars is None for role in self.roles.values()):
             return True
-        return any(effect.who in (THAT, OTHERS, ALL) for rule in self.rules for effect in rule.effects)
+        return any(effect.who in (THIS_CAR, OTHER_CARS, ALL_CARS) for rule in self.rules for effect in rule.effects)
 
     @property
     def named(self) -> tuple[str, ...]:

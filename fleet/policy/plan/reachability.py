@@ -13,7 +13,7 @@ from fleet.conditions.expression import And, Compare, Literal, Name, Node, Not, 
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.policy.allocation import find_barrier
 from fleet.policy.assignment import assign
-from fleet.policy.plan.plan import ALL, OTHERS, THAT, Effect, Plan, PlanCondition, Role, Rule
+from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Role, Rule
 from fleet.policy.snapshot import CarSnapshot, topic_of
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import OPTIONS, Platform, Profile, parse_platform
@@ -108,16 +108,14 @@ class ModeReachability:
             can_be_true(role.needs, each, mode) for each in self.profiles(car) for mode in Mode
         ):
             return ""
-        return (
-            f"it needs {role.needs}, and {_first_missing(role.needs, self.profiles(car), Mode)} is never measured on it"
-        )
+        return f"it needs {role.needs}, and never measures {_first_missing(role.needs, self.profiles(car), Mode)}"
 
     def assess(self, condition: PlanCondition, during: Iterable[str] | None) -> Outlook:
         """Assess whether a condition can be true in one of these phases (None: any) while cars follow the plan."""
         if why := explain_impossible(condition.expression):
-            return Outlook(why)
+            return Outlook(f"{why}.")
         if condition.car is not None and condition.car not in self.cars:
-            return Outlook(f"there is no car {condition.car}")
+            return Outlook(f"There is no car {condition.car}.")
         only, modes, kinds = "", dict[Mode, None](), dict[Profile, None]()
         for car in self._watched(condition):
             kinds |= dict.fromkeys(self.profiles(car))
@@ -141,19 +139,20 @@ class ModeReachability:
         during: Iterable[str] | None,
     ) -> str:
         where = f" in phase {' or '.join(sorted(during))}" if during is not None else ""
-        whom = condition.car or f"{condition.of} car{f' with role {condition.role}' if condition.role else ''}"
+        whom = condition.car or f"cars{f' with role {condition.role}' if condition.role else ''}"
         if not modes:
-            return f"there is never {whom.replace(f'{condition.of} ', 'a ', 1)}{where}"
+            return f"There are never {whom}{where}."
         missing = _first_missing(condition.expression, kinds, modes)
         can_have = [
             mode
             for mode in Mode
             if any(mode in one.modes and can_be_true(condition.expression, one, mode) for one in kinds)
         ]
-        words = f"{missing} is never measured on {whom}: this plan lets it be in {_or(modes)} only{where}"
+        words = f"It waits for {missing} from {whom}"
         if not can_have:
-            return f"{missing} is never measured on {whom}, in no mode"
-        return f"{words}, and it is measured in {_or(can_have)}: let {condition.car or 'a car'} be in such a mode then"
+            return f"{words}, which no mode measures there."
+        they = "it is" if condition.car else "they are"
+        return f"{words}, but {they} always in {_or(modes)}{where}. A car measures it only in {_or(can_have)}."
 
     # ------------------------------------------------------------------ reachable modes
 
@@ -202,7 +201,7 @@ class ModeReachability:
         return [
             role
             for role in can_have
-            if (counting is None or role.name in counting) and (not role.on_call or self._is_called(car, role, phase))
+            if (counting is None or role.name in counting) and (not role.by_rules or self._is_called(car, role, phase))
         ]
 
     def _is_called(self, car: str, role: Role, phase: str) -> bool:
@@ -211,26 +210,26 @@ class ModeReachability:
             for rule in self._in_force(phase)
             for effect in rule.effects
         )
-        return any(given) or any(other.fallback == role.name for other in self._plan.roles.values())
+        return any(given) or any(other.if_none == role.name for other in self._plan.roles.values())
 
     def _affects(self, rule: Rule, effect: Effect, car: str, role: str | None, roles: list[Role]) -> bool:
         when = rule.when
         match effect.who:
-            case who if who == THAT:
+            case who if who == THIS_CAR:
                 # A car that triggered the rule in another role may have this role by now, if `until` ends the rule.
                 own = role is None or rule.until is not None or when.role in (None, role)
                 could = when.role is None or rule.until is not None or any(each.name == when.role for each in roles)
                 return when.car in (None, car) and own and could
-            case who if who == OTHERS:
+            case who if who == OTHER_CARS:
                 return when.car != car
-            case who if who in (ALL, car):
+            case who if who in (ALL_CARS, car):
                 return True
             case who:
                 return any(each.name == who for each in roles) and role in (None, who)
 
     def _idle(self, car: str, phase: str, roles: list[Role]) -> str | None:
         """Return None if a car always has a role, empty if it may be without one, else the only case of that."""
-        own_roles = [role for role in roles if not role.on_call]
+        own_roles = [role for role in roles if not role.by_rules]
         if self._has_place_always(car, phase, [role for role in own_roles if role.needs is None]):
             return None
         if not self._has_place_always(car, phase, own_roles):

@@ -15,7 +15,7 @@ from tests.fleet.conftest import Cars, asked
 from tests.support.processes import LONG_S, GatewayProcess, wait_for
 
 PLAN = """
-cars: {red: tracking, green: manual}
+fixed: {red: {mode: tracking}, green: {mode: manual}}
 rules:
   - when: {car: green, is: motion.motion == 'spin_left'}
     then: {who: red, mode: light_seeking}
@@ -124,7 +124,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
 def test_a_car_whose_link_is_lost_is_left_alone_and_brought_to_its_mode_when_it_is_back(
     cars: Cars, tmp_path: Path
 ) -> None:
-    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {red: tracking}")
+    process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: tracking}}")
     lines = Lines(process)
     lines.until("red", "tracking", "role tracking")
     wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
@@ -140,7 +140,9 @@ def test_a_car_whose_link_is_lost_is_left_alone_and_brought_to_its_mode_when_it_
 
 
 def test_what_a_car_cannot_do_is_said_and_not_asked_for(cars: Cars, tmp_path: Path) -> None:
-    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {blue: tracking, green: manual, purple: manual}")
+    process = coordinator(
+        cars, tmp_path / "plan.yaml", "fixed: {blue: {mode: tracking}, green: {mode: manual}, purple: {mode: manual}}"
+    )
     lines = Lines(process)
     idle = lines.until("blue", "manual", "raspberry_pi cars do not know mode tracking; they know manual")
     assert idle["kind"] == "idle"
@@ -150,14 +152,14 @@ def test_what_a_car_cannot_do_is_said_and_not_asked_for(cars: Cars, tmp_path: Pa
 
 
 def test_a_plan_with_a_mistake_is_wrong_use(cars: Cars, tmp_path: Path) -> None:
-    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {red: fast}")
+    process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {role: fast}}")
     assert process.wait() == 2
-    assert "plan.yaml:1:13: cars.red: there is no role or mode fast: there are manual, " in process.stderr
+    assert "plan.yaml:1:21: error: fixed.red.role: there is no role fast. There is none." in process.stderr
     assert process.stderr.count("\n") == 1
 
 
 def test_plan_assignment_and_decisions_can_be_asked_for(cars: Cars, tmp_path: Path) -> None:
-    process = coordinator(cars, tmp_path / "plan.yaml", "cars: {red: manual}")
+    process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: manual}}")
     Lines(process).until("red", "manual", "role manual")
 
     def known() -> dict[str, Any] | None:
@@ -166,7 +168,7 @@ def test_plan_assignment_and_decisions_can_be_asked_for(cars: Cars, tmp_path: Pa
         return named if len(named) == 4 else None
 
     found = wait_for(known, "all four answer")
-    assert found["Plan"].text == "cars: {red: manual}"
+    assert found["Plan"].text == "fixed: {red: {mode: manual}}"
     assert found["red"].decided == "manual"
     assert found["role manual"].decided == "1 of 1"
     assert [role.name for role in found["Assignment"].roles] == ["manual"]
@@ -198,7 +200,7 @@ def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_a
     assert "nothing was decided of purple; there are decisions of blue, green, red" in nobody.stderr
 
     key = "fleet/@coordinator/@cmd/plan"
-    (refused,) = cars.bus.query(key, payload=b"cars: {red: fast}\nroles: {x: {}}", timeout_s=5.0)
+    (refused,) = cars.bus.query(key, payload=b"fixed: {red: {role: fast}}\nroles: {x: {}}", timeout_s=5.0)
     assert isinstance(refused, bus.Sample)
     answer: Any = refused.message()
     assert (answer.status, answer.reason) == ("rejected", "bad_value")
@@ -221,7 +223,7 @@ cars:
   green: {platform: raspberry_pi}
   blue: {platform: raspberry_pi}
 """
-NEVER = "cars: {purple: tracking}\nroles: {ghost: {mode: tracking, cars: [green]}}"
+NEVER = "fixed: {purple: {mode: tracking}}\nroles: {ghost: {mode: tracking, cars: [green]}}"
 
 
 def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_over_the_bus(
@@ -231,13 +233,13 @@ def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_ove
     file.write_text(LISTED, encoding="utf-8")
     listed = ("--fleet-file", str(file))
     told = (
-        "car purple: the fleet file has no such car; it has blue, green, red",
-        "role ghost: no car can fill it",
-        "role tracking: no car can fill it",
+        "1:9: error: car purple: the fleet file has no such car. There are blue, green, red.",
+        "2:9: error: role ghost: no car can fill it",
+        "1:9: error: role tracking: no car can fill it",
     )
     refused = coordinator(cars, tmp_path / "never.yaml", NEVER, *listed)
     assert refused.wait() == 2
-    assert all(f"{tmp_path / 'never.yaml'}: {each}" in refused.stderr for each in told), refused.stderr
+    assert all(f"{tmp_path / 'never.yaml'}:{each}" in refused.stderr for each in told), refused.stderr
     assert "Traceback" not in refused.stderr
     alone = coordinator(cars, tmp_path / "alone.yaml", "roles: {ghost: {mode: manual, platforms: [stm32]}}", *listed)
     assert alone.wait() == 2, "nor is one that only the cars of the fleet file cannot do"

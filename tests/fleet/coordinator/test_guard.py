@@ -85,7 +85,7 @@ def test_what_nobody_foresaw_is_answered_logged_and_survived(started: Started) -
     logged: list[Sample] = []
     started.processes.bus.subscribe("fleet/@coordinator/log", logged.append)
     started.broken = True
-    words = started.ask(b"cars: {purple: manual}")  # its warning meets what is broken
+    words = started.ask(b"fixed: {purple: {mode: manual}}")  # its warning meets what is broken
     started.broken = False
     assert isinstance(words, str)
     assert words.startswith(f"{INTERNAL_ERROR} while answering {KEY}: RuntimeError at test_guard.py:")

@@ -15,18 +15,18 @@ from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from fleet.policy.state import HUB_RETURN_GRACE_S, PolicyState, carry_over, on_hub_back, restore, to_persisted
 from tests.fleet.policy.cars import GONE, HERE, PolicyRun
 
-FIXED = parse("cars: {red: tracking}")
+FIXED = parse("fixed: {red: {mode: tracking}}")
 ONE = parse("roles: {scout: {mode: tracking}}")
 TWO = parse("roles: {patrol: {mode: obstacle_avoidance, count: 2, priority: 1}, scout: {mode: tracking}}")
 STRONG = parse("roles: {scout: {mode: tracking, needs: battery.voltage_v > 7.0}}")
 LAMP = parse("""
 roles:
   wait: {mode: manual, count: all}
-  leader: {mode: light_seeking, on_call: true}
-  follower: {mode: following, count: all, on_call: true}
+  leader: {mode: light_seeking, given_by: rules}
+  follower: {mode: following, count: all, given_by: rules}
 rules:
-  - when: {any: light.left or light.right, for_s: 1}
-    then: [{who: that, role: leader}, {who: others, role: follower}]
+  - when: {any_car: light.left or light.right, for_s: 1}
+    then: [{who: this_car, role: leader}, {who: other_cars, role: follower}]
 """)
 
 
@@ -169,7 +169,7 @@ def test_the_car_that_sees_the_lamp_leads_and_goes_on_while_it_changes_its_mode(
 
 def test_the_first_of_two_rules_that_are_true_counts() -> None:
     plan = parse("""
-cars: {red: tracking, blue: manual}
+fixed: {red: {mode: tracking}, blue: {mode: manual}}
 rules:
   - {when: {car: red, is: range.range_m < 0.3, for_s: 1}, then: {who: blue, mode: obstacle_avoidance}}
   - {when: {car: red, is: battery.level == 'critical'}, then: {who: blue, mode: color_led}}
@@ -211,7 +211,7 @@ def test_phases_follow_conditions_and_time_outs() -> None:
     plan = parse("""
 roles: {look: {mode: manual, count: all}, go: {mode: tracking, count: all}}
 phases:
-  search: {roles: [look], until: {any: light.left}, timeout_s: 30, next: run, on_timeout: give_up}
+  search: {roles: [look], until: {any_car: light.left}, timeout_s: 30, next: run, on_timeout: give_up}
   run: {roles: [go], timeout_s: 5, next: search}
   give_up: {roles: [look]}
 """)
@@ -243,8 +243,8 @@ phases: {a: {roles: [look], timeout_s: 0.01, next: b}, b: {roles: [go], timeout_
 def test_a_role_that_lacks_a_car_is_stood_in_for() -> None:
     plan = parse("""
 roles:
-  strong: {mode: tracking, cars: [red], fallback: weak}
-  weak: {mode: following, on_call: true}
+  strong: {mode: tracking, cars: [red], if_none: weak}
+  weak: {mode: following, given_by: rules}
 """)
     run = PolicyRun(plan, "blue", "red")
     assert run.at(0.0).roles == {"red": "strong"}
@@ -257,8 +257,8 @@ roles:
 
 def test_a_colour_is_asked_for_once_when_the_car_is_in_the_mode_in_which_it_obeys() -> None:
     plan = parse("""
-cars: {red: tracking, green: manual}
-rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led: [9, 0, 0]}}]
+fixed: {red: {mode: tracking}, green: {mode: manual}}
+rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led: '#090000'}}]
 """)
     run, coloured = PolicyRun(plan, "green", "red", obey=False), list[float]()
 
@@ -289,8 +289,8 @@ def test_a_stand_in_takes_no_car_from_the_role_that_it_stands_in_for_nor_from_on
     plan = parse(f"""
 roles:
   scout: {{mode: tracking, priority: {priority + 1}}}
-  pair: {{mode: following, count: 3, priority: {priority}, fallback: rest}}
-  rest: {{mode: manual, on_call: true}}
+  pair: {{mode: following, count: 3, priority: {priority}, if_none: rest}}
+  rest: {{mode: manual, given_by: rules}}
 """)
     run = PolicyRun(plan, "blue", "green", "pi")
     run.change("pi", platform="raspberry_pi")
@@ -328,7 +328,7 @@ def test_a_new_plan_keeps_the_roles_that_it_has_too() -> None:
     run = PolicyRun(TWO, "blue", "green", "red")
     run.at(0.0)
     before, asked = run.roles, len(run.asked)
-    after = parse(TWO.text + "\nrules: [{when: {any: light.left}, then: {who: that, mode: manual}}]")
+    after = parse(TWO.text + "\nrules: [{when: {any_car: light.left}, then: {who: this_car, mode: manual}}]")
     run.memory, run.plan = carry_over(run.memory, run.plan, after), after
     run.at(0.1)
     assert (run.roles, len(run.asked)) == (before, asked)
@@ -402,9 +402,9 @@ PLANS = (
     STRONG,
     LAMP,
     parse("""
-cars: {d: manual}
-roles: {x: {mode: tracking, count: 2, fallback: y}, y: {mode: following, needs: battery.voltage_v > 7, priority: 3}}
-rules: [{when: {all: not obstacle.left, for_s: 1}, then: {who: all, mode: color_led}}]
+fixed: {d: {mode: manual}}
+roles: {x: {mode: tracking, count: 2, if_none: y}, y: {mode: following, needs: battery.voltage_v > 7, priority: 3}}
+rules: [{when: {all_cars: not obstacle.left, for_s: 1}, then: {who: all_cars, mode: color_led}}]
 """),
 )
 changes = st.tuples(
@@ -467,7 +467,7 @@ def test_whatever_happens(plan: Any, course: list[Any]) -> None:
             if (known.held_by or known.estopped_by) and known.mode:  # else nothing is heard of it, nor of a hold
                 assert name not in result.roles
         for role in plan.roles.values():
-            if role.count is not None and not any(other.fallback == role.name for other in plan.roles.values()):
+            if role.count is not None and not any(other.if_none == role.name for other in plan.roles.values()):
                 assert list(result.roles.values()).count(role.name) <= role.count
         subjects = [decision.car for decision in result.decisions if decision.car is not None]
         assert len(subjects) == len(set(subjects)), "no car has two decisions"

@@ -14,24 +14,24 @@ from tests.support.vectors import rows
 SCOUT = parse("""
 roles:
   scout: {mode: tracking, needs: battery.voltage_v > 7.0}
-  seeker: {mode: light_seeking, on_call: true}
+  seeker: {mode: light_seeking, given_by: rules}
 rules:
   - name: lamp
-    when: {any: light.left, for_s: 1}
-    then: [{who: that, role: seeker}, {who: others, mode: color_led}]
+    when: {any_car: light.left, for_s: 1}
+    then: [{who: this_car, role: seeker}, {who: other_cars, mode: color_led}]
 """)
 STAND_IN = parse(
-    "roles: {first: {mode: tracking, cars: [red], fallback: second}, second: {mode: following, on_call: true}}"
+    "roles: {first: {mode: tracking, cars: [red], if_none: second}, second: {mode: following, given_by: rules}}"
 )
 PHASES = parse(
     """
-roles: {any: {mode: manual}}
+roles: {any_car: {mode: manual}}
 phases:
-  look: {until: {any: light.left}, next: go, timeout_s: 30, on_timeout: rest}
+  look: {until: {any_car: light.left}, next: go, timeout_s: 30, on_timeout: rest}
   go: {}
   rest: {}
 rules: [{name: enough, when: {car: red, is: motion.fan}, then: {phase: rest}}]
-""".replace("{any: {mode", "{some: {mode")
+""".replace("{any_car: {mode", "{some: {mode")
 )
 CHANGES: dict[str, dict[str, Any]] = {
     "free place": {},
@@ -120,7 +120,7 @@ phases: {look: {timeout_s: 9, next: rest}, rest: {roles: []}}
 PAIR = parse("roles: {pair: {mode: tracking, count: 2}}")
 PASSED_OVER = parse("""
 roles: {lead: {mode: tracking, cars: [red]}}
-rules: [{when: {car: red, is: light.left}, then: {who: others, mode: color_led}}]
+rules: [{when: {car: red, is: light.left}, then: {who: other_cars, mode: color_led}}]
 """)
 
 
@@ -152,11 +152,14 @@ REST = parse("roles: {rest: {mode: manual, count: all}}")
 CERTAIN = parse("roles: {lead: {mode: tracking, cars: [red], count: 2}, rest: {mode: manual}}")
 UNSEEN = parse("""
 roles: {guide: {mode: tracking}}
-rules: [{name: weak, when: {any: battery.level == 'low', role: guide, for_s: 5}, then: {who: that, mode: manual}}]
+rules:
+  - name: weak
+    when: {any_car: battery.level == 'low', with_role: guide, for_s: 5}
+    then: {who: this_car, mode: manual}
 """)
 HANGING = parse("""
 roles: {patrol: {mode: obstacle_avoidance, count: all}}
-phases: {search: {until: {any: light.left}, next: gather}, gather: {}}
+phases: {search: {until: {any_car: light.left}, next: gather}, gather: {}}
 """)
 OF_ALL = {
     "all that are left": (LEFT_OVER, ("blue", "green", "red")),

@@ -23,9 +23,6 @@ class Wagon(Entry):
     names: list[str] = Field(default_factory=list)
 
 
-FIELDS = "allowed are flag, mode, names, spare, wheels"
-
-
 def _faults(text: str) -> list[str]:
     with pytest.raises(BadFile) as caught:
         read_yaml(text, "f.yaml", Wagon)
@@ -35,13 +32,13 @@ def _faults(text: str) -> list[str]:
 def test_all_faults_are_told_at_once_each_in_its_place() -> None:
     text = "wheels:\n  a: {size_m: 12, spokes: 1.5, rim: 3}\n  b: 3\nmode: fats\nflg: true\nnames: [x, 7]\n"
     assert _faults(text) == [
-        "f.yaml:2:15: wheels.a.size_m: 12 is not allowed: a number, more than 0 and at most 10",
-        "f.yaml:2:27: wheels.a.spokes: 1.5 is not allowed: a whole number, at least 1",
-        "f.yaml:2:32: wheels.a.rim: there is no such field here: allowed are size_m, spokes",
-        "f.yaml:3:6: wheels.b: 3 is not allowed: fields, `name: value`",
-        "f.yaml:4:7: mode: 'fats' is not allowed: one of slow, fast; did you mean 'fast'?",
-        "f.yaml:5:1: flg: there is no such field here: " + FIELDS + "; did you mean 'flag'?",
-        "f.yaml:6:12: names[1]: 7 is not allowed: text (write it in quotes)",
+        "f.yaml:2:15: error: wheels.a.size_m: 12 is not allowed. Write a number, more than 0 and at most 10.",
+        "f.yaml:2:27: error: wheels.a.spokes: 1.5 is not allowed. Write a whole number, at least 1.",
+        "f.yaml:2:32: error: wheels.a.rim: there is no such field. There are size_m, spokes.",
+        "f.yaml:3:6: error: wheels.b: needs fields. Write: `b: {size_m: …}`",
+        "f.yaml:4:7: error: mode: 'fats' is not allowed. Did you mean fast?",
+        "f.yaml:5:1: error: flg: there is no such field. Did you mean flag?",
+        "f.yaml:6:12: error: name 2: 7 is not allowed. Write text in quotes.",
     ]
 
 
@@ -57,19 +54,19 @@ def test_yaml_is_that_of_1_2() -> None:
         ("", "1:1", "is empty"),
         ("# nothing but words\n", "1:1", "is empty"),
         ("wheels:\n\ta: 1", "2:1", "a tab"),
-        ("wheels: {a: {}\n", "2:1", "is no YAML"),
-        ("- 1", "1:1", "a list is not allowed: fields"),
+        ("wheels: {a: {}\n", "2:1", "this is not YAML"),
+        ("- 1", "1:1", "a list is not allowed. Write fields"),
         ("--- {}\n--- {}", "2:1", "a second document"),
         ("wheels: {}\nwheels: {}", "2:1", "wheels: is given twice, first in line 1"),
         ("wheels: {a: {spokes: 2, spokes: 3}}", "1:25", "wheels.a.spokes: is given twice"),
-        ("mode: fast", "1:1", "wheels: is missing: at least one wheel"),
-        ("wheels:", "1:8", "wheels: has no value: fields"),
+        ("mode: fast", "1:1", "wheels: is missing. At least one wheel."),
+        ("wheels:", "1:8", "wheels: has no value. Write fields"),
         ("wheels: {1: {}}", "1:10", "key '1' is no word"),
         ("wheels: {[a]: {}}", "1:10", "is no word"),
         ("wheels: {a: {size_m: .nan}}", "1:22", "no finite number"),
         ("wheels: {a: {size_m: 1e999}}", "1:22", "no finite number"),
-        ("wheels: {a: {size_m: true}}", "1:22", "true is not allowed: a number"),
-        ("wheels: {a: {spokes: '8'}}", "1:22", "'8' is not allowed: a whole number"),
+        ("wheels: {a: {size_m: true}}", "1:22", "true is not allowed. Write a number"),
+        ("wheels: {a: {spokes: '8'}}", "1:22", "'8' is not allowed. Write a whole number"),
         ("wheels: {a: {spokes: " + "9" * 5000 + "}}", "1:22", "too long a number"),
         ("wheels: {a: {spokes: " + "9" * 50 + "}}", "1:22", "too large a number"),
         ("wheels: !!python/object:os.system {a: {}}", "1:9", "the tag"),
@@ -77,7 +74,7 @@ def test_yaml_is_that_of_1_2() -> None:
         ("wheels: {}\nnames: ['\x01']", "2:10", "U+0001"),
         ('wheels: {}\nnames: ["\\ud800"]', "2:9", "half a character"),
         ("wheels: *nobody", "1:9", "undefined alias"),
-        ("spare: {spokes: 0}\nwheels: {}", "1:17", "spare.spokes: 0 is not allowed: a whole number, at least 1"),
+        ("spare: {spokes: 0}\nwheels: {}", "1:17", "spare.spokes: 0 is not allowed. Write a whole number, at least 1."),
     ],
 )
 def test_one_fault(text: str, place: str, words: str) -> None:
@@ -110,19 +107,20 @@ def test_a_bomb_is_a_fault(text: str, words: str) -> None:
 def test_no_more_faults_are_told_than_somebody_reads() -> None:
     lines = _faults("wheels: {" + ", ".join(f"w{number}: 1" for number in range(80)) + "}")
     assert len(lines) == 51
-    assert lines[-1] == "f.yaml: and 30 more"
+    assert lines[-1].startswith("f.yaml:1:")
+    assert lines[-1].endswith(": error: and 30 more")
 
 
 def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "f.yaml"
     path.write_bytes(b"wheels: {}\nmode: caf\xe9\n")
-    with pytest.raises(BadFile, match=r"f\.yaml:2:10: byte 0xe9 is no UTF-8"):
+    with pytest.raises(BadFile, match=r"f\.yaml:2:10: error: byte 0xe9 is no UTF-8"):
         read_text(path)
-    with pytest.raises(BadFile, match="cannot be read: No such file"):
+    with pytest.raises(BadFile, match="there is no such file"):
         read_text(tmp_path / "other.yaml")
     os.mkfifo(tmp_path / "fifo")
     for odd, kind in ((tmp_path, "directory"), (tmp_path / "fifo", "FIFO"), (Path(os.devnull), "device")):
-        with pytest.raises(BadFile, match=rf"{odd.name}:1:1: is a {kind}, not a file: save the text as a file"):
+        with pytest.raises(BadFile, match=rf"{odd.name}:1:1: error: is a {kind}, not a file: save the text as a file"):
             read_text(odd)
     path.write_bytes("\ufeffmode: fast\nwheels: {}".encode())
     assert read_yaml(read_text(path), "f", Wagon).mode == "fast"

@@ -26,25 +26,26 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
         (
             "roles: {x: {mode: tracking, needs: battery.voltage_v > 8 and battery.voltage_v < 7}}",
             "role x",
-            "is never so",
+            "is never true",
         ),
         (
             "roles: {x: {mode: manual, cars: [pi], needs: battery.voltage_v > 7}}",
             "role x",
-            "battery.voltage_v is never measured on it",
+            "and never measures battery.voltage_v",
         ),
-        ("roles: {x: {mode: tracking, on_call: true}}", "role x", "it is on_call, and no rule gives it"),
-        ("cars: {purple: manual}", "car purple", "the fleet file has no such car; it has green, pi, red"),
+        ("roles: {x: {mode: tracking, given_by: rules}}", "role x", "no rule gives it to a car"),
+        ("fixed: {purple: {mode: manual}}", "car purple", "the fleet file has no such car. There are green, pi, red."),
         (SCOUT + "rules: [{when: {car: zed, is: light.left}, then: {who: red, mode: manual}}]", "rule 1", "no car zed"),
         (
-            SCOUT + "rules: [{when: {any: range.range_m < 1 and range.range_m > 2}, then: {who: red, mode: manual}}]",
+            SCOUT
+            + "rules: [{when: {any_car: range.range_m < 1 and range.range_m > 2}, then: {who: red, mode: manual}}]",
             "rule 1",
-            "it can never fire: range.range_m < 1 and range.range_m > 2 is never so",
+            "it never fires. range.range_m < 1 and range.range_m > 2 is never true",
         ),
         (
-            SCOUT + "rules: [{when: {any: light.left, role: scout}, then: {who: all, mode: tracking}}]",
+            SCOUT + "rules: [{when: {any_car: light.left, with_role: scout}, then: {who: all_cars, mode: tracking}}]",
             "rule 1",
-            "it can never fire: light.left is never measured on any car with role scout",
+            "it never fires. It waits for light.left from cars with role scout, but they are always in tracking.",
         ),
         (
             SCOUT + "rules: [{when: {car: red, is: line.left_outer}, then: {who: pi, mode: tracking}}]",
@@ -53,55 +54,54 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
         ),
         (
             SCOUT
-            + "rules:\n  - {when: {any: line.left_outer}, then: {who: red, mode: manual}}\n"
-            + "  - {when: {any: line.left_outer}, then: {who: red, mode: following}}",
+            + "rules:\n  - {when: {any_car: line.left_outer}, then: {who: red, mode: manual}}\n"
+            + "  - {when: {any_car: line.left_outer}, then: {who: red, mode: following}}",
             "rule 2",
-            "it fights rule 1",
+            "it contradicts rule 1",
         ),
         (SCOUT + "phases: {x: {}, y: {}}", "phase y", "nothing leads to it"),
         (
             SCOUT + "phases: {x: {until: {car: red, is: imu.gyro_x_raw > 3}, next: x}}",
             "phase x",
-            "it never ends: imu.gyro_x_raw is never measured on red",
+            "it never ends. It waits for imu.gyro_x_raw from red, which no mode measures there.",
         ),
         ("roles: {x: {mode: tracking, needs: battery.voltage_v > 20}}", "role x", "battery.voltage_v is 0 .. 12"),
         (
-            SCOUT + "rules: [{when: {any: mode.asked == 'dancing'}, then: {who: red, mode: manual}}]",
+            SCOUT + "rules: [{when: {any_car: mode.asked == 'dancing'}, then: {who: red, mode: manual}}]",
             "rule 1",
-            "it can never fire: mode.asked == 'dancing' is never so: mode.asked is one of manual, remote_control,",
+            "it never fires. mode.asked == 'dancing' is never true: mode.asked is one of manual, remote_control,",
         ),
         (
-            SCOUT + "rules: [{when: {any: mode.asked == 'manual'}, then: {who: that, mode: following}}]",
+            SCOUT + "rules: [{when: {any_car: mode.asked == 'manual'}, then: {who: this_car, mode: following}}]",
             "rule 1",
-            "it undoes itself again and again: in mode following, mode.asked == 'manual' is not so",
+            "it undoes itself again and again. In mode following, mode.asked == 'manual' is false. Add `until`.",
         ),
         (
             SCOUT
-            + "rules:\n  - {when: {any: range.range_m < 0.5}, then: {who: all, mode: manual}}\n"
-            + "  - {when: {car: red, is: range.range_m < 0.3}, then: {who: that, mode: following}}",
+            + "rules:\n  - {when: {any_car: range.range_m < 0.5}, then: {who: all_cars, mode: manual}}\n"
+            + "  - {when: {car: red, is: range.range_m < 0.3}, then: {who: this_car, mode: following}}",
             "rule 2",
-            "it fights rule 1, which is true whenever it is and wants the same car to be manual",
+            "it contradicts rule 1, which is true whenever it is and wants the same car to be manual",
         ),
         (
             SCOUT
-            + "rules:\n  - {when: {any: line.left_outer}, then: {who: red, led: [9, 0, 0]}}\n"
-            + "  - {when: {any: line.left_outer}, then: {who: red, led: [0, 9, 0]}}",
+            + "rules:\n  - {when: {any_car: line.left_outer}, then: {who: red, led: '#090000'}}\n"
+            + "  - {when: {any_car: line.left_outer}, then: {who: red, led: '#000900'}}",
             "rule 2",
-            "it fights rule 1, which is true whenever it is and wants red to be of colour [9, 0, 0]",
+            "it contradicts rule 1, which is true whenever it is and wants red to be #090000",
         ),
         (
-            SCOUT
-            + "rules: [{when: {any: line.left_outer}, then: [{who: red, mode: manual}, {who: red, mode: following}]}]",
+            SCOUT + "rules: [{when: line.left_outer, then: [{who: red, mode: manual}, {who: red, mode: following}]}]",
             "rule 1",
-            "it fights itself",
+            "it contradicts itself",
         ),
         (
-            SCOUT + "rules: [{when: {any: line.left_outer}, then: {who: red, mode: following, led: [9, 0, 0]}}]",
+            SCOUT + "rules: [{when: {any_car: line.left_outer}, then: {who: red, mode: following, led: '#090000'}}]",
             "rule 1",
-            "its colour is never seen",
+            "its color is never seen",
         ),
         (
-            SCOUT + "rules: [{when: {any: line.left_outer}, then: {who: pi, role: scout}}]",
+            SCOUT + "rules: [{when: {any_car: line.left_outer}, then: {who: pi, role: scout}}]",
             "rule 1",
             "pi can never have role scout: raspberry_pi cars do not know mode tracking",
         ),
@@ -109,34 +109,35 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
             (
                 "roles: {x: {mode: tracking}, y: {mode: manual}}\n"
                 "phases: {a: {roles: [x], timeout_s: 9, next: b}, b: {}}\n"
-                "rules: [{when: {any: battery.level == 'low', role: y}, then: {who: red, mode: manual}, during: [a]}]"
+                "rules: [{when: {any_car: battery.level == 'low', with_role: y}, then: {who: red, mode: manual},"
+                " during: [a]}]"
             ),
             "rule 1",
-            "it can never fire: role y does not count in phase a",
+            "it never fires. Role y does not count in phase a.",
         ),
         (
             (
                 "roles: {x: {mode: tracking}, y: {mode: manual}}\n"
                 "phases: {a: {roles: [x], timeout_s: 9, next: b}, b: {}}\n"
-                "rules: [{when: {any: line.left_outer}, then: {who: red, role: y}, during: [a]}]"
+                "rules: [{when: {any_car: line.left_outer}, then: {who: red, role: y}, during: [a]}]"
             ),
             "rule 1",
-            "it can never help: role y does not count in phase a",
+            "it has no effect. Role y does not count in phase a.",
         ),
         (
             (
                 "roles: {x: {mode: tracking}, y: {mode: manual}}\n"
-                "phases: {a: {roles: [x], until: {any: battery.level == 'low', role: y}, next: b}, b: {}}"
+                "phases: {a: {roles: [x], until: {any_car: battery.level == 'low', with_role: y}, next: b}, b: {}}"
             ),
             "phase a",
-            "it never ends: role y does not count in it",
+            "it never ends. Role y does not count in it.",
         ),
         (
             SCOUT
-            + "rules: [{when: {any: line.left_outer}, until: {any: line.left_outer or line.right_outer},"
-            + " then: {who: all, mode: following}}]",
+            + "rules: [{when: {any_car: line.left_outer}, until: {any_car: line.left_outer or line.right_outer},"
+            + " then: {who: all_cars, mode: following}}]",
             "rule 1",
-            "it can never fire: any car: line.left_outer or line.right_outer ends it",
+            "it never fires. Its `until` (any car: line.left_outer or line.right_outer) is true whenever it begins.",
         ),
     ],
 )
@@ -152,14 +153,14 @@ def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> Non
         (SCOUT + "phases: {a: {timeout_s: 0.01, next: b}, b: {timeout_s: 9, next: a}}", "it lasts 1.5 s at least"),
         (
             SCOUT + "rules: [{when: {car: red, is: range.range_m < 0.3}, then: {who: red, mode: tracking}}]",
-            "it ends itself: in mode tracking, range.range_m is not measured; give it until",
+            "it ends itself. In mode tracking a car does not measure range.range_m. Add `until`.",
         ),
         ("roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {p: {roles: [x]}}", "no phase has it"),
         (
             SCOUT
-            + "rules:\n  - {when: {any: line.left_outer}, then: {who: red, mode: manual}}\n"
-            + "  - {when: {any: line.right_outer}, then: {who: red, mode: following}}",
-            "it may be true together with rule 1, and wants something else of the same car: the first counts",
+            + "rules:\n  - {when: {any_car: line.left_outer}, then: {who: red, mode: manual}}\n"
+            + "  - {when: {any_car: line.right_outer}, then: {who: red, mode: following}}",
+            "it may be true together with rule 1, and wants something else of the same car. The first counts.",
         ),
     ],
 )
@@ -172,7 +173,7 @@ def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
 def test_a_good_plan_is_let_alone_with_and_without_a_fleet_file() -> None:
     plan = parse("""
 roles: {scout: {mode: tracking, needs: battery.voltage_v > 7}, rest: {mode: manual, count: all, priority: -1}}
-rules: [{when: {any: line.left_outer, role: scout, for_s: 1}, then: {who: others, mode: color_led}}]
+rules: [{when: {any_car: line.left_outer, with_role: scout, for_s: 1}, then: {who: other_cars, mode: color_led}}]
 phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_outer}, next: one}}
 """)
     assert check(plan) == ()
@@ -184,22 +185,22 @@ phases: {one: {timeout_s: 9, next: two}, two: {until: {car: red, is: line.left_o
     [
         # The narrower one first: so it is meant.
         (
-            "rules: [{when: {any: range.range_m < 0.1}, then: {who: red, mode: manual}},"
-            " {when: {any: range.range_m < 0.9}, then: {who: red, mode: following}}]"
+            "rules: [{when: {any_car: range.range_m < 0.1}, then: {who: red, mode: manual}},"
+            " {when: {any_car: range.range_m < 0.9}, then: {who: red, mode: following}}]"
         ),
         (
             "rules: [{when: {car: red, is: line.left_outer and not line.right_outer}, then: {who: red, mode: manual}},"
             " {when: {car: red, is: line.right_outer}, then: {who: red, mode: following}}]"
         ),
         (
-            "rules: [{when: {any: line.left_outer}, then: {who: red, mode: manual}},"
-            " {when: {any: line.right_outer}, then: {who: green, mode: following}}]"
+            "rules: [{when: {any_car: line.left_outer}, then: {who: red, mode: manual}},"
+            " {when: {any_car: line.right_outer}, then: {who: green, mode: following}}]"
         ),
         (
-            "rules: [{when: {any: line.left_outer}, then: {phase: b}}]\nphases: {a: {timeout_s: 9, next: b},"
-            " b: {until: {any: line.left_outer}, next: a}}"
+            "rules: [{when: {any_car: line.left_outer}, then: {phase: b}}]\nphases: {a: {timeout_s: 9, next: b},"
+            " b: {until: {any_car: line.left_outer}, next: a}}"
         ),
-        "phases: {a: {until: {any: line.left_outer}, next: b}, b: {until: {any: not line.left_outer}, next: a}}",
+        "phases: {a: {until: line.left_outer, next: b}, b: {until: not line.left_outer, next: a}}",
     ],
 )
 def test_what_does_not_get_into_its_own_way_is_let_alone(more: str) -> None:
@@ -210,7 +211,7 @@ def test_what_does_not_get_into_its_own_way_is_let_alone(more: str) -> None:
 
 
 BROKEN = parse("""
-cars: {purple: tracking}
+fixed: {purple: {mode: tracking}}
 roles:
   patrol: {mode: tracking, cars: [orange]}
   ghost: {mode: following, needs: battery.voltage_v > 9 and battery.voltage_v < 8}
@@ -219,21 +220,21 @@ roles:
 
 def test_with_a_fleet_file_a_plan_that_can_never_work_is_refused_with_all_that_is_wrong() -> None:
     refusal = find_faults(BROKEN, FLEET).refusal("plan.yaml")
-    assert [line.split(": ")[1] for line in refusal.splitlines()] == [
+    assert [line.split(": ")[2] for line in refusal.splitlines()] == [
         "car orange",
         "car purple",
         "role patrol",
         "role ghost",
         "role tracking",
     ]
-    assert all(line.startswith("plan.yaml: ") for line in refusal.splitlines())
+    assert all(line.startswith("plan.yaml:") for line in refusal.splitlines())
 
 
 def test_without_one_a_named_car_that_is_not_there_is_a_warning() -> None:
-    plan = parse("cars: {purple: tracking, red: manual}")
+    plan = parse("fixed: {purple: {mode: tracking}, red: {mode: manual}}")
     assert find_faults(plan).warnings == ()
     found = find_faults(plan, None, {"red", "green"})
-    assert [str(each) for each in found.warnings] == ["car purple: it is not on the bus now, which has green, red"]
+    assert [str(each) for each in found.warnings] == ["car purple: it is not connected now. Connected: green, red."]
     assert found.refusal() == ""
     assert "role ghost: no car can fill it" in find_faults(BROKEN).refusal(), "what no car could do is refused anyway"
 
@@ -243,4 +244,4 @@ def test_a_role_of_the_fleet_file_that_the_plan_does_not_have_is_told() -> None:
     (found,) = check(parse("roles: {patrol: {mode: tracking}}"), fleet)
     assert found.severity is Severity.WARNING
     assert str(found).startswith("car red: the fleet file lets it take role patroll, which this plan does not have")
-    assert "did you mean 'patrol'" in found.words
+    assert "Did you mean patrol?" in found.words

@@ -20,7 +20,10 @@ def test_the_example_plans_are_plans(path: Path) -> None:
 
 
 def test_a_mode_for_a_car_is_a_role_of_its_own() -> None:
-    plan = parse("cars: {red: tracking, blue: tracking, green: patrol}\nroles: {patrol: {mode: following}}")
+    plan = parse(
+        "fixed: {red: {mode: tracking}, blue: {mode: tracking}, green: {role: patrol}}\n"
+        "roles: {patrol: {mode: following}}"
+    )
     assert plan.roles["tracking"].cars == ("red", "blue")
     assert plan.roles["tracking"].count == 2
     assert plan.roles["patrol"].mode is Mode.FOLLOWING
@@ -30,17 +33,18 @@ def test_a_mode_for_a_car_is_a_role_of_its_own() -> None:
 
 
 def test_words_that_yaml_1_1_takes_for_something_else_are_words() -> None:
-    plan = parse("cars: {on: manual, no: tracking, 'off': manual, y: manual}")
+    plan = parse("fixed: {on: {mode: manual}, no: {mode: tracking}, 'off': {mode: manual}, y: {mode: manual}}")
     assert list(plan.fixed) == ["on", "no", "off", "y"]
 
 
 def test_a_condition_is_told_as_it_was_meant() -> None:
     plan = parse(
-        "cars: {red: tracking}\nrules: [{when: {all: not (light.left), for_s: 2}, then: {who: all, mode: manual}}]"
+        "fixed: {red: {mode: tracking}}\n"
+        "rules: [{when: {all_cars: not (light.left), for_s: 2}, then: {who: all_cars, mode: manual}}]"
     )
     (rule,) = plan.rules
     assert rule.when.of is Quantifier.ALL
-    assert rule.when.text == "all car: not light.left for 2 s"
+    assert rule.when.text == "all cars: not light.left for 2 s"
 
 
 ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
@@ -49,51 +53,63 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "p:1:1: is empty"),
-        ("{}", "p:1:1: a plan has `cars:` or `roles:`"),
-        ("cars: {red: fast}", "p:1:13: cars.red: there is no role or mode fast: there are manual, "),
-        ("cars: {red: manual, red: tracking}", "p:1:21: cars.red: is given twice"),
-        ("cars: {Red: manual}", "p:1:8: cars.Red"),
+        ("", "p:1:1: error: is empty"),
+        ("{}", "p:1:1: error: a plan needs roles. Write: `roles: {"),
+        ("fixed: {red: {role: fast}}", "p:1:21: error: fixed.red.role: there is no role fast. There is none."),
+        ("fixed: {red: {mode: manual}, red: {mode: tracking}}", "p:1:30: error: fixed.red: is given twice"),
+        ("fixed: {Red: {mode: manual}}", "p:1:9: error: fixed.Red"),
         (
             "rolls: {}",
-            "there is no such field here: allowed are cars, idle, phases, roles, rules; did you mean 'roles'?",
+            "p:1:1: error: rolls: there is no such field. Did you mean roles?",
         ),
         (
             "roles: {a: {mode: tracking, count: 0}}",
-            "p:1:36: roles.a.count: 0 is not allowed: a whole number, at least 1",
+            "p:1:36: error: roles.a.count: 0 is not allowed. Write a whole number, at least 1",
         ),
         (
             "roles: {a: {mode: tracking, count: two}}",
-            "'two' is not allowed: a whole number, at least 1 and at most 1000 or the word all",
+            "'two' is not allowed. Write a whole number, at least 1 and at most 1000 or the word all.",
         ),
-        ("cars: {Red: manual}", "cars.Red: name 'Red' is not allowed: use 1 to 32 of a-z, 0-9, _ and -, beginning"),
-        ("roles: {a: {}}", "p:1:9: roles.a.mode: is missing: the mode of a car that has it, one of manual, remote_con"),
-        ("roles: {a: {mode: tracking, needs: volts > 7}}", "column 1: there is no volts"),
+        (
+            "fixed: {Red: {mode: manual}}",
+            "fixed.Red: name 'Red' is not allowed: use 1 to 32 of a-z, 0-9, _ and -, beginning",
+        ),
+        (
+            "roles: {a: {}}",
+            "p:1:9: error: roles.a.mode: is missing. The mode of a car that has it, one of manual, remote_con",
+        ),
+        ("roles: {a: {mode: tracking, needs: volts > 7}}", "volts is not a value. There are range.range_m"),
         (
             "roles: {a: {mode: tracking, needs: battery > 7.0}}",
-            "there is no battery: did you mean battery.voltage_v or",
+            "battery is not a value. Did you mean battery.voltage_v or",
         ),
         ("roles: {a: {mode: tracking, platforms: [raspberry_pi]}}", "raspberry_pi cars do not know mode tracking"),
-        ("roles: {a: {mode: tracking, fallback: b}}", "roles.a.fallback: there is no role b: there are a"),
-        ("roles: {a: {mode: tracking, fallback: a}}", "roles that stand in for each other: a -> a"),
+        ("roles: {a: {mode: tracking, if_none: b}}", "roles.a.if_none: there is no role b. There is only a."),
+        ("roles: {a: {mode: tracking, if_none: a}}", "these roles stand in for each other: a -> a"),
         ("roles: {a: {mode: tracking, capabilities: [wings]}}", "there is no capability wings"),
-        ("roles: {others: {mode: tracking}}", "others is a word of rules"),
-        ("cars: {a: b}\n" + ROLE, "a car has this name"),
+        ("roles: {other_cars: {mode: tracking}}", "other_cars is a word of rules"),
+        ("fixed: {a: {role: b}}\n" + ROLE, "a car in `fixed` has this name"),
         (
-            ROLE + "rules: [{when: {any: light.left, all: light.left}, then: {phase: x}}]",
-            "exactly one of any, all, car",
+            ROLE + "rules: [{when: {any_car: light.left, all_cars: light.left}, then: {phase: x}}]",
+            "needs one of any_car, all_cars, car",
         ),
         (ROLE + "rules: [{when: {car: red}, then: {who: red, role: a}}]", "car needs `is`"),
-        (ROLE + "rules: [{when: {any: light.left}, then: {who: red}}]", "who with one of role and mode, or led"),
-        (ROLE + "rules: [{when: {any: light.left}, then: {who: red, role: c}}]", "there is no role c: there are a, b"),
-        (ROLE + "rules: [{when: {all: light.left}, then: {who: that, role: a}}]", "with `all` there is no car"),
-        (ROLE + "rules: [{when: {any: light.left}, then: {phase: x}}]", "there is no phase x: there is none"),
+        (ROLE + "rules: [{when: {any_car: light.left}, then: {who: red}}]", "needs who and one of role, mode, led"),
+        (
+            ROLE + "rules: [{when: {any_car: light.left}, then: {who: red, role: c}}]",
+            "rule 1, then.role: there is no role c. There are a, b.",
+        ),
+        (
+            ROLE + "rules: [{when: {all_cars: light.left}, then: {who: this_car, role: a}}]",
+            "with `all_cars` no single car made it true",
+        ),
+        (ROLE + "rules: [{when: {any_car: light.left}, then: {phase: x}}]", "there is no phase x. There is none."),
         (
             ROLE + "phases: {x: {next: y}, y: {next: x}}",
-            "p:2:13: phases.x: a cycle of phases without a condition or a time-out: x -> y -> x",
+            "p:2:13: error: phases.x: a cycle of phases without a condition or a time-out: x -> y -> x",
         ),
         (ROLE + "phases: {x: {next: y}, y: {}}", "phases.x.next: nothing ends x: give it until, or timeout_s"),
-        (ROLE + "phases: {x: {until: {any: light.left}}}", "phases.x.until: it needs next"),
+        (ROLE + "phases: {x: {until: {any_car: light.left}}}", "phases.x.until: it needs next"),
         (ROLE + "phases: {x: {timeout_s: 3}}", "phases.x.timeout_s: it needs on_timeout, or next"),
         ("cars: !!python/name:os.system {}", "the tag"),
         (
@@ -115,7 +131,8 @@ def test_a_mistake_is_named(text: str, told: str) -> None:
 def test_all_mistakes_are_told_at_once() -> None:
     with pytest.raises(BadFile) as raised:
         parse(
-            "roles:\n  a: {mode: tracking, needs: volts > 7}\n  b: {mode: manual, fallback: c}\ncars: {red: fast}\n",
+            "roles:\n  a: {mode: tracking, needs: volts > 7}\n  b: {mode: manual, if_none: c}\n"
+            "fixed: {red: {role: fast}}\n",
             "p",
         )
     assert [line.split(":")[1] for line in str(raised.value).splitlines()] == ["2", "3", "4"]
@@ -125,18 +142,18 @@ EVERYTHING_WRONG = """\
 roles:
   Big Role: {mode: tracking, needs: volts > 7}
   a: {mode: dancing, needs: battery > 7.0, count: two}
-  b: {fallback: zed}
+  b: {if_none: zed}
   c: 5
-cars: {red: fast, Blue: manual}
+fixed: {red: {role: fast}, Blue: {mode: manual}}
 rules:
   - 7
-  - {when: {any: light.left}, then: {who: that, role: c}}
-  - {when: {any: light.leftt}, then: {who: that, role: nobody}}
+  - {when: {any_car: light.left}, then: {who: this_car, role: c}}
+  - {when: {any_car: light.leftt}, then: {who: this_car, role: nobody}}
   - {when: {car: red}, then: {whoo: that, role: a}}
-  - {then: {who: that, mode: flying}}
-  - {when: {any: light.left}, then: [{who: that, mode: 3}, {who: X Y, phase: q}]}
+  - {then: {who: this_car, mode: flying}}
+  - {when: {any_car: light.left}, then: [{who: this_car, mode: 3}, {who: X Y, phase: q}]}
 phases:
-  x: {until: {any: light.left}, nxt: y}
+  x: {until: {any_car: light.left}, nxt: y}
   y: {timeout_s: soon, next: z}
 """
 
@@ -152,21 +169,21 @@ def test_what_a_field_may_not_be_hides_no_other_fault_and_seems_to_be_none_itsel
         (3, "roles.a.needs"),
         (3, "roles.a.count"),
         (4, "roles.b.mode"),
-        (4, "roles.b.fallback"),
+        (4, "roles.b.if_none"),
         (5, "roles.c"),
-        (6, "cars.red"),
-        (6, "cars.Blue"),
-        (8, "rules[0]"),
-        (10, "rules[2].when.any"),
-        (10, "rules[2].then.role"),
-        (11, "rules[3].when"),
-        (11, "rules[3].then.whoo"),
-        (12, "rules[4].when"),
-        (12, "rules[4].then.mode"),
-        (13, "rules[5].then[0].mode"),
-        (13, "rules[5].then[1]"),
-        (13, "rules[5].then[1].who"),
-        (13, "rules[5].then[1].phase"),
+        (6, "fixed.red.role"),
+        (6, "fixed.Blue"),
+        (8, "rule 1"),
+        (10, "rule 3, when.any_car"),
+        (10, "rule 3, then.role"),
+        (11, "rule 4, when"),
+        (11, "rule 4, then.whoo"),
+        (12, "rule 5, when"),
+        (12, "rule 5, then.mode"),
+        (13, "rule 6, effect 1, mode"),
+        (13, "rule 6, effect 2"),
+        (13, "rule 6, effect 2, who"),
+        (13, "rule 6, effect 2, phase"),
         (15, "phases.x.nxt"),
         (16, "phases.y.timeout_s"),
         (16, "phases.y.next"),

@@ -20,9 +20,9 @@ GUIDE = "roles: {guide: {mode: tracking, count: all}}\n"
 PATROL = "roles: {patrol: {mode: obstacle_avoidance, count: all}}\n"
 SEARCH = """
 roles: {patrol: {mode: obstacle_avoidance, count: all}, rest: {mode: manual, count: all, priority: -1}}
-phases: {search: {SEARCH, until: {any: light.left or light.right, for_s: 1}, next: gather}, gather: {roles: [rest]}}
+phases: {search: {SEARCH, until: {any_car: light.left or light.right, for_s: 1}, next: gather}, gather: {roles: [rest]}}
 """
-LIGHT = "rules: [{when: {any: light.left or light.right, for_s: 1}, then: {who: others, mode: following}}]"
+LIGHT = "rules: [{when: {any_car: light.left or light.right, for_s: 1}, then: {who: other_cars, mode: following}}]"
 
 
 def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -> list[str]:
@@ -36,53 +36,55 @@ def found(text: str, fleet: dict[str, CarSnapshot] | None, severity: Severity) -
         (
             (
                 "roles: {guide: {mode: tracking}}\n"
-                "rules: [{when: {any: battery.level == 'low', role: guide, for_s: 5}, then: {who: that, mode: manual}}]"
+                "rules: [{when: {any_car: battery.level == 'low', with_role: guide}, then: {who: red, mode: manual}}]"
             ),
             (
-                "rule 1: it can never fire: battery.level is never measured on any car with role guide: this plan lets"
-                " it be in tracking only, and it is measured in manual: let a car be in such a mode then"
+                "rule 1: it never fires. It waits for battery.level from cars with role guide, but they are always in"
+                " tracking. A car measures it only in manual."
             ),
         ),
         (
-            GUIDE + "rules: [{when: {any: range.range_m < 0.3, role: guide}, then: {who: that, mode: manual}}]",
-            "rule 1: it can never fire: range.range_m is never measured on any car with role guide",
+            GUIDE
+            + "rules: [{when: {any_car: range.range_m < 0.3, with_role: guide}, then: {who: this_car, mode: manual}}]",
+            "rule 1: it never fires. It waits for range.range_m from cars with role guide",
         ),
         (
-            GUIDE + "rules: [{when: {any: light.left, role: guide, for_s: 2}, then: {who: that, mode: light_seeking}}]",
-            "it is measured in manual or light_seeking: let a car be in such a mode then",
+            GUIDE
+            + "rules: [{when: {any_car: light.left, with_role: guide}, then: {who: this_car, mode: light_seeking}}]",
+            "A car measures it only in manual or light_seeking.",
         ),
-        (PATROL + LIGHT, "rule 1: it can never fire: light.left is never measured on any car: this plan lets it be in"),
+        (PATROL + LIGHT, "rule 1: it never fires. It waits for light.left from cars, but they are always in"),
         (
             SEARCH.replace("SEARCH", "roles: [patrol]"),
             (
-                "phase search: it never ends: light.left is never measured on any car: this plan lets it be in"
-                " obstacle_avoidance only in phase search, and it is measured in manual or light_seeking: let a car be"
-                " in such a mode then; or give it timeout_s"
+                "phase search: it never ends. It waits for light.left from cars, but they are always in"
+                " obstacle_avoidance in phase search. A car measures it only in manual or light_seeking."
+                " Or add timeout_s."
             ),
         ),
         # Two rules that only each other would make true.
         (
             GUIDE
-            + "rules:\n  - {when: {any: light.left}, then: {who: all, mode: following}}\n"
-            + "  - {when: {any: obstacle.left}, then: {who: all, mode: light_seeking}}",
-            "rule 1: it can never fire: light.left is never measured",
+            + "rules:\n  - {when: {any_car: light.left}, then: {who: all_cars, mode: following}}\n"
+            + "  - {when: {any_car: obstacle.left}, then: {who: all_cars, mode: light_seeking}}",
+            "rule 1: it never fires. It waits for light.left",
         ),
         # A role that only such a rule gives.
         (
             (
-                "roles: {guide: {mode: tracking, count: all}, seek: {mode: light_seeking, on_call: true}}\n"
-                "rules:\n  - {when: {any: light.left}, then: {who: that, role: seek}}\n"
-                "  - {when: {any: light.right, role: seek}, then: {who: that, mode: manual}}"
+                "roles: {guide: {mode: tracking, count: all}, seek: {mode: light_seeking, given_by: rules}}\n"
+                "rules:\n  - {when: {any_car: light.left}, then: {who: this_car, role: seek}}\n"
+                "  - {when: {any_car: light.right, with_role: seek}, then: {who: this_car, mode: manual}}"
             ),
-            "rule 2: it can never fire: there is never a car with role seek",
+            "rule 2: it never fires. There are never cars with role seek.",
         ),
         # Each is measured in some mode, but in none that the plan has both.
         (
             (
                 "roles: {guide: {mode: tracking, count: all}, seek: {mode: light_seeking, count: all}}\n"
-                "rules: [{when: {any: light.left and line.left_outer}, then: {who: that, mode: manual}}]"
+                "rules: [{when: {any_car: light.left and line.left_outer}, then: {who: this_car, mode: manual}}]"
             ),
-            "rule 1: it can never fire: all of light.left, line.left_outer is never measured on any car",
+            "rule 1: it never fires. It waits for all of light.left, line.left_outer from cars",
         ),
     ],
 )
@@ -98,23 +100,23 @@ def test_what_the_plan_never_lets_be_measured_is_an_error(
         (
             PATROL.replace("count: all", "count: all, needs: battery.voltage_v > 7") + LIGHT,
             None,
-            "rule 1: it can fire only by a car that has no role because it has not battery.voltage_v > 7",
+            "rule 1: it fires only by a car that has no role because it has not battery.voltage_v > 7",
         ),
         (
             SEARCH.replace("SEARCH", "timeout_s: 60, roles: [patrol]"),
             THREE,
-            "phase search: only its time-out ends it: light.left is never measured on any car",
+            "phase search: only its timeout ends it. It waits for light.left from cars, but they are always in obs",
         ),
         (
             SEARCH.replace("SEARCH", "roles: [patrol]")
             + "rules: [{name: home, when: {car: red, is: motion.fan}, then: {phase: gather}, during: [search]}]",
             THREE,
-            "phase search: only rule home ends it: light.left is never measured on any car",
+            "phase search: only rule home ends it. It waits for light.left from cars, but they are always in obs",
         ),
         (
             SEARCH.replace("SEARCH", "timeout_s: 1.6, roles: [rest]").replace("for_s: 1", "for_s: 2"),
             THREE,
-            "phase search: only its time-out ends it: until wants 2 s, and timeout_s is 1.6",
+            "phase search: only its timeout ends it. Its `until` takes 2 s, and timeout_s is 1.6.",
         ),
     ],
 )
@@ -135,26 +137,29 @@ TWO_PATROLS = PATROL.replace("count: all", "count: 2")
         (TWO_PATROLS + LIGHT, THREE),
         (SEARCH.replace("SEARCH", "roles: [rest]"), None),
         # What is so is measured, whatever else is not.
-        (GUIDE + "rules: [{when: {any: light.left or line.left_outer}, then: {who: that, mode: manual}}]", THREE),
+        (
+            GUIDE + "rules: [{when: {any_car: light.left or line.left_outer}, then: {who: this_car, mode: manual}}]",
+            THREE,
+        ),
         # The first rule brings the cars to where the second one sees.
         (
             GUIDE
-            + "rules:\n  - {when: {any: line.left_outer}, until: {any: light.left}, then: {who: that, mode: manual}}\n"
-            + "  - {when: {any: light.left, for_s: 9}, then: {phase: b}}\nphases: {a: {}, b: {}}",
+            + "rules:\n  - {when: line.left_outer, until: light.left, then: {who: this_car, mode: manual}}\n"
+            + "  - {when: {any_car: light.left, for_s: 9}, then: {phase: b}}\nphases: {a: {}, b: {}}",
             THREE,
         ),
         # A rule about what a role needs is for the cars that lack it.
         (
             (
                 "roles: {guide: {mode: tracking, count: all, needs: battery.voltage_v > 7}}\n"
-                "rules: [{when: {any: battery.level == 'low', for_s: 5}, then: {who: that, led: [255, 0, 0]}}]"
+                "rules: [{when: {any_car: battery.level == 'low', for_s: 5}, then: {who: this_car, led: red}}]"
             ),
             THREE,
         ),
         (
             (
                 "roles: {guide: {mode: manual, count: all}}\nphases: {b: {}, a: {}}\n"
-                "rules: [{when: {any: imu.gyro_x_raw > 9}, then: {phase: a}}]"
+                "rules: [{when: {any_car: imu.gyro_x_raw > 9}, then: {phase: a}}]"
             ),
             None,
         ),
@@ -166,7 +171,7 @@ def test_what_can_be_measured_is_let_alone(text: str, fleet: dict[str, CarSnapsh
 
 def test_two_cars_for_two_places_leave_none_that_stands() -> None:
     (told,) = found(TWO_PATROLS + LIGHT, TWO, Severity.ERROR)
-    assert told.startswith("rule 1: it can never fire: light.left is never measured on any car")
+    assert told.startswith("rule 1: it never fires. It waits for light.left from cars")
 
 
 def test_a_large_fleet_and_a_long_plan_are_checked_in_time() -> None:
@@ -174,9 +179,9 @@ def test_a_large_fleet_and_a_long_plan_are_checked_in_time() -> None:
     cars = {f"car{number}": listed("arduino") for number in range(100)}
     roles = "".join(f"  role{number}: {{mode: tracking, count: 5}}\n" for number in range(20))
     rules = "".join(
-        f"  - {{when: {{any: range.range_m < 0.{number + 1}}}, then: {{who: that, mode: following}}}}\n"
+        f"  - {{when: {{any_car: range.range_m < 0.{number + 1}}}, then: {{who: this_car, mode: following}}}}\n"
         for number in range(200)
     )
     plan = parse(f"roles:\n{roles}rules:\n{rules}")
     told = check(plan, cars)
-    assert len([each for each in told if "it can never fire: range.range_m is never measured" in str(each)]) == 200
+    assert len([each for each in told if "it never fires. It waits for range.range_m" in str(each)]) == 200

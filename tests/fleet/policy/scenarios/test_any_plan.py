@@ -25,8 +25,8 @@ FLEET = {
 LOW = "battery.voltage_v < 7"
 PLACES = (
     "roles: {{scout: {{mode: tracking, needs: {0}}}}}",
-    "roles: {{scout: {{mode: tracking}}}}\nrules: [{{when: {{any: {0}}}, then: {{who: that, mode: manual}}}}]",
-    "roles: {{scout: {{mode: tracking}}}}\nphases: {{a: {{until: {{all: {0}}}, next: b}}, b: {{}}}}",
+    "roles: {{scout: {{mode: tracking}}}}\nrules: [{{when: {{any_car: {0}}}, then: {{who: this_car, mode: manual}}}}]",
+    "roles: {{scout: {{mode: tracking}}}}\nphases: {{a: {{until: {{all_cars: {0}}}, next: b}}, b: {{}}}}",
 )
 """Plans with room for a condition: of a role, a rule, a phase."""
 
@@ -116,9 +116,51 @@ SENSIBLE = st.recursive(
 CONDITIONS = st.one_of(st.lists(WORDS, max_size=20).map(" ".join), SENSIBLE, st.text())
 """Conditions that mean something, that nearly do, and that do not."""
 FIELDS = (
-    *("roles", "cars", "rules", "phases", "idle", "mode", "needs", "count", "priority", "capabilities", "platforms"),
-    *("fallback", "on_call", "name", "when", "then", "until", "during", "who", "role", "led", "phase", "any", "all"),
-    *("car", "is", "for_s", "timeout_s", "next", "on_timeout", "a", "b", "red", "x"),
+    *(
+        "roles",
+        "cars",
+        "fixed",
+        "rules",
+        "phases",
+        "without_role",
+        "mode",
+        "needs",
+        "count",
+        "priority",
+        "capabilities",
+        "platforms",
+    ),
+    *(
+        "if_none",
+        "given_by",
+        "name",
+        "when",
+        "then",
+        "until",
+        "during",
+        "who",
+        "role",
+        "led",
+        "phase",
+        "any_car",
+        "all_cars",
+    ),
+    *(
+        "car",
+        "all_cars",
+        "with_role",
+        "blink_s",
+        "color",
+        "is",
+        "for_s",
+        "timeout_s",
+        "next",
+        "on_timeout",
+        "a",
+        "b",
+        "red",
+        "x",
+    ),
 )
 VALUES = st.recursive(
     st.one_of(
@@ -127,7 +169,7 @@ VALUES = st.recursive(
         st.integers(),
         st.floats(),
         CONDITIONS,
-        st.sampled_from([*Mode, "red", "pi", "scout", "that", "others", "all", "any", "a", "b"]),
+        st.sampled_from([*Mode, "red", "pi", "scout", "this_car", "other_cars", "all_cars", "all", "a", "b"]),
     ),
     lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.sampled_from(FIELDS), inner, max_size=4)),
     max_leaves=10,

@@ -149,7 +149,7 @@ def bare(path: Path) -> Made:
 def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     no_frames = tmp_path / "plan.mcap"
     made = bare(no_frames)
-    made.put("fleet/@coordinator/plan", pb.Plan(text="cars: {red: manual}"), 1.0)
+    made.put("fleet/@coordinator/plan", pb.Plan(text="fixed: {red: {mode: manual}}"), 1.0)
     made.put("fleet/red/state/mode", pb.Mode(asked="manual"), 1.0)
     made.close()
     assert "holds no raw frames" in run("sessions", "redecode", no_frames).output

@@ -31,7 +31,7 @@ S = 1_000_000_000
 PLAN = """
 roles:
   track: {mode: tracking, cars: [red]}
-cars: {blue: manual, green: manual}
+fixed: {blue: {mode: manual}, green: {mode: manual}}
 rules:
   - name: spinning
     when: {car: green, is: motion.motion == 'spin_left'}
@@ -89,7 +89,9 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert client.car("red").resume().ok
         until(second, "red", "role")
         key = "fleet/@coordinator/@cmd/plan"
-        answers = list(client.bus.query(key, payload=b"cars: {red: manual}\n", encoding="text/plain", timeout_s=10.0))
+        answers = list(
+            client.bus.query(key, payload=b"fixed: {red: {mode: manual}}\n", encoding="text/plain", timeout_s=10.0)
+        )
         assert len(answers) == 1
         until(second, "red", "role")
         modes = "red is in the new plan's mode"
@@ -234,7 +236,7 @@ def test_a_sessions_fleet_file_may_name_its_plan_otherwise(tmp_path: Path) -> No
     for at in range(3):
         made.put("fleet/@coordinator/decision", pb.Decision(subject="red", decided="left alone", kind="alone"), at + 1)
     made.close()
-    (tmp_path / "plan.yaml").write_text("cars: {red: manual}", encoding="utf-8")
+    (tmp_path / "plan.yaml").write_text("fixed: {red: {mode: manual}}", encoding="utf-8")
     text = "plan: p2.yaml\nworld: w2.yaml\ncars: {red: {platform: arduino}}\n"
     (tmp_path / "fleet.yaml").write_text(text, encoding="utf-8")
     result = run("replan", tmp_path)
