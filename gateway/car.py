@@ -186,8 +186,8 @@ class CarGateway:
     def stop(self) -> None:
         """Stop the car, then end. A second call ends at once."""
         if self._ending:
-            log.error("%s: told twice to end: its stop may be incomplete", self._settings.car)
-            self._control.link_down("the gateway was told twice to end", self._loop.time())
+            log.error("%s may still be moving: its gateway was ended twice", self._settings.car)
+            self._control.link_down("the gateway was ended twice", self._loop.time())
         self._ending = True
         self._control.shut_down(self._loop.time())
         self._wake.set()
@@ -239,7 +239,7 @@ class CarGateway:
             await asyncio.sleep(self._attempts.delay_s(random.random()))  # noqa: S311 - jitter, no secret
 
     def _log_open(self) -> None:
-        self._commands.log(Level.INFO, "link_open", f"{self._settings.url} is open: bringing the car to a known state")
+        self._commands.log(Level.INFO, "link_open", f"{self._settings.url} is open. The gateway stops the car first.")
 
     async def _read(self, link: Link) -> None:
         """Decode bytes until the link is lost."""
@@ -266,8 +266,8 @@ class CarGateway:
         self._health.on_rejected(counted_as, count)
         if now >= self._flood_until:
             words = (
-                f"{self._settings.car} sends more than any car does: {RAW_PER_S:g} raw frames a second are published, "
-                "and what is left out is counted in state/link (another device, or another baud rate?)"
+                f"{self._settings.car} sends more bytes than any car: another device, or a wrong baud rate? "
+                f"The gateway publishes {RAW_PER_S:g} raw frames a second and counts the rest in state/link."
             )
             self._commands.log(Level.WARNING, "flood", words)
         self._flood_until = now + FLOOD_LOG_PAUSE_S
@@ -399,7 +399,9 @@ class CarGateway:
                 self._log_open()
             if self._settings.parent not in (None, os.getppid()) and not self._ending:
                 self._commands.log(
-                    Level.WARNING, "parent_gone", "the process that started this gateway has ended: ending, too"
+                    Level.WARNING,
+                    "parent_gone",
+                    "the process that started this gateway has ended, so the gateway stops the car and ends too",
                 )
                 self.stop()
             if self._bus.connected:

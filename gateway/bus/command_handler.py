@@ -163,7 +163,7 @@ class CommandHandler:
         try:
             self._save_to_disk(safety)
         except OSError as error:
-            words = f"hold and e-stops will not survive a restart: {error}"
+            words = f"{self._car} loses its hold and e-stops at a restart of its gateway: {error}"
             self.log(Level.ERROR, "not_saved", words)
             for index, each in enumerate(self._pending_queries):
                 answer = replace(each.answer, words="; ".join(filter(None, (each.answer.words, f"not saved: {error}"))))
@@ -172,7 +172,7 @@ class CommandHandler:
     def _publish_records(self, command_id: str = "", request: requests.ParsedRequest | None = None) -> None:
         for record in self._control.take_records():
             if isinstance(record, LogRecord):
-                log.log(_LOGGING_LEVELS[record.level], "%s: %s", self._car, record.words)
+                self._print(record)
                 self._publisher.publish_log(record)
                 continue
             first = request if request is not None and record.command.id == command_id else None
@@ -183,5 +183,11 @@ class CommandHandler:
 
     def log(self, level: Level, code: str, words: str) -> None:
         """Log an event of the gateway, and publish it."""
-        log.log(_LOGGING_LEVELS[level], "%s: %s", self._car, words)
-        self._publisher.publish_log(LogRecord(level, code, words, self._clock()))
+        record = LogRecord(level, code, words, self._clock())
+        self._print(record)
+        self._publisher.publish_log(record)
+
+    def _print(self, record: LogRecord) -> None:
+        """Print a log line, with the code that the troubleshooting page explains."""
+        car = "" if record.words.startswith(f"{self._car} ") else f"{self._car}: "
+        log.log(_LOGGING_LEVELS[record.level], "%s%s [%s]", car, record.words, record.code)

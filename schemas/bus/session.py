@@ -45,14 +45,14 @@ class Bus:
             ensure_hub(where)
         elif not accepts(where):
             raise NoFleet(
-                f"no fleet is running at {where}: start one (`gateway run`, or `make demo` to see one), "
-                "or name another with --connect"
+                "Nothing is running yet. Start your cars with `fleet up`, or simulated ones with `fleet up --sim 3`. "
+                f"(Looked at {where}; --connect names another place.)"
             )
         try:
             session = zenoh.open(client_config(where, timeout_s))
         except zenoh.ZError as error:
             raise BusError(
-                f"what listens at {where} is no Zenoh router, or does not answer: name the fleet's with --connect"
+                f"{where} does not answer, or is no Zenoh router. Name the fleet's address with --connect."
             ) from error
         return cls(session, where)
 

@@ -138,11 +138,11 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
     assert f"process {up.running('red')}" in shown.stdout
     told = json.loads(up.fleet("status", "--json").stdout)
     assert {"@hub", "@recorder", "@simulator", "red", "green"} == {each["name"] for each in told["processes"]}
-    assert "bringing the car to a known state" in up.fleet("logs", "red").stdout
+    assert "is open. The gateway stops the car first." in up.fleet("logs", "red").stdout
     assert " simulator | {" in up.fleet("logs", "simulator").stdout
     lines = [json.loads(line) for line in up.fleet("logs", "red", "--json").stdout.splitlines()]
     assert {each["name"] for each in lines} == {"red"}
-    assert any("bringing the car to a known state" in each["line"] for each in lines)
+    assert any("is open. The gateway stops the car first." in each["line"] for each in lines)
     assert [each["time"] for each in lines] == sorted(each["time"] for each in lines if each["time"].endswith("Z"))
     wrong = up.fleet("logs", "gren")
     assert wrong.returncode == 2
@@ -178,7 +178,7 @@ def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
         assert not started.left()
         gone = started.fleet("status")
         assert gone.returncode == 1
-        assert "no fleet is running at" in gone.stderr
+        assert "Nothing is running yet." in gone.stderr
         assert "is stopped (confirmed)" in started.fleet("logs", "red").stdout
 
 

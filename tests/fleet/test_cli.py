@@ -207,7 +207,7 @@ def test_no_fleet_running_is_a_failure_that_says_what_to_do() -> None:
     endpoint = free_endpoint()
     done = run(endpoint, "list")
     assert done.returncode == 1
-    assert done.stderr.startswith(f"fleet: no fleet is running at {endpoint}: start one")
+    assert done.stderr.startswith("fleet: Nothing is running yet. Start your cars with `fleet up`")
     assert done.stderr.count("\n") == 1
 
 

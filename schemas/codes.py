@@ -1,0 +1,69 @@
+"""The codes that texts end with or events are named by, each with its meaning. The docs print these tables. Pure.
+
+docs/how-to/troubleshooting.md has a section for each code. A test compares tables, source and page.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+REASONS: Final[dict[str, str]] = {
+    "bad_value": "The request has a wrong value.",
+    "unsupported": "This car cannot do it in any state.",
+    "wrong_mode": "The car ignores this command in its mode.",
+    "leased": "Another sender drives the car.",
+    "held": "The car is on hold after a stop.",
+    "estopped": "An emergency stop is in force.",
+    "battery_low": "The battery is too low for a new drive or mode.",
+    "link_down": "The gateway cannot reach the car.",
+    "write_failed": "The link broke while the gateway wrote the command.",
+    "queue_full": "Too many commands wait for the car.",
+    "expired": "The time of the command was over before the gateway could send it, or its sender disconnected.",
+    "superseded": "A later command ended this one.",
+    "duplicate": "A command with this id was accepted before.",
+    "stale": "The command arrived too late.",
+    "not_shown": "The car could have confirmed the stop and did not.",
+    "no_answer": "No gateway answered for this car.",
+    "no_result": "The gateway took the command, and its result did not arrive.",
+}
+"""Reasons of the gateway (`gateway.control.commands.Reason`), and `no_answer` and `no_result` of the client."""
+
+
+@dataclass(frozen=True, slots=True)
+class EventCode:
+    """One code of `event/log`."""
+
+    level: str
+    meaning: str
+
+
+EVENTS: Final[dict[str, EventCode]] = {
+    "link_open": EventCode("info", "The link is open, and the gateway brings the car to a known state."),
+    "link_lost": EventCode("warning", "The link is lost. The text has the cause."),
+    "recovered": EventCode("info", "The car is stopped in mode manual, and takes commands."),
+    "platform_settled": EventCode("info", "The readings show which program the car runs."),
+    "platform_contradicted": EventCode("warning", "The readings do not fit the platform in the fleet file."),
+    "mode_contradicted": EventCode("warning", "The readings do not fit the commanded mode."),
+    "not_obeyed": EventCode("warning", "Readings arrive, and the car does not react to a stop."),
+    "hears": EventCode("info", "The car reacts to stops again."),
+    "unheard": EventCode("warning", "The car is silent for longer than any normal silence. It may be moving."),
+    "answers_again": EventCode("info", "The car sends readings again, and the gateway stops it first."),
+    "not_shown": EventCode("error", "The car could have confirmed a stop and did not in time. The stop goes on."),
+    "not_stopped": EventCode("error", "The gateway ended, and the car has not confirmed its stop."),
+    "stalled": EventCode("error", "The gateway stood still during a drive, and stops the car."),
+    "battery_ok": EventCode("info", "The battery is above both limits again."),
+    "battery_low": EventCode("warning", "The battery is below the first limit."),
+    "battery_critical": EventCode("error", "The battery is below the second limit."),
+    "estop": EventCode("error", "Somebody emergency-stopped the car."),
+    "estop_joined": EventCode("error", "The gateway took over an emergency stop of the whole fleet."),
+    "estop_ended": EventCode("warning", "An emergency stop has ended."),
+    "hold_ended": EventCode("info", "The hold after a stop has ended."),
+    "lease_taken": EventCode("info", "Another sender has taken the car over."),
+    "duplicate": EventCode("warning", "A command came twice with the same id."),
+    "trust": EventCode("debug", "The gateway's knowledge about the motion has changed."),
+    "flood": EventCode("warning", "More bytes arrive than any car sends."),
+    "not_saved": EventCode("error", "The gateway could not save holds and e-stops to the disk."),
+    "no_hub": EventCode("error", "The gateway cannot reach the bus."),
+    "parent_gone": EventCode("warning", "The process that started this gateway has ended, so the gateway ends too."),
+    "internal_error": EventCode("error", "The coordinator failed in one decision, and continues."),
+}
+"""Codes of `event/log` of cars, and of `@coordinator/log`."""

@@ -1,0 +1,80 @@
+"""Each code of a reason or an event has its row and its section for troubleshooting, which quotes real texts."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from gateway.control.commands import Reason
+from gateway.control.estimate.battery import BatteryLevel
+from gateway.control.events import Level
+from schemas.codes import EVENTS, REASONS
+
+ROOT: Final = Path(__file__).parent.parent.parent
+PAGE: Final = ROOT / "docs/how-to/troubleshooting.md"
+
+
+def trees() -> Iterator[ast.Module]:
+    for package in ("gateway", "fleet", "schemas"):
+        for file in sorted((ROOT / package).rglob("*.py")):
+            if "gen" not in file.parts:
+                yield ast.parse(file.read_text(encoding="utf-8"))
+
+
+def logged() -> set[tuple[str, str]]:
+    """Return level and code of each call `log(Level.X, "code", ...)`."""
+    found = set()
+    for tree in trees():
+        for node in ast.walk(tree):
+            match node:
+                case ast.Call(func=ast.Attribute(attr="log"), args=[ast.Attribute(attr=level), ast.Constant(code), *_]):
+                    found.add((str(Level[level]), str(code)))
+    return found
+
+
+def templates() -> list[re.Pattern[str]]:
+    """Return a pattern for each text of at least three words in the source."""
+    found = []
+    for tree in trees():
+        for node in ast.walk(tree):
+            match node:
+                case ast.JoinedStr(values=values):
+                    text = "".join(str(each.value) if isinstance(each, ast.Constant) else "{}" for each in values)
+                case ast.Constant(value=str() as text):
+                    pass
+                case _:
+                    continue
+            if 3 <= len(text.split()) < 60:
+                found.append(re.compile(".+?".join(re.escape(each) for each in re.split(r"\{\w*\}", text.rstrip()))))
+    return found
+
+
+def test_each_reason_is_in_the_table() -> None:
+    assert set(REASONS) == {*map(str, Reason), "no_answer", "no_result"}
+
+
+def test_each_event_is_in_the_table_with_its_level() -> None:
+    assert logged() <= {(each.level, code) for code, each in EVENTS.items()}
+    elsewhere = {f"battery_{level}" for level in BatteryLevel} | {"internal_error"}
+    assert set(EVENTS) == {code for _, code in logged()} | elsewhere
+
+
+def test_each_code_has_a_section_that_says_what_to_do() -> None:
+    sections = re.findall(r"^### (\w+)\n\n(.+?)\n\nWhat to do: .", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert [code for code, _ in sections] == [*REASONS, *(code for code in EVENTS if code not in REASONS)]
+    meanings = {**{code: each.meaning for code, each in EVENTS.items()}, **REASONS}
+    assert not [code for code, text in sections if not text.startswith(meanings[code])]
+
+
+def test_each_quoted_message_is_in_the_source() -> None:
+    quoted = re.findall(r"^> (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(quoted) > 10
+    known = templates()
+    # A message may be made of several texts, and a quotation may end early: half of it in one text is enough.
+    strange = [
+        text
+        for text in quoted
+        if not any((found := each.search(text)) and len(found[0]) >= len(text) / 2 for each in known)
+    ]
+    assert not strange, "the page quotes what no code says"
