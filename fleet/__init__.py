@@ -1,6 +1,6 @@
 """Several cars from one laptop: drive, watch, record and replay them.
 
-`from fleet import Fleet` is the SDK, `from fleet.aio import Fleet` its asyncio twin.
+`from fleet import Fleet` is the SDK, `from fleet.aio import Fleet` its asyncio twin. `Session` is a recording.
 """
 
 from importlib import import_module
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from fleet.client.outcome import NotCarriedOut as NotCarriedOut
     from fleet.client.outcome import Outcome as Outcome
     from fleet.client.reading import Reading as Reading
+    from fleet.recording.reading.session import Session as Session
 
 _HOME: Final = {
     "Fleet": "fleet.client.client",
@@ -19,6 +20,7 @@ _HOME: Final = {
     "NotCarriedOut": "fleet.client.outcome",
     "Outcome": "fleet.client.outcome",
     "Reading": "fleet.client.reading",
+    "Session": "fleet.recording.reading.session",
 }
 
 

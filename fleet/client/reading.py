@@ -30,6 +30,14 @@ class Reading:
     value: Any
     """The protobuf message, e.g. `fleet.v1.Range`. Optional fields that were not measured are not set."""
 
+    @classmethod
+    def of(cls, key: str, value: Any, time_ns: int) -> Self:
+        """Return the reading of a message. time_ns: its time if it has no stamp, ns since the epoch."""
+        stamp = getattr(value, "stamp", None) or getattr(value, "timestamp", None)
+        if stamp is not None and stamp.seconds:
+            time_ns = stamp.seconds * 1_000_000_000 + stamp.nanos
+        return cls(key, _EPOCH + timedelta(microseconds=time_ns // 1000), value)
+
     @property
     def car(self) -> str:
         """The car's name. Empty for messages of the whole fleet."""
@@ -65,10 +73,7 @@ ReadingFilter: TypeAlias = Callable[[Reading], bool | None]
 
 def reading_of(sample: Sample) -> Reading:
     """Return the reading in a sample. Raises messages.BadPayload or KeyError if it is no message of ours."""
-    value: Any = sample.message()
-    stamp = getattr(value, "stamp", None) or getattr(value, "timestamp", None)
-    time_ns = stamp.seconds * 1_000_000_000 + stamp.nanos if stamp is not None and stamp.seconds else sample.time_ns
-    return Reading(sample.key, _EPOCH + timedelta(microseconds=time_ns // 1000), value)
+    return Reading.of(sample.key, sample.message(), sample.time_ns)
 
 
 class Watch:

@@ -72,7 +72,7 @@ def play(
     signals.calls(stop.set)
     with cli_errors():
         try:
-            found = Session.open(session)
+            found = Session(session)
             part = part_of(found, start, end, cars)
             about = of_session(found)
             begin_ns = about.start_ns if part.start_ns is None else part.start_ns

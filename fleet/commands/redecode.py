@@ -90,7 +90,7 @@ class _RedecodeReport:
         from fleet.recording.tools.summary import of_session as overview
         from fleet.replay.analysis.recorded_frames import FRAME_KEYS, of_session
 
-        self._session = session = Session.open(self._path)
+        self._session = session = Session(self._path)
         part_of(session, None, None, self._cars)  # raises for unknown cars
         self.start_ns = overview(session).start_ns
         expressions = [f"*/{car}/{key.split('/', 2)[2]}" for car in self._cars or ("*",) for key in FRAME_KEYS]
@@ -201,7 +201,7 @@ def vector(session: Path, car: str, start: str | None, end: str | None, out: Pat
     if out.suffix != vectors.ENDING:
         raise click.UsageError(f"--out {out}: a vector's name ends in {vectors.ENDING}")
     try:
-        found = Session.open(session)
+        found = Session(session)
         part = part_of(found, start, end, (car,))
         about = overview(found)
     except NoSession as error:

@@ -68,7 +68,7 @@ def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance:
     with cli_errors():
         plan = None if path is None else parse(read_text(path), str(path))
         try:
-            found = Session.open(session)
+            found = Session(session)
             own = found.path / FLEET_FILE
             listed: Mapping[str, CarSnapshot] = {}
             if fleet_file is not None:

@@ -49,7 +49,7 @@ def replay(
     from fleet.replay.rerun.viewer import has_display
 
     try:
-        found = Session.open(session)
+        found = Session(session)
         found.check()
         if save is not None:
             refuse_target(save, found.segments)

@@ -82,7 +82,7 @@ def _session_errors(out: Path | None = None) -> Iterator[None]:
 def _open(path: Path) -> "Session":
     from fleet.recording.reading.session import Session
 
-    return Session.open(path)
+    return Session(path)
 
 
 def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T]]:

@@ -1,10 +1,14 @@
 """Selects messages of a session by key expression and by time of the recorder's clock. Pure; reads no files."""
 
 import re
-from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from typing import Final, Self
+from typing import Final
+
+from schemas import keys
+from schemas.commands import COMMANDS
+from schemas.topics import TOPICS
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,13 +18,6 @@ class Selection:
     keys: tuple[str, ...] | None = None
     start_ns: int | None = None
     end_ns: int | None = None
-
-    @classmethod
-    def of(cls, keys: Iterable[str] | None, start_ns: int | None, end_ns: int | None) -> Self:
-        """Build a selection from the arguments of `Session.messages`. `keys` may be a single key."""
-        if isinstance(keys, str):
-            keys = (keys,)
-        return cls(None if keys is None else tuple(keys), start_ns, end_ns)
 
     def has_key(self, key: str) -> bool:
         """Return True if messages of this key are selected."""
@@ -36,6 +33,29 @@ class Selection:
 
 
 EVERYTHING: Final = Selection()
+
+
+_GROUPS: Final = frozenset(topic.partition("/")[0] for topic in TOPICS)
+"""First chunks of topics."""
+
+
+def key_expressions(name: str, fleet: str) -> tuple[str, ...]:
+    """Return the key expressions of a topic (`sensor/*`), a message, or a key, which may lack the fleet's name."""
+    if name.partition("/")[0] in _GROUPS:
+        return (_any_fleet(name),)
+    messages = (name, f"fleet.v1.{name}")
+    found = [_any_fleet(topic.name) for topic in TOPICS.values() if topic.message in messages]
+    found += [f"*/*/@cmd/{command.verb}" for command in COMMANDS.values() if command.message in messages]
+    if found:
+        return tuple(found)
+    if name.partition("/")[0] not in (fleet, "**"):
+        with suppress(keys.BadKey):
+            return name, keys.expand(name, fleet)
+    return (name,)
+
+
+def _any_fleet(topic: str) -> str:
+    return f"*/{topic}" if topic.startswith("@") else f"*/*/{topic}"
 
 
 def matches(expression: str, key: str) -> bool:

@@ -54,7 +54,7 @@ def _last_minute(directory: Path, scale: Scale) -> Measured:
 
     def ours() -> float:
         began = perf_counter()
-        count = sum(1 for _ in Session.open(path).messages(start_ns=start_ns))
+        count = sum(1 for _ in Session(path).messages(start_ns=start_ns))
         took = perf_counter() - began
         assert count == 60 * rate + 1
         return took
@@ -81,7 +81,7 @@ def _tables(directory: Path, name: str, source: Path, count: int, scale: Scale) 
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         began = perf_counter()
-        done = export(Session.open(source).rows(), out, FORMATS[name])
+        done = export(Session(source).rows(), out, FORMATS[name])
         took = perf_counter() - began
         assert sum(done.rows.values()) == count
         return took / count * 1e6

@@ -47,9 +47,9 @@ def hub_killed(
         running = {key: len(sent) for key, sent in load.sent.items()}
         wait_for(lambda: all(len(load.sent[key]) > count for key, count in running.items()), "all are publishing")
         ends_whole(fleet, load, cars, recording, [recording.session])
-    verdict = verify(Session.open(recording.session))
+    verdict = verify(Session(recording.session))
     assert verdict.whole, list(verdict.words())
-    description = Session.open(recording.session).description
+    description = Session(recording.session).description
     assert description is not None
     return Told(load.count(), sum(description.recovered.values()))
 
@@ -103,7 +103,7 @@ def recorder_killed(
         ends_whole(fleet, load, cars, recording, sessions)
     missing_s = []
     for number, (path, at_ns) in enumerate(zip(sessions[:-1], killed_ns, strict=True)):
-        session = Session.open(path)
+        session = Session(path)
         verdict = verify(session)
         words = list(verdict.words())
         assert not verdict.whole
@@ -133,11 +133,11 @@ def recorder_killed(
         if verdict.messages:
             rescued, _ = recover(session, recovered)
             assert rescued == verdict.messages
-            assert not verify(Session.open(recovered)).damage
+            assert not verify(Session(recovered)).damage
         else:  # its first second was not over yet
             with pytest.raises(NoSession):
                 recover(session, recovered)
-        following = Session.open(sessions[number + 1]).description
+        following = Session(sessions[number + 1]).description
         assert following is not None
         assert following.continues == path.name
     return Told(load.count(), 0, tuple(missing_s))

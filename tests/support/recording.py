@@ -123,7 +123,7 @@ def numbers(sessions: Iterable[Path]) -> dict[str, Counter[int]]:
     """By key: how often each number lies in these sessions, what is damaged left out."""
     found: dict[str, Counter[int]] = {}
     for path in sessions:
-        for message in Session.open(path).messages():
+        for message in Session(path).messages():
             found.setdefault(message.key, Counter())[message.sequence] += 1
     return found
 

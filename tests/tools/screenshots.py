@@ -86,7 +86,7 @@ def pictures(session: Path, folder: Path) -> dict[str, Shown]:
     from fleet.recording.reading.session import Session
     from fleet.replay.rerun.export import export
 
-    found = Session.open(session)
+    found = Session(session)
     made: dict[str, Shown] = {}
     with tempfile.TemporaryDirectory() as scratch:
         rrd = Path(scratch) / f"{found.name}.rrd"

@@ -86,3 +86,8 @@ def _field_shapes(descriptor: Any, prefix: str = "", above: frozenset[str] = fro
         if field.type == FieldDescriptor.TYPE_MESSAGE and inner is not None and inner.full_name not in above:
             found |= _field_shapes(inner, f"{path}.", above | {descriptor.full_name})
     return found
+
+
+def message_of(info: ChannelInfo) -> str:
+    """Return the full protobuf name of the messages of a channel; empty if the file has no schema for it."""
+    return info.schema.name if info.schema is not None and info.schema.encoding == "protobuf" else ""

@@ -4,21 +4,57 @@ A session is a directory (session_dir.py) or a single .mcap file of any writer. 
 """
 
 import json
+import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass
 from fnmatch import fnmatch
+from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, overload
 
+from fleet.client.reading import Reading
 from fleet.recording import session_dir
 from fleet.recording.reading.mcap_index import Index
-from fleet.recording.reading.mcap_reader import ChannelInfo, McapReader, NotMcap, Row
-from fleet.recording.selection import EVERYTHING, Selection
+from fleet.recording.reading.mcap_reader import McapReader, NotMcap, Row
+from fleet.recording.reading.message_decoder import MessageDecoder, message_of
+from fleet.recording.selection import EVERYTHING, Selection, key_expressions
+from fleet.recording.tools.analysis import arrow_table, data_frame, join_as_of
 from fleet.recording.writing.mcap_copy import Copy
+from schemas.keys import DEFAULT_FLEET
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
+
+
+LATEST: Final = "latest"
+ROOT: Final = Path("sessions")
+"""Default directory of sessions."""
 
 
 class NoSession(Exception):
     """The path is no session. The message names the path and the reason."""
+
+
+def find_session(session: str | PathLike[str], root: Path = ROOT) -> Path:
+    """Return the path of a session: a path, a name below `root`, or `latest`, `latest~1`, ... Raises NoSession.
+
+    `latest` is the session that was recorded last. Sessions that a tool made from others (cut, recover) do not count.
+    """
+    path = Path(session)
+    nth = re.fullmatch(rf"{LATEST}(?:~(\d+))?", str(session))
+    if path.exists() or nth is None:
+        return root / path if not path.exists() and (root / path).exists() else path
+    recorded = [
+        (info.started, each)
+        for each in (root.iterdir() if root.is_dir() else ())
+        if (info := session_dir.SessionInfo.read(each)) is not None and not info.origin
+    ]
+    back = int(nth[1] or 0)
+    if back >= len(recorded):
+        raise NoSession(f"{session}: there are {len(recorded)} recorded sessions in {root.absolute()}. Name a session.")
+    return sorted(recorded)[-1 - back][1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,21 +75,15 @@ class Recorded:
     """Sequence number of the publisher for the key, modulo 2^32; 0 if it sent none."""
 
 
-@dataclass(slots=True)
 class Session:
-    """Segments in order, and their `damage` found so far by opening, checking or reading."""
+    """A recorded session: `Session("latest").to_pandas("sensor/range")`.
 
-    path: Path
-    segments: tuple[Path, ...]
-    """Readable segments."""
-    description: session_dir.SessionInfo | None
-    damage: dict[Path, str] = field(default_factory=dict)
-    unended: set[Path] = field(default_factory=set)
-    """Segments that are only truncated, as a file still being written is."""
+    path: a session's directory, an .mcap file, the name of a session in `./sessions`, or `latest` (`latest~1` is the
+    one before). Raises NoSession. Reading never changes a session, and finds what is damaged: see `damage_words`.
+    """
 
-    @classmethod
-    def open(cls, path: Path) -> Self:
-        """Find the segments of a session; raises NoSession."""
+    def __init__(self, path: str | PathLike[str] = LATEST) -> None:
+        path = find_session(path)
         try:
             whole = path.is_dir()
             there = sorted(path.glob(session_dir.SEGMENTS)) if whole else [path]
@@ -67,18 +97,24 @@ class Session:
                 )
         except OSError as error:
             raise NoSession(f"{path} cannot be read: {error.strerror}") from None
-        damage = {}
+        self.path = path
+        self.damage: dict[Path, str] = {}
+        """Damage that opening, checking or reading has found so far."""
+        self.unended: set[Path] = set()
+        """Segments that are only truncated, as a file still being written is."""
         for segment in there:
             try:
                 McapReader(segment)
             except NotMcap as error:
-                damage[segment] = str(error)
-        if len(damage) == len(there):
-            raise NoSession("; ".join(f"{segment} {words}" for segment, words in damage.items()))
+                self.damage[segment] = str(error)
+        if len(self.damage) == len(there):
+            raise NoSession("; ".join(f"{segment} {words}" for segment, words in self.damage.items()))
+        self.segments = tuple(segment for segment in there if segment not in self.damage)
+        """Readable segments, in order."""
         if whole:
             numbered = {session_dir.segment(path, number + 1) for number in range(int(there[-1].stem))}
             if missing := sorted((numbered | _closed_segments(path)) - set(there)):
-                damage[path] = f"lacks {len(missing)} of its files, the first is {missing[0].name}"
+                self.damage[path] = f"lacks {len(missing)} of its files, the first is {missing[0].name}"
             given = _json(path / session_dir.SESSION_FILE).get("format")
             if isinstance(given, int) and given > session_dir.FORMAT_VERSION:
                 raise NoSession(
@@ -86,8 +122,16 @@ class Session:
                     "update zenoh-car-fleet; "
                     f"its files can be looked into one by one, as {there[0]}"
                 )
-        description = session_dir.SessionInfo.read(path) if whole else None
-        return cls(path, tuple(segment for segment in there if segment not in damage), description, damage)
+        self.description = session_dir.SessionInfo.read(path) if whole else None
+
+    def __repr__(self) -> str:
+        return f"Session({str(self.path)!r})"
+
+    def part(self, segments: tuple[Path, ...]) -> "Session":
+        """Return these segments as a session of their own."""
+        part = copy(self)
+        part.segments, part.damage, part.unended = segments, {}, set()
+        return part
 
     @property
     def name(self) -> str:
@@ -125,27 +169,97 @@ class Session:
                 copy.add(row)
         if not copy.messages:
             raise NoSession(f"{self.path} holds no message that is whole: {self.damage_words}")
-        return Session(self.path, (out,), self.description)
+        return self.part((out,))
+
+    @overload
+    def messages(
+        self,
+        keys: str | Iterable[str] | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        decode: Literal[False] = False,
+    ) -> Iterator[Recorded]: ...
+
+    @overload
+    def messages(
+        self,
+        keys: str | Iterable[str] | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        decode: Literal[True],
+    ) -> Iterator[Reading]: ...
 
     def messages(
-        self, keys: Iterable[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Recorded]:
-        """Yield every intact message in the order of the file; see `damage` afterwards.
+        self,
+        keys: str | Iterable[str] | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        decode: bool = False,
+    ) -> Iterator[Recorded] | Iterator[Reading]:
+        """Yield every intact message in the order of the file; see `damage_words` afterwards.
 
-        `keys` selects keys or key expressions (`fleet/red/**`, `fleet/*/sensor/range`). `start_ns` (included) and
-        `end_ns` (excluded) select times of the recorder's clock. With an index only chunks in question are read: the
-        last minute of a long session takes no longer than a minute's messages.
+        keys: one or several of a topic (`sensor/range`, `sensor/*`), a message (`fleet.v1.Range`), a key or a key expression
+        (`red/sensor/range`, `fleet/red/**`). start_ns (included), end_ns (excluded): times of the recorder's clock, ns
+        since the epoch. With an index only the chunks in question are read, so the last minute of a long session takes
+        no longer than a minute's messages.
+        decode: True to yield readings, as `Fleet.watch` does, and to leave out what is not protobuf. False to yield
+        payloads as they were on the bus.
         """
-        for info, sequence, log_ns, publish_ns, data in self.rows(Selection.of(keys, start_ns, end_ns)):
-            yield Recorded(
-                key=info.channel.topic,
-                payload=data,
-                message=message_of(info),
-                encoding=info.channel.message_encoding,
-                published_ns=publish_ns,
-                recorded_ns=log_ns,
-                sequence=sequence,
-            )
+        rows = self.rows(self.selection(keys, start_ns, end_ns))
+        return self._readings(rows) if decode else map(_recorded, rows)
+
+    def _readings(self, rows: Iterable[Row]) -> Iterator[Reading]:
+        decoder = MessageDecoder()
+        for info, _, _, publish_ns, data in rows:
+            value = decoder.message(info, data)
+            if value is not None:
+                yield Reading.of(info.channel.topic, value, publish_ns)
+
+    def to_arrow(self, of: str, *, start_ns: int | None = None, end_ns: int | None = None) -> "pa.Table":
+        """Return the messages of one type as a pyarrow.Table, one row for each message, in the order of publish_time.
+
+        of: a topic (`sensor/range`), a message (`fleet.v1.Range`), or a key expression that matches one type of message
+        (`red/sensor/range`). start_ns, end_ns: as for `messages`.
+        Columns: key, car, log_time (recorder's clock) and publish_time (publisher's clock) as timestamp[ns, UTC],
+        sequence, then the fields. A unit is in the column's name and in the field's metadata (`unit`). A value is null
+        if it was not measured. The request of a command has a column for each field (`request_motion`).
+        Raises NoTable, and FormatMissing (an ImportError) without the extra `analysis`.
+        """
+        return arrow_table(self.rows(self.selection(of, start_ns, end_ns)), of, self.name)
+
+    def to_pandas(self, of: str, *, start_ns: int | None = None, end_ns: int | None = None) -> "pd.DataFrame":
+        """Return the table of `to_arrow` as a pandas.DataFrame, with pd.NA for values that were not measured.
+
+        `frame.attrs["units"]` has the units by column.
+        """
+        return data_frame(self.to_arrow(of, start_ns=start_ns, end_ns=end_ns))
+
+    def joined(self, of: str, *others: str, tolerance_s: float | None = None) -> "pd.DataFrame":
+        """Return the table of the first topic, with the latest values that the same car had published in the others.
+
+        `session.joined("sensor/range", "state/mode")` adds the columns `mode.inferred`, `mode.verdict`, ... to those of
+        the distances. They are null in rows for which no value is young enough.
+        tolerance_s: maximum age of a value, s, by publish_time. The default is the time after which its topic is stale
+        (3 s for readings and states); values of topics that are never stale have no limit. Raises as `to_pandas`.
+        """
+        table = self.to_arrow(of)
+        for other in others:
+            prefix = re.split(r"[/.]", other)[-1].lower()
+            table = join_as_of(table, self.to_arrow(other), prefix, tolerance_s)
+        return data_frame(table)
+
+    def selection(
+        self, keys: str | Iterable[str] | None, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Selection:
+        """Return the selection of messages by names as in `messages` and by time."""
+        if keys is None:
+            return Selection(None, start_ns, end_ns)
+        fleet = self.description.fleet if self.description is not None else DEFAULT_FLEET
+        names = [keys] if isinstance(keys, str) else keys
+        return Selection(tuple(each for name in names for each in key_expressions(name, fleet)), start_ns, end_ns)
 
     def rows(self, selection: Selection = EVERYTHING) -> Iterator[Row]:
         """Yield messages as plain tuples with their channel and schema: a third of the time of `messages`."""
@@ -188,6 +302,13 @@ class Session:
             (self.unended.add if reader.only_cut else self.unended.discard)(reader.path)
 
 
+def _recorded(row: Row) -> Recorded:
+    info, sequence, log_ns, publish_ns, data = row
+    return Recorded(
+        info.channel.topic, data, message_of(info), info.channel.message_encoding, publish_ns, log_ns, sequence
+    )
+
+
 def _closed_segments(path: Path) -> set[Path]:
     """Return the segments listed in index.json, which alone shows that the last one is missing."""
     return {path / one["file"] for one in _indexed_segments(path)}
@@ -206,8 +327,3 @@ def _json(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):
         return {}
     return values if isinstance(values, dict) else {}
-
-
-def message_of(info: ChannelInfo) -> str:
-    """Return the full protobuf name of the messages of a channel; empty if the file has no schema for it."""
-    return info.schema.name if info.schema is not None and info.schema.encoding == "protobuf" else ""

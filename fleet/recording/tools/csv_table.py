@@ -13,20 +13,27 @@ from typing import Any, Final
 
 from fleet.client.reading import Reading
 from fleet.recording.time_spec import format_utc
+from fleet.recording.tools.table_formats import csv_cells
+from fleet.recording.tools.tables import RequestColumns, column_name
 from schemas import topics
 
 _OMITTED_FIELDS: Final = frozenset({"stamp", "timestamp", "boot_id"})
-_UNIT_NAMES: Final = {"1": "", "B": "bytes"}
 
 
 def table(readings: Sequence[Reading], topic: topics.Topic) -> str:
     """Return the table with its header. All readings must be of this topic."""
-    fields = list(_fields(readings))
+    requests = RequestColumns.of(readings[0].value.DESCRIPTOR)
+    fields = [field for field in _fields(readings) if requests is None or field[0] != RequestColumns.FIELD]
+    names = [column_name(name, topic.units.get(name, ""), index) for name, index in fields]
+    rows = [[_cell(reading.value, *field) for field in fields] for reading in readings]
+    if requests is not None:
+        names += [column.name for column in requests.columns]
+        cells = csv_cells(requests.columns, requests.fill([reading.value for reading in readings]))
+        rows = [[*row, *more] for row, more in zip(rows, cells, strict=True)]
     lines = io.StringIO(newline="")
     writer = csv.writer(lines)
-    writer.writerow(["time", "key", *(column_name(name, topic.units.get(name, ""), index) for name, index in fields)])
-    for reading in readings:
-        writer.writerow([iso(reading.time), reading.key, *(_cell(reading.value, *field) for field in fields)])
+    writer.writerow(["time", "key", *names])
+    writer.writerows([iso(reading.time), reading.key, *row] for reading, row in zip(readings, rows, strict=True))
     return lines.getvalue()
 
 
@@ -45,13 +52,6 @@ def _fields(readings: Sequence[Reading]) -> Iterable[tuple[str, int | None]]:
             yield from ((field.name, index) for index in range(longest))
         else:
             yield field.name, None
-
-
-def column_name(name: str, unit: str, index: int | None = None) -> str:
-    """Return the column name of a field: with the number of a list item, and with its unit unless the name has it."""
-    unit = _UNIT_NAMES.get(unit, unit).lower()
-    numbered = name if index is None else f"{name}_{index + 1}"
-    return numbered if not unit or name.endswith(f"_{unit}") or name == unit else f"{numbered}_{unit}"
 
 
 def _cell(message: Any, name: str, index: int | None) -> str:

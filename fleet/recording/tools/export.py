@@ -1,18 +1,17 @@
-"""Exports a session to tables in a directory, one file per message type. tables.py defines their columns."""
+"""Exports a session to tables, one per message type: files, or Arrow in memory. tables.py defines their columns."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from google.protobuf.message import DecodeError, Message
 
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
-from fleet.recording.reading.message_decoder import MessageDecoder
-from fleet.recording.reading.session import message_of
+from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.tools import tables
-from fleet.recording.tools.table_formats import Sink
+from fleet.recording.tools.table_formats import ArrowSink, FileSink, Sink
 
 BATCH_BYTES: Final = 4 << 20
 """Maximum buffered size of one table: its payloads, and ROW_BYTES per row."""
@@ -25,7 +24,7 @@ class Exported:
     """Result of an export."""
 
     rows: Mapping[str, int]
-    """Rows by file name."""
+    """Rows by name of the table."""
     undecoded: int
     """Messages that do not match their protobuf schema. Their bytes are in the table of other messages."""
 
@@ -72,7 +71,7 @@ class _Batch:
 
 @dataclass(slots=True)
 class _Table:
-    """One file, and its buffered messages."""
+    """One table, and its buffered messages."""
 
     sink: Sink
     layout: tables.Layout | None
@@ -116,9 +115,8 @@ def _split_undecodable(batch: _Batch, message_class: type[Message]) -> tuple[_Ba
 class _Export:
     """Tables of a session found so far."""
 
-    def __init__(self, out: Path, sink: type[Sink]) -> None:
-        self._out = out
-        self._sink = sink
+    def __init__(self, open_sink: Callable[[str, Sequence[tables.Column]], Sink]) -> None:
+        self._open_sink = open_sink
         self._decoder = MessageDecoder()
         self._by_channel: dict[int, tuple[ChannelInfo, _Table]] = {}
         self.tables: dict[type[Message] | None, _Table] = {}
@@ -159,24 +157,34 @@ class _Export:
         return self.tables[message_class]
 
     def _open_table(self, message_class: type[Message] | None) -> _Table:
-        """Open a new file. Number it if fields of the type changed within the session."""
-        name = message_class.DESCRIPTOR.full_name if message_class is not None else OTHER_TABLE
-        stem = re.sub(r"[^A-Za-z0-9._-]", "_", name)
+        """Open a new table. Number it if fields of the type changed within the session."""
+        stem = message_class.DESCRIPTOR.full_name if message_class is not None else OTHER_TABLE
         taken = {table.name.lower() for table in self.tables.values()}
-        file = next(one for one in _file_names(stem, self._sink.ending) if one.lower() not in taken)
+        name = next(one for one in _table_names(re.sub(r"[^A-Za-z0-9._-]", "_", stem)) if one.lower() not in taken)
         layout = tables.Layout(message_class.DESCRIPTOR) if message_class is not None else None
-        sink = self._sink(self._out / file, layout.columns if layout is not None else tables.OTHER_COLUMNS)
-        return _Table(sink, layout, message_class, file)
+        sink = self._open_sink(name, layout.columns if layout is not None else tables.OTHER_COLUMNS)
+        return _Table(sink, layout, message_class, name)
 
     def close(self) -> None:
-        """End every file."""
+        """End every table."""
         for table in self.tables.values():
             table.sink.close()
 
 
-def export(rows: Iterable[Row], out: Path, sink: type[Sink]) -> Exported:
+def export(rows: Iterable[Row], out: Path, sink: type[FileSink]) -> Exported:
     """Write the tables of messages into an existing directory; raises OSError, FormatMissing."""
-    writing = _Export(out, sink)
+    return _export(rows, lambda name, columns: sink(out / f"{name}{sink.ending}", columns))
+
+
+def arrow_tables(rows: Iterable[Row]) -> tuple[dict[str, Any], Exported]:
+    """Return the pyarrow tables of messages by name; raises FormatMissing."""
+    sinks: dict[str, ArrowSink] = {}
+    exported = _export(rows, lambda name, columns: sinks.setdefault(name, ArrowSink(columns)))
+    return {name: sink.table() for name, sink in sinks.items()}, exported
+
+
+def _export(rows: Iterable[Row], open_sink: Callable[[str, Sequence[tables.Column]], Sink]) -> Exported:
+    writing = _Export(open_sink)
     try:
         writing.run(rows)
     finally:
@@ -184,11 +192,11 @@ def export(rows: Iterable[Row], out: Path, sink: type[Sink]) -> Exported:
     return Exported({table.name: table.rows for table in writing.tables.values()}, writing.undecoded)
 
 
-def _file_names(stem: str, ending: str) -> Iterator[str]:
-    yield f"{stem}{ending}"
+def _table_names(stem: str) -> Iterator[str]:
+    yield stem
     number = 2
     while True:
-        yield f"{stem}-{number}{ending}"
+        yield f"{stem}-{number}"
         number += 1
 
 

@@ -82,7 +82,7 @@ def overviews(root: Path) -> Iterator[SessionSummary]:
 def overview(path: Path) -> SessionSummary:
     """Summarize one session. Damage is part of the summary and no error."""
     try:
-        session = Session.open(path)
+        session = Session(path)
     except NoSession as error:
         files = [*path.glob(session_dir.SEGMENTS)] if path.is_dir() else [path]
         return SessionSummary(path.name, str(path), SessionState.UNREADABLE, str(error), bytes=_size(files))
@@ -103,7 +103,7 @@ def of_session(session: Session) -> SessionSummary:
                 span.add(chunk.first_ns, chunk.last_ns)
             continue
         cut.append(segment)
-        for info, _, log_ns, _, _ in Session(segment, (segment,), None).rows():
+        for info, _, log_ns, _, _ in session.part((segment,)).rows():
             counts[info.channel.topic] = counts.get(info.channel.topic, 0) + 1
             span.add(log_ns, log_ns)
     found.keys = dict(sorted(counts.items()))
@@ -194,7 +194,7 @@ def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]
     found: list[Mapping[str, Any]] = []
     decoder = MessageDecoder()
     marked = [key for key in about.keys if key.endswith(f"/{MARK_TOPIC_NAME}")]
-    for info, _, log_ns, _, data in session.rows(Selection.of(marked, None, None)) if marked else ():
+    for info, _, log_ns, _, data in session.rows(Selection(tuple(marked))) if marked else ():
         message: Any = decoder.message(info, data)
         if message is not None:
             text, by = getattr(message, "message", ""), getattr(message, "name", "")

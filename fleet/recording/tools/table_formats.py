@@ -1,12 +1,11 @@
-"""Writes tables as CSV with the standard library, or as Parquet with pyarrow, imported only then.
+"""Writes tables as CSV with the standard library, as Parquet or into memory with pyarrow, imported only then.
 
-Times are UTC with nanoseconds and without a zone, because readers treat zones differently. pandas, DuckDB and Polars
-all parse `2026-03-14 15:16:17.123456789` as a time.
+Times are UTC with nanoseconds and say so: `2026-03-14T15:16:17.123456789Z` in CSV, `timestamp[ns, UTC]` in Arrow.
 """
 
 import csv
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol
@@ -17,22 +16,29 @@ MAX_CACHED_SECONDS: Final = 4096
 """Maximum seconds cached as text."""
 
 
-class FormatMissing(Exception):
-    """The package of a format is not installed. The message says how to install it."""
+class FormatMissing(ImportError):
+    """A package of the extra `analysis` is not installed. The message says how to install it."""
+
+    def __init__(self, package: str) -> None:
+        super().__init__(f"{package} is not installed. Type: pip install 'zenoh-car-fleet[analysis]'", name=package)
 
 
 class Sink(Protocol):
-    """One table to write; every method may raise OSError."""
-
-    ending: ClassVar[str]
-
-    def __init__(self, path: Path, columns: Sequence[Column]) -> None: ...
+    """One table to fill; every method may raise OSError."""
 
     def add(self, values: Sequence[Values]) -> None:
         """Write rows: the values of each column."""
 
     def close(self) -> None:
-        """End the file."""
+        """End the table."""
+
+
+class FileSink(Sink, Protocol):
+    """One table to write to a file."""
+
+    ending: ClassVar[str]
+
+    def __init__(self, path: Path, columns: Sequence[Column]) -> None: ...
 
 
 class CsvSink:
@@ -44,16 +50,23 @@ class CsvSink:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._file)
         self._writer.writerow([column.name for column in columns])
-        self._texts = [_TO_TEXT.get(column.kind) for column in columns]
+        self._columns = columns
 
     def add(self, values: Sequence[Values]) -> None:
         """Write rows: the values of each column."""
-        columns = [column if text is None else text(column) for text, column in zip(self._texts, values, strict=True)]
-        self._writer.writerows(zip(*columns, strict=True))
+        self._writer.writerows(csv_cells(self._columns, values))
 
     def close(self) -> None:
         """End the file."""
         self._file.close()
+
+
+def csv_cells(columns: Sequence[Column], values: Sequence[Values]) -> Iterator[tuple[Any, ...]]:
+    """Return the rows of a CSV table from the values of its columns."""
+    texts = [_TO_TEXT.get(column.kind) for column in columns]
+    return zip(
+        *(column if text is None else text(column) for text, column in zip(texts, values, strict=True)), strict=True
+    )
 
 
 class _SecondTexts(dict[int, str]):
@@ -62,14 +75,14 @@ class _SecondTexts(dict[int, str]):
     def __missing__(self, second: int) -> str:
         if len(self) >= MAX_CACHED_SECONDS:
             self.clear()
-        words = self[second] = datetime.fromtimestamp(second, UTC).strftime("%Y-%m-%d %H:%M:%S")
+        words = self[second] = datetime.fromtimestamp(second, UTC).strftime("%Y-%m-%dT%H:%M:%S")
         return words
 
 
 def _times(column: Values) -> Values:
     seconds = _SecondTexts()
     try:
-        return [None if ns is None else f"{seconds[ns // 1_000_000_000]}.{ns % 1_000_000_000:09d}" for ns in column]
+        return [None if ns is None else f"{seconds[ns // 1_000_000_000]}.{ns % 1_000_000_000:09d}Z" for ns in column]
     except (OverflowError, ValueError, OSError):
         return column  # not a date: the clock of another writer was wrong
 
@@ -88,26 +101,27 @@ _TO_TEXT: Final[dict[ColumnKind, Callable[[Values], Values]]] = {
 """Converter to text by kind of column. The csv module formats the other kinds itself."""
 
 
-class ParquetSink:
-    """Parquet table, compressed with zstd. The metadata of a field contains its `unit`."""
+def import_pyarrow() -> Any:
+    """Return pyarrow; raises FormatMissing."""
+    try:
+        import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
+    except ImportError:
+        raise FormatMissing("pyarrow") from None
+    return pa
 
-    ending: ClassVar[str] = ".parquet"
 
-    def __init__(self, path: Path, columns: Sequence[Column]) -> None:
-        try:
-            import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
-            import pyarrow.parquet as pq  # type: ignore[import-untyped]  # likewise
-        except ImportError:
-            raise FormatMissing(
-                "Parquet needs pyarrow. Type: pip install 'zenoh-car-fleet[analysis]', or use --csv"
-            ) from None
+class ArrowSink:
+    """Arrow table in memory. The metadata of a field contains its `unit`. Raises FormatMissing without pyarrow."""
+
+    def __init__(self, columns: Sequence[Column]) -> None:
+        pa = import_pyarrow()
         kinds = {
             ColumnKind.FLOAT: pa.float64(),
             ColumnKind.INT: pa.int64(),
             ColumnKind.UINT: pa.uint64(),
             ColumnKind.BOOL: pa.bool_(),
             ColumnKind.BYTES: pa.binary(),
-            ColumnKind.TIME: pa.timestamp("ns"),
+            ColumnKind.TIME: pa.timestamp("ns", "UTC"),
         }
         made = {ColumnKind.LIST: pa.list_, ColumnKind.MAP: lambda item: pa.map_(pa.string(), item)}
         self._types = [
@@ -117,22 +131,50 @@ class ParquetSink:
             for column in columns
         ]
         self._maps = [column.kind is ColumnKind.MAP for column in columns]
-        self._array = pa.array
-        self._table = pa.Table.from_arrays
-        self._schema = pa.schema(
+        self._pa = pa
+        self._batches: list[Any] = []
+        self.schema = pa.schema(
             pa.field(column.name, kind, metadata={"unit": column.unit} if column.unit else None)
             for column, kind in zip(columns, self._types, strict=True)
         )
+
+    def add(self, values: Sequence[Values]) -> None:
+        """Add rows: the values of each column."""
+        self._batches.append(self.batch(values))
+
+    def batch(self, values: Sequence[Values]) -> Any:
+        """Return rows as an Arrow record batch."""
+        arrays = [
+            self._pa.array(
+                [None if value is None else list(value.items()) for value in column] if is_map else column, kind
+            )
+            for kind, is_map, column in zip(self._types, self._maps, values, strict=True)
+        ]
+        return self._pa.RecordBatch.from_arrays(arrays, schema=self.schema)
+
+    def table(self) -> Any:
+        """Return the rows as a pyarrow.Table."""
+        return self._pa.Table.from_batches(self._batches, self.schema)
+
+    def close(self) -> None:
+        """Keep the rows."""
+
+
+class ParquetSink:
+    """Parquet table, compressed with zstd."""
+
+    ending: ClassVar[str] = ".parquet"
+
+    def __init__(self, path: Path, columns: Sequence[Column]) -> None:
+        self._arrow = ArrowSink(columns)
+        from pyarrow import parquet
+
         self._file = path.open("wb")
-        self._writer = pq.ParquetWriter(self._file, self._schema, compression="zstd")
+        self._writer = parquet.ParquetWriter(self._file, self._arrow.schema, compression="zstd")
 
     def add(self, values: Sequence[Values]) -> None:
         """Write rows: the values of each column."""
-        arrays = [
-            self._array([list(value.items()) for value in column] if is_map else column, kind)
-            for kind, is_map, column in zip(self._types, self._maps, values, strict=True)
-        ]
-        self._writer.write_table(self._table(arrays, schema=self._schema))
+        self._writer.write_batch(self._arrow.batch(values))
 
     def close(self) -> None:
         """End the file."""
@@ -142,4 +184,4 @@ class ParquetSink:
             self._file.close()
 
 
-FORMATS: Final[dict[str, type[Sink]]] = {"csv": CsvSink, "parquet": ParquetSink}
+FORMATS: Final[dict[str, type[FileSink]]] = {"csv": CsvSink, "parquet": ParquetSink}

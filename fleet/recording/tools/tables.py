@@ -2,6 +2,7 @@
 
 Every table begins with the same columns. `car` comes from the key, so the field of a message is left out. A field with
 a unit has it in its name (`rx_bytes`, `uptime_s`), as in `fleet get --csv`. Values that were not measured are None.
+The request of a command has a column for each field (`request_motion`), None if another command was requested.
 """
 
 import json
@@ -10,16 +11,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from google.protobuf.descriptor import FieldDescriptor
-from google.protobuf.message import Message
+from google.protobuf.json_format import Parse, ParseError
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
 
-from fleet.recording.tools.csv_table import column_name
 from schemas import keys
-from schemas.topics import TOPICS
+from schemas.topics import PROTOBUF, TOPICS
 
 TIMESTAMP: Final = "google.protobuf.Timestamp"
+_UNIT_NAMES: Final = {"1": "", "B": "bytes"}
 _UNITS_BY_MESSAGE: Final[Mapping[str, Mapping[str, str]]] = {topic.message: topic.units for topic in TOPICS.values()}
 
 
@@ -55,8 +58,8 @@ Values = list[Any]
 COMMON_COLUMNS: Final = (
     Column("key", ColumnKind.TEXT),
     Column("car", ColumnKind.TEXT),
-    Column("log_time", ColumnKind.TIME, "UTC"),
-    Column("publish_time", ColumnKind.TIME, "UTC"),
+    Column("log_time", ColumnKind.TIME),
+    Column("publish_time", ColumnKind.TIME),
     Column("sequence", ColumnKind.UINT),
 )
 OTHER_COLUMNS: Final = (
@@ -90,8 +93,9 @@ class Layout:
         taken = {column.name for column in COMMON_COLUMNS}
         columns: list[Column] = []
         self._fillers: list[Callable[[Sequence[Any]], Values]] = []
+        self._requests = RequestColumns.of(descriptor)
         for field in descriptor.fields:
-            if field.name == "car":
+            if field.name == "car" or (self._requests is not None and field.name == RequestColumns.FIELD):
                 continue
             name = column_name(field.name, units.get(field.name, ""))
             while name in taken:
@@ -100,11 +104,84 @@ class Layout:
             column, filler = _column(field, name, units.get(field.name, ""))
             columns.append(column)
             self._fillers.append(filler)
-        self.columns = (*COMMON_COLUMNS, *columns)
+        self.columns = (*COMMON_COLUMNS, *columns, *(self._requests.columns if self._requests is not None else ()))
 
     def fill(self, messages: Sequence[Message]) -> list[Values]:
         """Return the values of the columns after the common ones."""
-        return [filler(messages) for filler in self._fillers]
+        own = [filler(messages) for filler in self._fillers]
+        return own if self._requests is None else own + self._requests.fill(messages)
+
+
+class RequestColumns:
+    """Columns for the fields of all commands, in place of the bytes of a command event's request."""
+
+    FIELD: Final = "request"
+
+    def __init__(self, descriptor: Any) -> None:
+        # The schema of the recording has the commands of its time.
+        commands = {
+            name.removesuffix("Command").lower(): command
+            for name, command in descriptor.file.message_types_by_name.items()
+            if name.endswith("Command")
+        }
+        self._classes = {verb: GetMessageClass(command) for verb, command in commands.items()}
+        event = {field.name for field in descriptor.fields}
+        fields: dict[str, Any] = {}
+        for field in (each for command in commands.values() for each in command.fields if each.name not in event):
+            fields.setdefault(field.name, field)
+        self.columns = [Column(f"{self.FIELD}_unreadable", ColumnKind.TEXT)]
+        """The first one has the request as text (else hexadecimal) if it is not the message of its verb."""
+        self._fillers: dict[str, Callable[[Sequence[Any]], Values]] = {}
+        for name, field in fields.items():
+            unit = name.rpartition("_")[2]
+            column, self._fillers[name] = _column(field, f"{self.FIELD}_{name}", unit if unit in _REQUEST_UNITS else "")
+            self.columns.append(column)
+
+    @classmethod
+    def of(cls, descriptor: Any) -> Self | None:
+        """Return the columns for messages of this type; None if it is no event of a command."""
+        return cls(descriptor) if descriptor.full_name == TOPICS["event/command"].message else None
+
+    def fill(self, events: Sequence[Any]) -> list[Values]:
+        """Return the values of the columns."""
+        rows = [self._row(event) for event in events]
+        return [list(column) for column in zip(*rows, strict=True)] if rows else [[] for _ in self.columns]
+
+    def _row(self, event: Any) -> Values:
+        request = self._parse(event)
+        if request is None:
+            return [text_or_hex(event.request) or None, *(None for _ in self._fillers)]
+        fields = request.DESCRIPTOR.fields_by_name
+        return [None, *(fill([request])[0] if name in fields else None for name, fill in self._fillers.items())]
+
+    def _parse(self, event: Any) -> Message | None:
+        message_class = self._classes.get(event.verb)
+        if message_class is None or not event.request:
+            return None
+        try:
+            if event.request_encoding.startswith(PROTOBUF):
+                return message_class.FromString(event.request)
+            return Parse(event.request, message_class())
+        except (DecodeError, ParseError, UnicodeDecodeError):
+            return None
+
+
+_REQUEST_UNITS: Final = ("s", "deg")
+
+
+def text_or_hex(payload: bytes) -> str:
+    """Return UTF-8 as text, other bytes as hexadecimal."""
+    try:
+        return payload.decode()
+    except UnicodeDecodeError:
+        return payload.hex()
+
+
+def column_name(name: str, unit: str, index: int | None = None) -> str:
+    """Return the column name of a field: with the number of a list item, and with its unit unless the name has it."""
+    unit = _UNIT_NAMES.get(unit, unit).lower()
+    numbered = name if index is None else f"{name}_{index + 1}"
+    return numbered if not unit or name.endswith(f"_{unit}") or name == unit else f"{numbered}_{unit}"
 
 
 def car_of(key: str) -> str:
@@ -143,7 +220,7 @@ def _column(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Sequenc
             json.dumps([plain(value) if kind is ColumnKind.JSON else convert(value) for value in get(message)])
             for message in messages
         ]
-    column = Column(name, kind, unit or ("UTC" if kind is ColumnKind.TIME else ""))
+    column = Column(name, kind, unit)
     if kind is ColumnKind.JSON:
         return column, lambda messages: [
             json.dumps(plain(get(message))) if message.HasField(field.name) else None for message in messages

@@ -138,7 +138,7 @@ def _describe(session: Session, new: Path, count: int, origin: Mapping[str, obje
     """Write `session.json`, and copy the other files of the old session."""
     first = last = None
     fleet = ""
-    for index in Session.open(new).indexes().values():
+    for index in Session(new).indexes().values():
         if index is not None and index.statistics is not None:
             first = index.statistics.message_start_time if first is None else first
             last = index.statistics.message_end_time

@@ -8,8 +8,8 @@ from google.protobuf.message import Message
 
 from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
-from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema
-from fleet.recording.reading.session import Session, message_of
+from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema, message_of
+from fleet.recording.reading.session import Session
 from fleet.recording.sequence_tracker import PublisherSequence
 from fleet.recording.tools.transform import lost_words
 from schemas import keys

@@ -49,7 +49,7 @@ def _predecessors(session: Session, start_ns: int) -> list[Session]:
         if not name or Path(name).name != name:
             break
         try:
-            earlier = Session.open(session.path.parent / name)
+            earlier = Session(session.path.parent / name)
         except NoSession:
             break
         if earlier.description is None or earlier.path in [each.path for each in found]:
@@ -73,7 +73,7 @@ def _find_latest(root: Path, fleet: str, now_ns: int) -> Session | None:
         if description.closed or description.ended is not None:
             return None
         try:
-            session = Session.open(path.parent)
+            session = Session(path.parent)
             written_ns = session.segments[-1].stat().st_mtime_ns
         except (NoSession, OSError):
             return None

@@ -66,7 +66,7 @@ def written(path: Path) -> Original:
     chunks = tuple(
         (each.chunk_start_offset, each.chunk_start_offset + each.chunk_length) for each in summary.chunk_indexes
     )
-    session = Session.open(path)
+    session = Session(path)
     session.check()
     assert not session.damage_words
     found = tuple(session.messages())
@@ -87,7 +87,7 @@ def judge(original: Original, data: bytes, first: int, path: Path) -> list[Recor
     put(path, data)
     tracemalloc.start()
     try:
-        session = Session.open(path)
+        session = Session(path)
         session.check()
         checked = session.damage_words
         shown = list(session.messages())

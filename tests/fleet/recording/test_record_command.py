@@ -43,7 +43,7 @@ def test_a_signal_closes_the_session_whole(number: signal.Signals, endpoint: str
     end = json.loads(text)
     assert end["state"] == "closed"
     assert end["drops"] == end["missed"] == {}
-    opened = Session.open(session)
+    opened = Session(session)
     numbers = [message.sequence for message in opened.messages() if message.key == out.key]
     assert numbers == list(range(1, 101))
     opened.check()
@@ -70,7 +70,7 @@ def test_killed_it_loses_at_most_the_last_second(endpoint: str, bus: Bus, tmp_pa
     wait_for(told_often, "it says how many it has")
     process.kill()
     process.communicate(timeout=60)
-    opened = Session.open(session)
+    opened = Session(session)
     rows = list(opened.messages())
     numbers = [message.sequence for message in rows if message.key == out.key]
     assert numbers == list(range(1, len(numbers) + 1))
@@ -99,7 +99,7 @@ def test_a_full_disk_is_said_and_what_was_written_stays(endpoint: str, bus: Bus,
     assert str(session) in line
     assert "File too large" in line
     wait_for(lambda: "failed" in states, "that on the bus")
-    opened = Session.open(session)
+    opened = Session(session)
     numbers = [message.sequence for message in opened.messages() if message.key == out.key]
     assert len(numbers) > 50
     assert numbers == list(range(1, len(numbers) + 1))

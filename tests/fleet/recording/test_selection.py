@@ -39,7 +39,7 @@ def session(request: pytest.FixtureRequest, tmp_path: Path) -> Session:
         path.write_bytes(data[:-40] + b"\xff" * 8 + data[-32:])
     if request.param == "several":
         write(tmp_path / "0002.mcap", first=CHUNKS * PER_CHUNK)
-    return Session.open(tmp_path)
+    return Session(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -77,14 +77,14 @@ def test_what_is_not_needed_is_not_read(tmp_path: Path) -> None:
     """Every other chunk is damaged: whoever reads one says so."""
     path = tmp_path / "0001.mcap"
     write(path)
-    index = next(iter(Session.open(tmp_path).indexes().values()))
+    index = next(iter(Session(tmp_path).indexes().values()))
     assert index is not None
     data = bytearray(path.read_bytes())
     for number, place in enumerate(index.chunks):
         if number != 7:
             data[place.at + place.length - 3] ^= 1
     path.write_bytes(data)
-    session = Session.open(tmp_path)
+    session = Session(tmp_path)
     assert len(list(session.messages(start_ns=7 * PER_CHUNK, end_ns=8 * PER_CHUNK))) == PER_CHUNK + 1
     assert [one.payload for one in session.messages(keys=["fleet/green/event/log"])] == [b"rare"]
     assert not session.damage

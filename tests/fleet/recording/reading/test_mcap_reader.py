@@ -133,11 +133,11 @@ def test_a_file_whose_first_bytes_are_damaged_is_no_other_kind_of_file(
     path = tmp_path / "x.mcap"
     length = len(original.data) - cut
     put(path, flipped(original.data, at, chance(at))[:length])
-    session = Session.open(path)
+    session = Session(path)
     assert list(session.messages()) == original.until(length)
     assert "byte 0: the magic bytes of the beginning are damaged" in session.damage_words
     put(path, bytes(60) + original.data[60:length])  # nor if more than those are
-    assert list(Session.open(path).messages()) == original.until(length)
+    assert list(Session(path).messages()) == original.until(length)
 
 
 def test_what_looks_like_chunks_and_is_none_takes_no_time(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_what_looks_like_chunks_and_is_none_takes_no_time(tmp_path: Path) -> Non
         parts.append(struct.pack("<BQQQQII4sQ", 6, length, 1, 2, 2**20, 7, 4, b"zstd", length - 44) + bytes(4))
     path.write_bytes(b"".join(parts).ljust(size, b"x"))
     began = time.process_time()
-    assert list(Session.open(path).messages()) == []
+    assert list(Session(path).messages()) == []
     assert time.process_time() - began < 20
 
 
@@ -296,7 +296,7 @@ def test_what_was_described_in_a_lost_chunk_is_said(original: Original, tmp_path
     shown = judge(original, data, begin, path)
     assert shown
     assert {message.key for message in shown} == {"fleet/blue/note"}
-    session = Session.open(path)
+    session = Session(path)
     session.check()
     list(session.messages())
     assert "described in what is lost" in session.damage_words
@@ -358,7 +358,7 @@ def test_any_record_anywhere_gives_no_surprise(
         salvage.check()
         assert salvage.words
         before = original.until(at)
-        shown = list(Session.open(path).messages())
+        shown = list(Session(path).messages())
         assert set(before) <= set(shown)
 
 
@@ -371,12 +371,12 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
             McapReader(path)
     for path in (tmp_path / "fifo.mcap", tmp_path / "loop.mcap", Path(os.devnull), tmp_path / ("n" * 300)):
         with pytest.raises(NoSession) as caught:
-            Session.open(path)
+            Session(path)
         assert str(path) in str(caught.value)
     for name in ("0001.mcap", "0002.mcap"):
         os.mkfifo(tmp_path / name)
     with pytest.raises(NoSession, match=r"0001\.mcap is not a regular file; .*0002\.mcap is not"):
-        Session.open(tmp_path)
+        Session(tmp_path)
 
 
 @contextmanager
@@ -407,7 +407,7 @@ def test_what_must_not_be_read_is_said(original: Original, tmp_path: Path) -> No
         with no_superuser(tmp_path):
             for path in (file, locked, locked / "0001.mcap"):
                 with pytest.raises(NoSession, match="Permission denied") as caught:
-                    Session.open(path)
+                    Session(path)
                 assert str(path) in str(caught.value)
     finally:
         locked.chmod(0o700)

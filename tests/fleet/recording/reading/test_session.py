@@ -27,7 +27,7 @@ def test_a_file_that_is_none_hides_no_other(tmp_path: Path) -> None:
     (tmp_path / "0002.mcap").write_bytes(b"")
     (tmp_path / "0003.mcap").mkdir()
     (tmp_path / "0005.mcap").write_bytes(mcap(3)[:-20])
-    session = Session.open(tmp_path)
+    session = Session(tmp_path)
     assert [message.sequence for message in session.messages()] == [1, 2, 3]
     rescued = session.rescue(tmp_path / "rescued.mcap")
     assert [message.sequence for message in rescued.messages()] == [1, 2, 3]
@@ -48,7 +48,7 @@ def test_a_file_that_is_none_hides_no_other(tmp_path: Path) -> None:
 def test_a_session_of_which_nothing_is_whole_is_refused_with_the_cause(tmp_path: Path) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1)[:40])
     with pytest.raises(NoSession, match=r"holds no message that is whole: .*0001\.mcap is cut .*: byte 8: "):
-        Session.open(tmp_path).rescue(tmp_path / "rescued.mcap")
+        Session(tmp_path).rescue(tmp_path / "rescued.mcap")
 
 
 WRONG = [
@@ -63,7 +63,7 @@ WRONG = [
 def test_a_description_that_cannot_be_read_hides_no_message(tmp_path: Path, text: str) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1))
     (tmp_path / "session.json").write_text(text)
-    session = Session.open(tmp_path)
+    session = Session(tmp_path)
     assert session.description is None
     assert [message.sequence for message in session.messages()] == [1]
 
@@ -71,7 +71,7 @@ def test_a_description_that_cannot_be_read_hides_no_message(tmp_path: Path, text
 def test_a_description_that_is_a_device_is_not_waited_for(tmp_path: Path) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1))
     os.mkfifo(tmp_path / "session.json")
-    assert Session.open(tmp_path).description is None
+    assert Session(tmp_path).description is None
 
 
 @pytest.mark.parametrize(
@@ -83,22 +83,22 @@ def test_what_is_no_session_says_why(content: bytes | None, words: str, tmp_path
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(NoSession, match=words) as caught:
-        Session.open(path)
+        Session(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_an_empty_directory_and_a_newer_format_are_refused(tmp_path: Path) -> None:
     with pytest.raises(NoSession, match=r"no 0001\.mcap"):
-        Session.open(tmp_path)
+        Session(tmp_path)
     (tmp_path / "0001.mcap").write_bytes(mcap(1))
     (tmp_path / "session.json").write_text(
         '{"fleet": "fleet", "started": "", "host": "", "versions": {}, "format": 99}'
     )
     with pytest.raises(NoSession, match=r"format 99.*update zenoh-car-fleet.* as .*0001\.mcap"):
-        Session.open(tmp_path)
+        Session(tmp_path)
     # Nor is it read when what else it says cannot be understood by now.
     (tmp_path / "session.json").write_text('{"format": 99, "messages": {"red": 3}}')
     with pytest.raises(NoSession, match="format 99"):
-        Session.open(tmp_path)
-    assert len([*Session.open(tmp_path / "0001.mcap").messages()]) == 1
+        Session(tmp_path)
+    assert len([*Session(tmp_path / "0001.mcap").messages()]) == 1

@@ -131,7 +131,7 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
         wait_for(lambda: status(bus).bytes > 300 * 2000, "that is in the file")
         there.fill()
         publish_until("full")
-        before = {message.sequence for message in Session.open(session).messages() if message.key == out.key}
+        before = {message.sequence for message in Session(session).messages() if message.key == out.key}
         assert set(range(1, 301)) <= before
         found = fleet(endpoint, "record", "status")
         assert found.returncode == 0
@@ -145,20 +145,20 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
         process.send_signal(signal.SIGTERM)
         text, errors = process.communicate(timeout=60)
         end = json.loads(text)
-        numbers = [message.sequence for message in Session.open(session).messages() if message.key == out.key]
+        numbers = [message.sequence for message in Session(session).messages() if message.key == out.key]
         # What came meanwhile was held, and is here, too.
         assert numbers == list(range(1, sent + 1))
         assert (process.returncode, end["drops"], end["missed"]) == (0, {}, {})
         assert "nothing is written until there is room" in errors
         assert "there is room again" in errors
-        verdict = verify(Session.open(session))
+        verdict = verify(Session(session))
         assert (verdict.missing, verdict.twice, verdict.closed) == ([], [], True)
         # Nearly full, a file is closed in time; where there is no room at all, not even its index can be written.
         assert list(verdict.damage) == ([] if kind == "keep free" else ["0001.mcap"])
 
 
 def holds(session: Path, key: str) -> list[int]:
-    return [message.sequence for message in Session.open(session).messages() if message.key == key]
+    return [message.sequence for message in Session(session).messages() if message.key == key]
 
 
 @pytest.mark.parametrize("kind", DISKS)
@@ -195,11 +195,11 @@ def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_dro
         dropped = end["drops"].get(out.key, 0)
         assert description.drops == end["drops"]
         assert len(holds(session, out.key)) + dropped == sent
-        assert description.messages == end["messages"] == sum(1 for _ in Session.open(session).messages())
+        assert description.messages == end["messages"] == sum(1 for _ in Session(session).messages())
         assert not (session / session_dir.SPARE_FILE).exists()
         if kind == "keep free":  # there was room, which only was to stay free
             assert (process.returncode, dropped) == (0, 0)
-            assert verify(Session.open(session)).whole
+            assert verify(Session(session)).whole
         else:
             assert process.returncode == 1
             total = sum(end["drops"].values())
@@ -230,7 +230,7 @@ def test_a_disk_that_is_full_at_the_start_is_waited_for_and_nothing_is_left_lyin
         end = json.loads(text)
         assert (process.returncode, end["session"], end["drops"]) == (0, str(session), {})
         assert holds(session, out.key) == list(range(1, 101))
-        opened = Session.open(session)
+        opened = Session(session)
         assert verify(opened).whole
         assert opened.description is not None
         assert [mark["text"] for mark in opened.description.marks] == ["full"]
@@ -250,14 +250,14 @@ def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_noth
         text, errors = process.communicate(timeout=60)
         if kind == "keep free":
             assert process.returncode == 0
-            assert verify(Session.open(session)).whole
+            assert verify(Session(session)).whole
             return
         assert process.returncode == 1
         dropped = sum(json.loads(text)["drops"].values())
         assert f"no room to the end: {dropped} messages that waited for it are dropped" in errors.splitlines()[-1]
         assert list(there.root.glob("*")) == []
         with pytest.raises(NoSession):
-            Session.open(session)
+            Session(session)
 
 
 @pytest.mark.skipif(not MAY_MOUNT, reason="may not mount a disk of its own")
@@ -277,7 +277,7 @@ def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing
             tape.tick(BEGUN_NS + second * SECOND_NS)
             written.append(tape.messages - tape.waiting)
         assert 0 < written[-1] < 1500
-        assert all(any(Session.open(segment).messages()) for segment in tape.path.glob("000[2-9].mcap"))
+        assert all(any(Session(segment).messages()) for segment in tape.path.glob("000[2-9].mcap"))
         assert tape.segments < 4
         description = session_dir.SessionInfo.read(tape.path)
         assert description is not None
@@ -287,7 +287,7 @@ def test_what_waits_is_written_as_there_is_room_and_no_file_is_begun_for_nothing
         assert not tape.full
         tape.close(BEGUN_NS + 11 * SECOND_NS)
         assert (tape.drops, tape.cost) == ({}, "")
-        times = [message.recorded_ns for message in Session.open(tape.path).messages()]
+        times = [message.recorded_ns for message in Session(tape.path).messages()]
         assert times == [BEGUN_NS + second * SECOND_NS + number for second in range(3) for number in range(500)]
 
 
@@ -311,7 +311,7 @@ def test_a_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Pat
     assert Path(json.loads(text)["session"]) != session
     assert f"{session} was removed" in errors
     assert errors.count("more than its quota") <= 2  # told when it begins, not with every figure
-    assert all(verify(Session.open(path)).whole for path in tmp_path.iterdir())
+    assert all(verify(Session(path)).whole for path in tmp_path.iterdir())
 
 
 def test_a_directory_that_vanishes_is_said_and_ends_the_recorder(endpoint: str, bus: Bus, tmp_path: Path) -> None:
@@ -345,7 +345,7 @@ def test_it_is_stopped_started_and_marked_over_the_bus(endpoint: str, bus: Bus, 
     assert fleet(endpoint, "record", "start").stderr.startswith("fleet: the recorder says: fleet 'fleet' is being")
     stopped = fleet(endpoint, "record", "stop")
     assert stopped.stdout.startswith(f"stopped: {first}")
-    assert verify(Session.open(first)).whole
+    assert verify(Session(first)).whole
     refused = fleet(endpoint, "mark", "nobody hears it")
     assert refused.returncode == 1
     assert "nothing is being recorded" in refused.stderr
@@ -356,11 +356,11 @@ def test_it_is_stopped_started_and_marked_over_the_bus(endpoint: str, bus: Bus, 
     process.send_signal(signal.SIGTERM)
     text, _ = process.communicate(timeout=60)
     assert json.loads(text)["session"] == str(second)
-    description = Session.open(first).description
+    description = Session(first).description
     assert description is not None
     assert description.kept
     assert [(mark["text"], mark["by"]) for mark in description.marks] == [("the cat came", "me")]
-    marks = [message for message in Session.open(first).messages() if message.key == "fleet/@recorder/mark"]
+    marks = [message for message in Session(first).messages() if message.key == "fleet/@recorder/mark"]
     assert len(marks) == 1
     assert marks[0].message == "foxglove.Log"
 

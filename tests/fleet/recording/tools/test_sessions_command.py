@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from fleet.recording import open_session, session_dir
+from fleet.recording import session_dir
 from fleet.recording.reading.mcap_scan import MAGIC
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools.transform import recover
@@ -97,12 +97,12 @@ def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     expected = [
         one
-        for one in open_session(session).messages()
+        for one in Session(session).messages()
         if one.recorded_ns >= 1_790_000_000_001_000_001 + 50_000_000
         and one.recorded_ns < 1_790_000_000_000_000_000 + len(every_type.keys_and_types()) * 4 * 1_000_001 - 20_000_000
     ]
     assert expected
-    assert list(open_session(out).messages()) == expected
+    assert list(Session(out).messages()) == expected
     assert (out / "fleet.yaml").exists()
     assert "cut of 20260921T141320Z-fleet" in fleet("info", out).stdout
     with (out / "0001.mcap").open("rb") as file:  # the stock reader takes it
@@ -163,7 +163,7 @@ def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -
     out = session.with_name(f"{session.name}-recovered")
     assert done.returncode == 0
     assert "; lost: " in done.stdout
-    assert list(open_session(out).messages()) == list(open_session(session).messages())
+    assert list(Session(out).messages()) == list(Session(session).messages())
     description = session_dir.SessionInfo.read(out)
     assert description is not None
     assert description.closed
@@ -216,7 +216,7 @@ def test_a_foreign_recording_is_looked_into_and_exported(tmp_path: Path) -> None
 def test_messages_that_do_not_fit_their_schema_are_kept_as_bytes(session: Path, tmp_path: Path) -> None:
     (session / "0001.mcap").unlink()
     original = written(session / "0001.mcap")
-    source = Session.open(session)
+    source = Session(session)
     out = tmp_path / "bent.mcap"
     with out.open("wb") as file:
         writer = Writer(file)
@@ -265,7 +265,7 @@ def test_who_is_interrupted_leaves_nothing_half_done(session: Path, tmp_path: Pa
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        recover(Session.open(session), tmp_path / "out", interrupted)  # type: ignore[arg-type]  # the same
+        recover(Session(session), tmp_path / "out", interrupted)  # type: ignore[arg-type]  # the same
     assert sorted(path.name for path in tmp_path.iterdir()) == ["all"]
 
 
@@ -289,9 +289,9 @@ def test_cut_or_damaged_anywhere_every_whole_chunk_is_recovered(
     (path / "0001.mcap").write_bytes(broken)
     if at < len(MAGIC) and len(broken) < len(whole):
         with pytest.raises(NoSession, match=re.escape(str(path))):
-            Session.open(path)
+            Session(path)
         return
-    session = Session.open(path)
+    session = Session(path)
     verdict = verify(session)
     if not verdict.messages:
         assert at < original.chunks[0][1]
@@ -300,7 +300,7 @@ def test_cut_or_damaged_anywhere_every_whole_chunk_is_recovered(
         return
     count, words = recover(session, out)
     assert not verdict.whole
-    recovered = open_session(out)
+    recovered = Session(out)
     recovered.check()
     assert not recovered.damage
     shown = list(recovered.messages())

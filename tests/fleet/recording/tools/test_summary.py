@@ -45,7 +45,7 @@ def test_what_was_made_of_a_damaged_one_says_how_much_is_missing(tmp_path: Path)
     old, new, again = tmp_path / "old", tmp_path / "new", tmp_path / "again"
     write(old, [[1, 2], [3, 4, 5], [6]])
     data = bytearray((old / "0001.mcap").read_bytes())
-    index = Session.open(old).indexes()[old / "0001.mcap"]
+    index = Session(old).indexes()[old / "0001.mcap"]
     assert index is not None
     place = index.chunks[1]
     data[place.at + place.length - 2] ^= 1
@@ -117,7 +117,7 @@ def test_what_is_being_recorded_is_not_called_damaged(tmp_path: Path) -> None:
     assert "is being recorded, nothing is missing until now" in result.output
     assert "damage" not in result.output
     assert result.exit_code == 0
-    assert not growing(Session.open(path))()
+    assert not growing(Session(path))()
     killed = run("verify", path)
     assert killed.exit_code == 1
     assert "the recorder did not close it" in killed.output

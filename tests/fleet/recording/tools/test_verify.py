@@ -49,7 +49,7 @@ class Written:
     def verdict(self) -> SessionVerdict:
         self._writer.finish()
         self._file.close()
-        return verify(Session.open(Path(self._file.name)))
+        return verify(Session(Path(self._file.name)))
 
 
 @pytest.fixture

@@ -240,10 +240,10 @@ def test_a_flush_each_second_puts_a_young_session_on_the_disk(endpoint: str, bus
         out.put(pb.Range(range_m=1.0), time.time_ns())
 
         def held() -> list[str]:
-            return [message.key for message in Session.open(session).messages() if message.key == out.key]
+            return [message.key for message in Session(session).messages() if message.key == out.key]
 
         def damage() -> str:
-            opened = Session.open(session)
+            opened = Session(session)
             opened.check()
             return opened.damage_words
 

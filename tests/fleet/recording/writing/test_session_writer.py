@@ -26,7 +26,7 @@ def feed(tape: SessionWriter, at_ns: int, count: int = 10, size: int = 1000) -> 
 
 
 def payloads(paths: Iterable[Path]) -> int:
-    return sum(message.key == "fleet/red/note" for path in paths for message in Session.open(path).messages())
+    return sum(message.key == "fleet/red/note" for path in paths for message in Session(path).messages())
 
 
 @pytest.mark.parametrize("sync", list(Sync))
@@ -36,7 +36,7 @@ def test_a_file_ends_at_its_size_and_none_is_begun_for_nothing(tmp_path: Path, s
         feed(tape, BEGUN_NS + second * SECOND_NS, count=20)
         tape.tick(BEGUN_NS + second * SECOND_NS)
     tape.close(BEGUN_NS + 20 * SECOND_NS)
-    session = Session.open(tape.path)
+    session = Session(tape.path)
     assert 3 < len(session.segments) == tape.segments < 10
     assert all(segment.stat().st_size < 200_000 for segment in session.segments)
     verdict = verify(session)
@@ -52,7 +52,7 @@ def test_a_file_ends_at_its_time(tmp_path: Path) -> None:
         tape.tick(BEGUN_NS + second * SECOND_NS)
     tape.close(BEGUN_NS + 12 * SECOND_NS)
     assert tape.segments == 3
-    assert verify(Session.open(tape.path)).whole
+    assert verify(Session(tape.path)).whole
 
 
 def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
@@ -62,10 +62,10 @@ def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
         tape.tick(BEGUN_NS + second * SECOND_NS)
     tape.close(BEGUN_NS + 12 * SECOND_NS)
     found = json.loads((tape.path / session_dir.INDEX_FILE).read_text())["segments"]
-    assert [one["file"] for one in found] == [path.name for path in Session.open(tape.path).segments]
-    assert [one["bytes"] for one in found] == [path.stat().st_size for path in Session.open(tape.path).segments]
+    assert [one["file"] for one in found] == [path.name for path in Session(tape.path).segments]
+    assert [one["bytes"] for one in found] == [path.stat().st_size for path in Session(tape.path).segments]
     for one in found:
-        rows = [(m.recorded_ns, m.key) for m in Session.open(tape.path / one["file"]).messages()]
+        rows = [(m.recorded_ns, m.key) for m in Session(tape.path / one["file"]).messages()]
         assert (one["first_ns"], one["last_ns"]) == (rows[0][0], rows[-1][0])
         assert one["messages"] == one["keys"]["fleet/red/note"]["count"] == len(rows)
 
@@ -76,7 +76,7 @@ def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> Non
         feed(tape, BEGUN_NS + second * SECOND_NS)
         tape.tick(BEGUN_NS + second * SECOND_NS)
     tape.close(BEGUN_NS - 3598 * SECOND_NS)
-    verdict = verify(Session.open(tape.path))
+    verdict = verify(Session(tape.path))
     assert verdict.whole
     assert verdict.messages == 50
     assert [round(one["step_s"]) for one in verdict.backwards] == [3602]
@@ -103,7 +103,7 @@ def test_a_session_that_has_enough_begins_no_other_file(limit: dict[str, Any], t
     assert tape.over
     tape.close(BEGUN_NS)
     assert [path.name for path in sorted(tape.path.glob("*.mcap"))] == ["0001.mcap"]
-    assert verify(Session.open(tape.path)).whole
+    assert verify(Session(tape.path)).whole
 
 
 def session(root: Path, number: int, *, closed: bool = True) -> Path:
@@ -162,4 +162,4 @@ def test_files_are_copied_into_each_session(tmp_path: Path) -> None:
     )
     assert after.uncopied == [f"{plan} could not be copied into {after.path}: No such file or directory"]
     after.close(BEGUN_NS + SECOND_NS)
-    assert verify(Session.open(after.path)).whole
+    assert verify(Session(after.path)).whole

@@ -135,7 +135,7 @@ def test_its_frames_are_decoded_as_they_were(recorded: Path) -> None:
 def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "part"
     # A plan is published again every ten seconds: between the first two times there is none.
-    first, second, *_ = (each.recorded_ns for each in Session.open(recorded).messages(["fleet/@coordinator/plan"]))
+    first, second, *_ = (each.recorded_ns for each in Session(recorded).messages(["fleet/@coordinator/plan"]))
     between = ("--from", time_spec.iso(first + S), "--to", time_spec.iso(second))
     assert run("sessions", "cut", recorded, *between, "--out", out).exit_code == 0
     assert "has no plan: name one with --plan" in run("replan", out).output

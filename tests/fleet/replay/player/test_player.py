@@ -82,7 +82,7 @@ def test_all_of_it_comes_again_as_it_was(fleet: FleetProcesses, session: Path) -
     assert player.wait() == 0
     lines = player.lines()
     then: dict[str, list[Recorded]] = {}
-    for one in Session.open(session).messages():
+    for one in Session(session).messages():
         if "/@supervisor/" not in one.key:
             then.setdefault(one.key.replace("fleet/", "again/", 1), []).append(one)
     wait_for(lambda: len(got) == sum(map(len, then.values())), "all has come")
@@ -218,7 +218,7 @@ def test_commands_of_a_recording_are_not_given_again(fleet: FleetProcesses, tmp_
     assert got == ["fleet-replay/red/sensor/range"]
     # Neither is it taken out of the recording, nor would it be published if it were.
     player = Player(fleet.bus, "direct", "")
-    player.play(Session.open(tmp_path / "driven.mcap").messages(), Schedule(), 0.0, lambda: False, lambda _: None)
+    player.play(Session(tmp_path / "driven.mcap").messages(), Schedule(), 0.0, lambda: False, lambda _: None)
     assert player.published == 1
 
 

@@ -33,18 +33,18 @@ def test_the_made_session_has_every_message_type(made: tuple[Path, Counter[str]]
 def test_the_rrd_holds_every_message_and_its_layout(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     path, counts = made
     out = tmp_path / "out.rrd"
-    assert export.export(Session.open(path), out) == counts
+    assert export.export(Session(path), out) == counts
     assert export.rows(out) == counts
     reader = rrc.RrdReader(out)
     (recording,), (layout,) = reader.recordings(), reader.blueprints()
     assert recording.application_id == layout.application_id == export.APPLICATION
-    assert recording.recording_id == Session.open(path).name
+    assert recording.recording_id == Session(path).name
     assert list(tmp_path.iterdir()) == [out]
 
 
 def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
-    export.export(Session.open(made[0]), out)
+    export.export(Session(made[0]), out)
     texts: list[str] = []
     lanes: dict[str, list[object]] = {}
     for chunk in rrc.RrdReader(out).store().stream():
@@ -57,14 +57,14 @@ def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]
                     lanes.setdefault(name, []).extend(row[0] for row in batch.column(name).to_pylist())
     assert "red  drive  asked  forward for 3 s  by ann" in texts
     assert "red  drive  sent  by ann" in texts
-    messages = [m for m in Session.open(made[0]).messages() if m.key == "fleet/red/state/mode"]
+    messages = [m for m in Session(made[0]).messages() if m.key == "fleet/red/state/mode"]
     assert len(lanes["mode asked"]) == len(lanes["mode inferred"]) == len(messages)
     assert set(lanes["mode inferred"]) == {"manual", "tracking", "unknown"}
 
 
 def test_lanes_say_what_was_so_and_for_how_long(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
-    export.export(Session.open(made[0]), out)
+    export.export(Session(made[0]), out)
     lanes: dict[tuple[str, str], list[tuple[float, object]]] = {}
     for chunk in rrc.RrdReader(out).store().stream():
         batch = chunk.to_record_batch()
@@ -128,7 +128,7 @@ def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None
     path = tmp_path / "0001.mcap"
     make(path, writer=Flushing)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    session = Session.open(tmp_path)
+    session = Session(tmp_path)
     whole = Counter(message.key for message in session.messages())
     assert sum(whole.values()) > 100
     out = tmp_path / "out.rrd"
@@ -241,7 +241,7 @@ def test_ctrl_c_does_not_blame_the_recording(
         monkeypatch.setattr(lenses, "_words", interrupt)
     with pytest.raises(KeyboardInterrupt):
         export.export(
-            Session.open(made[0]), tmp_path / "out.rrd", seen=interrupt if where == "between chunks" else lambda _: None
+            Session(made[0]), tmp_path / "out.rrd", seen=interrupt if where == "between chunks" else lambda _: None
         )
     assert list(tmp_path.iterdir()) == []
 
@@ -254,7 +254,7 @@ def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
         writer.start()
         writer.finish()  # type: ignore[no-untyped-call]
     with pytest.raises(NoSession, match="holds no message"):
-        export.export(Session.open(tmp_path), tmp_path / "out.rrd")
+        export.export(Session(tmp_path), tmp_path / "out.rrd")
 
 
 def test_nothing_is_written_outside(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:

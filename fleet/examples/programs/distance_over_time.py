@@ -1,0 +1,16 @@
+"""Plot the distances of a session: `python -m fleet.examples.programs.distance_over_time latest red distance.png`."""
+
+import sys
+
+from fleet import Session
+
+
+def main(session: str, car: str, picture: str) -> None:
+    """Save the picture. A point is a reading; the line has a gap where there was no echo."""
+    frame = Session(session).to_pandas(f"{car}/sensor/range")
+    plot = frame.plot(x="publish_time", y="range_m", marker=".", xlabel="time (UTC)", ylabel="distance (m)")
+    plot.figure.savefig(picture)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,109 @@
+"""Tables of a session for pyarrow and pandas, which are imported only then: conversion, and joins by car and time."""
+
+import difflib
+import math
+import warnings
+from bisect import bisect_right
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Final
+
+from fleet.recording.reading.mcap_reader import Row
+from fleet.recording.tools.export import OTHER_TABLE, arrow_tables
+from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import_pyarrow
+from fleet.recording.tools.tables import Layout
+from schemas import messages, topics
+from schemas.commands import COMMANDS
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
+
+TIME: Final = "publish_time"
+"""Column by which tables are sorted and joined. All messages of a car have it from the clock of its gateway."""
+_NOT_JOINED: Final = frozenset({"key", "car", "log_time", "sequence", "seq", "boot_id"})
+
+
+class NoTable(ValueError):
+    """A name that selects no table, or several. The text lists the likely names."""
+
+
+def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
+    """Return the only table of these messages, sorted by publish_time. Raises NoTable, FormatMissing.
+
+    of, session: the names for errors. If `of` is a topic or a message of ours, the table may be empty.
+    """
+    tables, exported = arrow_tables(rows)
+    if exported.undecoded:
+        warnings.warn(
+            f"{exported.undecoded} messages of {session} do not match their schema and are left out", stacklevel=3
+        )
+    other = tables.pop(OTHER_TABLE, None)
+    if not tables:
+        tables = {of: other if other is not None and not exported.undecoded else _empty_table(of, session)}
+    # A type whose fields changed within the session has several tables.
+    types = sorted({name.partition("-")[0] for name in tables})
+    if len(types) > 1:
+        raise NoTable(f"{of} selects several types of messages: name one of {', '.join(types)}")
+    first, *rest = tables.values()
+    if rest:
+        first = import_pyarrow().concat_tables([first, *rest], promote_options="permissive")
+    return first.sort_by(TIME)
+
+
+def _empty_table(of: str, session: str) -> "pa.Table":
+    known = {name: topic.message for name, topic in topics.TOPICS.items()}
+    known |= {name: name for name in (*known.values(), *(command.message for command in COMMANDS.values()))}
+    known |= {name.rpartition(".")[2]: name for name in known.values()}
+    if of in known:
+        return ArrowSink(Layout(messages.message_class(known[of]).DESCRIPTOR).columns).table()
+    near = difflib.get_close_matches(of, known, n=2)
+    raise NoTable(f"{session} has no messages of {of}." + (f" Did you mean {' or '.join(near)}?" if near else ""))
+
+
+def data_frame(table: "pa.Table") -> "pd.DataFrame":
+    """Return a table for pandas, with pd.NA for null, and the units in `attrs`. Raises FormatMissing."""
+    try:
+        import pandas as pd
+    except ImportError:
+        raise FormatMissing("pandas") from None
+    kinds = {
+        "double": pd.Float64Dtype(),
+        "int64": pd.Int64Dtype(),
+        "uint64": pd.UInt64Dtype(),
+        "bool": pd.BooleanDtype(),
+        "string": pd.StringDtype(),
+    }
+    frame: Any = table.to_pandas(types_mapper=lambda kind: kinds.get(str(kind)), maps_as_pydicts="strict")
+    units = ((field.name, (field.metadata or {}).get(b"unit")) for field in table.schema)
+    frame.attrs["units"] = {name: unit.decode() for name, unit in units if unit}
+    return frame
+
+
+def join_as_of(left: "pa.Table", right: "pa.Table", prefix: str, tolerance_s: float | None) -> "pa.Table":
+    """Add to each row of `left` the fields of the latest row of `right` of the same car, at most `tolerance_s` older.
+
+    Both are sorted by publish_time. tolerance_s: None for the time after which the topic of `right` is stale.
+    """
+    if tolerance_s is None:
+        topic = topics.of_key(right["key"][0].as_py()) if right.num_rows else None
+        tolerance_s = topic.stale_after_s if topic is not None else None
+    tolerance_ns = (math.inf if tolerance_s is None else tolerance_s) * 1e9
+    by_car: dict[str, tuple[list[int], list[int]]] = {}
+    for row, (car, at_ns) in enumerate(_cars_and_times(right)):
+        times, rows = by_car.setdefault(car, ([], []))
+        times.append(at_ns)
+        rows.append(row)
+    found: list[int | None] = []
+    for car, at_ns in _cars_and_times(left):
+        times, rows = by_car.get(car, ([], []))
+        last = bisect_right(times, at_ns) - 1
+        found.append(rows[last] if last >= 0 and at_ns - times[last] <= tolerance_ns else None)
+    joined = [name for name in right.column_names if name not in _NOT_JOINED]
+    matched = right.select(joined).take(import_pyarrow().array(found, "int64"))
+    for field, column in zip(matched.schema, matched.columns, strict=True):
+        left = left.append_column(field.with_name(f"{prefix}.{field.name}"), column)
+    return left
+
+
+def _cars_and_times(table: "pa.Table") -> Iterable[tuple[str, int]]:
+    return zip(table["car"].to_pylist(), table[TIME].cast("int64").to_pylist(), strict=True)
