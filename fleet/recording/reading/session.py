@@ -201,7 +201,7 @@ class Session:
     ) -> Iterator[Recorded] | Iterator[Reading]:
         """Yield every intact message in the order of the file; see `damage_words` afterwards.
 
-        keys: one or several of a topic (`sensor/range`, `sensor/*`), a message (`fleet.v1.Range`), a key or a key expression
+        keys: one or several topics (`sensor/range`, `sensor/*`), messages (`fleet.v1.Range`), keys or key expressions
         (`red/sensor/range`, `fleet/red/**`). start_ns (included), end_ns (excluded): times of the recorder's clock, ns
         since the epoch. With an index only the chunks in question are read, so the last minute of a long session takes
         no longer than a minute's messages.

@@ -20,7 +20,7 @@ class FormatMissing(ImportError):
     """A package of the extra `analysis` is not installed. The message says how to install it."""
 
     def __init__(self, package: str) -> None:
-        super().__init__(f"{package} is not installed. Type: pip install 'zenoh-car-fleet[analysis]'", name=package)
+        super().__init__(f"{package} is not installed. Type: pip install 'zenoh-car-fleet[analysis]'")
 
 
 class Sink(Protocol):
