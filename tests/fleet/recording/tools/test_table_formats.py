@@ -194,7 +194,7 @@ def test_parquet_holds_what_the_recording_holds(original: Rows, tables: Path) ->
         relation = duckdb.sql(f"from '{path}'")
         assert tuple(relation.columns[:5]) == NO_FIELD
         exact = [
-            f'epoch_ns("{name}")' if str(kind) == "TIMESTAMP_NS" else f'"{name}"'
+            f'epoch_ns("{name}")' if str(kind) == "TIMESTAMPTZ_NS" else f'"{name}"'
             for name, kind in zip(relation.columns, relation.types, strict=True)
         ]
         for key, car, log, published, _, *cells in relation.project(", ".join(exact)).fetchall():
