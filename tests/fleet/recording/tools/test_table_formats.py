@@ -286,4 +286,4 @@ def test_duckdb_reads_the_csv_without_being_told_how(tables: Path) -> None:
     kinds = dict(zip(relation.columns, map(str, relation.types), strict=True))
     assert kinds["log_time"] == kinds["stamp"] == "TIMESTAMP WITH TIME ZONE"
     assert kinds["voltage_v"] == kinds["charge"] == "DOUBLE"
-    assert len(relation.fetchall()) == every_type.EACH
+    assert relation.count("*").fetchall() == [(every_type.EACH,)]
