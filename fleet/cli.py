@@ -19,7 +19,7 @@ COMMANDS: Final = {
         "scan": ("fleet.commands.gateway_tools:scan", "Look for cars on Bluetooth and serial ports."),
         "init": ("fleet.commands.fleet_file:init", "Create fleet.yaml: find the cars and name them."),
         "example": ("fleet.commands.example:example", "Fleet files, plans, worlds and programs to start from."),
-        "check": ("fleet.commands.fleet_file:check", "Check fleet.yaml and the ports of its cars for mistakes."),
+        "check": ("fleet.commands.check:check", "Check fleet files, plans and worlds for mistakes."),
         "schema": ("fleet.commands.fleet_file:print_schema", "Print the JSON Schema of fleet files, for editors."),
         "bind": (
             "fleet.commands.bind:bind",
@@ -77,9 +77,7 @@ COMMANDS: Final = {
         ),
     },
     "Plans": {
-        "plan": ("fleet.commands.plan:plan", "What the cars do together: check, restart."),
-        "coordinate": ("fleet.commands.coordinate:coordinate", "Run a plan until Ctrl-C."),
-        "replan": ("fleet.commands.replan:replan", "Replay a session through a plan."),
+        "plan": ("fleet.commands.plan:plan", "run | set | show | try | ...: what the cars do together."),
         "why": (
             "fleet.commands.plan:why",
             "Why a car does what it does, and what would change it.",

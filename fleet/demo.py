@@ -219,8 +219,8 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
             run,
             "coordinator",
             "fleet.cli",
-            "coordinate",
-            *("--connect", run.endpoint, "--plan", str(plan), "--with-parent"),
+            "plan",
+            *("run", str(plan), "--connect", run.endpoint, "--with-parent"),
         ),
     )
     for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):

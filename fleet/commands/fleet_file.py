@@ -2,28 +2,24 @@
 
 import json
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
 import click
 
-from fleet.commands.options import cli_errors, json_option
+from fleet.commands.options import cli_errors
 from fleet.fleetfile.fleet_file import PALETTE, FleetFile, parse_fleet, read_fleet
-from fleet.fleetfile.link_check import check_link
 from fleet.fleetfile.models import schema, validate_color, validate_link, validate_name, validate_platform
 from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, format_new_plan, scan
 from fleet.links import LINK_SIM
 from fleet.supervisor.spec import MAX_SIMULATED_CARS
-from schemas import bus
 from schemas.atomic_file import write_atomically
 from schemas.yaml_document.document import BadFile
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
 DEFAULT_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "violet", "orange", "teal", "brown")
 """Default names, in the order of the palette."""
-_CHECK_THREADS: Final = 16
 _SKIP: Final = "-"
 
 file_argument = click.argument(
@@ -35,31 +31,6 @@ link_option = click.option(
 seconds_option = click.option(
     "--seconds", type=click.FloatRange(0.5, 120), help="How long to listen at each port (default 6)."
 )
-
-
-@click.command(
-    epilog="""\b
-examples:
-  fleet check
-  fleet check lab.yaml --json
-
-Exit codes: 0 all is well, 1 a car cannot be reached as it stands, 2 the file is wrong."""
-)
-@file_argument
-@json_option
-def check(file: Path, *, as_json: bool) -> None:
-    """Check a fleet file, and whether its cars' ports exist, are permitted and free. Open nothing, move nothing."""
-    fleet = read(file, as_json=as_json)
-    served = _served(fleet)
-    with ThreadPoolExecutor(_CHECK_THREADS) as pool:
-        found = list(pool.map(lambda car: check_link(car, served), fleet.cars.values()))
-    widest = max(len(each.car) for each in found)
-    for each in found:
-        if as_json:
-            click.echo(json.dumps(asdict(each)))
-        else:
-            click.echo(f"{each.car:{widest}}  {'ok ' if each.ok else 'NOT'}  {each.link}: {each.words}")
-    raise SystemExit(0 if all(each.ok for each in found) else 1)
 
 
 def read(file: Path, *, as_json: bool = False, unbound: bool = False) -> FleetFile:
@@ -80,19 +51,6 @@ def print_errors(error: BadFile, *, as_json: bool = False) -> None:
             click.echo(json.dumps({"file": error.source, **asdict(problem)}))
     else:
         click.echo(str(error), err=True)
-
-
-def _served(fleet: FleetFile) -> dict[str, tuple[str, str, str]]:
-    """Return state, reason and URL of the link of every running gateway. Empty if no fleet is running."""
-    from fleet.client.client import Fleet
-
-    with cli_errors():
-        if not bus.accepts(bus.resolve_endpoint(fleet.endpoint)):
-            return {}
-        with Fleet(fleet.endpoint, fleet.name, kind="person") as client:
-            urls = {each.value.car: each.value.link for each in client.get("*/state/health")}
-            links = [each.value for each in client.get("*/state/link")]
-            return {link.car: (link.state, link.reason, urls.get(link.car, "")) for link in links}
 
 
 @click.command("schema", epilog="\b\nexample:\n  fleet schema > fleet.schema.json")

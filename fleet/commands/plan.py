@@ -1,20 +1,26 @@
-"""`fleet why` and `fleet plan`: explains decisions of the coordinator, checks a plan and restarts it."""
+"""`fleet why` and `fleet plan`: the plan in force, what it decides and why, and requests for it."""
 
+import importlib
 import json
+import re
 import time
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
 
 from fleet.client.client import Fleet
 from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from fleet.client.reading import Reading
-from fleet.commands.options import cli_errors, json_option, with_client
-from fleet.coordinator.coordinator import RESTART_VERB
+from fleet.commands.group import CommandGroup, did_you_mean
+from fleet.commands.options import WrongFile, bus_options, json_option, with_client
 from schemas import keys, messages, topics
 from schemas.bus import Failure
+
+NO_PLAN: Final = "No plan is running. `fleet up --plan FILE` starts one."
+_OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.commands.plan_try:try_plan"}
+"""Subcommands whose imports would slow down all others."""
 
 
 @click.command(
@@ -28,18 +34,17 @@ examples:
 @json_option
 @with_client
 def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
-    """Explain the coordinator's last decision on a car or role: reason, readings, and what would change it."""
+    """Explain why a car does what it does: what the plan decided, from which readings, and what would change it."""
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}
     if not found and not client.bus.tokens(f"{client.name}/{keys.COORDINATOR}"):
-        raise click.ClickException(
-            f"no coordinator answers in fleet {client.name}: start one (fleet coordinate --plan FILE)"
-        )
+        raise click.ClickException(NO_PLAN)
     for subject in subjects or sorted(found):
         reading = found.get(subject) or found.get(f"role {subject}")
         if reading is None:
-            there = ", ".join(name.removeprefix("role ") for name in sorted(found)) or "nothing"
-            raise click.ClickException(f"nothing was decided of {subject}; there are decisions of {there}")
+            names = [name.removeprefix("role ") for name in sorted(found)]
+            near = did_you_mean(subject, names) or f"There are decisions about: {', '.join(names) or 'nothing yet'}."
+            raise click.ClickException(f"No decision about {subject}. {near}")
         click.echo(json.dumps(reading.as_dict()) if as_json else _describe(reading))
 
 
@@ -48,86 +53,146 @@ def _describe(reading: Reading) -> str:
     since_s = decision.since.seconds + decision.since.nanos / 1e9
     at = datetime.fromtimestamp(since_s).astimezone().strftime("%H:%M:%S")
     lasting = timedelta(seconds=max(0, int(time.time() - since_s)))
-    lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})"]
-    lines.append(f"  because:   {decision.why}")
-    lines += [f"  with       {each}" for each in decision.readings]
-    lines.append(f"  changes by {decision.would_change}")
+    lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})", f"  because: {decision.why}"]
+    lines += [f"  reading: {each}" for each in decision.readings]
+    lines += [f"  would change if: {each}" for each in decision.would_change.split("; or ")]
     return "\n".join(lines)
 
 
-@click.group(epilog="\b\nexamples:\n  fleet plan check plan.yaml --fleet-file fleet.yaml\n  fleet plan restart")
-def plan() -> None:
-    """Check a plan, or restart the plan in force."""
+class _PlanGroup(CommandGroup):
+    """A group that imports some of its commands when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return ["run", "set", "show", "try", *(each for each in super().list_commands(ctx) if each not in _FIRST)]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _OWN_MODULES:
+            return super().get_command(ctx, cmd_name)
+        module, _, name = _OWN_MODULES[cmd_name].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), name)
+        return command
 
 
-@plan.command(
+_FIRST: Final = ("set", "show")
+
+
+@click.group(
+    cls=_PlanGroup,
     epilog="""\b
-example:
-  fleet plan check plan.yaml --fleet-file fleet.yaml
+examples:
+  fleet up --plan plan.yaml       run a plan with a fleet
+  fleet plan set other.yaml       change it while it runs
+  fleet plan stop                 let go of all cars
 
-Exit codes: 0 nothing that can never work, 1 something, 2 no plan."""
+`fleet check plan.yaml` looks for mistakes.""",
 )
+def plan() -> None:
+    """Run, change, show and stop the plan: what the cars do together."""
+
+
+@plan.command("set", epilog="\b\nexample:\n  fleet plan set plan.yaml")
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-@click.option(
-    "--fleet-file",
-    "--fleet",
-    "fleet_file",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="The fleet file: its cars, platforms and roles; without one, cars of any platform.",
-)
 @json_option
-def check(file: Path, fleet_file: Path | None, *, as_json: bool) -> None:
-    """Find roles that no car can fill, rules that never fire or contradict each other, and unreachable phases."""
-    from fleet.coordinator.observer import listed_cars
-    from fleet.fleetfile.fleet_file import read_fleet
-    from fleet.policy.plan.lint import Severity
-    from fleet.policy.plan.lint import check as check_plan
+@bus_options
+def set_plan(file: Path, *, as_json: bool, connect: str | None, fleet: str) -> None:
+    """Put another plan in force. It is accepted as a whole, or rejected with all its errors.
+
+    Roles, rules and the phase go on if both plans have them. A stopped plan runs again.
+    """
     from fleet.policy.plan.parser import parse
     from schemas.yaml_document.document import read_text
 
-    with cli_errors():
-        read = parse(read_text(file), str(file))
-        cars = None if fleet_file is None else listed_cars(read_fleet(fleet_file))
-    findings = check_plan(read, cars)
-    errors = [each for each in findings if each.severity is Severity.ERROR]
-    for each in findings:
-        if as_json:
-            click.echo(
-                json.dumps(
-                    {
-                        "gravity": each.severity,
-                        "line": each.line,
-                        "column": each.column,
-                        "part": each.part,
-                        "words": each.words,
-                    }
-                )
-            )
-        else:
-            click.echo(each.at(str(file)))
-    if errors:
-        raise SystemExit(1)
-    if not as_json:
-        what = f"{len(read.roles)} roles, {len(read.rules)} rules, {len(read.phases)} phases"
-        click.echo(f"{file}: {what}: nothing that can never work")
+    text = read_text(file)
+    parse(text, str(file))  # before it is sent, for errors with the position in this file
+    with Fleet(connect, fleet, kind="person") as client:
+        command = messages.message_class("fleet.v1.Plan")(text=text, set_by=client.sender)
+        _request(client, "plan", command, source=str(file), as_json=as_json)
 
 
-@plan.command(
-    epilog="""\b
-example:
-  fleet plan restart"""
-)
+@plan.command(epilog="\b\nexample:\n  fleet plan show --json")
+@json_option
+@with_client
+def show(client: Fleet, *, as_json: bool) -> None:
+    """Show the plan in force: its roles and the cars that have them, the phase, and the rules in force."""
+    from fleet.policy.plan.parser import parse
+
+    place = f"{client.name}/{keys.COORDINATOR}"
+    found = {reading.key.rpartition("/")[2]: reading.value for reading in client.get(f"{place}/*")}
+    if "plan" not in found:
+        raise click.ClickException(NO_PLAN)
+    in_force, assignment = found["plan"], found.get("assignment")
+    plan = parse(in_force.text, "the plan in force")
+    cars = {role.name: list(role.cars) for role in assignment.roles} if assignment else {}
+    rules = list(assignment.rules) if assignment else []
+    phase, stopped_by = (assignment.phase, assignment.stopped_by) if assignment else ("", "")
+    roles = {name: cars.get(name, []) for name in plan.roles}
+    others = {name: them for name, them in cars.items() if name not in plan.roles}
+    if as_json:
+        whole = {"version": in_force.version, "set_by": in_force.set_by, "stopped_by": stopped_by, "phase": phase}
+        whole |= {"phases": list(plan.phases), "roles": roles, "without_role": others, "rules_in_force": rules}
+        click.echo(json.dumps(whole))
+        return
+    by = f", set by {in_force.set_by}" if in_force.set_by else ""
+    state = f"stopped by {stopped_by}. `fleet plan restart` starts it again" if stopped_by else "running"
+    click.echo(f"Plan {in_force.version}{by}: {state}.")
+    if plan.phases:
+        click.echo(f"phase: {phase or '-'} (of {', '.join(plan.phases)})")
+    for name, role in plan.roles.items():
+        wanted = "all" if role.count is None else role.count
+        click.echo(f"role {name} ({role.mode}): {', '.join(roles[name]) or 'no car'}, {len(roles[name])} of {wanted}")
+    for name, them in others.items():
+        click.echo(f"{name}: {', '.join(them)}")
+    if plan.rules:
+        click.echo(f"rules in force: {', '.join(rules) or 'none'} (of {len(plan.rules)})")
+
+
+@plan.command(epilog="\b\nexample:\n  fleet plan restart")
 @json_option
 @with_client
 def restart(client: Fleet, *, as_json: bool) -> None:
-    """Restart the plan in force: its first phase, no rule in force. Cars keep the roles that they still fit."""
-    key = keys.command_key(client.name, keys.COORDINATOR, RESTART_VERB)
-    for answer in client.bus.query(key, timeout_s=ANSWER_TIMEOUT_S):
+    """Begin the plan in force anew, with its first phase and without its memory. Also after `fleet plan stop`."""
+    _request(client, "restart", _command(client), as_json=as_json)
+
+
+@plan.command("next", epilog="\b\nexample:\n  fleet plan next")
+@json_option
+@with_client
+def next_phase(client: Fleet, *, as_json: bool) -> None:
+    """Go on to the next phase of the plan, now. Refused if the plan has no phases, or no further one."""
+    _request(client, "next", _command(client), as_json=as_json)
+
+
+@plan.command(epilog="\b\nexamples:\n  fleet plan stop\n  fleet plan restart")
+@json_option
+@with_client
+def stop(client: Fleet, *, as_json: bool) -> None:
+    """Let go of all cars: the plan brings those that it commands to rest, and decides nothing more.
+
+    The cars get no hold: anyone may drive them at once. Cars that a person has stopped or drives stay as they are.
+    `fleet plan restart` or `fleet plan set` goes on. A coordinator that is restarted stays stopped.
+    """
+    _request(client, "stop", _command(client), as_json=as_json)
+
+
+def _command(client: Fleet) -> Any:
+    return messages.message_class("fleet.v1.PlanCommand")(sender=client.sender, kind="person")
+
+
+def _request(client: Fleet, verb: str, command: Any, *, as_json: bool, source: str = "plan") -> None:
+    """Send a request to the coordinator, and print its answer. Exit with code 1 if it refuses, 2 for a wrong plan."""
+    key = keys.command_key(client.name, keys.COORDINATOR, verb)
+    payload, encoding = command.SerializeToString(), messages.encoding_of(command.DESCRIPTOR.full_name)
+    for answer in client.bus.query(key, payload=payload, encoding=encoding, timeout_s=ANSWER_TIMEOUT_S):
         if isinstance(answer, Failure):
             raise click.ClickException(answer.words)
         result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)
-        click.echo(json.dumps({"status": result.status, "words": result.words}) if as_json else result.words)
-        return
-    raise click.ClickException(
-        f"no coordinator answers in fleet {client.name}: start one (fleet up, fleet coordinate --plan FILE)"
-    )
+        ok = result.status == "sent"
+        result.words = re.sub("^plan:", f"{source}:", result.words, flags=re.MULTILINE)
+        if as_json:
+            click.echo(json.dumps({"status": result.status, "reason": result.reason, "words": result.words}))
+        elif ok:
+            click.echo(result.words)
+        else:
+            raise (WrongFile if result.reason == "bad_value" else click.ClickException)(result.words)
+        raise SystemExit(0 if ok else 2 if result.reason == "bad_value" else 1)
+    raise click.ClickException(NO_PLAN)

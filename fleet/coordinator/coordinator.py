@@ -10,7 +10,7 @@ import time
 import traceback
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,8 +27,9 @@ from fleet.policy.decision import LEFT_ALONE, Decision
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
+from fleet.policy.requests import PlanRequest, RequestRefused, on_request
 from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
-from fleet.policy.state import PolicyState, carry_over, on_hub_back, restart_plan, restore, to_persisted
+from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to_persisted
 from schemas import keys, messages, topics
 from schemas.bus import HubKeeper, Latest, Publisher, Sample, reply_message, reply_value
 from schemas.gen import fleet_v1_pb2 as pb
@@ -56,11 +57,18 @@ INTERNAL_ERROR: Final = "internal_error"
 """Code of the event about an unexpected exception. The coordinator goes on."""
 _MAX_ERROR_LENGTH: Final = 500
 """Maximum characters of such an exception's text, which may quote payloads from the bus."""
-_LEVEL_ERROR: Final = 4  # foxglove.Log.Level
+_LEVEL_INFO, _LEVEL_ERROR = 2, 4  # foxglove.Log.Level
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
-RESTART_VERB: Final = "restart"
-"""`<fleet>/@coordinator/@cmd/restart` begins the plan in force anew, with its first phase."""
+_ANONYMOUS: Final = "anonymous"
+_EVENTS: Final = {
+    PlanRequest.RESTART: ("plan_restarted", "restarted the plan"),
+    PlanRequest.NEXT: ("plan_next", "went on to the next phase"),
+    PlanRequest.STOP: ("plan_stopped", "stopped the plan"),
+}
+"""Code and words of the event for each request, whose sender stands before the words."""
+_PLAN_SET: Final = "plan_set"
+_UNSAVED: Final = "It cannot be saved: a coordinator that is started again does not know it."
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +104,11 @@ class Coordinator:
     dropped: int = 0
     """Number of samples and queries dropped because the inbox was full."""
     _memory: PolicyState = field(default_factory=PolicyState)
+    _state_file: CoordinatorStateFile | None = None
+    _restored: bool = False
+    """True once the persisted state is restored."""
+    _early: list[zenoh.Query] = field(default_factory=list)
+    """Commands that came before that."""
     _mode_commands: "dict[str, tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=dict)
     _led_commands: "list[tuple[Ask, Future[list[Outcome]]]]" = field(default_factory=list)
     _last_failures: dict[str, str] = field(default_factory=dict)
@@ -122,12 +135,12 @@ class Coordinator:
             raise AnotherCoordinator(self._describe(self._others()))
         bus.token(token)
         observer = FleetObserver(self.listed)
-        state_file = CoordinatorStateFile(fleet, bus.endpoint, self.run_name)
+        state_file = self._state_file = CoordinatorStateFile(fleet, bus.endpoint, self.run_name)
         self._subscribe(f"{fleet}/*/state/*")
         bus.watch_tokens(keys.car_token(fleet, "*"), lambda key, alive: self._tokens(key.rpartition("/")[2], alive))
         self._put_in_force(self.plan)
         bus.queryable(f"{fleet}/{keys.COORDINATOR}/*", self._on_query)
-        for verb in (PLAN_VERB, RESTART_VERB):
+        for verb in (PLAN_VERB, *PlanRequest):
             bus.queryable(keys.command_key(fleet, keys.COORDINATOR, verb), self._on_query)
         republish_at = time.monotonic() + REPUBLISH_INTERVAL_S
         recheck_at: float | None = time.monotonic() + SINGLETON_RECHECK_S
@@ -142,6 +155,9 @@ class Coordinator:
                         break
                 now = time.monotonic()
                 self._memory = restore(self.plan, observer.snapshot(()), state_file.load(), now, time.time())
+                self._restored = True
+                for query in self._early:
+                    self._answer(query, observer)
                 while not has_ended():
                     # Read the hubs before the inbox, which then has the lost tokens of a hub that is gone.
                     linked_hubs = bus.hubs
@@ -153,7 +169,7 @@ class Coordinator:
                     if linked_hubs != hubs:
                         hubs, self._memory = linked_hubs, on_hub_back(self._memory, now)
                     try:
-                        self._step(observer, pool, state_file, now)
+                        self._step(observer, pool, now)
                     except OSError:  # its own output is closed: its parent has ended
                         raise
                     except Exception as error:  # noqa: BLE001 - the input came over the bus
@@ -165,14 +181,15 @@ class Coordinator:
                         republish_at = now + REPUBLISH_INTERVAL_S
                         for publisher, message in self._published.values():
                             publisher.put(message, time.time_ns())
+                if not self.run_name and self._memory.stopped_by:
+                    # Who ends a coordinator by hand and starts another one wants its plan to run.
+                    self._save(replace(self._memory, stopped_by="", to_rest=frozenset()))
             finally:
                 self.client.close()  # ends pending commands
 
     # ------------------------------------------------------------------ one step
 
-    def _step(
-        self, observer: FleetObserver, pool: ThreadPoolExecutor, state_file: CoordinatorStateFile, now: float
-    ) -> None:
+    def _step(self, observer: FleetObserver, pool: ThreadPoolExecutor, now: float) -> None:
         for car, (ask, future) in list(self._mode_commands.items()):
             if future.done():
                 del self._mode_commands[car]
@@ -186,14 +203,14 @@ class Coordinator:
         result = step(self.plan, observer.snapshot(self._mode_commands), self._memory, now)
         before, self._memory = self._memory, result.memory
         # Persist before anything is published or commanded: a coordinator killed now is followed by one that knows.
-        state_file.save(to_persisted(self.plan, self._memory, now, time.time()))
+        self._save(self._memory)
         self._forget(before.decisions.keys() - result.memory.decisions.keys())
         since_s = time.time() - now
         for decision in (*result.changed, *result.reworded):
             self._publish("decision", _message(decision, since_s + decision.since))
         for decision in result.changed:
             self.on_decision(decision)
-        if result.changed or before.phase.name != result.memory.phase.name:
+        if result.changed or _in_force(before) != _in_force(result.memory):
             self._publish("assignment", _assignment(self.plan, result))
         for ask in result.asks:
             request = mode_request(ask.mode) if ask.mode is not None else led_request(*(ask.led or (0, 0, 0)))
@@ -220,19 +237,50 @@ class Coordinator:
 
     # ------------------------------------------------------------------ the plan
 
-    def _put_in_force(self, plan: Plan) -> None:
+    def _save(self, memory: PolicyState) -> bool:
+        """Persist the state. Return False if it cannot be written."""
+        assert self._state_file is not None
+        return self._state_file.save(to_persisted(self.plan, memory, time.monotonic(), time.time()))
+
+    def _on_request(self, query: zenoh.Query, request: PlanRequest) -> None:
+        """Carry out a request for the plan in force. It is persisted and recorded before it is confirmed."""
+        try:
+            by = _sender(query, "fleet.v1.PlanCommand")
+            memory, words = on_request(request, self.plan, self._memory, by, time.monotonic())
+        except RequestRefused as refused:
+            reason = str(refused).rpartition("[")[2].rstrip("]")
+            self._reply_result(query, pb.Result(status="rejected", reason=reason, words=str(refused)))
+            return
+        except messages.BadPayload as error:
+            self._reply_result(query, pb.Result(status="rejected", reason="bad_value", words=f"{error} [bad_value]"))
+            return
+        if request is not PlanRequest.NEXT and memory is not self._memory:
+            self._drop_decisions()
+        self._memory = memory
+        saved = self._save(memory)
+        code, did = _EVENTS[request]
+        self._log(_LEVEL_INFO, code, f"{by} {did} ({words})")
+        self._reply_result(query, pb.Result(status="sent", words=words if saved else f"{words}. {_UNSAVED}"))
+
+    def _drop_decisions(self) -> None:
+        for name, subject in [*self._published]:
+            if name == "decision":
+                del self._published[name, subject]
+
+    def _put_in_force(self, plan: Plan, set_by: str = "") -> None:
         """Put a plan in force: subscribe to the readings that it uses, and publish it."""
         self.plan = plan
         for topic in sorted({topic_of(name) for name in plan.names}):
             if not topic.startswith("state/"):
                 self._subscribe(f"{self.client.name}/*/{topic}")
-        self._publish("plan", pb.Plan(text=plan.text, version=plan.version))
+        self._publish("plan", pb.Plan(text=plan.text, version=plan.version, set_by=set_by))
 
     def _on_plan(self, query: zenoh.Query, observer: FleetObserver) -> None:
         """Put the plan of a query in force, or refuse it with all its faults."""
         result = pb.Result(status="sent")
         try:
-            plan = parse(_text(query))
+            text, by = _plan_command(query)
+            plan = parse(text)
         except (ValueError, messages.BadPayload) as error:  # BadPlan and UnicodeDecodeError are ValueErrors
             result = pb.Result(status="rejected", reason="bad_value", words=str(error))
         else:
@@ -242,7 +290,7 @@ class Coordinator:
             else:
                 warnings = [f"warning: {each}" for each in plan_faults.warnings]
                 result.words = "\n".join((f"plan {plan.version} is in force", *warnings))
-                self._take_over(plan)
+                self._take_over(plan, by)
                 for each in plan_faults.warnings:
                     self.on_failure(f"the new plan: {each}")
         self._reply_result(query, result)
@@ -250,12 +298,12 @@ class Coordinator:
     def _reply_result(self, query: zenoh.Query, result: pb.Result) -> None:
         reply_message(query, str(query.key_expr), result, as_json=query.parameters.get("format") == "json")
 
-    def _take_over(self, plan: Plan) -> None:
+    def _take_over(self, plan: Plan, by: str) -> None:
         self._memory = carry_over(self._memory, self.plan, plan)
-        for name, subject in [*self._published]:
-            if name == "decision":
-                del self._published[name, subject]
-        self._put_in_force(plan)
+        self._drop_decisions()
+        self._put_in_force(plan, by)
+        self._save(self._memory)
+        self._log(_LEVEL_INFO, _PLAN_SET, f"{by} put plan {plan.version} in force")
         self._query_states()
 
     # ------------------------------------------------------------------ samples and queries
@@ -313,7 +361,10 @@ class Coordinator:
         now = time.monotonic()
         if isinstance(item, zenoh.Query):
             self._query_slots.release()
-            self._answer(item, observer)
+            if not self._restored and "/@cmd/" in str(item.key_expr):
+                self._early.append(item)
+            else:
+                self._answer(item, observer)
         elif isinstance(item, _QueriedSample):
             observer.on_sample(item.sample, now, time.time())
         else:
@@ -347,12 +398,12 @@ class Coordinator:
                 query.reply_err(words, encoding="text/plain")
 
     def _reply(self, query: zenoh.Query, observer: FleetObserver) -> None:
-        if str(query.key_expr).endswith(f"/@cmd/{PLAN_VERB}"):
-            self._on_plan(query, observer)
-            return
-        if str(query.key_expr).endswith(f"/@cmd/{RESTART_VERB}"):
-            self._memory = restart_plan(self._memory)
-            self._reply_result(query, pb.Result(status="sent", words=f"plan {self.plan.version} begins anew"))
+        begin, _, verb = str(query.key_expr).rpartition("/")
+        if begin.endswith("/@cmd"):
+            if verb == PLAN_VERB:
+                self._on_plan(query, observer)
+            else:
+                self._on_request(query, PlanRequest(verb))
             return
         for publisher, message in self._published.values():
             if query.key_expr.intersects(publisher.key):
@@ -372,19 +423,19 @@ class Coordinator:
         }
         if words not in self._internal_errors:
             self._internal_errors[words] = now
-            self._log(words)
+            self._log(_LEVEL_ERROR, INTERNAL_ERROR, words)
+            with contextlib.suppress(Exception):  # the error may come from `on_failure` itself
+                self.on_failure(words)
         return words
 
-    def _log(self, words: str) -> None:
-        """Publish an error as foxglove.Log, and call `on_failure`."""
+    def _log(self, level: int, code: str, words: str) -> None:
+        """Publish an event as foxglove.Log."""
         now_ns = time.time_ns()
         message: Any = messages.message_class("foxglove.Log")(
-            level=_LEVEL_ERROR, name=f"{keys.COORDINATOR} {INTERNAL_ERROR}", message=words
+            level=level, name=f"{keys.COORDINATOR} {code}", message=words
         )
         message.timestamp.seconds, message.timestamp.nanos = divmod(now_ns, 1_000_000_000)
         self._publisher("log").put(message, now_ns)
-        with contextlib.suppress(Exception):  # the error may come from `on_failure` itself
-            self.on_failure(words)
 
     # ------------------------------------------------------------------ other coordinators, the hub, publishers
 
@@ -416,14 +467,26 @@ class Coordinator:
         return self._publishers[name]
 
 
-def _text(query: zenoh.Query) -> str:
-    """Return the text of the plan in a query: protobuf, JSON or plain text."""
+def _payload(query: zenoh.Query) -> tuple[bytes, str]:
+    """Return the payload of a query and its encoding, both empty if there is none."""
     payload = query.payload.to_bytes() if query.payload is not None else b""
-    encoding = str(query.encoding) if query.encoding is not None else ""
+    return payload, str(query.encoding) if query.encoding is not None else ""
+
+
+def _plan_command(query: zenoh.Query) -> tuple[str, str]:
+    """Return the text of the plan in a query (protobuf, JSON or plain text) and its sender. Raises BadPayload."""
+    payload, encoding = _payload(query)
     if not encoding.startswith((topics.PROTOBUF, messages.JSON)):
-        return payload.decode()
+        return payload.decode(), _ANONYMOUS
     message: Any = messages.parse(topics.TOPICS[f"{keys.COORDINATOR}/plan"].message, payload, encoding)
-    return str(message.text)
+    return str(message.text), str(message.set_by) or _ANONYMOUS
+
+
+def _sender(query: zenoh.Query, message_type: str) -> str:
+    """Return the sender of a command, whose payload may be left out. Raises BadPayload."""
+    payload, encoding = _payload(query)
+    command: Any = messages.parse(message_type, payload, encoding) if payload else None
+    return str(command.sender if command is not None else "") or _ANONYMOUS
 
 
 def _message(decision: Decision, since_s: float) -> pb.Decision:
@@ -439,6 +502,11 @@ def _message(decision: Decision, since_s: float) -> pb.Decision:
     )
 
 
+def _in_force(memory: PolicyState) -> tuple[str, list[int]]:
+    """Return the phase and the rules in force."""
+    return memory.phase.name, sorted(index for index, state in memory.rules.items() if state.on)
+
+
 def _assignment(plan: Plan, result: DecisionStep) -> pb.Assignment:
     roles: dict[str, list[str]] = {}
     for car, role in sorted(result.roles.items()):
@@ -450,4 +518,6 @@ def _assignment(plan: Plan, result: DecisionStep) -> pb.Assignment:
         roles=[pb.Role(name=name, cars=cars) for name, cars in sorted(roles.items())],
         phase=result.memory.phase.name,
         plan_version=plan.version,
+        rules=[plan.rules[index].name for index in _in_force(result.memory)[1]],
+        stopped_by=result.memory.stopped_by,
     )

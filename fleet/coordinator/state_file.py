@@ -6,7 +6,7 @@ ignored.
 
 import contextlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,21 +46,27 @@ class CoordinatorStateFile:
                 str(content["phase"]),
                 float(content["phase_since_s"]),
                 {int(index): str(that) for index, that in content["rules"].items()},
+                str(content.get("stopped_by", "")),
+                tuple(map(str, content.get("to_rest", ()))),
             )
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return PersistedPolicy()
 
-    def save(self, state: PersistedPolicy) -> None:
-        """Write the state, whole or not at all, if it has changed."""
-        if self.path is None or _same(state, self._last):
-            return
+    def save(self, state: PersistedPolicy) -> bool:
+        """Write the state, whole or not at all, if it has changed. Return False if it cannot be written."""
+        if self.path is None:
+            return False
+        if _same(state, self._last):
+            return True
         self._last = state
         content = {"endpoint": self._endpoint, "run": self._run, **asdict(state)}
         with contextlib.suppress(OSError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self.path, json.dumps(content).encode())
+            return True
+        return False
 
 
 def _same(one: PersistedPolicy, other: PersistedPolicy) -> bool:
     """Return True if nothing but the start of the phase differs (its last digit follows the clock)."""
-    return (one.version, one.roles, one.phase, one.rules) == (other.version, other.roles, other.phase, other.rules)
+    return replace(one, phase_since_s=0.0) == replace(other, phase_since_s=0.0)

@@ -21,6 +21,8 @@ from fleet.policy.explain import (
     explain_phase,
     explain_role,
     explain_rule,
+    explain_stopped,
+    explain_stopped_role,
     explain_vacancy,
     is_new,
     is_reworded,
@@ -69,6 +71,8 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     memory = memory if memory.started_at is not None else replace(memory, started_at=now)
     subjects = _cars_of(plan, snapshot)
     barrier_of = {car: _find_barrier(car, snapshot.cars.get(car, UNKNOWN_CAR)) for car in subjects}
+    if memory.stopped_by:
+        return _step_stopped(plan, snapshot, barrier_of, memory, now)
     barriers = {car: barrier[0] for car, barrier in barrier_of.items() if barrier is not None}
     gone_since = {car: memory.gone_since.get(car, now) for car in barriers}
     lately = {car for car, since in gone_since.items() if now - since < HYSTERESIS_S}
@@ -144,6 +148,47 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
         tuple(each for each in decisions if is_reworded(each, memory.decisions)),
         (*asks, *led_commands),
         allocation.roles,
+    )
+
+
+def _step_stopped(
+    plan: Plan,
+    snapshot: FleetSnapshot,
+    barrier_of: Mapping[str, tuple[Barrier, bool] | None],
+    memory: PolicyState,
+    now: float,
+) -> DecisionStep:
+    """Bring the cars of a stopped plan to rest, without a hold, and leave all others alone."""
+    attempts, asks, decisions = dict[str, ModeAttempts](), list[Ask](), list[Decision]()
+    for car, barrier in barrier_of.items():
+        tried = memory.mode_attempts.get(car, ModeAttempts(Mode.MANUAL))
+        known = snapshot.cars.get(car, UNKNOWN_CAR)
+        # A mode command may have been on its way when the plan was stopped: only a later one shows that it is over.
+        rests = tried.count and known.mode == Mode.MANUAL and known.verdict != CONTRADICTED and known.refused is None
+        taken = known.estopped_by is not None or known.held_by is not None or known.driven_by is not None
+        waits = car in memory.to_rest and not taken and (barrier is not None or known.busy or not rests)
+        if waits:
+            if barrier is None and not known.busy and now >= tried.again_at:
+                tried = ModeAttempts(Mode.MANUAL, tried.count + 1, now + min(MODE_RETRY_MAX_S, 2.0**tried.count))
+                asks.append(Ask(car, Mode.MANUAL))
+            attempts[car] = tried
+        if barrier is not None:
+            decisions.append(explain_alone(car, barrier[0], None, 0.0))
+        else:
+            decisions.append(explain_stopped(car, memory.stopped_by, rests=not waits))
+    decisions += [explain_stopped_role(name, memory.stopped_by) for name in plan.roles]
+    decisions = [each.after(memory.decisions.get(each.subject), now) for each in decisions]
+    return DecisionStep(
+        replace(
+            memory,
+            mode_attempts=attempts,
+            to_rest=frozenset(attempts) | (memory.to_rest - barrier_of.keys()),
+            decisions={each.subject: each for each in decisions},
+        ),
+        tuple(decisions),
+        tuple(each for each in decisions if is_new(each, memory.decisions)),
+        tuple(each for each in decisions if is_reworded(each, memory.decisions)),
+        tuple(asks),
     )
 
 

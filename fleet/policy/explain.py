@@ -17,6 +17,7 @@ from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HeldRole
 from gateway.protocol.enums import Mode
 
+_GOES_ON: Final = "`fleet plan restart` or `fleet plan set`"
 _MAX_REASONS: Final = 4
 """Maximum roles, rules or cars that a reason lists."""
 
@@ -77,6 +78,21 @@ def explain_alone(car: str, barrier: Barrier, reserved_role: str | None, kept_s:
     """Explain a car that is left alone."""
     why = f"{barrier.why}; its role {reserved_role} is kept for {kept_s:g} s" if reserved_role else barrier.why
     return _about_car(car, DecisionKind.ALONE, barrier.why, why, (), [barrier.change], reserved_role, None)
+
+
+def explain_stopped(car: str, by: str, *, rests: bool) -> Decision:
+    """Explain a car of a stopped plan."""
+    if rests:
+        why, kind, mode = f"{by} stopped the plan", DecisionKind.ALONE, None
+    else:
+        why, kind, mode = f"{by} stopped the plan: {car} is brought to rest", DecisionKind.IDLE, Mode.MANUAL
+    return _about_car(car, kind, why, why, (), [_GOES_ON], None, mode)
+
+
+def explain_stopped_role(name: str, by: str) -> Decision:
+    """Explain a role of a stopped plan."""
+    why = f"{by} stopped the plan"
+    return _about_role(name, DecisionKind.OUT, "not wanted", f"out: {why}", why, _GOES_ON)
 
 
 def explain_rule(car: str, override: Override, role: str | None) -> Decision:

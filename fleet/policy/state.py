@@ -48,6 +48,10 @@ class PersistedPolicy:
     phase_since_s: float = 0.0
     """Start of the phase on the wall clock."""
     rules: Mapping[int, str] = field(default_factory=dict)
+    stopped_by: str = ""
+    """Sender who stopped the plan; empty: the plan runs."""
+    to_rest: tuple[str, ...] = ()
+    """Cars to be brought to rest since then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +83,10 @@ class PolicyState:
     led_requests: frozenset[LedRequest] = frozenset()
     decisions: Mapping[str, Decision] = field(default_factory=dict)
     """The last decision of each subject."""
+    stopped_by: str = ""
+    """Sender who stopped the plan; empty: the plan runs. All cars are left alone then, except `to_rest`."""
+    to_rest: frozenset[str] = frozenset()
+    """Cars that the stopped plan has commanded, until they are at rest or a person has taken them."""
 
     @property
     def roles(self) -> dict[str, str]:
@@ -100,6 +108,8 @@ def carry_over(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:
     same = {name for name, role in after.roles.items() if before.roles.get(name) == role}
     return replace(
         memory,
+        stopped_by="",
+        to_rest=frozenset(),
         phase=memory.phase if memory.phase.name in after.phases else PhaseState(),
         rules=rules,
         led_requests=frozenset(
@@ -113,17 +123,14 @@ def carry_over(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:
     )
 
 
-def restart_plan(memory: PolicyState) -> PolicyState:
-    """Return the state for a restart of the plan: the roles remain, phase and rules begin anew."""
-    return replace(memory, phase=PhaseState(), rules={}, led_requests=frozenset())
-
-
 def restore(plan: Plan, snapshot: FleetSnapshot, persisted: PersistedPolicy, now: float, wall_s: float) -> PolicyState:
     """Return the state of a coordinator that starts, from the persisted state of the one before.
 
     Under another plan only the roles count that both plans have. A car in the mode of another role loses its role:
-    somebody has changed it since.
+    somebody has changed it since. A plan that was stopped stays stopped, even if the plan is another one.
     """
+    if persisted.stopped_by:
+        return PolicyState(stopped_by=persisted.stopped_by, to_rest=frozenset(persisted.to_rest))
     modes = {role.mode for role in plan.roles.values()} - {Mode.MANUAL}
     held_roles = {}
     for car, name in persisted.roles.items():
@@ -156,4 +163,6 @@ def to_persisted(plan: Plan, memory: PolicyState, now: float, wall_s: float) -> 
         memory.phase.name,
         round(wall_s - (now - memory.phase.since), 1) if memory.phase.name else 0.0,
         {index: state.that or "" for index, state in memory.rules.items() if state.on},
+        memory.stopped_by,
+        tuple(sorted(memory.to_rest)),
     )

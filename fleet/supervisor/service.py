@@ -119,7 +119,10 @@ class SupervisorService:
     def send_plan(self, text: str) -> bool:
         """Send the coordinator another plan. Return True if it accepted. Call it on a thread."""
         key = f"{self.fleet}/{keys.COORDINATOR}/@cmd/plan"
-        payload, encoding = pb.Plan(text=text).SerializeToString(), messages.encoding_of("fleet.v1.Plan")
+        payload, encoding = (
+            pb.Plan(text=text, set_by=keys.SUPERVISOR).SerializeToString(),
+            messages.encoding_of("fleet.v1.Plan"),
+        )
         for answer in self.bus.query(key, payload=payload, encoding=encoding, timeout_s=SERVICE_QUERY_TIMEOUT_S):
             if isinstance(answer, Sample):
                 result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)

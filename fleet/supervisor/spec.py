@@ -244,4 +244,4 @@ def recorder_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
 def coordinator_command(spec: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
     """Return the command of the coordinator, with its copies of the plan and the fleet file in the run directory."""
     where = ("--fleet", spec.fleet, "--connect", endpoint, "--with-parent", "--run", plan.parent.name)
-    return module("fleet.cli", "coordinate", "--plan", str(plan), "--fleet-file", str(listed), "--json", *where)
+    return module("fleet.cli", "plan", "run", str(plan), "--fleet-file", str(listed), "--json", *where)

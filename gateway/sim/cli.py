@@ -86,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="room: walls and a line to track; open: nothing, so no ranging has an echo; or a file with lamps, things "
         "and cars that meet, as `fleet example show follow` prints (default: room)",
     )
+    parser.add_argument("--check", action="store_true", help="only check the world, for any cars")
     parser.add_argument(
         "--fault",
         action="append",
@@ -116,6 +117,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run until SIGINT or SIGTERM; return the exit code."""
     try:
+        if args.check:
+            _world(args.world, None)
+            return 0
         specs = parse_cars(args.car)
         replays = [parse_replay(text) for text in args.replay]
         everyone: list[CarSpec | ReplaySpec] = [*specs, *replays]
@@ -161,7 +165,7 @@ def _captures(replays: Sequence[ReplaySpec], args: argparse.Namespace) -> list[t
     return found
 
 
-def _world(words: str, cars: list[str]) -> World:
+def _world(words: str, cars: list[str] | None) -> World:
     """Return a world by its name or from its file; raise BadSpec."""
     if words in WORLDS:
         return WORLDS[words]()

@@ -531,20 +531,22 @@ class World(_message.Message):
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., lamps: _Optional[_Iterable[_Union[SimLamp, _Mapping]]] = ..., things: _Optional[_Iterable[_Union[SimThing, _Mapping]]] = ..., walls: _Optional[_Iterable[_Union[SimWall, _Mapping]]] = ..., line: _Optional[_Iterable[_Union[SimPoint, _Mapping]]] = ...) -> None: ...
 
 class Plan(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "text", "version")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "text", "version", "set_by")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
     TEXT_FIELD_NUMBER: _ClassVar[int]
     VERSION_FIELD_NUMBER: _ClassVar[int]
+    SET_BY_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
     boot_id: str
     text: str
     version: str
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., text: _Optional[str] = ..., version: _Optional[str] = ...) -> None: ...
+    set_by: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., text: _Optional[str] = ..., version: _Optional[str] = ..., set_by: _Optional[str] = ...) -> None: ...
 
 class Role(_message.Message):
     __slots__ = ("name", "cars")
@@ -555,7 +557,7 @@ class Role(_message.Message):
     def __init__(self, name: _Optional[str] = ..., cars: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Assignment(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "roles", "phase", "plan_version")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "roles", "phase", "plan_version", "rules", "stopped_by")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -563,6 +565,8 @@ class Assignment(_message.Message):
     ROLES_FIELD_NUMBER: _ClassVar[int]
     PHASE_FIELD_NUMBER: _ClassVar[int]
     PLAN_VERSION_FIELD_NUMBER: _ClassVar[int]
+    RULES_FIELD_NUMBER: _ClassVar[int]
+    STOPPED_BY_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -570,7 +574,9 @@ class Assignment(_message.Message):
     roles: _containers.RepeatedCompositeFieldContainer[Role]
     phase: str
     plan_version: str
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., roles: _Optional[_Iterable[_Union[Role, _Mapping]]] = ..., phase: _Optional[str] = ..., plan_version: _Optional[str] = ...) -> None: ...
+    rules: _containers.RepeatedScalarFieldContainer[str]
+    stopped_by: str
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., roles: _Optional[_Iterable[_Union[Role, _Mapping]]] = ..., phase: _Optional[str] = ..., plan_version: _Optional[str] = ..., rules: _Optional[_Iterable[str]] = ..., stopped_by: _Optional[str] = ...) -> None: ...
 
 class Decision(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "subject", "decided", "why", "readings", "would_change", "kind", "role", "since")
@@ -730,6 +736,16 @@ class DownCommand(_message.Message):
     def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ...) -> None: ...
 
 class ReloadCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ...) -> None: ...
+
+class PlanCommand(_message.Message):
     __slots__ = ("sender", "kind", "id")
     SENDER_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]

@@ -24,9 +24,7 @@ def test_who_sees_the_lamp_leads_and_the_others_follow(fleet: FleetProcesses) ->
     for car in ROW:
         fleet.ready(car)
     began = _truth(sim)
-    coordinator = fleet.start(
-        "-m", "fleet.cli", "coordinate", "--plan", str(EXAMPLES / "plans" / "3-leader.yaml"), "--json"
-    )
+    coordinator = fleet.start("-m", "fleet.cli", "plan", "run", str(EXAMPLES / "plans" / "3-leader.yaml"), "--json")
     wait_for(lambda: {car: mode for car, (mode, _) in _truth(sim).items()} == MODES, "red leads, the others follow")
     roles = {role.name: list(role.cars) for role in fleet.get("fleet/@coordinator/assignment")[0].roles}
     assert roles == {"leader": ["red"], "follower": ["blue", "green"]}

@@ -110,8 +110,8 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("list --connect nowhere", "endpoint 'nowhere' is not allowed: write it as tcp/HOST:PORT"),
         ("list --connect tcp/localhost", "endpoint 'tcp/localhost' is not allowed"),
         ("list --fleet A", "fleet name 'A' is not allowed"),
-        ("coordinate", "Missing option '--plan'"),
-        ("coordinate --plan no/such.yaml", "no/such.yaml:1:1: error: there is no such file"),
+        ("plan run", "Missing argument 'FILE'"),
+        ("plan run no/such.yaml", "no/such.yaml:1:1: error: there is no such file"),
     ],
 )
 def test_wrong_use_is_one_line_and_exit_code_2(
@@ -131,7 +131,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(
 
 @pytest.mark.parametrize(
     "arguments",
-    ["check", "plan check", "coordinate --plan", "up", "up --sim 1 --plan", "up --sim 1 --world"],
+    ["check", "plan run", "plan set", "up", "up --sim 1 --plan", "up --sim 1 --world"],
 )
 def test_a_fifo_as_a_file_is_refused_and_not_waited_for(
     arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -145,7 +145,7 @@ def test_a_fifo_as_a_file_is_refused_and_not_waited_for(
     assert f"{tmp_path / 'fifo'}:1:1: error: is a FIFO, not a file" in capsys.readouterr().err
 
 
-OF_FILES = ("scan", "sim", "example", "init", "check", "bind", "schema", "plan", "sessions", "replay", "play", "replan")
+OF_FILES = ("scan", "sim", "example", "init", "check", "bind", "schema", "plan", "sessions", "replay", "play")
 """Subcommands that look at no bus, or at that of the file."""
 NAMES = [name for section in cli.COMMANDS.values() for name in section]
 

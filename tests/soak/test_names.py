@@ -27,7 +27,7 @@ def test_ten_thousand_names_in_ten_seconds(kind: str, tmp_path: Path) -> None:
             "fleet/@coordinator/decision",
             lambda sample: decided.append((time.monotonic(), sample.message().subject)),  # type: ignore[attr-defined]
         )
-        coordinator = fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(plan))
+        coordinator = fleet.start("-m", "fleet.cli", "plan", "run", str(plan))
 
         def subjects() -> set[str]:
             return {each.subject for each in fleet.get("fleet/@coordinator/decision") if not isinstance(each, str)}

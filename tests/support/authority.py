@@ -17,7 +17,7 @@ def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str])
     plan.write_text(PLAN, encoding="utf-8")
 
     def coordinate() -> GatewayProcess:
-        return fleet.start("-m", "fleet.cli", "coordinate", "--plan", str(plan), "--json")
+        return fleet.start("-m", "fleet.cli", "plan", "run", str(plan), "--json")
 
     def decided(process: GatewayProcess, mode: str | None) -> None:
         while (line := process.line())["car"] is None or line["mode"] != mode:

@@ -179,7 +179,7 @@ def test_ports_are_looked_at_and_left_alone(command: Command, port: Port, tcp: T
 def test_a_bridge_is_connected_to_and_told_nothing(command: Command, tcp: TcpCar, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{platform: arduino, link: '{tcp.link}'}}}}")
     done = command("check")
-    assert (done.returncode, done.stdout) == (0, f"red  ok   {tcp.link}: its bridge accepts connections\n")
+    assert (done.returncode, done.stdout) == (0, f"red  ok     {tcp.link}: its bridge accepts connections\n")
     wait_for(lambda: tcp.hung_up, "it is known what was sent")
     assert (tcp.connections, tcp.received) == (1, [])
 
@@ -205,7 +205,7 @@ def test_a_car_with_a_gateway_is_left_to_it(command: Command, endpoint: str, tmp
         fleet.ready()
         (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{link: {link}}}}}")
         done = command("check")
-        assert (done.returncode, done.stdout) == (0, f"red  ok   {link}: its gateway runs, the link is online\n")
+        assert (done.returncode, done.stdout) == (0, f"red  ok     {link}: its gateway runs, the link is online\n")
     finally:
         fleet.close()
 

@@ -1,4 +1,4 @@
-"""`fleet coordinate` as a process, with real gateways: a plan is kept, and never against a hold."""
+"""`fleet plan run` as a process, with real gateways: a plan is kept, and never against a hold."""
 
 import re
 import signal
@@ -49,7 +49,7 @@ class Lines:
 
 def coordinator(cars: Cars, path: Path, plan: str = PLAN, *more: str) -> GatewayProcess:
     path.write_text(plan, encoding="utf-8")
-    process = cars.start("-m", "fleet.cli", "coordinate", "--plan", str(path), "--json", *more)
+    process = cars.start("-m", "fleet.cli", "plan", "run", str(path), "--json", *more)
     STARTED.append(process)
     return process
 

@@ -6,9 +6,10 @@ import pytest
 
 from fleet.coordinator.state_file import CoordinatorStateFile
 from fleet.policy.plan.parser import parse
+from fleet.policy.requests import PlanRequest, on_request
 from fleet.policy.rules import PHASE_SETTLE_TIMEOUT_S
 from fleet.policy.snapshot import FleetSnapshot
-from fleet.policy.state import PersistedPolicy, restart_plan, restore, to_persisted
+from fleet.policy.state import PersistedPolicy, restore, to_persisted
 from tests.fleet.policy.cars import GONE, HERE, PolicyRun
 
 PLAN = parse(
@@ -80,7 +81,8 @@ def test_phase_and_rules_are_kept_within_one_run_and_roles_longer(
 def test_a_restarted_plan_begins_with_its_first_phase() -> None:
     run = PolicyRun(PLAN, "red")
     run.until(12.0)
-    run.memory = restart_plan(run.memory)
+    run.memory, words = on_request(PlanRequest.RESTART, PLAN, run.memory, "ann", 12.1)
+    assert words == f"plan {PLAN.version} begins anew with phase work"
     step = run.at(12.1)
     assert step.memory.phase.name == "work"
     assert [each.decided for each in step.changed if each.subject == "phase"] == ["work"]

@@ -30,7 +30,7 @@ def test_it_is_whole_and_has_all_messages() -> None:
     ("command", "words"),
     [
         ("sessions redecode", "212 frames and 287 readings of green, red: no difference"),
-        ("replan", "6 decisions from 5.2 s to 7.1 s: no difference"),
+        ("plan try", "6 decisions from 5.2 s to 7.1 s: no difference"),
     ],
 )
 def test_todays_decoder_and_policy_do_with_it_as_they_did(command: str, words: str) -> None:

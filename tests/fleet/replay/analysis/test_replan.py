@@ -1,4 +1,4 @@
-"""`fleet replan`: the same plan decides what was decided, another one otherwise; and how that is told apart."""
+"""`fleet plan try`: the same plan decides what was decided, another one otherwise; and how that is told apart."""
 
 import json
 import signal
@@ -45,7 +45,7 @@ def run(*arguments: str | Path) -> Result:
 
 
 def coordinator(cars: Cars, plan: Path) -> GatewayProcess:
-    return cars.start("-m", "fleet.cli", "coordinate", "--plan", str(plan), "--json")
+    return cars.start("-m", "fleet.cli", "plan", "run", str(plan), "--json")
 
 
 def until(process: GatewayProcess, subject: str, kind: str) -> None:
@@ -102,7 +102,7 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_same_plan_shows_no_difference(recorded: Path) -> None:
-    result = run("replan", recorded, "--json")
+    result = run("plan", "try", recorded, "--json")
     assert result.exit_code == 0, result.output
     summary = json.loads(result.output.splitlines()[-1])
     assert summary["differences"] == 0
@@ -114,14 +114,14 @@ def test_the_same_plan_shows_no_difference(recorded: Path) -> None:
 def test_another_plan_shows_where_and_why(recorded: Path, tmp_path: Path) -> None:
     plan = tmp_path / "other.yaml"
     plan.write_text(OTHER, encoding="utf-8")
-    result = run("replan", recorded, "--plan", plan, "--json")
+    result = run("plan", "try", recorded, plan, "--json")
     assert result.exit_code == 1
     first = json.loads(result.output.splitlines()[0])
     assert first["subject"] == "red"
     assert (first["then"]["kind"], first["then"]["decided"]) == ("rule", "light_seeking")
     assert "motion=spin_left" in first["then"]["readings"][0]
     assert (first["now"]["kind"], first["now"]["decided"]) == ("role", "tracking")
-    told = run("replan", recorded, "--plan", plan).output
+    told = run("plan", "try", recorded, plan).output
     assert (
         "  then: rule light_seeking (role track), because: rule spinning: green: motion.motion == 'spin_left'" in told
     )
@@ -138,9 +138,9 @@ def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp
     first, second, *_ = (each.recorded_ns for each in Session(recorded).messages(["fleet/@coordinator/plan"]))
     between = ("--from", time_spec.iso(first + S), "--to", time_spec.iso(second))
     assert run("sessions", "cut", recorded, *between, "--out", out).exit_code == 0
-    assert "has no plan: name one with --plan" in run("replan", out).output
+    assert "has no plan: name one after the session" in run("plan", "try", out).output
     (out / "plan.yaml").write_text(PLAN, encoding="utf-8")
-    result = run("replan", out, "--json")
+    result = run("plan", "try", out, "--json")
     summary = json.loads(result.output.splitlines()[-1])
     assert (summary["differences"], summary["begun_before"]) == (0, 1), result.output
 
@@ -148,7 +148,7 @@ def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp
 def test_a_session_without_cars_that_were_decided_on_is_refused(recorded: Path, tmp_path: Path) -> None:
     for source, out, more in ((recorded, "red", ["--cars", "red"]), (tmp_path / "red", "part", ["--from", "1s"])):
         assert run("sessions", "cut", source, *more, "--out", tmp_path / out).exit_code == 0
-        result = run("replan", tmp_path / out)
+        result = run("plan", "try", tmp_path / out)
         assert result.exit_code == 1
         assert "was cut to red" in result.output
         assert "blue, green too" in result.output
@@ -206,7 +206,7 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     made = Made(empty, Writer)
     made.put("fleet/red/state/mode", pb.Mode(asked="manual"), 1.0)
     made.close()
-    result = run("replan", empty)
+    result = run("plan", "try", empty)
     assert result.exit_code == 1
     assert "has no decisions of a coordinator" in result.output
 
@@ -215,7 +215,7 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     made.put("fleet/@coordinator/plan", pb.Plan(text="{: no plan"), 1.0)
     made.put("fleet/@coordinator/decision", pb.Decision(subject="red", decided="manual", kind="role"), 1.1)
     made.close()
-    result = run("replan", old)
+    result = run("plan", "try", old)
     assert result.exit_code == 2
     assert "the recorded plan of fleet" in result.output
     assert "Traceback" not in result.output
@@ -224,10 +224,10 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     made = Made(without, Writer)
     made.put("fleet/@coordinator/decision", pb.Decision(subject="red", decided="manual", kind="role"), 1.1)
     made.close()
-    assert "has no plan: name one with --plan" in run("replan", without).output
-    assert run("replan", without, "--plan", tmp_path / "nowhere.yaml").exit_code == 2
-    assert run("replan", tmp_path / "nowhere").exit_code == 1
-    assert run("replan", without, "--tolerance", "0").exit_code == 2
+    assert "has no plan: name one after the session" in run("plan", "try", without).output
+    assert run("plan", "try", without, tmp_path / "nowhere.yaml").exit_code == 2
+    assert run("plan", "try", tmp_path / "nowhere").exit_code == 1
+    assert run("plan", "try", without, "--tolerance", "0").exit_code == 2
 
 
 def test_a_sessions_fleet_file_may_name_its_plan_otherwise(tmp_path: Path) -> None:
@@ -239,10 +239,10 @@ def test_a_sessions_fleet_file_may_name_its_plan_otherwise(tmp_path: Path) -> No
     (tmp_path / "plan.yaml").write_text("fixed: {red: {mode: manual}}", encoding="utf-8")
     text = "plan: p2.yaml\nworld: w2.yaml\ncars: {red: {platform: arduino}}\n"
     (tmp_path / "fleet.yaml").write_text(text, encoding="utf-8")
-    result = run("replan", tmp_path)
+    result = run("plan", "try", tmp_path)
     assert "decisions from" in result.output, result.output
     other = tmp_path / "other.yaml"
     other.write_text(text, encoding="utf-8")
-    named = run("replan", tmp_path, "--fleet-file", other)
+    named = run("plan", "try", tmp_path, "--fleet-file", other)
     assert named.exit_code == 2
     assert "plan: 'p2.yaml': there is no such file beside this one" in named.output

@@ -1,4 +1,4 @@
-"""`fleet replan`: replays a session through a plan, and compares its decisions with the recorded ones."""
+"""`fleet plan try`: replays a session through a plan, and compares its decisions with the recorded ones."""
 
 import json
 from collections.abc import Mapping
@@ -29,17 +29,13 @@ TOLERANCE_S: Final = 2.0
 @click.command(
     epilog="""\b
 examples:
-  fleet replan sessions/20260314T151617Z-fleet
-  fleet replan sessions/20260314T151617Z-fleet --plan new.yaml
+  fleet plan try sessions/20260314T151617Z-fleet new.yaml
+  fleet plan try sessions/20260314T151617Z-fleet
+
 Exit codes: 0 no difference, 1 some, or nothing to compare, 2 no plan."""
 )
 @click.argument("session", type=click.Path(path_type=Path))
-@click.option(
-    "--plan",
-    "path",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="The plan to try; without one the session's own.",
-)
+@click.argument("path", metavar="[PLAN]", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @click.option(
     "--fleet-file",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -53,10 +49,11 @@ Exit codes: 0 no difference, 1 some, or nothing to compare, 2 no plan."""
     help="Seconds by which the same decision may come earlier or later.",
 )
 @json_option
-def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance: float, *, as_json: bool) -> None:
-    """Replay SESSION through a plan. List decisions that differ from the recorded ones, with their reasons.
+def try_plan(session: Path, path: Path | None, fleet_file: Path | None, tolerance: float, *, as_json: bool) -> None:
+    """Replay the recorded sensor data through a plan and show where it would have decided differently.
 
-    The cars' messages stay as recorded, whatever the plan decides. They include a person's stops and drives.
+    Without PLAN it takes the session's own plan. The cars' messages stay as recorded, whatever the plan decides. They
+    include a person's stops and drives.
     """
     from fleet.coordinator.observer import listed_cars
     from fleet.fleetfile.fleet_file import read_fleet
@@ -87,7 +84,7 @@ def replan(session: Path, path: Path | None, fleet_file: Path | None, tolerance:
 
 
 class _ReplanReport:
-    """One run of `fleet replan`: replays every coordinator of a session and collects the differences."""
+    """One run of `fleet plan try`: replays every coordinator of a session and collects the differences."""
 
     def __init__(
         self, session: "Session", plan: "Plan | None", listed: "Mapping[str, CarSnapshot]", tolerance_ns: int
@@ -136,7 +133,7 @@ class _ReplanReport:
                 else [(run.start_ns, self._plan)]
             )
             if not plans:
-                raise click.ClickException(f"{self._session.path} has no plan: name one with --plan")
+                raise click.ClickException(f"{self._session.path} has no plan: name one after the session")
             again = Replanning(run, plans, self._listed, persisted)
             persisted = self._one(run, again, tokens)
 
@@ -153,7 +150,7 @@ class _ReplanReport:
         if others := sorted(decided - {*left, "phase"}):
             raise click.ClickException(
                 f"{self._session.path} was cut to {', '.join(left)}: what was decided then was decided with "
-                f"{', '.join(others)} too, and what they said is not in it; replan the session it was cut from"
+                f"{', '.join(others)} too, and what they said is not in it; try the session it was cut from"
             )
 
     def _one(self, run: "CoordinatorRun", again: "Replanning", tokens: "list[PresenceToken]") -> Any:

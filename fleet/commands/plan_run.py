@@ -1,4 +1,4 @@
-"""`fleet coordinate`: runs the coordinator as a process."""
+"""`fleet plan run`: runs the coordinator as a process."""
 
 import json
 import os
@@ -22,7 +22,9 @@ from schemas.yaml_document.document import read_text
 @click.command(
     epilog="""\b
 example:
-  fleet coordinate --plan plan.yaml
+  fleet plan run plan.yaml
+
+With `fleet up --plan FILE` the plan runs beside the cars: this command is for a coordinator of its own.
 
 \b
 a plan:
@@ -34,22 +36,33 @@ a plan:
     - when: {car: red, is: range_m < 0.3, for_s: 0.5}
       then: {who: blue, mode: tracking}"""
 )
-@click.option("--plan", "path", required=True, type=click.Path(path_type=Path, dir_okay=False), help="The plan, YAML.")
+@click.argument("path", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False))
 @click.option(
     "--fleet-file",
     type=click.Path(path_type=Path, dir_okay=False),
     help="The fleet file with the cars' capabilities and roles.",
 )
 @click.option(
-    "--run", default="", metavar="NAME", help="Phase and rules outlive the coordinator within one run (of fleet up)."
+    "--run",
+    "run_name",
+    default="",
+    metavar="NAME",
+    help="Phase and rules outlive the coordinator within one run (of fleet up).",
 )
 @click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
 @json_option
 @bus_options
-def coordinate(
-    path: Path, fleet_file: Path | None, run: str, connect: str | None, fleet: str, *, with_parent: bool, as_json: bool
+def run(
+    path: Path,
+    fleet_file: Path | None,
+    run_name: str,
+    connect: str | None,
+    fleet: str,
+    *,
+    with_parent: bool,
+    as_json: bool,
 ) -> None:
-    """Carry out a plan until Ctrl-C. Leave cars on hold alone. Print one line per decision."""
+    """Run a plan until Ctrl-C. Prints one line per decision. Cars you stopped are left alone."""
     parent = os.getppid() if with_parent else None
     plan = parse(read_text(path), str(path))
     listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file, unbound=True))
@@ -67,7 +80,7 @@ def coordinate(
     with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True) as client:
         try:
             Coordinator(
-                client, plan, on_decided, lambda words: click.echo(f"fleet: {words}", err=True), listed, run
+                client, plan, on_decided, lambda words: click.echo(f"fleet: {words}", err=True), listed, run_name
             ).run(lambda: stop.is_set() or parent not in (None, os.getppid()))
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None

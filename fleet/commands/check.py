@@ -1,0 +1,201 @@
+"""`fleet check`: checks fleet files, plans and worlds, which it recognizes by their content."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from enum import IntEnum, StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+import click
+import yaml
+
+from fleet.commands.fleet_file import DEFAULT_FILE, print_errors
+from fleet.commands.options import cli_errors, json_option
+from fleet.coordinator.observer import listed_cars
+from fleet.fleetfile.fleet_file import FleetFile, read_fleet
+from fleet.fleetfile.link_check import check_link
+from fleet.fleetfile.models import FileEntry
+from fleet.policy.plan.lint import Severity
+from fleet.policy.plan.lint import check as find_findings
+from fleet.policy.plan.models import PlanEntry
+from fleet.policy.plan.parser import parse as parse_plan
+from fleet.policy.snapshot import CarSnapshot
+from schemas import bus
+from schemas.yaml_document.document import BadFile, read_text
+
+_CHECK_THREADS: Final = 16
+_WORLD_FIELDS: Final = frozenset({"room", "walls", "boxes", "line", "lamps", "things", "cars_meet", "cars"})
+_Cars = Mapping[str, CarSnapshot] | None
+
+
+class FileKind(StrEnum):
+    """The kind of a file."""
+
+    FLEET = "fleet file"
+    PLAN = "plan"
+    WORLD = "world"
+
+
+class _Result(IntEnum):
+    """The result for one file, which is also an exit code."""
+
+    GOOD = 0
+    FAILED = 1
+    """A car cannot be reached, or a part of a plan can never work."""
+    WRONG = 2
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet check
+  fleet check plan.yaml
+  fleet check fleet.yaml plan.yaml world.yaml --json
+
+Exit codes: 0 no mistakes, 1 a car's port is missing or a part of a plan can never work, 2 a file is wrong."""
+)
+@click.argument("files", nargs=-1, metavar="[FILE...]", type=click.Path(path_type=Path, dir_okay=False))
+@json_option
+def check(files: tuple[Path, ...], *, as_json: bool) -> None:
+    """Check fleet files, plans and worlds (default: fleet.yaml), and whether each car's port exists and is free.
+
+    Does not touch the cars. With a fleet file, its plan and world are checked too, for the cars of that file.
+    """
+    checks = _Checks(as_json=as_json)
+    kinds = {file: checks.recognize(file) for file in files or (DEFAULT_FILE,)}
+    for kind in FileKind:  # fleet files first: plans are checked for their cars
+        for file in (each for each, its in kinds.items() if its is kind):
+            checks.check(kind, file)
+    raise SystemExit(int(checks.result))
+
+
+class _Checks:
+    """The checks of one call of `fleet check`."""
+
+    def __init__(self, *, as_json: bool) -> None:
+        self.result = _Result.GOOD
+        self._as_json = as_json
+        self._cars: _Cars = None
+        self._done: set[Path] = set()
+
+    def recognize(self, file: Path) -> FileKind | None:
+        """Return the kind of a file. None if it cannot be read, which is an error of it."""
+        try:
+            text = read_text(file)
+        except BadFile as error:
+            self._wrong(error)
+            if file == DEFAULT_FILE and not file.exists():
+                click.echo("fleet: make one with `fleet init`", err=True)
+            return None
+        return recognize(text)
+
+    def check(self, kind: FileKind, file: Path) -> None:
+        """Check one file, and those that it names."""
+        if file.resolve() in self._done:
+            return
+        self._done.add(file.resolve())
+        try:
+            match kind:
+                case FileKind.FLEET:
+                    self._check_fleet(file)
+                case FileKind.PLAN:
+                    self._check_plan(file)
+                case FileKind.WORLD:
+                    self._check_world(file)
+        except BadFile as error:
+            self._wrong(error)
+
+    def _check_fleet(self, file: Path) -> None:
+        fleet = read_fleet(file)
+        if self._cars is None:
+            self._cars = listed_cars(fleet)
+        served = _served(fleet)
+        with ThreadPoolExecutor(_CHECK_THREADS) as pool:
+            found = list(pool.map(lambda car: check_link(car, served), fleet.cars.values()))
+        widest = max(len(each.car) for each in found)
+        for each in found:
+            state = "ok" if each.ok else "error"
+            self._print(asdict(each), f"{each.car:{widest}}  {state:5}  {each.link}: {each.words}")
+            self._worse(_Result.GOOD if each.ok else _Result.FAILED)
+        for kind, path in ((FileKind.PLAN, fleet.plan), (FileKind.WORLD, fleet.world)):
+            if path is not None:
+                self.check(kind, path)
+
+    def _check_plan(self, file: Path) -> None:
+        plan = parse_plan(read_text(file), str(file))
+        findings = find_findings(plan, self._cars)
+        for each in findings:
+            self._print({"file": str(file), **asdict(each)}, each.at(str(file)))
+        if any(each.severity is Severity.ERROR for each in findings):
+            self._worse(_Result.FAILED)
+            return
+        parts = {"role": len(plan.roles), "rule": len(plan.rules), "phase": len(plan.phases)}
+        self._good(file, FileKind.PLAN, ", ".join(f"{n} {part}{'' if n == 1 else 's'}" for part, n in parts.items()))
+
+    def _check_world(self, file: Path) -> None:
+        # Worlds belong to the simulator, whose code no part of the fleet imports.
+        command = [sys.executable, "-m", "gateway.cli", "sim", "--check", "--world", str(file)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        for line in done.stderr.splitlines():
+            words = line.removeprefix("gateway sim: ")
+            self._print({"file": str(file), "severity": "error", "words": words}, words, err=True)
+        if done.returncode:
+            self._worse(_Result.WRONG)
+        else:
+            self._good(file, FileKind.WORLD, "can be simulated")
+
+    def _wrong(self, error: BadFile) -> None:
+        print_errors(error, as_json=self._as_json)
+        self._worse(_Result.WRONG)
+
+    def _good(self, file: Path, kind: FileKind, words: str) -> None:
+        if not self._as_json:
+            click.echo(f"{file}: {kind}, {words}: no mistakes found")
+
+    def _worse(self, result: _Result) -> None:
+        self.result = max(self.result, result)
+
+    def _print(self, values: Mapping[str, object], line: str, *, err: bool = False) -> None:
+        click.echo(json.dumps(values) if self._as_json else line, err=err and not self._as_json)
+
+
+def recognize(text: str) -> FileKind:
+    """Return the kind of a file by its fields. A file of none is taken for a fleet file, whose errors then tell."""
+    try:
+        found: Any = yaml.safe_load(text)
+    except yaml.YAMLError:
+        found = None
+    if not isinstance(found, dict):
+        return FileKind.PLAN if text.lstrip().startswith(("roles:", "rules:")) else FileKind.FLEET
+    names = {str(each) for each in found}
+    fields = {
+        FileKind.FLEET: frozenset(FileEntry.model_fields),
+        FileKind.PLAN: frozenset(each.alias or name for name, each in PlanEntry.model_fields.items()),
+        FileKind.WORLD: _WORLD_FIELDS,
+    }
+    return max(FileKind, key=lambda kind: (len(names & fields[kind]), kind is _kind_of_cars(found.get("cars"))))
+
+
+def _kind_of_cars(cars: Any) -> FileKind:
+    """Return the kind of a file by its `cars`: with places, with modes, or with links."""
+    values: Sequence[Any] = list(cars.values()) if isinstance(cars, dict) else []
+    if any(isinstance(each, dict) and "x_m" in each for each in values):
+        return FileKind.WORLD
+    return FileKind.PLAN if values and all(isinstance(each, str) for each in values) else FileKind.FLEET
+
+
+def _served(fleet: FleetFile) -> dict[str, tuple[str, str, str]]:
+    """Return state, reason and URL of the link of every running gateway. Empty if no fleet is running."""
+    from fleet.client.client import Fleet
+
+    with cli_errors():
+        if not bus.accepts(bus.resolve_endpoint(fleet.endpoint)):
+            return {}
+        with Fleet(fleet.endpoint, fleet.name, kind="person") as client:
+            urls = {each.value.car: each.value.link for each in client.get("*/state/health")}
+            links = [each.value for each in client.get("*/state/link")]
+            return {link.car: (link.state, link.reason, urls.get(link.car, "")) for link in links}

@@ -1,0 +1,65 @@
+"""Requests of people for the plan in force: restart it, go on to the next phase, stop it. Pure; times in s."""
+
+from dataclasses import replace
+from enum import StrEnum
+from typing import Final
+
+from fleet.policy.plan.plan import Plan
+from fleet.policy.rules import PhaseState
+from fleet.policy.state import PolicyState
+
+GOES_ON: Final = "`fleet plan restart` or `fleet plan set` goes on"
+
+
+class PlanRequest(StrEnum):
+    """A request for the plan in force, as the last part of its key."""
+
+    RESTART = "restart"
+    NEXT = "next"
+    STOP = "stop"
+
+
+class RequestRefused(Exception):
+    """The request cannot be carried out. The text gives the reason and, in brackets, its code."""
+
+
+def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, now: float) -> tuple[PolicyState, str]:
+    """Return the state after the request of the sender `by`, and what it did in words. Raises RequestRefused."""
+    match request:
+        case PlanRequest.RESTART:
+            begins = f" with phase {plan.first}" if plan.first else ""
+            return PolicyState(started_at=memory.started_at), f"plan {plan.version} begins anew{begins}"
+        case PlanRequest.NEXT:
+            name = _next_phase(plan, memory)
+            phase = PhaseState(name, now, why=f"{by} went on to it from {memory.phase.name}")
+            return replace(memory, phase=phase), f"phase {memory.phase.name} is over: {name}"
+        case PlanRequest.STOP:
+            return _stop(memory, by)
+
+
+def _next_phase(plan: Plan, memory: PolicyState) -> str:
+    if memory.stopped_by:
+        raise RequestRefused(f"The plan is stopped (by {memory.stopped_by}): {GOES_ON}. [unsupported]")
+    if not plan.phases:
+        raise RequestRefused("The plan has no phases. [unsupported]")
+    phase = plan.phases.get(memory.phase.name)
+    if phase is None:
+        raise RequestRefused("No phase has begun yet. Try again. [unsupported]")
+    name = phase.next or phase.on_timeout
+    if name is None:
+        raise RequestRefused(
+            f"Phase {phase.name} is the last one: `next` names none after it. "
+            f"`fleet plan restart` begins with {plan.first}. [unsupported]"
+        )
+    return name
+
+
+def _stop(memory: PolicyState, by: str) -> tuple[PolicyState, str]:
+    """Let go of all cars. Those that the plan commands are brought to rest first, without a hold."""
+    if memory.stopped_by:
+        return memory, f"the plan is stopped already (by {memory.stopped_by}): {GOES_ON}"
+    commanded = {each.car for each in memory.decisions.values() if each.car is not None and each.mode is not None}
+    cars = sorted(commanded | memory.held_roles.keys())
+    stopped = PolicyState(started_at=memory.started_at, stopped_by=by, to_rest=frozenset(cars))
+    rest = f"{', '.join(cars)} brought to rest" if cars else "it commanded no car"
+    return stopped, f"the plan is stopped: {rest}. {GOES_ON}"

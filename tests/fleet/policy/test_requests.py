@@ -1,0 +1,155 @@
+"""Requests of people for the plan in force: restart, next phase, stop. A stopped plan drives no car again by itself."""
+
+from typing import Any
+
+import pytest
+
+from fleet.policy.plan.parser import parse
+from fleet.policy.requests import PlanRequest, RequestRefused, on_request
+from fleet.policy.snapshot import FleetSnapshot, Refusal
+from fleet.policy.state import PersistedPolicy, carry_over, restore, to_persisted
+from tests.fleet.policy.cars import PolicyRun
+
+PHASES = parse(
+    """
+roles: {line: {mode: tracking, count: all}, light: {mode: light_seeking, count: all}}
+phases:
+  first: {roles: [line], timeout_s: 60, on_timeout: second}
+  second: {roles: [light], until: {any: light.left}, next: third}
+  third: {roles: [line]}
+"""
+)
+FLAT = parse("roles: {line: {mode: tracking, count: all}}")
+
+
+def ask(run: PolicyRun, request: str) -> str:
+    run.memory, words = on_request(PlanRequest(request), run.plan, run.memory, "ann", run.now)
+    return words
+
+
+def started(plan: Any = PHASES, *cars: str, obey: bool = True) -> PolicyRun:
+    run = PolicyRun(plan, *(cars or ("red", "blue")), obey=obey)
+    run.until(3.0)
+    return run
+
+
+def test_next_goes_from_phase_to_phase_and_is_refused_at_the_end() -> None:
+    run = started()
+    assert ask(run, "next") == "phase first is over: second"
+    run.until(4.0)
+    assert run.of("red").mode == "light_seeking"
+    assert run.of("phase").why == "ann went on to it from first"
+    ask(run, "next")
+    run.until(5.0)
+    assert run.memory.phase.name == "third"
+    with pytest.raises(RequestRefused, match=r"third is the last one: .* `fleet plan restart` .*\[unsupported\]$"):
+        ask(run, "next")
+    ask(run, "restart")
+    run.until(6.0)
+    assert (run.memory.phase.name, run.of("red").mode) == ("first", "tracking")
+
+
+def test_next_is_refused_without_phases_and_while_the_plan_is_stopped() -> None:
+    with pytest.raises(RequestRefused, match="has no phases"):
+        ask(started(FLAT), "next")
+    run = started()
+    ask(run, "stop")
+    with pytest.raises(RequestRefused, match=r"stopped \(by ann\)"):
+        ask(run, "next")
+
+
+def test_a_stopped_plan_brings_its_cars_to_rest_once_and_leaves_them_alone() -> None:
+    run = started(FLAT)
+    assert "blue, red brought to rest" in ask(run, "stop")
+    run.asked.clear()
+    step = run.at(3.1)
+    assert run.asked == [(3.1, "blue", "manual"), (3.1, "red", "manual")]
+    assert run.of("red").why == "ann stopped the plan: red is brought to rest"
+    assert {each.subject for each in step.changed} == {"red", "blue", "role line"}
+    run.until(4.0)
+    assert not run.memory.to_rest
+    assert run.of("red").decided == "left alone"
+    run.change("red", mode="light_seeking")  # by a person
+    run.until(90.0, every=1.0)
+    assert len(run.asked) == 2
+    assert "already" in ask(run, "stop")
+
+
+def test_a_command_that_was_on_its_way_does_not_pass_for_rest() -> None:
+    """The car still says manual: the mode command before the stop has no outcome yet."""
+    run = started(FLAT, "red", obey=False)
+    ask(run, "stop")
+    run.change("red", busy=True)
+    run.asked.clear()
+    run.until(4.0)
+    assert run.memory.to_rest == {"red"}
+    run.change("red", busy=False)
+    run.at(4.1)
+    assert run.asked == [(4.1, "red", "manual")], "it may be in tracking by now"
+    run.change("red", mode="tracking")
+    run.until(5.5)
+    assert run.memory.to_rest == {"red"}
+    assert [car for _, car, _ in run.asked] == ["red", "red"]
+    run.change("red", mode="manual")
+    run.at(5.6)
+    assert not run.memory.to_rest
+
+
+@pytest.mark.parametrize("fields", [{"held_by": "bob"}, {"estopped_by": "bob"}, {"driven_by": "bob"}])
+def test_what_a_person_has_taken_is_left_to_that_person(fields: dict[str, str]) -> None:
+    run = started(FLAT, "red")
+    ask(run, "stop")
+    run.asked.clear()
+    run.change("red", **fields)
+    run.at(3.1)
+    run.change("red", **dict.fromkeys(fields))
+    run.until(10.0)
+    assert (run.asked, run.memory.to_rest) == ([], frozenset())
+
+
+def test_a_lost_car_is_brought_to_rest_when_it_is_back_and_a_refusal_is_no_rest() -> None:
+    run = started(FLAT, "red")
+    run.change("red", link="lost")
+    run.at(3.1)
+    ask(run, "stop")
+    run.asked.clear()
+    run.until(10.0)
+    assert run.memory.to_rest == {"red"}
+    run.obey = False
+    run.change("red", link="online", mode="manual")
+    run.at(10.1)
+    run.change("red", refused=Refusal("manual", "link_down", "", 10.1))
+    run.at(10.2)
+    assert run.memory.to_rest == {"red"}
+    run.change("red", refused=None)
+    run.at(10.3)
+    assert not run.memory.to_rest
+    assert len(run.asked) == 1
+
+
+@pytest.mark.parametrize("plan", [FLAT, PHASES])
+def test_a_coordinator_that_is_started_again_stays_stopped(plan: Any) -> None:
+    run = started(FLAT)
+    ask(run, "stop")
+    kept = to_persisted(FLAT, run.memory, run.now, 1000.0)
+    run.plan, run.memory = plan, restore(plan, FleetSnapshot(run.cars), kept, 50.0, 1050.0)
+    run.asked.clear()
+    run.now = 50.0
+    run.until(60.0)
+    assert {mode for _, _, mode in run.asked} == {"manual"}
+    assert (run.memory.stopped_by, run.memory.to_rest) == ("ann", frozenset())
+
+
+@pytest.mark.parametrize("how", ["restart", "set"])
+def test_restart_and_set_go_on(how: str) -> None:
+    run = started(FLAT)
+    ask(run, "stop")
+    run.until(5.0)
+    run.asked.clear()
+    if how == "restart":
+        ask(run, "restart")
+    else:
+        run.memory, run.plan = carry_over(run.memory, FLAT, PHASES), PHASES
+    run.until(8.0)
+    assert {(car, mode) for _, car, mode in run.asked} == {("red", "tracking"), ("blue", "tracking")}
+    assert to_persisted(run.plan, run.memory, run.now, 0.0).stopped_by == PersistedPolicy().stopped_by
