@@ -81,7 +81,14 @@ examples:
 )
 @click.option("--yes", is_flag=True, help="Accept every detected car without asking.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
-@click.option("--out", default=DEFAULT_FILE, show_default=True, type=click.Path(path_type=Path, dir_okay=False))
+@click.option(
+    "--out",
+    metavar="FILE",
+    default=DEFAULT_FILE,
+    show_default=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write this file.",
+)
 @link_option
 @seconds_option
 def init(

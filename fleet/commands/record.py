@@ -58,6 +58,8 @@ _FILE: Final = click.Path(path_type=Path, dir_okay=False)
 examples:
   fleet record --out sessions --quota 20GB
   fleet record status
+  fleet record stop
+  fleet record start
   fleet mark "the blue one lost the line"
 
 The quota does not remove marked sessions.""",

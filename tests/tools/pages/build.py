@@ -39,8 +39,8 @@ PARTS: Final[dict[str, tuple[str, Callable[[], str]]]] = {
     "trust": ("docs/reference/stop-evidence.md", tables.trust_table),
     "transitions": ("docs/reference/stop-evidence.md", tables.transition_table),
     "platforms": ("docs/reference/platforms.md", tables.platform_table),
-    "fleet file": ("docs/reference/fleet-file.md", files.fleet_fields),
-    "plan": ("docs/reference/plan-file.md", files.plan_fields),
+    "fleet file": ("docs/reference/fleet-file.md", lambda: files.schema_tables(files.fleet_schema())),
+    "plan": ("docs/reference/plan-file.md", lambda: files.schema_tables(files.plan_schema())),
     "any_client": ("docs/how-to/use-any-zenoh-client.md", any_client),
     "drive_one": ("docs/how-to/drive-from-python.md", drive_one),
 }

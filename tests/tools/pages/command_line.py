@@ -72,6 +72,8 @@ def _page(command: click.Command, name: str) -> str:
     for words, each in subcommands(name, command):
         level = "#" if words == name else "##"
         parts.append(f"{level} fleet {words}\n\n{_body(words, each)}")
+    if name in gateway.cli.COMMANDS:
+        parts.append(f"[`gateway {name}`]({GATEWAY}#gateway-{name}) is the same for one car.")
     return "\n\n".join(parts) + "\n"
 
 

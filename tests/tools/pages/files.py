@@ -1,10 +1,17 @@
 """The fields of fleet files, plans and worlds, from the JSON Schemas that `fleet schema` prints."""
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+from fleet.fleetfile import fleet_file
 from fleet.fleetfile import models as fleet_models
+from fleet.policy.plan import lint, parser
 from fleet.policy.plan import models as plan_models
+from gateway.sim import world_file
 from tests.tools.pages.command_line import escape
+
+SchemaMaker = Callable[[], dict[str, Any]]
 
 
 def schema_tables(schema: dict[str, Any]) -> str:
@@ -19,7 +26,7 @@ def schema_tables(schema: dict[str, Any]) -> str:
         required = set(part.get("required", ()))
         for field, each in part["properties"].items():
             rows.append(
-                f"| `{field}` | {_value(each, definitions)} | {_default(each, field in required)} | {_about(each)} |"
+                f"| `{field}` | {_value(each, definitions)} | {_default(each, field in required)} | {about(each)} |"
             )
         heading = f"## {_title(name)}\n\n" if name else ""
         parts.append(f"{heading}{escape(words)}\n\n" + "\n".join(rows))
@@ -80,18 +87,33 @@ def _default(each: dict[str, Any], required: bool) -> str:
     )
 
 
-def _about(each: dict[str, Any]) -> str:
+def about(each: dict[str, Any]) -> str:
+    """Return the description of a field."""
     words = each.get("description") or next(
         (kind["description"] for kind in each.get("anyOf", []) if "description" in kind), ""
     )
     return escape(" ".join(words.split())).replace("|", "\\|")
 
 
-def fleet_fields() -> str:
-    """Return the fields of a fleet file."""
-    return schema_tables(fleet_models.schema())
+def fleet_schema() -> dict[str, Any]:
+    """Return the schema of fleet files."""
+    return fleet_models.schema()
 
 
-def plan_fields() -> str:
-    """Return the fields of a plan."""
-    return schema_tables(plan_models.PlanEntry.model_json_schema())
+def plan_schema() -> dict[str, Any]:
+    """Return the schema of plans."""
+    return plan_models.PlanEntry.model_json_schema()
+
+
+def problems(kind: str, text: str) -> list[str]:
+    """Return what the reader and the check of this kind of file find in a text."""
+    try:
+        if kind == "plan":
+            return [str(each) for each in lint.check(parser.parse(text, "plan.yaml")) if each.severity == "error"]
+        if kind == "fleet":
+            fleet_file.parse_fleet(text, Path("fleet.yaml"))
+        else:
+            world_file.read_world(text, "world.yaml")
+    except ValueError as error:
+        return [str(error)]
+    return []
