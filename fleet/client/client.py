@@ -65,7 +65,8 @@ class Fleet:
     kind: `script`, `person` (outranks scripts) or `coordinator`.
 
     While it is open, it has the token `<fleet>/@operator/<sender>`. If the token is lost, gateways stop the cars that
-    it drives. Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
+    it drives. A script that does not close it ends with a ResourceWarning.
+    Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
     """
 
     def __init__(

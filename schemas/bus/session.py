@@ -1,9 +1,12 @@
 """The only place that opens a Zenoh session: publications, subscriptions, queries and liveliness tokens."""
 
+import atexit
 import os
 import threading
+import warnings
 from collections.abc import Callable, Iterator
-from typing import Any, Final, Self
+from concurrent.futures import Future
+from typing import Any, Final, Self, TypeVar
 
 import zenoh
 
@@ -14,25 +17,35 @@ from schemas.bus.replies import BUSY, refuse
 from schemas.bus.sample import Failure, Sample, sample_of, unread
 from schemas.topics import Qos, Topic
 
+T = TypeVar("T")
+
 # On a busy machine, existing tokens arrive late. A token that disappears at this moment never arrives.
 _TOKEN_HISTORY_TIMEOUT_S: Final = 2.0
 """Timeout for the existing tokens at the start of a watch."""
+
+_THREAD_END_TIMEOUT_S: Final = 2.0
+"""Timeout for the end of a callback when the session is closed."""
+_DECLARE_LOCK: Final = threading.Lock()
 
 _MAX_QUEUED_ANSWERS: Final = 1 << 16
 """Maximum number of queued answers of one query. Beyond it, the link stalls and Zenoh drops answers on the way."""
 
 
 class Bus:
-    """One Zenoh session. Close it (`with`): an open session with callbacks keeps the interpreter from exiting."""
+    """One Zenoh session. Close it (`with`). The interpreter closes open ones when it exits, with a ResourceWarning."""
 
     def __init__(self, session: zenoh.Session, endpoint: str) -> None:
         self._session = session
         self._declarations: list[Any] = []
         self._lock = threading.Lock()
+        self._threads: set[threading.Thread] = set()
+        """Threads of Zenoh that run our callbacks."""
         self._alive: dict[str, set[str]] = {}
         """Existing tokens by watched expression."""
         self.endpoint = endpoint
         self.boot_id = os.urandom(16).hex()
+        self._pid = os.getpid()
+        atexit.register(self._close_at_exit)
 
     @classmethod
     def open(cls, endpoint: str | None = None, *, start_hub: bool = False, timeout_s: float = 5.0) -> Self:
@@ -64,8 +77,39 @@ class Bus:
 
     def close(self) -> None:
         """Undeclare everything and close the session."""
+        atexit.unregister(self._close_at_exit)
         self._declarations.clear()
         self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+        # A daemon thread that is still in Zenoh's code when the interpreter ends would abort the process.
+        for thread in self._threads - {threading.current_thread()}:
+            thread.join(_THREAD_END_TIMEOUT_S)
+
+    def _close_at_exit(self) -> None:
+        if os.getpid() == self._pid:  # a forked process has no session of its own
+            words = f"the session at {self.endpoint} was not closed: use `with`, or call close()"
+            warnings.warn(words, ResourceWarning, stacklevel=1)
+            self.close()
+
+    def _declare(self, declare: Callable[[], T]) -> T:
+        """Declare something with a callback, and keep it."""
+        # Zenoh starts a Python thread for each callback. The interpreter joins such a thread when it exits, before it
+        # runs any exit handler: unless the thread is a daemon, which it is if the declaring thread is one.
+        declared: Future[T] = Future()
+
+        def run() -> None:
+            with _DECLARE_LOCK:
+                before = _zenoh_threads()
+                try:
+                    declared.set_result(declare())
+                except BaseException as error:  # noqa: BLE001 - raised again where it is awaited
+                    declared.set_exception(error)
+                self._threads |= _zenoh_threads() - before
+
+        thread = threading.Thread(target=run, name="bus-declare", daemon=True)
+        thread.start()
+        thread.join()
+        self._declarations.append(declared.result())
+        return declared.result()
 
     @property
     def id(self) -> str:
@@ -88,9 +132,9 @@ class Bus:
 
         largest: maximum size of a payload in bytes (see `Sample.unread`).
         """
-        subscriber = self._session.declare_subscriber(expression, lambda sample: callback(sample_of(sample, largest)))
-        self._declarations.append(subscriber)
-        return subscriber
+        return self._declare(
+            lambda: self._session.declare_subscriber(expression, lambda sample: callback(sample_of(sample, largest)))
+        )
 
     def subscribe_channel(self, expression: str, capacity: int) -> zenoh.Subscriber[Any]:
         """Subscribe with a channel for `try_recv`. Read it often: a full channel stalls the whole session."""
@@ -119,9 +163,7 @@ class Bus:
             elif (too_large(query, words) if words and too_large is not None else callback(query)) is False:
                 refuse(query, BUSY)
 
-        queryable = self._session.declare_queryable(expression, on_query, complete=True)
-        self._declarations.append(queryable)
-        return queryable
+        return self._declare(lambda: self._session.declare_queryable(expression, on_query, complete=True))
 
     def token(self, key: str) -> zenoh.LivelinessToken:
         """Declare a liveliness token. It lasts until it is undeclared or the session ends."""
@@ -153,12 +195,7 @@ class Bus:
             if not awaited:
                 complete.set()
 
-        subscriber = self._session.liveliness().declare_subscriber(
-            expression,
-            on_token,
-            history=True,
-        )
-        self._declarations.append(subscriber)
+        self._declare(lambda: self._session.liveliness().declare_subscriber(expression, on_token, history=True))
         if awaited:
             complete.wait(_TOKEN_HISTORY_TIMEOUT_S)
         with self._lock:
@@ -219,3 +256,7 @@ class Bus:
         """Publish a payload unchanged, with this sequence number (0: with none)."""
         source = zenoh.SourceInfo(self._session.id, (sequence - 1) & 0xFFFFFFFF) if sequence else None
         self._session.put(key, payload, encoding=encoding, source_info=source, **ZENOH_QOS[qos])
+
+
+def _zenoh_threads() -> set[threading.Thread]:
+    return {thread for thread in threading.enumerate() if thread.name.endswith("(pyo3-closure)")}
