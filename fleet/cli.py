@@ -144,7 +144,7 @@ Exit codes: 0 carried out, 1 not carried out, 2 wrong use, 130 Ctrl-C.""",
     package_name="zenoh-car-fleet", prog_name="fleet", message="%(prog)s %(version)s", help="Show the version."
 )
 @connect_option("The bus of the fleet. Also accepted after the command.")
-@fleet_option
+@fleet_option()
 def cli(connect: str | None, fleet: str) -> None:
     """Drive, watch and record small robot cars."""
 
@@ -158,8 +158,7 @@ def main() -> None:
         error.show()
         code = 2
     except click.UsageError as error:
-        where = error.ctx.command_path if error.ctx is not None else "fleet"
-        sys.stderr.write(f"fleet: {_one_line(error)} (see {where} --help)\n")
+        sys.stderr.write(f"fleet: {_one_line(error)} (see {_command_path(error)} --help)\n")
         code = error.exit_code
     except click.ClickException as error:
         own_form = getattr(error, "own_form", False) or "\n" in error.message
@@ -196,10 +195,18 @@ def _no_output(error: OSError) -> int:
     return 1
 
 
+def _command_path(error: click.UsageError) -> str:
+    """Return the command that the error is about. Errors of click's parser do not carry it."""
+    if error.ctx is not None:
+        return error.ctx.command_path
+    return " ".join(["fleet", *[word for word in sys.argv[1:] if word in _FUNCTIONS][:1]])
+
+
 def _one_line(error: click.ClickException) -> str:
-    if isinstance(error, click.BadParameter) and isinstance(error.param, click.Argument) and not error.param.metavar:
-        # Click would name the argument by its choices, which the message contains anyway.
-        error.param_hint = f"'{(error.param.name or '').upper()}'"
+    """Return the message on one line. Our types name the wrong word, so an argument needs no name."""
+    if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
+        option = f"{error.param.opts[-1]}: " if isinstance(error.param, click.Option) else ""
+        return " ".join(f"{option}{error.message}".split())
     return " ".join(error.format_message().split())
 
 

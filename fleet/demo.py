@@ -99,14 +99,20 @@ class Demo:
     epilog="""\b
 examples:
   fleet demo
-  fleet demo --json --out sessions"""
+  fleet demo --json --no-view"""
 )
 @click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("sessions"), help="where the session goes"
+    "--sessions",
+    "out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("sessions"),
+    show_default=True,
+    metavar="DIR",
+    help="Where the session goes.",
 )
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object: checks, session, rrd")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object: checks, session, rrd.")
 @click.option(
-    "--view/--no-view", default=None, help="open Rerun's viewer afterwards (default: ask, if there is a display)"
+    "--view/--no-view", default=None, help="Open Rerun's viewer afterwards (default: ask, if there is a display)."
 )
 def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
     """Run a job with three simulated cars of two platforms: modes, driving, LEDs, a cut link, a stop. Check it."""
@@ -120,7 +126,7 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
         with signals.sigterm_interrupts():
             session, rrd = _run(run)
     except OSError as error:
-        raise click.ClickException(f"no demo in {out}: {error.strerror}; name another directory with --out") from None
+        raise click.ClickException(f"No demo in {out}: {error.strerror}. Name another place with --sessions.") from None
     failed = [check for check in run.checks if not check.ok]
     if as_json:
         result = {
@@ -155,7 +161,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
                 "recorder",
                 "fleet.cli",
                 "record",
-                *("--connect", run.endpoint, "--out", str(run.folder), "--json", "--with-parent"),
+                *("--connect", run.endpoint, "--sessions", str(run.folder), "--json", "--with-parent"),
             ),
         )
         session = Path(_line(recorder, "recorder")["session"])

@@ -8,6 +8,7 @@ import os
 import sys
 from typing import Final
 
+from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio
 
@@ -97,24 +98,29 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         help="where e-stops and holds of each bus are kept (default: FLEET_STATE_DIR, or the user's)",
     )
     run.add_argument(
-        "--longest-drive", metavar="S", type=float, default=10.0, help="longest duration_s of a drive (default 10 s)"
+        "--longest-drive",
+        metavar="DURATION",
+        default="10s",
+        help="longest duration of a drive command (default 10s)",
     )
     run.add_argument(
         "--speed-max", metavar="SHARE", type=float, default=1.0, help="no step beyond this share of full speed, 0..1"
     )
     for level, default, volts in (("low", "warn", 7.0), ("critical", "refuse", 6.6)):
         run.add_argument(
-            f"--battery-{level}",
+            f"--on-battery-{level}",
             choices=("warn", "refuse", "stop"),
             default=default,
-            help=f"{level} battery: warn, refuse new drives and modes, or stop (default {default})",
+            help=f"reaction to a {level} battery: warn, refuse new drives and modes, or stop (default {default})",
         )
         run.add_argument(
             f"--battery-{level}-v", metavar="V", type=float, default=volts, help=f"below this it is {level} ({volts} V)"
         )
     run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
     run.add_argument(
-        "--with-parent", action="store_true", help="stop the car and end when the process that started this ends"
+        "--with-parent",
+        action="store_true",
+        help=argparse.SUPPRESS,  # end with the process that started this
     )
 
 
@@ -130,10 +136,12 @@ def _run(arguments: argparse.Namespace) -> int:
         url, (profile, auto) = parse_url(arguments.link), parse_platform_option(arguments.platform)
     except (BadKey, BadUrl, ValueError) as error:
         return _failed(str(error), 2)
-    longest_s, speed_max = arguments.longest_drive, arguments.speed_max
+    speed_max = arguments.speed_max
     low_v, critical_v = arguments.battery_low_v, arguments.battery_critical_v
-    if not 0 < longest_s <= 3600:
-        return _failed(f"--longest-drive {longest_s:g}: allowed are more than 0 and at most 3600 s", 2)
+    try:
+        longest_s = parse_duration(arguments.longest_drive, max_s=3600)
+    except ValueError as error:
+        return _failed(f"--longest-drive: {error}", 2)
     if not 0 < speed_max <= 1:
         return _failed(f"--speed-max {speed_max:g}: allowed are more than 0 and at most 1, of full speed", 2)
     if not 0 < critical_v <= low_v <= 30:
@@ -164,8 +172,8 @@ def _run(arguments: argparse.Namespace) -> int:
                 state_dir,
                 arguments.retry,
                 battery=BatteryPolicy(
-                    BatteryReaction(arguments.battery_low),
-                    BatteryReaction(arguments.battery_critical),
+                    BatteryReaction(arguments.on_battery_low),
+                    BatteryReaction(arguments.on_battery_critical),
                     low_v,
                     critical_v,
                 ),

@@ -21,9 +21,14 @@ class BadKey(ValueError):
     """An invalid name or key expression. The text names it and the rule."""
 
 
+def is_name(name: str) -> bool:
+    """Return True for a valid name of a car or fleet."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(name: str, what: str = "car name") -> str:
     """Return `name` if it is a valid name of a car or fleet. Raises BadKey."""
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise BadKey(f"{what} {name!r} is not allowed: use {NAME_RULE}")
     return name
 

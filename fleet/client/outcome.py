@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from enum import StrEnum
 from typing import Final, Self
 
@@ -171,9 +172,9 @@ class Progress:
 
     def on_missing(self, present: Sequence[str], at: float) -> None:
         """Give up: the car has no token."""
-        words = f'No car named "{self.car}". ' + (
-            f"Connected: {', '.join(present)}." if present else "No car is connected."
-        )
+        near = get_close_matches(self.car, present, n=1)
+        there = f"Connected: {', '.join(present)}." if present else "No car is connected."
+        words = f'No car named "{self.car}". {f"Did you mean {near[0]}? " if near else ""}{there}'
         if self._verb in STOP_VERBS:
             words = f"NOT STOPPED: {words} If it moves, go to the car."
         self._end(NO_ANSWER, "", words, at, ok=False)

@@ -17,7 +17,8 @@ from fleet.client.commands import (
     speed_request,
     whistle_request,
 )
-from fleet.commands.options import carry_out, cars_argument, json_option, take_option, with_client
+from fleet.commands.options import carry_out, json_option, take_option, with_client
+from fleet.commands.params import CarNames, Choice, Color, cars_argument, missing_words
 from gateway.protocol.enums import Light, SpeedStep
 
 _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
@@ -25,25 +26,14 @@ _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 _ARM_EXAMPLE: Final = "fleet arm red 90 90 45 120 90 30"
 
 
-class _Color(click.ParamType[tuple[int, int, int]]):
-    """Red, green and blue as `#rrggbb`."""
+class _LightColor(Color):
+    """A color of the light, or any other color, which the LED has."""
 
-    name = "'#RRGGBB'"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int, int]:
-        """Return three numbers, 0..255."""
-        match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", str(value))
-        if match is None:
-            self.fail(
-                f"{value!r} is not allowed: six hexadecimal digits, two each for red, green and blue, as '#ff0010'",
-                param,
-                ctx,
-            )
-        return int(match[1], 16), int(match[2], 16), int(match[3], 16)
-
-    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:  # noqa: ARG002 - click's
-        """Return a hint for users who forgot the quotes."""
-        return "Six hexadecimal digits, in quotes: to a shell, what follows a bare # is a comment"
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the request for the lamp that can show the color."""
+        if value in list(Light):
+            return light_request(value)
+        return led_request(*super().convert(value, param, ctx))
 
 
 def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> CommandRequest:
@@ -65,35 +55,53 @@ def _servo(ctx: click.Context, _: click.Parameter, action: str | None) -> Comman
         raise click.BadParameter(str(error)) from None
 
 
-def _arm(_: click.Context, __: click.Parameter, joints: tuple[str, ...]) -> CommandRequest:
-    """Return the request for six joints."""
+def _arm(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tuple[tuple[str, ...], CommandRequest]:
+    """Split the words into cars and six joints. Return the cars and the request."""
+    cars, joints = words[:-6] or words[:1], words[-6:] if len(words) > 6 else words[1:]
+    if not words:
+        raise click.UsageError(missing_words(ctx), ctx)
     needed = f"6 are needed, 0 to 180 degrees each, as: {_ARM_EXAMPLE}"
+    if len(cars) > 1 and any(each.isdigit() for each in cars):  # rather a joint too many than a car of that name
+        cars, joints = words[:1], words[1:]
     for number, joint in enumerate(joints, start=1):
         if not re.fullmatch("[0-9]{1,3}", joint) or int(joint) > 180:
-            raise click.BadParameter(f"joint {number}, {joint!r}, is not allowed: {needed}")
+            raise click.BadParameter(f'joint {number} is "{joint}": {needed}')
     if len(joints) != 6:
         raise click.BadParameter(f"{len(joints)} joints given: {needed}")
-    return arm_request([int(joint) for joint in joints])
+    return _names(ctx, cars), arm_request([int(joint) for joint in joints])
 
 
-@click.command(epilog="\b\nexample:\n  fleet led red '#ff0010'")
+def _fan(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tuple[tuple[str, ...], CommandRequest]:
+    """Split the words into cars and the state, if there is one. Return the cars and the request."""
+    state = words[-1] if len(words) > 1 and words[-1] in ("on", "off") else None
+    cars = words[:-1] if state else words
+    if not cars:
+        raise click.UsageError(missing_words(ctx), ctx)
+    return _names(ctx, cars), fan_request(state)
+
+
+def _names(ctx: click.Context, words: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(name for word in words for name in CarNames().convert(word, None, ctx))
+
+
+@click.command(epilog="\b\nexamples:\n  fleet led red '#ff0010'\n  fleet led red blue green")
 @cars_argument
-@click.argument("colour", type=_Color())
+@click.argument("color", type=Color())
 @json_option
 @with_client
-def led(client: Fleet, cars: tuple[str, ...], colour: tuple[int, int, int], *, as_json: bool) -> None:
-    """Set the color LED."""
-    carry_out(client, led_request(*colour), cars, as_json=as_json)
+def led(client: Fleet, cars: tuple[str, ...], color: tuple[int, int, int], *, as_json: bool) -> None:
+    """Set the color LED to any color. The light, a lamp of its own, has seven colors: `fleet light`."""
+    carry_out(client, led_request(*color), cars, as_json=as_json)
 
 
-@click.command(epilog="\b\nexample:\n  fleet light red,blue cyan")
+@click.command(epilog="\b\nexamples:\n  fleet light red,blue cyan\n  fleet light all off\n  fleet light red '#ff8000'")
 @cars_argument
-@click.argument("light", type=click.Choice([str(light) for light in Light]))
+@click.argument("request", type=_LightColor(), metavar="COLOR")
 @json_option
 @with_client
-def light(client: Fleet, cars: tuple[str, ...], light: str, *, as_json: bool) -> None:
-    """Set the light."""
-    carry_out(client, light_request(light), cars, as_json=as_json)
+def light(client: Fleet, cars: tuple[str, ...], request: CommandRequest, *, as_json: bool) -> None:
+    """Set the light of a car to a color or off. For any other color (#rrggbb) set its LED instead."""
+    carry_out(client, request, cars, as_json=as_json)
 
 
 @click.command(
@@ -101,8 +109,8 @@ def light(client: Fleet, cars: tuple[str, ...], light: str, *, as_json: bool) ->
     context_settings=_NEGATIVE_NUMBERS,
 )
 @cars_argument
-@click.argument("servo", type=click.Choice(["front", "vertical", "horizontal"]))
-@click.argument("request", metavar="left|right|up|down|reset|DEG", callback=_servo, required=False)
+@click.argument("servo", type=Choice("servo", ("front", "vertical", "horizontal")))
+@click.argument("request", metavar="ACTION", callback=_servo)
 @take_option
 @json_option
 @with_client
@@ -123,13 +131,13 @@ def servo(
 
 
 @click.command(epilog=f"\b\nexample:\n  {_ARM_EXAMPLE}", context_settings=_NEGATIVE_NUMBERS)
-@cars_argument
-@click.argument("request", nargs=-1, metavar="J1 J2 J3 J4 J5 J6", callback=_arm)
+@click.argument("cars_and_request", nargs=-1, metavar="CAR... J1 J2 J3 J4 J5 J6", callback=_arm)
 @take_option
 @json_option
 @with_client
-def arm(client: Fleet, cars: tuple[str, ...], request: CommandRequest, *, take: bool, as_json: bool) -> None:
+def arm(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest], *, take: bool, as_json: bool) -> None:
     """Move the arm's six joints to 0..180 degrees each."""
+    cars, request = cars_and_request
     carry_out(client, request, cars, take=take, as_json=as_json)
 
 
@@ -144,7 +152,7 @@ def whistle(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
 
 @click.command(epilog="\b\nexample:\n  fleet speed red up")
 @cars_argument
-@click.argument("step", type=click.Choice([str(step) for step in SpeedStep]))
+@click.argument("step", type=Choice("speed step", SpeedStep))
 @take_option
 @json_option
 @with_client
@@ -154,14 +162,14 @@ def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_jso
 
 
 @click.command(epilog="\b\nexamples:\n  fleet fan red\n  fleet fan red off")
-@cars_argument
-@click.argument("state", type=click.Choice(["on", "off"]), required=False)
+@click.argument("cars_and_request", nargs=-1, metavar="CAR... [on|off]", callback=_fan)
 @take_option
 @json_option
 @with_client
-def fan(client: Fleet, cars: tuple[str, ...], state: str | None, *, take: bool, as_json: bool) -> None:
-    """Toggle the fan; `on` and `off` only while the gateway knows its state."""
-    carry_out(client, fan_request(state), cars, take=take, as_json=as_json)
+def fan(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest], *, take: bool, as_json: bool) -> None:
+    """Switch the fan. Cars only know "toggle", so `on` and `off` work only if its state is known."""
+    cars, request = cars_and_request
+    carry_out(client, request, cars, take=take, as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet identify red")

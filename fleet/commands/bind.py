@@ -18,13 +18,14 @@ from fleet.client.client import Fleet
 from fleet.commands.fleet_file import (
     file_argument,
     link_option,
+    listen_option,
     look_for,
     print_errors,
     prompt_name,
     read,
-    seconds_option,
     write,
 )
+from fleet.commands.group import connect_option
 from fleet.commands.options import cli_errors
 from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import FleetFile
@@ -53,8 +54,8 @@ A TCP car is named by its address: write that into the file."""
 )
 @file_argument
 @link_option
-@seconds_option
-@click.option("--connect", metavar="ENDPOINT", help="The bus (default: the file's, FLEET_ENDPOINT, or loopback).")
+@listen_option
+@connect_option("The bus (default: the file's, FLEET_ENDPOINT, or port 7447).")
 def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str | None) -> None:
     """Find out which car is at which link: each blinks and beeps, you say which it was, and the file has it."""
     with cli_errors():

@@ -1,6 +1,7 @@
 """`fleet drive, mode, stop, estop, resume`: the commands that move cars or stop them."""
 
 from dataclasses import replace
+from typing import Final
 
 import click
 
@@ -8,32 +9,33 @@ from fleet.client.client import Fleet
 from fleet.client.commands import MAX_DRIVE_S, drive_request, estop_request, mode_request, resume_request, stop_request
 from fleet.client.outcome import Outcome
 from fleet.commands.options import (
-    CarNames,
     carry_out,
-    cars_argument,
     end_with,
     json_option,
     print_outcomes,
     take_option,
     with_client,
 )
-from fleet.commands.params import DurationType
+from fleet.commands.params import ALL_CARS, Choice, Duration, any_cars_argument, cars_argument, resolve_cars
 from gateway.protocol.enums import Mode, Motion
 from schemas.process import signals, startup
+
+_MOTIONS: Final = tuple(each for each in Motion if each is not Motion.STOP)
 
 
 @click.command(
     epilog="""\b
 examples:
   fleet drive red forward --for 2s
-  fleet drive red,blue spin_left --for 500ms"""
+  fleet drive red blue spin_left --for 500ms
+  fleet drive all forward"""
 )
 @cars_argument
-@click.argument("motion", type=click.Choice([str(motion) for motion in Motion]))
+@click.argument("motion", type=Choice("motion", _MOTIONS, {"stop": "To stop cars, write: fleet stop red"}))
 @click.option(
     "--for",
     "duration_s",
-    type=DurationType(MAX_DRIVE_S),
+    type=Duration(MAX_DRIVE_S),
     default="500ms",
     show_default=True,
     help="Duration, at most 10s or the limit of the car's gateway.",
@@ -43,11 +45,12 @@ examples:
 @with_client
 def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, take: bool, as_json: bool) -> None:
     """Hold a motion for a time, then stop. Wait until the drive is over; Ctrl-C stops the car."""
+    named = resolve_cars(client, cars)
     with signals.sigterm_interrupts():
         try:
-            outcomes = client.ask(replace(drive_request(motion, duration_s), take=take), cars)
+            outcomes = client.ask(replace(drive_request(motion, duration_s), take=take), named)
         except KeyboardInterrupt:
-            print_outcomes(client.ask(drive_request("stop"), cars), as_json=as_json)
+            print_outcomes(client.ask(drive_request("stop"), named), as_json=as_json)
             raise SystemExit(startup.INTERRUPTED) from None
     end_with(outcomes, as_json=as_json)
 
@@ -59,7 +62,7 @@ example:
   fleet mode red,blue manual"""
 )
 @cars_argument
-@click.argument("mode", type=click.Choice([str(mode) for mode in Mode]))
+@click.argument("mode", type=Choice("mode", Mode))
 @take_option
 @json_option
 @with_client
@@ -74,12 +77,12 @@ examples:
   fleet stop
   fleet stop red blue"""
 )
-@click.argument("cars", type=CarNames(), nargs=-1, metavar="[CAR...]")
+@any_cars_argument
 @json_option
 @with_client
-def stop(client: Fleet, cars: tuple[tuple[str, ...], ...], *, as_json: bool) -> None:
+def stop(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
     """Stop these cars, or all, and hold them against the coordinator until someone drives or resumes them."""
-    _end_with_any(client, client.ask(stop_request(), _flat(cars)), as_json=as_json)
+    _end_with_any(client.ask(stop_request(), _named(client, cars)), as_json=as_json)
 
 
 @click.command(
@@ -88,14 +91,15 @@ examples:
   fleet estop
   fleet estop red --why 'someone is on the track'"""
 )
-@click.argument("cars", type=CarNames(), nargs=-1, metavar="[CAR...]")
+@any_cars_argument
 @click.option("--why", default="", help="What happened, for the record.")
 @json_option
 @with_client
-def estop(client: Fleet, cars: tuple[tuple[str, ...], ...], why: str, *, as_json: bool) -> None:
+def estop(client: Fleet, cars: tuple[str, ...], why: str, *, as_json: bool) -> None:
     """Emergency stop of these cars, or of the whole fleet."""
-    request = estop_request(why, "car" if cars else "fleet")
-    _end_with_any(client, client.ask(request, _flat(cars)), as_json=as_json)
+    named = _named(client, cars)
+    request = estop_request(why, "fleet" if named is None else "car")
+    _end_with_any(client.ask(request, named), as_json=as_json)
 
 
 @click.command(
@@ -105,23 +109,21 @@ examples:
   fleet resume red --estops
   fleet resume red blue --id 5f0c2e"""
 )
-@click.argument("cars", type=CarNames(), nargs=-1, required=True, metavar="CAR...")
+@any_cars_argument
 @click.option(
     "--id", "ids", multiple=True, metavar="ID", help="An e-stop to end, or its beginning; as often as needed."
 )
 @click.option("--estops", is_flag=True, help="End every e-stop in force on these cars; they stay on hold.")
 @json_option
 @with_client
-def resume(
-    client: Fleet, cars: tuple[tuple[str, ...], ...], ids: tuple[str, ...], *, estops: bool, as_json: bool
-) -> None:
+def resume(client: Fleet, cars: tuple[str, ...], ids: tuple[str, ...], *, estops: bool, as_json: bool) -> None:
     """End the hold of cars: the coordinator may use them again. With --id or --estops, end their e-stops.
 
     An e-stop of the whole fleet ends on every car when it ends on one.
     """
     if estops and ids:
         raise click.UsageError("--estops ends every e-stop: leave --id out")
-    named = list(dict.fromkeys(_flat(cars) or ()))
+    named = resolve_cars(client, cars or [ALL_CARS])
     if not estops and not ids:
         carry_out(client, resume_request(), named, as_json=as_json)
     outcomes = []
@@ -150,11 +152,12 @@ def _complete_id(car: str, prefix: str, in_force: list[str]) -> str:
     return prefix if prefix in found or not found else found[0]
 
 
-def _flat(cars: tuple[tuple[str, ...], ...]) -> list[str] | None:
-    return [car for some in cars for car in some] or None
+def _named(client: Fleet, cars: tuple[str, ...]) -> list[str] | None:
+    """Return the cars. None for all: one query reaches them at once, also cars that have just connected."""
+    return resolve_cars(client, cars) if cars and ALL_CARS not in cars else None
 
 
-def _end_with_any(client: Fleet, outcomes: list[Outcome], *, as_json: bool) -> None:
+def _end_with_any(outcomes: list[Outcome], *, as_json: bool) -> None:
     if not outcomes:
-        raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
+        raise click.ClickException("No car is connected.")
     end_with(outcomes, as_json=as_json)

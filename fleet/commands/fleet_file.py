@@ -9,6 +9,7 @@ from typing import Final
 import click
 
 from fleet.commands.options import cli_errors
+from fleet.commands.params import Duration, Number
 from fleet.fleetfile.fleet_file import PALETTE, FleetFile, parse_fleet, read_fleet
 from fleet.fleetfile.models import schema, validate_color, validate_link, validate_name, validate_platform
 from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, format_new_plan, scan
@@ -28,8 +29,8 @@ file_argument = click.argument(
 link_option = click.option(
     "--link", "links", multiple=True, metavar="URL", help="Scan only this link; may be repeated."
 )
-seconds_option = click.option(
-    "--seconds", type=click.FloatRange(0.5, 120), help="How long to listen at each port (default 6)."
+listen_option = click.option(
+    "--for", "seconds", type=Duration(120.0, 0.5), help="How long to listen at each port (default 6s)."
 )
 
 
@@ -75,22 +76,23 @@ examples:
 @click.option(
     "--sim",
     "simulated",
-    type=click.IntRange(1, MAX_SIMULATED_CARS),
+    type=Number(int, 1, MAX_SIMULATED_CARS),
     metavar="N",
     help="Write N simulated cars and plan.yaml. Look for no cars.",
 )
-@click.option("--yes", is_flag=True, help="Accept every detected car without asking.")
+@click.option("-y", "--yes", is_flag=True, help="Accept every detected car without asking.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
 @click.option(
+    "-o",
     "--out",
-    metavar="FILE",
     default=DEFAULT_FILE,
     show_default=True,
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Write this file.",
+    metavar="FILE",
+    help="The file to write.",
 )
 @link_option
-@seconds_option
+@listen_option
 def init(
     *, simulated: int | None, yes: bool, force: bool, out: Path, links: tuple[str, ...], seconds: float | None
 ) -> None:

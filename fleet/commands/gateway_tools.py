@@ -17,13 +17,13 @@ examples:
 Opening a USB port can reset an Arduino. TCP cars are not searched: closing the connection ends their program."""
 )
 @click.option("--link", "links", multiple=True, metavar="URL", help="Look at this link only; may be repeated.")
-@click.option("--seconds", type=float, metavar="N", help="How long to listen at each port (default 6).")
+@click.option("--for", "listen", metavar="DURATION", help="How long to listen at each port (default 6s).")
 @click.option("--probe", is_flag=True, help="Also ask silent ports. This stops every car that is there.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object per line.")
-def scan(links: tuple[str, ...], seconds: float | None, *, probe: bool, as_json: bool) -> None:
+def scan(links: tuple[str, ...], listen: str | None, *, probe: bool, as_json: bool) -> None:
     """Look for cars on Bluetooth and serial ports. Only listens: no car moves."""
     words = [word for link in links for word in ("--link", link)]
-    words += [] if seconds is None else ["--seconds", f"{seconds:g}"]
+    words += [] if listen is None else ["--for", listen]
     _run_gateway("scan", *words, *(["--probe"] if probe else []), *(["--json"] if as_json else []))
 
 

@@ -1,5 +1,6 @@
 """What the group of commands and the commands share. Imports neither a command nor the bus, so that help is fast."""
 
+import difflib
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -13,8 +14,6 @@ _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 def did_you_mean(wrong: str, names: Iterable[str]) -> str:
     """Return a question with the likely name. Empty if no name is near."""
-    import difflib
-
     near = difflib.get_close_matches(wrong.lower(), list(names), n=1)
     return f"Did you mean {near[0]}?" if near else ""
 
@@ -47,6 +46,7 @@ def connect_option(words: str = "The bus, tcp/HOST:PORT (default: FLEET_ENDPOINT
     return click.option("-e", "--connect", "--endpoint", metavar="ENDPOINT", callback=_from_group, help=words)
 
 
-fleet_option = click.option(
-    "--fleet", metavar="NAME", default=DEFAULT_FLEET, show_default=True, callback=_from_group, help="Name of the fleet."
-)
+def fleet_option(default: str | None = DEFAULT_FLEET) -> _Decorator:
+    """Return the option --fleet. Without a default the fleet file has the name."""
+    words = "Name of the fleet." if default else f"Name of the fleet (default: the file's, or {DEFAULT_FLEET})."
+    return click.option("--fleet", metavar="NAME", default=default, show_default=True, callback=_from_group, help=words)

@@ -122,7 +122,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
 
 @click.command(epilog="\b\nexamples:\n  fleet logs red\n  fleet logs recorder --follow\n  fleet logs red --json")
 @click.argument("name", metavar="CAR")
-@click.option("--follow", is_flag=True, help="Go on until Ctrl-C.")
+@click.option("-f", "--follow", is_flag=True, help="Go on until Ctrl-C.")
 @json_option
 @bus_options
 def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: bool) -> None:

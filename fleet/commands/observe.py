@@ -16,7 +16,7 @@ from fleet.client.reading import Reading, Watch
 from fleet.client.wait import NotInTime
 from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.output import json_text, line, show_table
-from fleet.commands.params import DurationType, describe_available, warn_if_missing, written_out
+from fleet.commands.params import Duration, Number, describe_available, warn_if_missing, written_out
 from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
@@ -42,7 +42,7 @@ def list_cars(client: Fleet, *, as_json: bool) -> None:
         if key is not None:
             latest.setdefault(key.car, {})[key.topic] = reading
     if not latest:
-        raise click.ClickException(f"no car of fleet {client.name} is on the bus at {client.bus.endpoint}")
+        raise click.ClickException("No car is connected.")
     rows = [row_of(car, values) for car, values in sorted(latest.items())]
     for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
         session = token.rpartition("/")[2]
@@ -121,10 +121,8 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
     "  fleet get red/sensor/range --last 100\n  fleet get '*/sensor/range' --since 30s --csv > range.csv"
 )
 @click.argument("keyexpr")
-@click.option("--last", type=click.IntRange(1), metavar="N", help="The last N values of each key, oldest first.")
-@click.option(
-    "--since", type=DurationType(history.MAX_HISTORY_S), help="The values of the last so many seconds, as 30s or 5m."
-)
+@click.option("-n", "--last", type=Number(int, 1), help="The last N values of each key, oldest first.")
+@click.option("--since", type=Duration(history.MAX_HISTORY_S), help="The values of this last time, such as 30s or 5m.")
 @click.option("--csv", "as_csv", is_flag=True, help="One CSV table; KEYEXPR must mean one type of message.")
 @json_option
 @bus_options
@@ -186,7 +184,7 @@ def _print_shortfalls(lines: Sequence[str]) -> None:
 )
 @click.argument("keyexpr")
 @click.option("--when", metavar="CONDITION", help="Only readings of which it holds, as 'range_m < 0.3'.")
-@click.option("--count", type=click.IntRange(1), metavar="N", help="End after N readings.")
+@click.option("--count", type=Number(int, 1), help="End after N readings.")
 @json_option
 @bus_options
 def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, connect: str | None, fleet: str) -> None:
@@ -220,7 +218,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
 @click.option(
     "--for",
     "look_s",
-    type=DurationType(600.0),
+    type=Duration(600.0),
     default=f"{SURVEY_S:g}s",
     show_default=True,
     help="How long rates are measured.",
@@ -307,13 +305,13 @@ def _cells(alive: KeyInfo) -> dict[str, str]:
 @click.option(
     "--timeout",
     "timeout_s",
-    type=DurationType(_DAY_S),
+    type=Duration(_DAY_S),
     help=f"Give up after this time (default: never; with --ready: {READY_WAIT_S:g}s).",
 )
 @click.option(
     "--for",
     "for_s",
-    type=DurationType(_DAY_S),
+    type=Duration(_DAY_S),
     help="Minimum time for which the condition must be true. With --ready: the same as --timeout.",
 )
 @json_option

@@ -13,7 +13,7 @@ from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
 from fleet.client.outcome import Outcome
 from fleet.commands.group import connect_option, fleet_option
-from schemas import keys
+from fleet.commands.params import resolve_cars
 from schemas.bus import BadEndpoint, BusError
 
 _Function = Callable[..., Any]
@@ -29,7 +29,7 @@ def bus_options(function: _Function) -> _Function:
     """Add --connect and --fleet. Errors of the bus and of names become one line."""
 
     @connect_option()
-    @fleet_option
+    @fleet_option()
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> Any:
         with cli_errors():
@@ -71,30 +71,14 @@ def cli_errors() -> Iterator[None]:
         raise click.ClickException(str(error)) from None
 
 
-class CarNames(click.ParamType[tuple[str, ...]]):
-    """One car or several: `red`, or `red,blue`."""
-
-    name = "CAR[,CAR...]"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        """Return the names. Fail with the rule if a name is invalid."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            return tuple(keys.check_name(name) for name in str(value).split(","))
-        except keys.BadKey as error:
-            self.fail(str(error), param, ctx)
-
-
-cars_argument = click.argument("cars", type=CarNames(), metavar="CAR[,CAR...]")
 take_option = click.option("--take", is_flag=True, help="Take the car over from another person.")
 
 
 def carry_out(
-    client: Fleet, request: CommandRequest, cars: Iterable[str], *, as_json: bool, take: bool = False
+    client: Fleet, request: CommandRequest, cars: Sequence[str], *, as_json: bool, take: bool = False
 ) -> None:
     """Send a command to the cars, print each outcome, and exit with the code of `end_with`."""
-    end_with(client.ask(replace(request, take=take), cars), as_json=as_json)
+    end_with(client.ask(replace(request, take=take), resolve_cars(client, cars)), as_json=as_json)
 
 
 def end_with(outcomes: Sequence[Outcome], *, as_json: bool) -> Never:

@@ -1,36 +1,245 @@
-"""Arguments that several subcommands take: durations and key expressions."""
+"""Types of arguments and options that several subcommands take, and key expressions."""
 
 import re
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, TypeVar
 
 import click
 
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
+from fleet.commands.group import did_you_mean
+from fleet.recording.session_dir import is_session
 from schemas import keys
 from schemas.bus import canon
+from schemas.duration import parse_duration
 
-_DURATION_UNITS: Final = {"ms": 0.001, "": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
+N = TypeVar("N", bound=float)
+
+ALL_CARS: Final = "all"
+DEFAULT_SESSIONS: Final = Path("sessions")
+_PLACE: Final = "fleet.sessions"
+"""Key of the value of --sessions in the context."""
+_SESSION_STAMP: Final = re.compile(r"\d{8}T\d{6}Z", re.ASCII)
+COLORS: Final = {
+    "red": (255, 0, 0),
+    "green": (0, 255, 0),
+    "blue": (0, 0, 255),
+    "yellow": (255, 255, 0),
+    "cyan": (0, 255, 255),
+    "magenta": (255, 0, 255),
+    "white": (255, 255, 255),
+    "off": (0, 0, 0),
+}
+"""Names of colors of the LED: those of the light."""
 
 
-class DurationType(click.ParamType[float]):
-    """A duration: `30s`, `500ms`, `5m`, `1h`, or a number of seconds."""
+class Duration(click.ParamType[float]):
+    """A duration: `500ms`, `2s`, `1m30s`, `1h`, or a number of seconds."""
 
-    name = "TIME"
+    name = "DURATION"
 
-    def __init__(self, max_s: float) -> None:
-        self._max_s = max_s
+    def __init__(self, max_s: float, min_s: float = 0.0) -> None:
+        self._max_s, self._min_s = max_s, min_s
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the duration in seconds. Fail outside the range."""
-        match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?|\.[0-9]+)(ms|s|m|h|)", str(value))
-        seconds = float(match[1]) * _DURATION_UNITS[match[2]] if match else 0.0
-        if not 0 < seconds <= self._max_s:
-            self.fail(
-                f"{value!r} is not allowed: more than 0 and at most {self._max_s:g} s, as 2s, 500ms or 5m", param, ctx
-            )
-        return seconds
+        try:
+            return parse_duration(str(value), self._min_s, self._max_s)
+        except ValueError as error:
+            self.fail(f"{error}.", param, ctx)
+
+
+class Number(click.ParamType[N]):
+    """A number within a range. kind: int or float."""
+
+    def __init__(self, kind: type[N], least: N, most: N | None = None) -> None:
+        self.name = "N" if kind is int else "FACTOR"
+        self._kind, self._least, self._most = kind, least, most
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> N:
+        """Return the number. Fail outside the range."""
+        try:
+            number = self._kind(value)
+        except ValueError:
+            self.fail(f'"{value}" is not a {"whole " if self._kind is int else ""}number.', param, ctx)
+        if not number >= self._least:
+            self.fail(f"{value} is too small: at least {self._least:g}.", param, ctx)
+        if self._most is not None and number > self._most:
+            self.fail(f"{value} is too large: at most {self._most:g}.", param, ctx)
+        return number
+
+
+class Choice(click.Choice[str]):
+    """A word of a closed set, such as a motion. A wrong word names the likely one."""
+
+    def __init__(self, what: str, choices: Iterable[str], hints: Mapping[str, str] | None = None) -> None:
+        super().__init__([str(each) for each in choices])
+        self._what, self._hints = what, hints or {}
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:
+        """Return the name of the argument; its choices for an option."""
+        return (param.name or "").upper() if isinstance(param, click.Argument) else super().get_metavar(param, ctx)
+
+    def get_invalid_choice_message(self, value: Any, ctx: click.Context | None) -> str:
+        """Return the likely word, or else all."""
+        near = self._hints.get(value) or did_you_mean(str(value), self.choices)
+        if ctx is not None and set(ctx.params.get("cars", ())) & set(self.choices):
+            near = f"Write the {self._what} last."
+        all_of_them = f"Choose from: {', '.join(self.choices)}."
+        return f'"{value}" is not a {self._what}. {near or all_of_them}'
+
+
+class CarNames(click.ParamType[tuple[str, ...]]):
+    """Cars: `red`, `red,blue`, `all`, or `@group`."""
+
+    name = "CAR"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        """Return the names as typed. Fail if one cannot be a name."""
+        if isinstance(value, tuple):
+            return value
+        names = tuple(str(value).split(","))
+        for name in names:
+            try:
+                keys.check_name(name.removeprefix("@"))
+            except keys.BadKey as error:
+                lower = name.lower()
+                if lower != name and keys.is_name(lower):
+                    self.fail(f'No car "{name}". Names are lower case: did you mean "{lower}"?', param, ctx)
+                self.fail(str(error), param, ctx)
+        return names
+
+
+class Color(click.ParamType[tuple[int, int, int]]):
+    """A color: a name, or red, green and blue as `#rrggbb`."""
+
+    name = "COLOR"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int, int]:
+        """Return three numbers, 0..255."""
+        if isinstance(value, tuple):
+            return value
+        if (named := COLORS.get(str(value))) is not None:
+            return named
+        match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", str(value))
+        if match is None:
+            near = did_you_mean(str(value), COLORS)
+            rest = near or f"Choose from: {', '.join(COLORS)}, or write '#ff8000'."
+            self.fail(f'"{value}" is not a color. {rest}', param, ctx)
+        return int(match[1], 16), int(match[2], 16), int(match[3], 16)
+
+
+class SessionPath(click.ParamType[Path]):
+    """A session: its directory, its name below the place of sessions, `latest`, or `latest~1` for the one before."""
+
+    name = "SESSION"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the path. Fail if there are not so many sessions."""
+        path = Path(value)
+        if path.exists() or ctx is None:
+            return path
+        place = ctx.meta.get(_PLACE) or sessions_place()
+        match = re.fullmatch(r"latest(?:~(\d{1,6}))?", str(value), re.ASCII)
+        if match is None:
+            return place / path if (place / path).exists() else path
+        found = newest_first(place)
+        if not found:
+            raise click.ClickException(f"No recordings here yet (in {place}). `fleet up` records everything.")
+        back = int(match[1] or 0)
+        if back >= len(found):
+            self.fail(f"{value}: there are only {len(found)} sessions in {place}.", param, ctx)
+        return found[back]
+
+
+def sessions_place() -> Path:
+    """Return the place of sessions: `sessions` here, or else where the fleet file here records to."""
+    if not DEFAULT_SESSIONS.is_dir() and Path("fleet.yaml").is_file():
+        from fleet.fleetfile.fleet_file import read_fleet
+
+        with suppress(ValueError):  # a BadFile
+            return read_fleet(Path("fleet.yaml"), unbound=True).recordings or DEFAULT_SESSIONS
+    return DEFAULT_SESSIONS
+
+
+def newest_first(place: Path) -> list[Path]:
+    """Return the sessions of a directory, the one that was begun last first. Empty if there is no such directory."""
+
+    def begun(path: Path) -> tuple[str, float]:
+        changed = path.stat().st_mtime
+        stamp = _SESSION_STAMP.match(path.name)
+        return stamp[0] if stamp else f"{datetime.fromtimestamp(changed, UTC):%Y%m%dT%H%M%SZ}", changed
+
+    found = (each for each in place.iterdir() if is_session(each)) if place.is_dir() else ()
+    return sorted(found, key=begun, reverse=True)
+
+
+def _flat(_: click.Context, __: click.Parameter, value: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
+    """Join `red,blue` and `green`."""
+    return tuple(dict.fromkeys(name for names in value for name in names))
+
+
+def _needed(ctx: click.Context, param: click.Parameter, value: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
+    """Join `red,blue` and `green`. Fail with an example if no car is named."""
+    if not value:
+        raise click.UsageError(missing_words(ctx), ctx)
+    return _flat(ctx, param, value)
+
+
+def missing_words(ctx: click.Context) -> str:
+    """Return what to write if words are missing, with the first example of the command."""
+    pieces = [each for each in ctx.command.collect_usage_pieces(ctx) if each != "[OPTIONS]"]
+    example = next(line.strip() for line in (ctx.command.epilog or "").splitlines() if line.startswith("  fleet"))
+    return f"Write: {ctx.command_path} {' '.join(pieces)}, such as: {example}"
+
+
+def _place(ctx: click.Context, _: click.Parameter, value: Path | None) -> None:
+    ctx.meta[_PLACE] = value
+
+
+cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="CAR...", callback=_needed)
+any_cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="[CAR...]", callback=_flat)
+car_option = click.option(
+    "--car", "cars", type=CarNames(), multiple=True, metavar="CAR[,CAR...]", callback=_flat, help="Only these cars."
+)
+
+
+def session_argument(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the argument SESSION, the newest session by default, and --sessions."""
+    place = click.option(
+        "--sessions",
+        type=click.Path(path_type=Path, file_okay=False),
+        metavar="DIR",
+        is_eager=True,
+        expose_value=False,
+        callback=_place,
+        help="Where SESSION is searched (default: sessions).",
+    )
+    return place(click.argument("session", type=SessionPath(), default="latest", metavar="[SESSION]")(function))
+
+
+def resolve_cars(client: Fleet, written: Sequence[str]) -> list[str]:
+    """Return the names of the cars: `all` stands for every connected car. Raises click's errors."""
+    found: list[str] = []
+    for each in written:
+        if each == ALL_CARS:
+            if not (connected := client.cars()):
+                raise click.ClickException("No car is connected.")
+            found += connected
+        elif each.startswith("@"):
+            found += _members(client, each.removeprefix("@"))
+        else:
+            found.append(each)
+    return list(dict.fromkeys(found))
+
+
+def _members(client: Fleet, group: str) -> list[str]:  # noqa: ARG001 - groups come from the running fleet
+    """Return the cars of a group. Raises click's errors."""
+    raise click.ClickException(f'There is no group "{group}".')
 
 
 def written_out(keyexpr: str, fleet: str) -> str:
@@ -49,12 +258,12 @@ def describe_available(client: Fleet, written: str) -> str:
         begin = len(f"{client.name}/{key.car}/")
         found = [reading.key[begin:] for reading in client.get(f"{client.name}/{key.car}/*/*")]
         return f"{key.car} has {', '.join(found)}" if found else f"{key.car} says nothing"
-    return f"the cars on the bus are: {', '.join(cars)}" if cars else "there is no car on the bus"
+    return f"connected: {', '.join(cars)}" if cars else "no car is connected"
 
 
 def warn_if_missing(written: str, cars: Sequence[str]) -> None:
     """Warn if the named car is not on the bus: the name may be misspelled."""
     key = keys.parse(written)
     if key is not None and not set(key.car) & set("*$@") and key.car not in cars:
-        there = f"there are: {', '.join(cars)}" if cars else "there is none"
-        click.echo(f"fleet: no car {key.car} on the bus yet ({there}); waiting", err=True)
+        there = f"connected: {', '.join(cars)}" if cars else "no car is"
+        click.echo(f'fleet: No car "{key.car}" is connected yet ({there}). Waiting.', err=True)

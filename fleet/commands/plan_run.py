@@ -49,7 +49,7 @@ a plan:
     metavar="NAME",
     help="Phase and rules outlive the coordinator within one run (of fleet up).",
 )
-@click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
+@click.option("--with-parent", is_flag=True, hidden=True, help="End when the process that started this ends.")
 @json_option
 @bus_options
 def run(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from fleet.commands.options import cli_errors, json_option
+from fleet.commands.params import Duration, SessionPath, session_argument
 
 if TYPE_CHECKING:
     from fleet.policy.plan.plan import Plan
@@ -29,12 +30,13 @@ TOLERANCE_S: Final = 2.0
 @click.command(
     epilog="""\b
 examples:
-  fleet plan try sessions/20260314T151617Z-fleet new.yaml
-  fleet plan try sessions/20260314T151617Z-fleet
+  fleet plan try new.yaml
+  fleet plan try latest~1
+  fleet plan try latest~1 new.yaml
 
 Exit codes: 0 no difference, 1 some, or nothing to compare, 2 no plan."""
 )
-@click.argument("session", type=click.Path(path_type=Path))
+@session_argument
 @click.argument("path", metavar="[PLAN]", required=False, type=click.Path(path_type=Path, dir_okay=False))
 @click.option(
     "--fleet-file",
@@ -43,10 +45,10 @@ Exit codes: 0 no difference, 1 some, or nothing to compare, 2 no plan."""
 )
 @click.option(
     "--tolerance",
-    default=TOLERANCE_S,
+    default=f"{TOLERANCE_S:g}s",
     show_default=True,
-    type=click.FloatRange(0.1, 60.0),
-    help="Seconds by which the same decision may come earlier or later.",
+    type=Duration(60.0, 0.1),
+    help="Time by which the same decision may come earlier or later.",
 )
 @json_option
 def try_plan(session: Path, path: Path | None, fleet_file: Path | None, tolerance: float, *, as_json: bool) -> None:
@@ -62,6 +64,8 @@ def try_plan(session: Path, path: Path | None, fleet_file: Path | None, toleranc
     from fleet.recording.session_dir import FLEET_FILE
     from schemas.yaml_document.document import read_text
 
+    if path is None and session.suffix in (".yaml", ".yml"):
+        path, session = session, SessionPath().convert("latest", None, click.get_current_context())
     with cli_errors():
         plan = None if path is None else parse(read_text(path), str(path))
         try:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from fleet.commands.group import connect_option
-from fleet.commands.options import CarNames, cli_errors, from_option, to_option
+from fleet.commands.options import cli_errors, from_option, to_option
+from fleet.commands.params import Duration, Number, car_option, session_argument
 from schemas import keys
 from schemas.process import signals
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from fleet.recording.tools.summary import SessionSummary
 
 PROGRESS_INTERVAL_S: Final = 0.5
+_DAY_S: Final = 86_400.0
 INITIAL_VALUES_NS: Final = 300_000_000_000
 """Time before the start from which latest values are loaded, such as a plan or a battery voltage."""
 
@@ -26,23 +28,23 @@ INITIAL_VALUES_NS: Final = 300_000_000_000
 @click.command(
     epilog="""\b
 examples:
-  fleet play sessions/20260314T151617Z-fleet
-  fleet play sessions/20260314T151617Z-fleet --as rehearsal --rate 4 --loop
-  fleet play sessions/20260314T151617Z-fleet --car red --from=-60s
+  fleet play
+  fleet play --as rehearsal --rate 4 --loop
+  fleet play --car red --from=-60s
 
 Look at it with `fleet list --fleet fleet-replay`, or run your own program on it."""
 )
-@click.argument("session", type=click.Path(path_type=Path))
-@click.option("--car", "cars", type=CarNames(), default=(), help="Only these cars, and the services.")
+@session_argument
+@car_option
 @from_option
 @to_option
 @click.option(
     "--as", "name", metavar="NAME", help="Name of the replayed fleet (default: the recorded name with -replay)."
 )
-@click.option("--rate", default=1.0, type=click.FloatRange(0.01, 1000.0), metavar="FACTOR", help="Speed factor.")
+@click.option("--rate", default=1.0, type=Number(float, 0.01, 1000.0), help="Speed factor.")
 @click.option("--loop", is_flag=True, help="Repeat until Ctrl-C.")
 @click.option("--offset", metavar="TIME", help="Start at this time; with --loop in the first round only.")
-@click.option("--skip-gaps", metavar="TIME", help="Shorten longer pauses to this, such as 5s.")
+@click.option("--skip-gaps", "skip_gaps_s", type=Duration(_DAY_S), help="Shorten longer pauses to this, such as 5s.")
 @click.option("--cars-only", is_flag=True, help="Leave out the messages of coordinator, recorder and supervisor.")
 @connect_option()
 def play(
@@ -55,7 +57,7 @@ def play(
     rate: float,
     loop: bool,
     offset: str | None,
-    skip_gaps: str | None,
+    skip_gaps_s: float | None,
     cars_only: bool,
     connect: str | None,
 ) -> None:
@@ -81,15 +83,13 @@ def play(
             if not begin_ns <= first_ns < max(end_ns, begin_ns + 1):
                 length = time_spec.words((end_ns - begin_ns) / 1e9)
                 raise click.UsageError(f"--offset {offset} is not within what is played, which is {length} long")
-            gap_ns = None if skip_gaps is None else _time("--skip-gaps", skip_gaps, 0, 0)
-            if gap_ns is not None and gap_ns <= 0:
-                raise click.UsageError(f"--skip-gaps {skip_gaps}: a pause is longer than 0, as 5s")
+            gap_ns = None if skip_gaps_s is None else round(skip_gaps_s * 1e9)
             fleets = _fleets(found, about)
             name = keys.check_name(name or f"{fleets[0]}-replay", "fleet name (--as)")
             if name in fleets:
                 raise click.UsageError(
-                    f"--as {name}: so the recorded fleet is called, and a recording is not to be taken for it: "
-                    f"choose another name, as {name[:25]}-replay"
+                    f"--as {name} is the recorded fleet's own name. Choose another, such as --as {name[:25]}-replay, "
+                    "so that nobody mistakes the replay for real cars."
                 )
         except NoSession as error:
             raise click.ClickException(str(error)) from None

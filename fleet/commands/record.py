@@ -14,7 +14,7 @@ from click.core import ParameterSource
 from fleet.client.client import default_sender
 from fleet.commands.group import connect_option, fleet_option
 from fleet.commands.options import bus_options, json_option
-from fleet.commands.params import DurationType
+from fleet.commands.params import DEFAULT_SESSIONS, Duration
 from schemas import keys, messages
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
@@ -22,7 +22,6 @@ from schemas.process import signals
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
 """Time without a link after which the recorder restarts the hub."""
-DEFAULT_OUT: Final = "sessions"
 _RECORDER_TIMEOUT_S: Final = 15.0
 """Timeout for the recorder's answer. It may have to wait for the disk."""
 
@@ -56,7 +55,7 @@ _FILE: Final = click.Path(path_type=Path, dir_okay=False)
     invoke_without_command=True,
     epilog="""\b
 examples:
-  fleet record --out sessions --quota 20GB
+  fleet record --quota 20GB
   fleet record status
   fleet record stop
   fleet record start
@@ -65,17 +64,19 @@ examples:
 The quota does not remove marked sessions.""",
 )
 @click.option(
-    "--out",
-    default=DEFAULT_OUT,
+    "--sessions",
+    "place",
+    default=DEFAULT_SESSIONS,
     show_default=True,
     type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
     help="Directory in which the session's directory is created.",
 )
 @click.option(
     "--segment-size", type=SizeType(10**6), default="512MB", show_default=True, help="Maximum size of a file."
 )
 @click.option(
-    "--segment-time", type=DurationType(_WEEK_S), default="10m", show_default=True, help="Maximum duration of a file."
+    "--segment-time", type=Duration(_WEEK_S), default="10m", show_default=True, help="Maximum duration of a file."
 )
 @click.option(
     "--sync",
@@ -94,7 +95,7 @@ The quota does not remove marked sessions.""",
 @click.option(
     "--quota",
     type=SizeType(10**6),
-    help="Maximum size of all sessions in --out. The oldest ones without a mark are removed.",
+    help="Maximum size of all sessions in --sessions. The oldest ones without a mark are removed.",
 )
 @click.option(
     "--keep-free",
@@ -106,13 +107,13 @@ The quota does not remove marked sessions.""",
 @click.option("--fleet-file", type=_FILE, help="Copy this file into the session as fleet.yaml.")
 @click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
 @connect_option()
-@fleet_option
-@click.option("--with-parent", is_flag=True, help="End when the process that started this ends.")
+@fleet_option()
+@click.option("--with-parent", is_flag=True, hidden=True, help="End when the process that started this ends.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object per line: when ready, and at the end.")
 @click.pass_context
 def record(
     ctx: click.Context,
-    out: Path,
+    place: Path,
     segment_size: int,
     segment_time: float,
     sync: str,
@@ -160,7 +161,7 @@ def record(
     signals.calls(stop.set)
     try:
         with Bus.open(connect, start_hub=True) as bus:
-            recorder = Recorder(bus, fleet, out, options, notify=_warn)
+            recorder = Recorder(bus, fleet, place, options, notify=_warn)
             session = recorder.start()
             if full := recorder.full:
                 _say(as_json, {"session": str(session), "state": "full"}, f"fleet {fleet} waits for room: {full}")
@@ -174,7 +175,7 @@ def record(
         raise click.ClickException(str(error)) from None
     except OSError as error:
         raise click.ClickException(
-            f"no session can be made in {out}: {error.strerror}; name another with --out"
+            f"No session can be made in {place}: {error.strerror}. Name another place with --sessions."
         ) from None
     lost = {"drops": dict(outcome.drops), "missed": dict(outcome.missed)}
     session = outcome.session  # it may be another by now

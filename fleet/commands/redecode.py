@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fleet.commands.options import CarNames, from_option, json_option, to_option
+from fleet.commands.options import from_option, json_option, to_option
+from fleet.commands.params import car_option, session_argument
 from schemas import keys
 
 if TYPE_CHECKING:
@@ -19,13 +20,17 @@ if TYPE_CHECKING:
 @click.command(
     epilog="""\b
 examples:
-  fleet sessions redecode sessions/20260314T151617Z-fleet
+  fleet sessions redecode
   fleet sessions redecode tests/vectors/recorded/tracking.jsonl
 Exit codes: 0 no difference, 1 some, or nothing to decode."""
 )
-@click.argument("session", type=click.Path(path_type=Path))
-@click.option("--car", "cars", type=CarNames(), default=(), help="Only these cars.")
-@click.option("--platform", help="Platform to use instead of the recorded one: arduino, raspberry_pi, stm32+imu.")
+@session_argument
+@car_option
+@click.option(
+    "--platform",
+    metavar="PLATFORM",
+    help="Platform to use instead of the recorded one: arduino, raspberry_pi, stm32+imu.",
+)
 @json_option
 def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_json: bool) -> None:
     """Decode the raw frames of SESSION again and list the differences to the recorded readings.
@@ -172,21 +177,28 @@ def _fields(each: "ReadingDifference", start_ns: int) -> dict[str, Any]:
 @click.command(
     epilog="""\b
 example:
-  fleet sessions vector sessions/20260314T151617Z-fleet --car red --from 10s --to 20s --out tracking.jsonl
+  fleet sessions vector --car red --from 10s --to 20s --out tracking.jsonl
 """,
 )
-@click.argument("session", type=click.Path(path_type=Path))
-@click.option("--car", required=True, callback=lambda _ctx, _param, value: keys.check_name(value), help="Whose frames.")
+@session_argument
+@click.option(
+    "--car",
+    required=True,
+    metavar="CAR",
+    callback=lambda _ctx, _param, value: keys.check_name(value),
+    help="Whose frames.",
+)
 @from_option
 @to_option
 @click.option(
+    "-o",
     "--out",
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE.jsonl",
     help="The vector's file; a new one.",
 )
-@click.option("--source", metavar="TEXT", help="Where it is from, in words (default: the session and the car).")
+@click.option("--source", metavar="WORDS", help="Where it is from, in words (default: the session and the car).")
 def vector(session: Path, car: str, start: str | None, end: str | None, out: Path, source: str | None) -> None:
     """Write a stretch of SESSION as a test vector: raw frames with their times, and what they are decoded to.
 

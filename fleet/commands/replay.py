@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fleet.commands.options import CarNames, from_option, to_option
+from fleet.commands.options import from_option, to_option
 from fleet.commands.output import progress_bar
+from fleet.commands.params import car_option, session_argument
 from schemas.process import startup
 
 if TYPE_CHECKING:
@@ -23,11 +24,11 @@ if TYPE_CHECKING:
 @click.command(
     epilog="""\b
 examples:
-  fleet replay sessions/20260314T151617Z-fleet
-  fleet replay sessions/20260314T151617Z-fleet --car red --from=-60s --save red.rrd"""
+  fleet replay
+  fleet replay latest~1 --car red --from=-60s --save red.rrd"""
 )
-@click.argument("session", type=click.Path(path_type=Path))
-@click.option("--car", "cars", type=CarNames(), default=(), help="Only these cars, and the services.")
+@session_argument
+@car_option
 @from_option
 @to_option
 @click.option(

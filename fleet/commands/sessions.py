@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 
 from fleet.commands.group import CommandGroup, did_you_mean
-from fleet.commands.options import CarNames, from_option, json_option, to_option
+from fleet.commands.options import from_option, json_option, to_option
 from fleet.commands.output import progress_bar
+from fleet.commands.params import car_option, session_argument, sessions_place
 from fleet.commands.redecode import redecode, vector
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
     from fleet.recording.tools.summary import SessionSummary
 
-DEFAULT_DIR: Final = "sessions"
 _PROGRESS_STEP: Final = 1024
 
 T = TypeVar("T")
@@ -41,8 +41,8 @@ class _DefaultCommandGroup(CommandGroup):
     epilog="""\b
 examples:
   fleet sessions
-  fleet sessions verify sessions/20260314T151617Z-fleet
-  fleet sessions export sessions/20260314T151617Z-fleet --csv tables
+  fleet sessions verify latest~1
+  fleet sessions export --csv tables
 """,
 )
 def sessions() -> None:
@@ -52,9 +52,8 @@ def sessions() -> None:
 sessions.add_command(redecode)
 sessions.add_command(vector)
 
-session_argument = click.argument("session", type=click.Path(path_type=Path))
 out_option = click.option(
-    "--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="The new session's directory."
+    "-o", "--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="The new session's directory."
 )
 
 
@@ -106,22 +105,23 @@ examples:
   fleet sessions list /media/disk/sessions --json
 """,
 )
-@click.argument("directory", default=DEFAULT_DIR, type=click.Path(path_type=Path))
+@click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
-def list_sessions(directory: Path, *, as_json: bool) -> None:
-    """List the sessions in DIRECTORY: state, length, size, lost messages, marks and cars."""
+def list_sessions(directory: Path | None, *, as_json: bool) -> None:
+    """List the sessions in DIR: state, length, size, lost messages, marks and cars."""
     from fleet.recording.tools.summary import overviews
 
+    place = directory or sessions_place()
     try:
-        found = list(overviews(directory))
+        found = list(overviews(place)) if directory is not None or place.exists() else []
     except OSError as error:
-        raise click.ClickException(f"{directory} cannot be listed: {error.strerror}; name another directory") from None
+        raise click.ClickException(f"{place} cannot be listed: {error.strerror}.") from None
     if as_json:
         for one in found:
             click.echo(json.dumps(one.to_dict()))
         return
     if not found:
-        click.echo(f"no session in {directory}", err=True)
+        click.echo(f"No recordings here yet (in {place}). `fleet up` records everything.", err=True)
         return
     rows = [("session", "state", "length", "size", "messages", "lost", "marks", "cars"), *map(_row, found)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
@@ -153,7 +153,7 @@ def _size(count: int) -> str:
 @sessions.command(
     epilog="""\b
 example:
-  fleet sessions info sessions/20260314T151617Z-fleet
+  fleet sessions info
 """,
 )
 @session_argument
@@ -203,7 +203,7 @@ def _say_contents(about: "SessionSummary") -> None:
 @sessions.command(
     epilog="""\b
 example:
-  fleet sessions verify sessions/20260314T151617Z-fleet
+  fleet sessions verify
 """,
 )
 @session_argument
@@ -230,7 +230,7 @@ def verify(session: Path, *, as_json: bool) -> None:
 @sessions.command(
     epilog="""\b
 example:
-  fleet sessions recover sessions/20260314T151617Z-fleet --out rescued
+  fleet sessions recover --out rescued
 """,
 )
 @session_argument
@@ -251,15 +251,16 @@ def recover(session: Path, out: Path | None) -> None:
 @sessions.command(
     epilog="""\b
 examples:
-  fleet sessions cut sessions/20260314T151617Z-fleet --from 30s --to -10s --out part
-  fleet sessions cut sessions/20260314T151617Z-fleet --cars red,blue --out part
+  fleet sessions cut --from 30s --to -10s --out part
+  fleet sessions cut --car red,blue --out part
 """,
 )
 @session_argument
 @from_option
 @to_option
-@click.option("--cars", type=CarNames(), default=(), help="Only these cars, and the services.")
+@car_option
 @click.option(
+    "-o",
     "--out",
     required=True,
     type=click.Path(path_type=Path, file_okay=False),
@@ -287,7 +288,7 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
     about = of_session(session)
     if missing := sorted(set(cars) - set(about.cars)):
         raise click.UsageError(
-            f"--cars: {', '.join(missing)} is not in {session.path}: there are {', '.join(about.cars) or 'none'}"
+            f"--car: {', '.join(missing)} is not in {session.path}: there are {', '.join(about.cars) or 'none'}"
         )
     bounds: list[int | None] = []
     for name, text in (("--from", start), ("--to", end)):
@@ -307,8 +308,8 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
 @sessions.command(
     epilog="""\b
 examples:
-  fleet sessions export sessions/20260314T151617Z-fleet --csv tables
-  fleet sessions export sessions/20260314T151617Z-fleet --parquet tables
+  fleet sessions export --csv tables
+  fleet sessions export --parquet tables
 """,
 )
 @session_argument

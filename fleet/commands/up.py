@@ -15,7 +15,9 @@ from typing import Final
 
 import click
 
+from fleet.commands.group import connect_option, fleet_option
 from fleet.commands.options import cli_errors
+from fleet.commands.params import Number
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
 from fleet.policy.plan.lint import find_faults
@@ -50,7 +52,7 @@ opened). The fleet runs on in both cases: `fleet logs supervisor` shows its log,
 Exit codes: 0 every car was stopped (--detach: all are ready), 1 one was not or nothing came up, 2 wrong use."""
 )
 @click.argument("file", required=False, type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--sim", "simulated", type=click.IntRange(1, MAX_SIMULATED_CARS), metavar="N",
+@click.option("--sim", "simulated", type=Number(int, 1, MAX_SIMULATED_CARS),
               help="Simulate N cars: those of the file first, whatever their link.")  # fmt: skip
 @click.option(
     "--plan",
@@ -60,15 +62,15 @@ Exit codes: 0 every car was stopped (--detach: all are ready), 1 one was not or 
 @click.option("--world", type=click.Path(path_type=Path, dir_okay=False), help="The simulated cars' world.")
 @click.option("--record/--no-record", default=None, help="Record everything (the default, unless the file says no).")
 @click.option(
-    "--out", type=click.Path(path_type=Path, file_okay=False), help="Where recordings go (default: sessions)."
+    "--sessions",
+    "out",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Where sessions go (default: as the file says, or sessions).",
 )
 @click.option("--json", "as_json", is_flag=True, help="One JSON object for each thing that happens.")
-@click.option(
-    "--connect",
-    metavar="ENDPOINT",
-    help="The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or loopback port 7447).",
-)
-@click.option("--fleet", help="Name of the fleet (default: the file's, or fleet).")
+@connect_option("The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or port 7447).")
+@fleet_option(default=None)
 @click.option("--insecure-lan", is_flag=True, help="Open the bus to a network: everyone there can drive the cars.")
 @click.option("--detach", is_flag=True, help="Return when the cars are ready. The fleet runs until `fleet down`.")
 @click.option("--detached", is_flag=True, hidden=True, help="Run as the process that --detach has started.")

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from fleet.commands.options import bus_options
+from fleet.commands.params import Duration
 from fleet.commands.replay import quiet_rerun, refuse_target
 from schemas import keys
 
 if TYPE_CHECKING:
     from fleet.replay.rerun.viewer import Viewer
 
+_DAY_S: Final = 86_400.0
 MEMORY: Final = "1GiB"
 LAYOUT_DELAY_S: Final = 1.5
 """Delay of the first layout, so that the tabs do not change while the user clicks on them."""
@@ -28,7 +30,7 @@ LAYOUT_DELAY_S: Final = 1.5
 examples:
   fleet view
   fleet view --web
-  fleet view --save now.rrd --for 30"""
+  fleet view --save now.rrd --for 30s"""
 )
 @click.option("--web", is_flag=True, help="Serve the viewer as a web page on this machine only, and print its address.")
 @click.option(
@@ -37,9 +39,7 @@ examples:
     metavar="OUT.rrd",
     help="Write a file that carries its layout instead of opening the viewer.",
 )
-@click.option(
-    "--for", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="End after this."
-)
+@click.option("--for", "seconds", type=Duration(_DAY_S), help="End after this time.")
 @click.option(
     "--memory",
     default=MEMORY,

@@ -22,7 +22,7 @@ EMPTY_V, FULL_V = 6.4, 8.4  # docs/reference/protocol.md#readings: two Li-ion ce
 
 
 class BatteryAction(StrEnum):
-    """The reaction to a battery's level, a value of `gateway run --battery-low`."""
+    """The reaction to a battery's level, a value of `gateway run --on-battery-low`."""
 
     WARN = "warn"
     REFUSE = "refuse"

@@ -160,6 +160,14 @@ def plan(root: Path, fleet: str, now: datetime) -> tuple[Path, SessionInfo]:
     return _unused(root / stem), SessionInfo(fleet, format_utc(now), socket.gethostname(), versions())
 
 
+def is_session(path: Path) -> bool:
+    """Return True for the directory of a session and for a single MCAP file."""
+    if not path.is_dir():
+        return path.suffix == ".mcap" and path.is_file()
+    described = (path / SESSION_FILE).exists() or next(path.glob(SEGMENTS), None) is not None
+    return described and not path.name.startswith(".")
+
+
 def create(directory: Path, description: SessionInfo) -> Path:
     """Create the directory of a session, under another name if taken; raises OSError without leaving a directory."""
     directory.parent.mkdir(parents=True, exist_ok=True)

@@ -1,21 +1,18 @@
 """Parses times within a session as users type them: an offset from its start or end, or a date. Pure."""
 
-import re
 from datetime import UTC, datetime
 from typing import Final
 
+from schemas.duration import duration_s
+
 RULE: Final = "an offset from the start (90s, 1m30s, 1h, 500ms), from the end with - (-60s), or 2026-03-14T15:16:17Z"
-_UNIT_NS: Final = {"h": 3_600_000_000_000, "m": 60_000_000_000, "s": 1_000_000_000, "ms": 1_000_000}
-_OFFSET: Final = re.compile(r"-?(?:\d+(?:\.\d+)?(?:ms|h|m|s))+|-?\d+(?:\.\d+)?")
 
 
 def at_ns(text: str, start_ns: int, end_ns: int) -> int:
     """Return the time in ns since the epoch. A date without a zone is UTC. Raises ValueError with the syntax."""
-    if _OFFSET.fullmatch(text):
-        size = 0.0
-        for number, unit in re.findall(r"(\d+(?:\.\d+)?)(ms|h|m|s|)", text):
-            size += float(number) * _UNIT_NS[unit or "s"]
-        return end_ns - round(size) if text.startswith("-") else start_ns + round(size)
+    if (offset_s := duration_s(text.removeprefix("-"))) is not None:
+        offset_ns = round(offset_s * 1e9)
+        return end_ns - offset_ns if text.startswith("-") else start_ns + offset_ns
     try:
         when = datetime.fromisoformat(text)
     except ValueError:

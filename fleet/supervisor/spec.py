@@ -170,9 +170,9 @@ def _car(spec: FleetCar) -> CarProcessSpec:
         (
             *("--longest-drive", f"{limits.longest_drive_s:g}"),
             *("--speed-max", f"{limits.speed_max:g}"),
-            *("--battery-low", limits.on_battery_low, "--battery-low-v", f"{limits.battery_low_v:g}"),
+            *("--on-battery-low", limits.on_battery_low, "--battery-low-v", f"{limits.battery_low_v:g}"),
             *(
-                "--battery-critical",
+                "--on-battery-critical",
                 limits.on_battery_critical,
                 "--battery-critical-v",
                 f"{limits.battery_critical_v:g}",
@@ -238,7 +238,7 @@ def recorder_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
     where = ("--fleet", spec.fleet, "--connect", endpoint, "--with-parent")
     files = {"--fleet-file": spec.file, "--plan": spec.plan}
     copies = [word for option, path in files.items() if path is not None for word in (option, str(path))]
-    return module("fleet.cli", "record", "--out", str(spec.recordings), "--json", *copies, *where)
+    return module("fleet.cli", "record", "--sessions", str(spec.recordings), "--json", *copies, *where)
 
 
 def coordinator_command(spec: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:

@@ -111,7 +111,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--connect", metavar="ENDPOINT", help="hub for the truth (default: FLEET_ENDPOINT, else loopback)"
     )
     parser.add_argument("--no-truth", action="store_true", help="publish nothing, use no bus")
-    parser.add_argument("--with-parent", action="store_true", help="end when the process that started this one ends")
+    parser.add_argument("--with-parent", action="store_true", help=argparse.SUPPRESS)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from typing import IO, Any, Final
 from gateway.capture import BadCapture
 from gateway.link import BadUrl, LinkError, LinkUrl
 from gateway.protocol.platforms import Profile, parse_platform
+from schemas.duration import parse_duration
 from schemas.links import TcpUrl
 from schemas.process import startup, stdio
 
@@ -56,6 +57,14 @@ def run_command(name: str, run: Callable[[], None]) -> int:
 def _fail(message: str, code: int) -> int:
     sys.stderr.write(message + "\n")
     return code
+
+
+def duration(option: str, text: str, min_s: float, max_s: float) -> float:
+    """Return the duration of an option in seconds; raise WrongUse."""
+    try:
+        return parse_duration(text, min_s, max_s)
+    except ValueError as error:
+        raise WrongUse(f"{option}: {error}") from None
 
 
 def profile_of(text: str) -> Profile:

@@ -45,11 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--link", action="append", metavar="URL", help=f"look at this link, and at no other; {cli_support.LINK_HELP}"
     )
     parser.add_argument(
-        "--seconds",
-        type=float,
-        default=DEFAULT_LISTEN_S,
-        metavar="S",
-        help=f"how long to listen (default {DEFAULT_LISTEN_S:g})",
+        "--for",
+        dest="listen",
+        default=f"{DEFAULT_LISTEN_S:g}s",
+        metavar="DURATION",
+        help=f"how long to listen (default {DEFAULT_LISTEN_S:g}s)",
     )
     parser.add_argument("--probe", action="store_true", help="send cars and silent ones an unknown car's stop")
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
@@ -61,17 +61,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    if not _MIN_LISTEN_S <= arguments.seconds <= _MAX_LISTEN_S:
-        raise cli_support.WrongUse(
-            f"--seconds {arguments.seconds:g}: a number from {_MIN_LISTEN_S:g} to {_MAX_LISTEN_S:g}"
-        )
+    listen_s = cli_support.duration("--for", arguments.listen, _MIN_LISTEN_S, _MAX_LISTEN_S)
     if arguments.link:
         probes = [LinkProbe(url) for url in dict.fromkeys(map(parse_url, arguments.link))]
     else:
         probes = [LinkProbe(parse_url(port.device), port) for port in serial_ports()]
     for probe in probes:
         cli_support.warn_before_opening(probe.url)
-    scan = _Scan(probes, arguments.seconds, probe=arguments.probe, bluetooth=not arguments.link)
+    scan = _Scan(probes, listen_s, probe=arguments.probe, bluetooth=not arguments.link)
     cli_support.run_until_interrupted(scan.run())
     if arguments.json:
         for fields in scan.fields():

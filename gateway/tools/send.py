@@ -38,7 +38,7 @@ examples (in single quotes: in double ones the shell replaces $0 and $4):
 
 A car keeps its last motion for ever: put it on blocks. `gateway run` is what drives a car safely.
 Opening a serial port can reset an Arduino that is on a USB cable; it misses what comes in the two seconds of its start:
---wait 3."""
+--wait 3s."""
 
 MAX_WAIT_S: Final = 60.0
 _STOP: Final = encode(General(Motion.STOP)).decode()
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--link", required=True, metavar="URL", help=cli_support.LINK_HELP)
     platform_help = cli_support.PLATFORM_HELP + "; decides which frames are sent"
     parser.add_argument("--platform", default="unknown", help=platform_help)
-    parser.add_argument("--wait", type=float, default=0.0, metavar="S", help="open the link, wait so long, then send")
+    parser.add_argument("--wait", metavar="DURATION", help="time between opening the link and sending")
     parser.add_argument("--raw", action="store_true", help="send the text as it is, whatever it is")
     parser.add_argument("frame", metavar="FRAME", help=f"for example '{_STOP}', in single quotes")
 
@@ -70,11 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace) -> None:
     url, profile = parse_url(arguments.link), cli_support.profile_of(arguments.platform)
-    if not 0 <= arguments.wait <= MAX_WAIT_S:
-        raise cli_support.WrongUse(f"--wait {arguments.wait:g}: a number of seconds from 0 to {MAX_WAIT_S:g}")
+    wait_s = 0.0 if arguments.wait is None else cli_support.duration("--wait", arguments.wait, 0.0, MAX_WAIT_S)
     data = raw_bytes(arguments.frame) if arguments.raw else check_frame(arguments.frame, profile, url)
     cli_support.warn_before_opening(url)
-    cli_support.run_until_interrupted(_send(url, data, arguments.wait))
+    cli_support.run_until_interrupted(_send(url, data, wait_s))
     sent = f"sent {cli_support.printable(data)} to {url}"
     cli_support.print_lines([sent, *aftermath(parse_sent(data), profile, arguments.link)])
 

@@ -210,7 +210,7 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
     environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(tmp_path / "state"), "TERM": "xterm"}
     master, slave = pty.openpty()
     termios.tcsetwinsize(slave, (40, 400))  # no line is broken, however long the path of the session
-    command = [sys.executable, "-m", "fleet.cli", "up", "--sim", "2", "--out", str(tmp_path / "sessions")]
+    command = [sys.executable, "-m", "fleet.cli", "up", "--sim", "2", "--sessions", str(tmp_path / "sessions")]
     # A session of its own, whose terminal the pty becomes: Ctrl-C is typed, and comes to its foreground group.
     program = f"import os, fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv({command[0]!r}, {command!r})"
     process = subprocess.Popen(

@@ -22,7 +22,7 @@ def _left(marker: str) -> list[str]:
 @pytest.mark.timeout(PATIENCE_S + 60)
 def test_every_check_of_the_demo_holds(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "fleet.cli", "demo", "--json", "--out", str(tmp_path)],
+        [sys.executable, "-m", "fleet.cli", "demo", "--json", "--sessions", str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,
@@ -39,7 +39,7 @@ def test_every_check_of_the_demo_holds(tmp_path: Path) -> None:
 @pytest.mark.timeout(PATIENCE_S + 60)
 def test_a_demo_that_is_terminated_stops_its_cars_and_leaves_nothing(tmp_path: Path) -> None:
     demo = subprocess.Popen(
-        [sys.executable, "-m", "fleet.cli", "demo", "--out", str(tmp_path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "fleet.cli", "demo", "--sessions", str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
     assert demo.stdout is not None
     with demo, demo.stdout:
@@ -54,9 +54,12 @@ def test_a_demo_that_is_terminated_stops_its_cars_and_leaves_nothing(tmp_path: P
 
 def test_a_directory_that_cannot_be_made_is_one_line() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "fleet.cli", "demo", "--out", "/proc/x"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "fleet.cli", "demo", "--sessions", "/proc/x"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert "/proc/x" in line
-    assert "--out" in line
+    assert "--sessions" in line

@@ -35,7 +35,7 @@ def test_wrong_use_is_told(command: Command, arguments: list[str]) -> None:
 @pytest.mark.parametrize(
     ("option", "value", "allowed"),
     [
-        ("--longest-drive", "0", "more than 0 and at most 3600 s"),
+        ("--longest-drive", "0", "0 is too short: more than 0"),
         ("--speed-max", "1.2", "more than 0 and at most 1"),
         ("--battery-critical-v", "7.5", "0 < critical <= low <= 30 V"),
         ("--battery-low-v", "nan", "0 < critical <= low <= 30 V"),

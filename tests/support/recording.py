@@ -95,7 +95,7 @@ class Recording:
 
     def __init__(self, fleet: FleetProcesses, out: Path, *options: str) -> None:
         self.process: GatewayProcess = fleet.start(
-            "-m", "fleet.cli", "record", "--out", str(out), "--connect", fleet.endpoint, "--json", *options
+            "-m", "fleet.cli", "record", "--sessions", str(out), "--connect", fleet.endpoint, "--json", *options
         )
         self.session = Path(self.process.line()["session"])
 

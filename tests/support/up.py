@@ -49,7 +49,7 @@ class Up:
         self.environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(directory / "state")}
         self.out = directory / "sessions"
         self.began = time.perf_counter()
-        words = ["-m", "fleet.cli", "up", *arguments, "--out", str(self.out), "--json"]
+        words = ["-m", "fleet.cli", "up", *arguments, "--sessions", str(self.out), "--json"]
         self.process = GatewayProcess(words, directory / "up.log", self.environment)
         self.heard: list[dict[str, Any]] = []
         self._bus: Bus | None = None

@@ -70,13 +70,7 @@ class SessionSummary:
 
 def overviews(root: Path) -> Iterator[SessionSummary]:
     """Yield every session below a directory, oldest first; raises OSError if it cannot be listed."""
-    for path in sorted(root.iterdir()):
-        if path.is_dir() and not path.name.startswith("."):
-            described = (path / session_dir.SESSION_FILE).exists()
-            if described or next(path.glob(session_dir.SEGMENTS), None) is not None:
-                yield overview(path)
-        elif path.suffix == ".mcap" and path.is_file():
-            yield overview(path)
+    yield from map(overview, filter(session_dir.is_session, sorted(root.iterdir())))
 
 
 def overview(path: Path) -> SessionSummary:

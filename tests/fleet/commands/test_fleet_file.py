@@ -221,7 +221,7 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
     simulate("a", "b")
     links = [f"{tmp_path}/{name}.tty" for name in "ab"]
     told = [word for link in [*links, port.path, "tcp://pi:8888"] for word in ("--link", link)]
-    done = command("init", "--yes", "--seconds", "5", *told)
+    done = command("init", "--yes", "--for", "5", *told)
     assert done.returncode == 0, done.stderr
     assert "Wrote fleet.yaml with red, green, blue" in done.stdout
     written = (tmp_path / "fleet.yaml").read_text()
@@ -234,7 +234,7 @@ def test_what_is_found_is_written_and_is_right(command: Command, simulate: Any, 
     assert done.returncode == 2
     assert "exists already" in done.stderr
     assert (tmp_path / "fleet.yaml").read_text() == written
-    done = command("init", "--yes", "--force", "--seconds", "5", "--link", links[1])
+    done = command("init", "--yes", "--force", "--for", "5", "--link", links[1])
     assert done.returncode == 0, done.stderr
     assert list(read_fleet(tmp_path / "fleet.yaml").cars) == ["red"]
 
@@ -274,7 +274,7 @@ def test_simulated_cars_overwrite_nothing(command: Command, tmp_path: Path, name
 
 
 def test_nothing_found_says_what_to_do(command: Command, port: Port, tmp_path: Path) -> None:
-    done = command("init", "--yes", "--seconds", "0.5", "--link", port.path)
+    done = command("init", "--yes", "--for", "0.5", "--link", port.path)
     assert done.returncode == 1
     for words in ("no car was found", "gateway scan", "--link tcp://", "fleet up --sim"):
         assert words in done.stderr
@@ -290,7 +290,7 @@ def test_a_link_that_is_none_is_wrong_use(command: Command) -> None:
 def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: Any, port: Port, tmp_path: Path) -> None:
     simulate("a")
     (tmp_path / "fleet.yaml").write_text("mine\n")
-    init = terminal("init", "--seconds", "5", "--link", f"{tmp_path}/a.tty", "--link", port.path)
+    init = terminal("init", "--for", "5", "--link", f"{tmp_path}/a.tty", "--link", port.path)
     init.until("Overwrite it? [y/N]: ")
     init.type("y")
     init.until("its name (- to leave it out) [red]: ")
@@ -341,7 +341,7 @@ def test_each_unknown_link_blinks_and_a_person_says_who_it_was(
     sim = simulate("a", "b", "c")
     (tmp_path / "fleet.yaml").write_text(UNBOUND)
     told = [word for name in "abc" for word in ("--link", f"{tmp_path}/{name}.tty")]
-    bind = terminal("bind", "--seconds", "2", *told)
+    bind = terminal("bind", "--for", "2", *told)
     for number, answers in enumerate((("green",), ("again", "blue"), ("rover",)), 1):
         bind.until(f"{number} of 3: serial://{tmp_path}/{'abc'[number - 1]}.tty")
         for answer in answers:
@@ -367,7 +367,7 @@ def test_each_unknown_link_blinks_and_a_person_says_who_it_was(
 
 def test_no_unknown_link(command: Command, port: Port, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{link: {port.path}}}}}")
-    done = command("bind", "--seconds", "0.5", "--link", port.path)
+    done = command("bind", "--for", "0.5", "--link", port.path)
     assert done.returncode == 1
     assert "no link that may be a car's" in done.stderr
     assert port.received() == b""

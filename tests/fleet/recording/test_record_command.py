@@ -31,7 +31,7 @@ def ready(process: "subprocess.Popen[str]") -> Path:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_closes_the_session_whole(number: signal.Signals, endpoint: str, bus: Bus, tmp_path: Path) -> None:
-    process = start(RECORD, "--out", str(tmp_path), "--connect", endpoint, "--json")
+    process = start(RECORD, "--sessions", str(tmp_path), "--connect", endpoint, "--json")
     session = ready(process)
     out = publisher(bus, "red", "sensor/range")
     for _ in range(100):
@@ -59,7 +59,7 @@ def test_killed_it_loses_at_most_the_last_second(endpoint: str, bus: Bus, tmp_pa
         "fleet/@recorder/status",
         lambda sample: told.append((sample.time_ns, sample.message().messages)),  # type: ignore[attr-defined]
     )
-    process = start(RECORD, "--out", str(tmp_path), "--connect", endpoint, "--json")
+    process = start(RECORD, "--sessions", str(tmp_path), "--connect", endpoint, "--json")
     session = ready(process)
     out = publisher(bus, "red", "sensor/range")
 
@@ -87,7 +87,7 @@ def test_a_full_disk_is_said_and_what_was_written_stays(endpoint: str, bus: Bus,
     states: list[str] = []
     bus.subscribe("fleet/@recorder/status", lambda sample: states.append(sample.message().state))  # type: ignore[attr-defined]
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000)); " + RECORD
-    process = start(limit, "--out", str(tmp_path), "--connect", endpoint, "--json")
+    process = start(limit, "--sessions", str(tmp_path), "--connect", endpoint, "--json")
     session = ready(process)
     out = publisher(bus, "red", "frame/rx")
     while process.poll() is None:
@@ -112,11 +112,11 @@ def test_a_full_disk_is_said_and_what_was_written_stays(endpoint: str, bus: Bus,
     [
         (["--fleet", "No Good"], 2, "fleet name 'No Good' is not allowed"),
         (["--connect", "nonsense"], 2, "endpoint 'nonsense' is not allowed"),
-        (["--out", "/dev/null/x"], 1, "/dev/null/x"),
+        (["--sessions", "/dev/null/x"], 1, "/dev/null/x"),
     ],
 )
 def test_bad_input_is_one_line(arguments: list[str], code: int, words: str, endpoint: str, tmp_path: Path) -> None:
-    given = ["--connect", endpoint, "--out", str(tmp_path)]
+    given = ["--connect", endpoint, "--sessions", str(tmp_path)]
     process = start(RECORD, *given, *arguments)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == code

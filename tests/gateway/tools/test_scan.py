@@ -89,7 +89,7 @@ def test_what_each_link_is(
     other.says = b"$GPGGA,123519,4807.038,N*47\r\n"
     monitor = start("monitor", "--link", green, "--json")
     monitor.line()  # it has the port
-    found, done = _scan(command, *links, silent.link, other.link, more=("--seconds", "8"))
+    found, done = _scan(command, *links, silent.link, other.link, more=("--for", "8"))
     assert (done.returncode, done.stderr) == (0, "")
     assert {link: each["verdict"] for link, each in found.items()} == {
         red: "car",
@@ -120,7 +120,7 @@ def test_a_probe_asks_what_is_silent_and_stops_cars_driving_ones_too(
     assert command("send", "--link", red, "--wait", "1", "$1,0,0,0,0,0,0,0,0#").returncode == 0
     wait_for(lambda: driving(sim, "red"), "it drives, in mode 0")
     wait_for(lambda: sim.say({"car": "blue", "ask": "truth"})["mode"] == "obstacle_avoidance", "it avoids obstacles")
-    found, done = _scan(command, *links, silent.link, other.link, loop.link, more=("--seconds", "5", "--probe"))
+    found, done = _scan(command, *links, silent.link, other.link, loop.link, more=("--for", "5", "--probe"))
     assert done.returncode == 0
     assert {link: each["probed"] for link, each in found.items()} == {
         red: True,
@@ -149,7 +149,7 @@ def test_a_probe_asks_what_is_silent_and_stops_cars_driving_ones_too(
 def test_for_a_person(simulate: Callable[..., Any], command: Command, stranger: Callable[[], SpeakingStranger]) -> None:
     _, [link] = simulate("red:arduino:pty")
     silent = stranger()
-    done = command("scan", "--link", link, "--link", silent.link, "--seconds", "8")
+    done = command("scan", "--link", link, "--link", silent.link, "--for", "8")
     first, what, second, nothing = done.stdout.splitlines()
     assert (first, second) == (link, silent.link)
     assert what.startswith("  a car: ")
@@ -161,7 +161,7 @@ def test_a_link_that_is_not_there_fails_and_the_others_are_shown(
     command: Command, simulate: Callable[..., Any]
 ) -> None:
     _, [link] = simulate("red:arduino:pty")
-    found, done = _scan(command, "/dev/nope", link, more=("--seconds", "4"))
+    found, done = _scan(command, "/dev/nope", link, more=("--for", "4"))
     assert done.returncode == 1
     assert found["serial:///dev/nope"]["verdict"] == "failed"
     assert "there is no such port" in found["serial:///dev/nope"]["words"]
@@ -171,7 +171,7 @@ def test_a_link_that_is_not_there_fails_and_the_others_are_shown(
 
 def test_a_device_that_goes_away_while_it_is_listened_to(start: Started) -> None:
     controller, device = pty.openpty()
-    scan = start("scan", "--json", "--link", os.ttyname(device), "--seconds", "100")
+    scan = start("scan", "--json", "--link", os.ttyname(device), "--for", "100")
     wait_for(lambda: not termios.tcgetattr(device)[3] & termios.ICANON, "the port is being opened")
     for _ in range(2):  # opening throws away what is there, once; what goes then is read
         os.write(controller, b"\n")
@@ -187,7 +187,7 @@ def test_a_device_that_goes_away_while_it_is_listened_to(start: Started) -> None
 def test_a_tcp_car_is_named_and_warned_of(command: Command) -> None:
     car = TcpCar()
     try:
-        found, done = _scan(command, car.link, more=("--seconds", "1"))
+        found, done = _scan(command, car.link, more=("--for", "1"))
         assert done.stderr.startswith(f"note: {car.link}: a Raspberry Pi car's program dies")
         assert found[car.link]["verdict"] == "silent"
         assert car.received == []
@@ -198,8 +198,8 @@ def test_a_tcp_car_is_named_and_warned_of(command: Command) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--seconds", "0"], "--seconds 0: a number from 0.5 to 120"),
-        (["--seconds", "nan"], "--seconds nan: a number from 0.5 to 120"),
+        (["--for", "0"], "--for: 0 is too short: at least 500ms"),
+        (["--for", "nan"], '--for: "nan" is not a duration'),
         (["--link", "usb"], "neither a URL nor a device path"),
     ],
 )
@@ -213,7 +213,7 @@ def test_progress_is_for_a_terminal(stranger: Callable[[], SpeakingStranger]) ->
     silent = stranger()
     controller, device = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-m", "gateway.cli", "scan", "--link", silent.link, "--seconds", "5"],
+        [sys.executable, "-m", "gateway.cli", "scan", "--link", silent.link, "--for", "5"],
         stderr=device,
         stdout=subprocess.PIPE,
         text=True,
@@ -279,8 +279,8 @@ def test_bluetooth_devices_are_listed_likely_cars_first(monkeypatch: pytest.Monk
     bluez = FakeBluez(other, car, nordic)
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", bluez.address)
     try:
-        shown = command("scan", "--seconds", "3")
-        told = command("scan", "--seconds", "3", "--json")
+        shown = command("scan", "--for", "3")
+        told = command("scan", "--for", "3", "--json")
     finally:
         bluez.close()
     assert shown.returncode == 0
@@ -299,7 +299,7 @@ def test_bluetooth_devices_are_listed_likely_cars_first(monkeypatch: pytest.Monk
 
 def test_without_bluetooth_the_ports_are_still_shown(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", "unix:path=/nowhere/bus")
-    done = command("scan", "--seconds", "0.5")
+    done = command("scan", "--for", "0.5")
     assert done.returncode == 0
     assert done.stdout
     assert len(done.stderr.splitlines()) == 1

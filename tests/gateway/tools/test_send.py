@@ -99,8 +99,8 @@ def test_why_a_text_is_no_frame(text: str, words: str) -> None:
         (["\u20ac"], "'\u20ac' is no byte"),
         (["", "--raw"], "frame '' is empty"),
         ([STOP, "--platform", "pi"], "'pi' is not known"),
-        ([STOP, "--wait", "-1"], "--wait -1: a number of seconds from 0 to 60"),
-        ([STOP, "--wait", "nan"], "--wait nan: a number of seconds from 0 to 60"),
+        ([STOP, "--wait", "-1"], '--wait: "-1" is not a duration'),
+        ([STOP, "--wait", "nan"], '--wait: "nan" is not a duration'),
         ([STOP, "--link", "ws://x"], "ws:// is no kind of link"),
     ],
 )

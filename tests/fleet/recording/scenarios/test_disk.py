@@ -93,7 +93,7 @@ def fleet(endpoint: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
 
 
 def record(endpoint: str, out: Path, *options: str) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "fleet.cli", "record", "--out", str(out), "--connect", endpoint, "--json"]
+    command = [sys.executable, "-m", "fleet.cli", "record", "--sessions", str(out), "--connect", endpoint, "--json"]
     return popen([*command, *options])
 
 

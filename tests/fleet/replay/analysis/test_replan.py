@@ -60,7 +60,7 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rule, a hold, a gateway that is killed, a coordinator that is killed and started again, a new plan."""
     plan = tmp_path_factory.mktemp("plan") / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
-    recorder = cars.start("-m", "fleet.cli", "record", "--out", str(plan.parent), "--json")
+    recorder = cars.start("-m", "fleet.cli", "record", "--sessions", str(plan.parent), "--json")
     session = Path(recorder.line()["session"])
     first = coordinator(cars, plan)
     until(first, "red", "role")

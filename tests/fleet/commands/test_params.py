@@ -1,0 +1,125 @@
+"""Types of arguments: durations, cars, colors, sessions; and resolving the names of cars."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from fleet.commands.params import (
+    Color,
+    Duration,
+    Number,
+    cars_argument,
+    newest_first,
+    session_argument,
+)
+from schemas.duration import format_duration, parse_duration
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("500ms", 0.5), ("2s", 2.0), ("1m30s", 90.0), ("1h", 3600.0), ("1h2m3s4ms", 3723.004), ("2", 2.0), (".5", 0.5)],
+)
+def test_a_duration_is_a_number_with_units_or_seconds(text: str, seconds: float) -> None:
+    assert parse_duration(text) == pytest.approx(seconds)
+    assert Duration(7200.0).convert(text, None, None) == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize("text", ["", "s", "1d", "-1s", "1s30", "1e3", "1 s", "nan", "inf", "\u0661s", "1..5s"])
+def test_anything_else_is_not(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a duration"):
+        parse_duration(text)
+
+
+def test_a_duration_outside_its_range_names_the_range() -> None:
+    with pytest.raises(click.BadParameter, match=r"2h is too long: at most 1h\."):
+        Duration(3600.0).convert("2h", None, None)
+    with pytest.raises(click.BadParameter, match=r"0\.1 is too short: at least 500ms\."):
+        Duration(3600.0, 0.5).convert("0.1", None, None)
+    assert [format_duration(each) for each in (0.5, 1.5, 90, 120, 86_400)] == ["500ms", "1.5s", "90s", "2m", "24h"]
+
+
+def test_a_number_outside_its_range_names_the_range() -> None:
+    assert Number(int, 1).convert("3", None, None) == 3
+    with pytest.raises(click.BadParameter, match=r"0 is too small: at least 1\."):
+        Number(int, 1).convert("0", None, None)
+    with pytest.raises(click.BadParameter, match="nan is too small"):
+        Number(float, 0.01, 1000.0).convert("nan", None, None)
+
+
+def test_a_color_is_a_name_or_three_bytes() -> None:
+    assert Color().convert("cyan", None, None) == (0, 255, 255)
+    assert Color().convert("#ff8000", None, None) == (255, 128, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [("red x", "red"), ("red,blue x", "red blue"), ("red blue x", "red blue"), ("red red,all @a x", "red all @a")],
+)
+def test_cars_are_separated_by_commas_or_blanks(arguments: str, names: str) -> None:
+    @click.command(epilog="  fleet go red x")
+    @cars_argument
+    @click.argument("word")
+    def go(cars: tuple[str, ...], word: str) -> None:
+        click.echo(f"{' '.join(cars)}, {word}")
+
+    result = CliRunner().invoke(go, arguments.split())
+    assert result.output == f"{names}, x\n"
+    assert "such as: fleet go red x" in CliRunner().invoke(go, ["red"]).output
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    for number, name in enumerate(("20260101T000000Z-fleet", "20260301T000000Z-lab", "20260201T000000Z-fleet", "cut")):
+        session = tmp_path / "sessions" / name
+        session.mkdir(parents=True)
+        (session / "session.json").write_text("{}")
+        os.utime(session, (1_000_000 + number, 1_000_000 + number))  # in 1970: only `cut` counts by it
+    (tmp_path / "sessions" / "empty").mkdir()
+    return tmp_path / "sessions"
+
+
+def test_the_newest_session_is_the_one_that_was_begun_last(place: Path) -> None:
+    names = ["20260301T000000Z-lab", "20260201T000000Z-fleet", "20260101T000000Z-fleet", "cut"]
+    assert [each.name for each in newest_first(place)] == names
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "20260301T000000Z-lab"),
+        ("latest", "20260301T000000Z-lab"),
+        ("latest~1", "20260201T000000Z-fleet"),
+        ("cut", "sessions/cut"),
+        ("sessions/cut", "sessions/cut"),
+        ("nothing", "nothing"),
+        ("latest~4", "latest~4: there are only 4 sessions in "),
+        ("--sessions elsewhere", "No recordings here yet (in elsewhere)."),
+    ],
+)
+def test_a_session_is_the_newest_or_named(
+    place: Path, arguments: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @click.command()
+    @session_argument
+    def show(session: Path) -> None:
+        click.echo(session)
+
+    monkeypatch.chdir(place.parent)
+    result = CliRunner().invoke(show, arguments.split())
+    assert words in result.output
+
+
+def test_without_a_directory_here_the_fleet_file_names_the_place(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place.rename(tmp_path / "elsewhere")
+    (tmp_path / "fleet.yaml").write_text("cars: {red: {link: /dev/ttyUSB0}}\nrecordings: elsewhere\n")
+    monkeypatch.chdir(tmp_path)
+    seen: list[Any] = []
+    command = click.command()(session_argument(lambda session: seen.append(session)))  # noqa: PLW0108 - click calls it by name
+    CliRunner().invoke(command, ["latest~1"])
+    assert [each.name for each in seen] == ["20260201T000000Z-fleet"]
