@@ -1,12 +1,14 @@
 """Readings (key, time, value), and a stream of them with a bounded queue. No Zenoh here."""
 
 import contextlib
+import json
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from html import escape
 from typing import Any, Final, Self, TypeAlias
 
 from fleet.conditions import fields_of, value_in
@@ -20,9 +22,14 @@ _CLOSE_POLL_S: Final = 0.2
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-@dataclass(frozen=True, slots=True)
+_HEADER: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
+"""Fields that every message has."""
+_NOT_MEASURED: Final = "<span title='not measured'>\u2014</span>"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
 class Reading:
-    """One message under one key."""
+    """One message under one key. A notebook shows it as a table."""
 
     key: str
     time: datetime
@@ -61,6 +68,34 @@ class Reading:
         """Return True if it is older than `stale_after_s` of its topic."""
         topic = topics.of_key(self.key)
         return topic is not None and topic.stale_after_s is not None and self.age_s(now) > topic.stale_after_s
+
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{name}={'not measured' if text is None else text}" for name, text in self._fields())
+        return f"<{self.key} {self._clock} UTC: {fields}>"
+
+    def _repr_html_(self) -> str:
+        cell = "<tr><th style='text-align:left'>{}</th><td style='text-align:left'>{}</td></tr>"
+        rows = [cell.format(name, _NOT_MEASURED if text is None else escape(text)) for name, text in self._fields()]
+        return f"<table><caption>{escape(self.key)}, {self._clock} UTC</caption>{''.join(rows)}</table>"
+
+    @property
+    def _clock(self) -> str:
+        return self.time.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+
+    def _fields(self) -> Iterator[tuple[str, str | None]]:
+        """Yield the fields with their values as text and their units; None if not measured."""
+        topic = topics.of_key(self.key)
+        values = self.as_dict()
+        for field in self.value.DESCRIPTOR.fields:
+            if field.name in _HEADER:
+                continue
+            if field.has_presence and not self.value.HasField(field.name):
+                yield field.name, None
+                continue
+            value = values.get(field.name)
+            unit = topic.units.get(field.name, "") if topic is not None else ""
+            text = f"{value:g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
+            yield field.name, text if unit in ("", "1") else f"{text} {unit}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the message in protobuf's JSON mapping, with the field names of the .proto."""

@@ -1,6 +1,7 @@
 """Readings out of samples, and what a reader that is too slow gets of a stream."""
 
 import asyncio
+import re
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
@@ -28,6 +29,21 @@ def test_a_reading_has_the_time_of_its_stamp_else_the_time_on_the_bus() -> None:
     assert reading.time == datetime.fromtimestamp(1_600_000_000, UTC).replace(microsecond=123_456)
     assert (reading.key, reading.value.range_m) == (KEY, 0.5)
     assert reading_of(sample(1)).time == datetime.fromtimestamp(1_700_000_000, UTC)
+
+
+def test_a_reading_shows_itself_with_units_and_what_was_not_measured() -> None:
+    at = datetime(2026, 3, 14, 15, 16, 17, 123_456, UTC)
+    measured = Reading(KEY, at, pb.Range(range_m=0.25))
+    assert repr(measured) == "<fleet/red/sensor/range 2026-03-14 15:16:17.123 UTC: range_m=0.25 m, no_echo=false>"
+    nothing = Reading(KEY, at, pb.Range(no_echo=True))
+    assert "range_m=not measured, no_echo=true" in repr(nothing)
+    rows = re.findall(r"<tr><th[^>]*>(.*?)</th><td[^>]*>(.*?)</td>", nothing._repr_html_())
+    assert rows == [("range_m", "<span title='not measured'>\u2014</span>"), ("no_echo", "true")]
+    assert "<td style='text-align:left'>0.25 m</td>" in measured._repr_html_()
+    hostile = Reading("fleet/red/state/mode", at, pb.Mode(asked="<b>", candidates=["a"]))
+    assert "&lt;b&gt;" in hostile._repr_html_()
+    assert 'candidates=["a"]' in repr(hostile)
+    assert 'rejects={"cut": "2"}' in repr(Reading("fleet/red/state/link", at, pb.Link(rejects={"cut": 2})))
 
 
 def test_a_reading_is_stale_when_its_topic_says_so_and_is_never_from_the_future() -> None:

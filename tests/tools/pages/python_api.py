@@ -7,10 +7,13 @@ import inspect
 import re
 from collections.abc import Callable
 
-from fleet import LeaseLost, NotCarriedOut, Outcome, Reading, aio, conditions
+from fleet import LeaseLost, NotCarriedOut, Outcome, Reading, Session, aio, conditions
 from fleet.client import client, reading, wait
 from fleet.client.commands import CarCommands
 from fleet.client.lease import Lease
+from fleet.recording.reading.session import NoSession
+from fleet.recording.tools.analysis import NoTable
+from fleet.recording.tools.table_formats import FormatMissing
 from schemas import bus, keys
 
 _HEAD = """# Python
@@ -19,7 +22,7 @@ This page has every name of the Python client. Times are in seconds, distances i
 a name says otherwise. A value that was not measured is None.
 
 ```python
-from fleet import Fleet, LeaseLost, NotCarriedOut
+from fleet import Fleet, LeaseLost, NotCarriedOut, Session
 ```
 
 `from fleet.aio import Fleet` has the same names for asyncio, and each call is awaited.
@@ -32,6 +35,7 @@ _CLASSES: tuple[tuple[str, type], ...] = (
     ("Outcome", Outcome),
     ("Reading", Reading),
     ("Watch", reading.Watch),
+    ("Session", Session),
 )
 _ERRORS = (
     NotCarriedOut,
@@ -42,10 +46,16 @@ _ERRORS = (
     bus.BadEndpoint,
     bus.NoFleet,
     bus.BusError,
+    NoSession,
+    NoTable,
+    FormatMissing,
 )
 _HIDDEN = {"do", "ask", "call", "begin", "expression"}
 """What the package's own parts use."""
-_INTERNAL = {(Lease, "check"), (Lease, "checked")}
+_INTERNAL = {
+    *((Lease, name) for name in ("check", "checked")),
+    *((Session, name) for name in ("part", "lacking", "check", "rescue", "rows", "expected", "indexes", "selection")),
+}
 
 
 def reference() -> str:
@@ -53,8 +63,8 @@ def reference() -> str:
     parts = [_HEAD]
     for name, each in _CLASSES:
         parts.append(f"## {name}\n\n{_text(each)}\n")
-        if each is client.Fleet:
-            parts.append(f"### `Fleet{_signature(client.Fleet.__init__)}`\n")
+        if each in (client.Fleet, Session):
+            parts.append(f"### `{name}{_signature(inspect.getattr_static(each, '__init__'))}`\n")
         parts.append("\n".join(_attributes(each)))
         parts += [_method(each, method) for method in _methods(each)]
     parts.append("## Errors\n\n" + "\n".join(f"- `{_module(each)}{each.__name__}`: {_text(each)}" for each in _ERRORS))
@@ -96,7 +106,7 @@ def _signature(function: Callable[..., object]) -> str:
     given = [each for each in signature.parameters.values() if each.name != "self"]
     words = [_parameter(each) for each in given]
     keyword_only = [each.kind is inspect.Parameter.KEYWORD_ONLY for each in given]
-    if any(keyword_only):
+    if any(keyword_only) and not any(each.kind is inspect.Parameter.VAR_POSITIONAL for each in given):
         words.insert(keyword_only.index(True), "*")
     gives = "" if function.__name__ == "__init__" else f" -> {_type(signature.return_annotation)}"
     return f"({', '.join(words)}){gives}"
@@ -104,7 +114,8 @@ def _signature(function: Callable[..., object]) -> str:
 
 def _parameter(each: inspect.Parameter) -> str:
     default = "" if each.default is inspect.Parameter.empty else f" = {each.default!r}"
-    return f"{each.name}: {_type(each.annotation)}{default}"
+    star = "*" if each.kind is inspect.Parameter.VAR_POSITIONAL else ""
+    return f"{star}{each.name}: {_type(each.annotation)}{default}"
 
 
 def _type(annotation: object) -> str:
