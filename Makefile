@@ -23,16 +23,24 @@ help: ## what can be made
 .venv/.ready: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is %s: make PYTHON=python3.12 ..." % sys.version.split()[0])'
 	@mkdir -p .cache .tmp .state
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@echo "Setting up .venv with Rerun and the test tools: 1.2 GB, one to three minutes. Nothing outside this clone changes."
+	@$(PYTHON) -m venv .venv
+# pip says nothing while it unpacks. The second process says how far it is, and ends with this shell.
+	@( while sleep 5 >/dev/null 2>&1 && kill -0 $$$$ 2>/dev/null; do \
+	    echo "  installing: $$(du -sm .venv | cut -f 1) MB so far"; done ) & beat=$$!; \
+	  trap "kill $$beat" EXIT; trap 'exit 130' INT TERM; \
+	  $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@echo "Set up: $$(du -sm .venv | cut -f 1) MB in .venv. \`make clean\` removes everything."
 	@touch $@
 
 demo: .venv/.ready ## three simulated cars do a job, recorded, checked, ready for Rerun (about half a minute)
 	@mkdir -p .tmp
+	@echo "Running the demo: three simulated cars do a job, about half a minute."
 	$(BIN)/fleet demo
 
 test: .venv/.ready ## the test suite (under seven minutes on two processors)
 	@mkdir -p .tmp
+	@echo "Running the test suite: under seven minutes on two processors."
 	$(BIN)/python -m pytest $(TESTS) -m 'not soak' -n auto --dist loadgroup
 
 stress: .venv/.ready ## the suite twice at once while its processes are paused at random (TESTS=..., STRESS_SEED=...)

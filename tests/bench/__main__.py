@@ -24,6 +24,7 @@ BENCHMARKS = {
     "sessions": "sessions",
     "fleet": "fleet",
     "plan": "planning",
+    "cli": "command_line",
 }
 
 
@@ -31,7 +32,8 @@ def _row(one: Measured) -> str:
     verdict = ""
     if one.goal is not None:
         slack = f" + {one.slack:g} {one.unit}" if one.slack else ""
-        verdict = f"{f'{one.goal:g} x{slack}':13} {'met' if one.met else 'MISSED'}"
+        goal = f"{one.goal:g} x{slack}" if one.goal else f"{one.slack:g} {one.unit}"
+        verdict = f"{goal:13} {'met' if one.met else 'MISSED'}"
     numbers = f"{one.ours_median:8.2f} {one.floor_median:8.2f} {one.unit:3} {one.ratio:6.2f} x"
     return f"{one.name:54} {numbers}   {verdict}".rstrip()
 

@@ -43,7 +43,7 @@ class Measured:
     goal: float | None
     """The ratio that is wanted at most; None where issue 3 sets none."""
     slack: float = 0.0
-    """What may come on top of goal x floor, in `unit`."""
+    """What may come on top of goal x floor, in `unit`. With a goal of 0 it is an absolute limit."""
 
     @property
     def ours_median(self) -> float:
