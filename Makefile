@@ -27,7 +27,7 @@ help: ## what can be made
 	@$(PYTHON) -m venv .venv
 # pip says nothing while it unpacks. The second process says how far it is, and ends with this shell.
 	@( while sleep 5 >/dev/null 2>&1 && kill -0 $$$$ 2>/dev/null; do \
-	    echo "  installing: $$(du -sm .venv | cut -f 1) MB so far"; done ) & beat=$$!; \
+	    echo "  downloading and unpacking: $$(du -sm .venv .cache .tmp | awk "{ n += \$$1 } END { print n }") MB so far"; done ) & beat=$$!; \
 	  trap "kill $$beat" EXIT; trap 'exit 130' INT TERM; \
 	  $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	@echo "Set up: $$(du -sm .venv | cut -f 1) MB in .venv. \`make clean\` removes everything."

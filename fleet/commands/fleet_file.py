@@ -122,7 +122,7 @@ def init(
             "silent is asked for without --yes; a TCP car is named with --link tcp://HOST:8888; without cars there is "
             "`fleet up --sim 3`"
         )
-    text = format_new_file(cars, plan=bool(simulated))
+    text = format_new_file(cars)
     try:
         parse_fleet(text, out)
     except BadFile as error:
@@ -133,6 +133,8 @@ def init(
     click.echo(f"Wrote {out}{f' and {plan}' if simulated else ''} with {names}. Next, type:")
     where = "" if out == DEFAULT_FILE else f" {out}"
     click.echo(f"  fleet check{where}\n  fleet up{where}")
+    if simulated:
+        click.echo(f"  fleet up{where} --plan {plan}")
 
 
 def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:

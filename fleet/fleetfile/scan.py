@@ -18,7 +18,7 @@ POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, "silent", "busy")
 """Verdicts on links that may be a car's: a scan receives nothing from a car that is off, silent or served already.
 
 `ble`: a Bluetooth device with the service of a car's module. `given`: typed by the user and not scanned."""
-SCHEMA_URL: Final = "https://raw.githubusercontent.com/zenoh-car-fleet/zenoh-car-fleet/main/deploy/fleet.schema.json"
+SCHEMA_URL: Final = "https://raw.githubusercontent.com/zenoh-car-fleet/zenoh-car-fleet/main/deploy/{}.schema.json"
 
 
 class ScanFailed(Exception):
@@ -91,10 +91,10 @@ def format_key(name: str) -> str:
     return name if name[0].isalpha() and name not in ("null", "true", "false") else quote(name)
 
 
-def format_new_file(cars: Sequence[NewCar], *, plan: bool = False) -> str:
-    """Return the text of a fleet file with these cars. plan: True if `plan.yaml` lies beside it."""
+def format_new_file(cars: Sequence[NewCar]) -> str:
+    """Return the text of a fleet file with these cars."""
     lines = [
-        f"# yaml-language-server: $schema={SCHEMA_URL}",
+        f"# yaml-language-server: $schema={SCHEMA_URL.format('fleet')}",
         "# Your cars. `fleet check` looks for mistakes, `fleet up` connects them all.",
         "cars:",
     ]
@@ -114,7 +114,7 @@ def format_new_file(cars: Sequence[NewCar], *, plan: bool = False) -> str:
         "    longest_drive_s: 5      # no command drives longer than this",
         "    on_battery_low: warn    # below 7.0 V: warn, refuse or stop",
         "",
-        f"{'' if plan else '# '}{'plan: plan.yaml':<{28 if plan else 26}}# what the cars do together",
+        "# plan: plan.yaml           # what the cars do together",
         "# recordings: sessions      # where `fleet up` records; `record: false` records nothing",
     ]
     return "\n".join(lines) + "\n"
@@ -128,7 +128,8 @@ def _scalar(text: str) -> str:
 def format_new_plan(count: int) -> str:
     """Return the text of a first plan for this number of cars."""
     lines = [
-        "# What the cars do together. `fleet check plan.yaml` looks for mistakes, `fleet up` runs the plan.",
+        f"# yaml-language-server: $schema={SCHEMA_URL.format('plan')}",
+        "# What the cars do together. Run it with `fleet up --plan plan.yaml`, or name it in fleet.yaml.",
         "roles:",
     ]
     if count > 1:

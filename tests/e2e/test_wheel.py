@@ -1,0 +1,108 @@
+"""The wheel in an empty environment, outside the clone: first minutes without an extra, then with the extra `view`."""
+
+import shutil
+import subprocess
+import sys
+import venv
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+from packaging.requirements import Requirement
+
+from tests.support.ports import free_endpoint
+
+ROOT = Path(__file__).parents[2]
+BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+
+
+def wheel(directory: Path) -> Path:
+    """Build the wheel from a copy of what is in the clone."""
+    source = directory / "source"
+    for name in ("fleet", "gateway", "schemas"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source / name)
+    subprocess.run([sys.executable, "-c", BUILD, str(directory)], cwd=source, check=True, capture_output=True)
+    (built,) = directory.glob("*.whl")
+    return built
+
+
+def required(requirements: list[str], extra: str = "") -> Iterator[metadata.Distribution]:
+    """Yield what has to be installed for these requirements, and for theirs."""
+    for requirement in map(Requirement, requirements):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
+            continue
+        found = metadata.distribution(requirement.name)
+        assert found.version in requirement.specifier, requirement
+        yield found
+        yield from required(found.requires or [])
+
+
+class Environment:
+    """A virtual environment with the wheel, and links to the installed packages that the wheel says it needs."""
+
+    def __init__(self, directory: Path) -> None:
+        self._bin = directory / "venv" / "bin"
+        self.home = directory / "home"
+        self.home.mkdir()
+        venv.create(directory / "venv", with_pip=False)
+        pip = [sys.executable, "-m", "pip", "--python", str(self._bin / "python"), "--disable-pip-version-check"]
+        arguments = ["install", "--quiet", "--no-deps", "--no-index", "--no-compile", str(wheel(directory))]
+        subprocess.run([*pip, *arguments], check=True)
+        (self.packages,) = (directory / "venv").glob("lib/python*/site-packages")
+        (self.metadata,) = self.packages.glob("zenoh_car_fleet-*.dist-info")
+        self.install()
+        self._environment = {
+            "PATH": f"{self._bin}:/usr/bin:/bin",
+            "HOME": str(self.home),
+            "FLEET_ENDPOINT": free_endpoint(),
+            "FLEET_STATE_DIR": str(directory / "state"),
+            "COLUMNS": "200",
+        }
+
+    def install(self, extra: str = "") -> None:
+        """Make importable what the wheel needs, with this extra."""
+        for each in required(metadata.PathDistribution(self.metadata).requires or [], extra):
+            for name in {file.parts[0] for file in each.files or ()} - {"..", "__pycache__"}:
+                if not (self.packages / name).exists():
+                    (self.packages / name).symlink_to(Path(str(each.locate_file(name))))
+
+    def run(self, command: str) -> "subprocess.CompletedProcess[str]":
+        """Run a command as a user would type it."""
+        return subprocess.run(
+            ["bash", "-c", command], cwd=self.home, env=self._environment, capture_output=True, text=True, check=False
+        )
+
+    def succeeds(self, command: str) -> str:
+        """Run a command that must succeed without a word on stderr; return what it printed."""
+        done = self.run(command)
+        assert (done.returncode, done.stderr) == (0, ""), (command, done.stdout, done.stderr)
+        return done.stdout
+
+
+def test_the_first_minutes_from_the_wheel(tmp_path: Path) -> None:
+    here = Environment(tmp_path)
+    hidden = "for module in ('rerun', 'pyarrow', 'numpy', 'PIL', 'bleak'): assert not find_spec(module), module"
+    here.succeeds(f'python -c "from importlib.util import find_spec\n{hidden}"')
+    assert "1-patrol" in here.succeeds("fleet example list")
+    assert "fleet up" in here.succeeds("fleet init --sim 3")
+    here.succeeds("fleet check")
+    try:
+        assert "All 3 cars are ready" in here.succeeds("fleet up --detach")
+        here.succeeds("fleet wait --ready")
+        here.succeeds("fleet drive red forward --for 0.3s")
+        script = "from fleet import Fleet; fleet = Fleet(); print(*fleet.cars()); fleet.close()"
+        assert here.succeeds(f'python -c "{script}"') == "blue green red\n"
+        refused = here.run("fleet replay sessions/* --save x.rrd")
+        assert (refused.returncode, refused.stdout) == (1, "")
+        assert refused.stderr.endswith("Type: pip install 'zenoh-car-fleet[view]'\n")
+        assert refused.stderr.count("\n") == 1
+    finally:
+        down = here.run("fleet down")
+    assert down.returncode == 0, down.stderr
+    assert sorted(down.stdout.splitlines()) == ["blue: stopped", "green: stopped", "red: stopped"]
+    here.succeeds("fleet sessions verify sessions/*")
+    here.install("view")
+    here.succeeds("fleet replay sessions/* --save x.rrd")
+    assert (here.home / "x.rrd").stat().st_size > 10_000
