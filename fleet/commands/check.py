@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from enum import IntEnum, StrEnum
@@ -177,15 +177,14 @@ def recognize(text: str) -> FileKind:
         FileKind.PLAN: frozenset(each.alias or name for name, each in PlanEntry.model_fields.items()),
         FileKind.WORLD: _WORLD_FIELDS,
     }
-    return max(FileKind, key=lambda kind: (len(names & fields[kind]), kind is _kind_of_cars(found.get("cars"))))
-
-
-def _kind_of_cars(cars: Any) -> FileKind:
-    """Return the kind of a file by its `cars`: with places, with modes, or with links."""
-    values: Sequence[Any] = list(cars.values()) if isinstance(cars, dict) else []
-    if any(isinstance(each, dict) and "x_m" in each for each in values):
+    if _is_world(found.get("cars")):
         return FileKind.WORLD
-    return FileKind.PLAN if values and all(isinstance(each, str) for each in values) else FileKind.FLEET
+    return max(FileKind, key=lambda kind: len(names & fields[kind]))
+
+
+def _is_world(cars: Any) -> bool:
+    """Return True if the `cars` of a file have places."""
+    return isinstance(cars, dict) and any(isinstance(each, dict) and "x_m" in each for each in cars.values())
 
 
 def _served(fleet: FleetFile) -> dict[str, tuple[str, str, str]]:

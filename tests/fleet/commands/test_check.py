@@ -10,7 +10,7 @@ from fleet.commands.check import FileKind, check, recognize
 from tests.support.ports import free_endpoint
 
 PLAN = "roles:\n  line: {mode: tracking}\n"
-NEVER = f"{PLAN}rules:\n  - {{when: {{any: battery.voltage_v < 0}}, then: {{who: all, mode: manual}}}}\n"
+NEVER = f"{PLAN}rules:\n  - {{when: {{any_car: battery.voltage_v < 0}}, then: {{who: all_cars, mode: manual}}}}\n"
 WORLD = "room: {width_m: 4.0, depth_m: 3.0}\n"
 
 
@@ -35,10 +35,10 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
     ("text", "kind"),
     [
         ("cars: {red: {link: sim}}", FileKind.FLEET),
-        ("cars: {red: tracking}", FileKind.PLAN),
+        ("fixed: {red: {mode: tracking}}", FileKind.PLAN),
         ("cars: {red: {x_m: 1, y_m: 2}}", FileKind.WORLD),
         ("name: lab\nplan: p.yaml\ncars: {}", FileKind.FLEET),
-        ("roles: {a: {mode: tracking}}\ncars: {red: manual}", FileKind.PLAN),
+        ("roles: {a: {mode: tracking}}\nfixed: {}", FileKind.PLAN),
         ("rules: []", FileKind.PLAN),
         ("walls: []\ncars: {}", FileKind.WORLD),
         ("roles: {a: [", FileKind.PLAN),

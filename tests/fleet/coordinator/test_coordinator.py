@@ -1,7 +1,9 @@
 """`fleet plan run` as a process, with real gateways: a plan is kept, and never against a hold."""
 
+import json
 import re
 import signal
+import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,10 +11,11 @@ from typing import Any
 
 import pytest
 
-from fleet.client.client import Fleet
+from fleet.client.client import Fleet, default_sender
 from schemas import bus
 from tests.fleet.conftest import Cars, asked
 from tests.support.processes import LONG_S, GatewayProcess, wait_for
+from tests.support.up import fleet_command
 
 PLAN = """
 fixed: {red: {mode: tracking}, green: {mode: manual}}
@@ -197,7 +200,7 @@ def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_a
     assert re.match(r"red: tracking, for 0:0\d:\d\d \(since \d\d:\d\d:\d\d\)", said.lines()[0]), said.stderr
     nobody = cars.start("-m", "fleet.cli", "why", "purple")
     assert nobody.wait() == 1
-    assert "nothing was decided of purple; there are decisions of blue, green, red" in nobody.stderr
+    assert "No decision about purple. There are decisions about: blue, green, red" in nobody.stderr
 
     key = "fleet/@coordinator/@cmd/plan"
     (refused,) = cars.bus.query(key, payload=b"fixed: {red: {role: fast}}\nroles: {x: {}}", timeout_s=5.0)
@@ -215,6 +218,59 @@ def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_a
     lines.until("red", "light_seeking", "role dance")
     wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
     assert process.end(signal.SIGTERM) == 0
+
+
+PHASES = """
+roles: {line: {mode: tracking, cars: [red]}, light: {mode: light_seeking, cars: [red]}}
+phases: {first: {roles: [line], next: second}, second: {roles: [light]}}
+"""
+
+
+def test_a_person_goes_on_to_the_next_phase_stops_the_plan_and_restarts_it(cars: Cars, tmp_path: Path) -> None:
+    events: list[Any] = []
+    cars.bus.subscribe("fleet/@coordinator/log", lambda sample: events.append(sample.message()))
+
+    def plan(*words: str) -> "subprocess.CompletedProcess[str]":
+        return fleet_command("plan", *words, environment={"FLEET_ENDPOINT": cars.endpoint})
+
+    lines = Lines(coordinator(cars, tmp_path / "plan.yaml", PHASES))
+    lines.until("red", "tracking", "role line")
+    assert plan("next").stdout == "phase first is over: second\n"
+    lines.until("red", "light_seeking", "role light")
+    refused = plan("next")
+    assert (refused.returncode, refused.stderr[:32]) == (1, "fleet: Phase second is the last ")
+    assert refused.stderr.endswith("[unsupported]\n")
+    wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
+    shown = plan("show").stdout
+    assert "phase: second (of first, second)" in shown
+    assert "role light (light_seeking): red, 1 of 1" in shown
+
+    assert plan("stop").stdout.startswith("the plan is stopped: red brought to rest. ")
+    wait_for(lambda: truth(cars, "red") == "manual", "red rests")
+    lines.until("red", None, "stopped the plan")
+    lines.process.kill()
+    lines.process.wait()
+    again = Lines(coordinator(cars, tmp_path / "plan.yaml", PHASES))
+    again.until("red", None, "stopped the plan")
+    assert truth(cars, "red") == "manual"
+    assert json.loads(plan("show", "--json").stdout)["stopped_by"]
+    assert not cars.state("safety").HasField("hold"), "anyone may drive it"
+
+    assert plan("restart").returncode == 0
+    again.until("red", "tracking", "role line")
+    (tmp_path / "other.yaml").write_text("fixed: {red: {mode: manual}}")
+    assert plan("set", str(tmp_path / "other.yaml")).returncode == 0
+    again.until("red", "manual", "role manual")
+    (tmp_path / "other.yaml").write_text("fixed: {red: {role: fast}}")
+    wrong = plan("set", str(tmp_path / "other.yaml"))
+    assert wrong.returncode == 2
+    assert f"{tmp_path / 'other.yaml'}:1:21: error: " in wrong.stderr
+    assert again.process.end(signal.SIGTERM) == 0
+    wait_for(lambda: len(events) == 4, "each request is an event")
+    codes = [each.name.removeprefix("@coordinator ") for each in events]
+    assert codes == ["plan_next", "plan_stopped", "plan_restarted", "plan_set"]
+    assert {each.message.split()[0] for each in events} == {default_sender()}
+    assert plan("show").stderr == "fleet: No plan is running. `fleet up --plan FILE` starts one.\n"
 
 
 LISTED = """

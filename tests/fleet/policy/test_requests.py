@@ -15,7 +15,7 @@ PHASES = parse(
 roles: {line: {mode: tracking, count: all}, light: {mode: light_seeking, count: all}}
 phases:
   first: {roles: [line], timeout_s: 60, on_timeout: second}
-  second: {roles: [light], until: {any: light.left}, next: third}
+  second: {roles: [light], until: {any_car: light.left}, next: third}
   third: {roles: [line]}
 """
 )
