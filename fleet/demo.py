@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
@@ -27,6 +27,7 @@ from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
 
+DEFAULT_OUT: Final = Path("sessions")
 DEMO_CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
 DEMO_PLAN: Final = """\
 # Red follows the line, green keeps clear of walls, blue is driven by hand.
@@ -105,7 +106,7 @@ examples:
     "--sessions",
     "out",
     type=click.Path(file_okay=False, path_type=Path),
-    default=Path("sessions"),
+    default=DEFAULT_OUT,
     show_default=True,
     metavar="DIR",
     help="Where the session goes.",
@@ -137,9 +138,9 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
         }
         click.echo(json.dumps(result))
     else:
-        click.echo(f"\n{len(run.checks) - len(failed)} of {len(run.checks)} checks passed. Session: {session}")
-        if rrd is not None:
-            click.echo(f"Look at it: rerun {rrd}")
+        newest = "latest" if out == DEFAULT_OUT else session
+        passed = f"{len(run.checks) - len(failed)} of {len(run.checks)} checks passed."
+        click.echo(f"\n{passed} Look at it: fleet replay {newest}")
     if failed:
         raise SystemExit(1)
     if rrd is not None and (
@@ -175,12 +176,16 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
         for process in gateways.values():
             process.send_signal(signal.SIGTERM)
         codes = {car: _ended(process) for car, process in gateways.items()}
-        run.check("gateways end", f"exit codes {codes}", ok=set(codes.values()) == {0})
+        run.check("gateways end", _ends(codes), ok=set(codes.values()) == {0})
         simulator.terminate()
         _ended(simulator)
         recorder.send_signal(signal.SIGTERM)
         code = _ended(recorder)
-        run.check("recording closed", f"{session.name}, exit code {code}", ok=code == 0)
+        run.check(
+            "recording closed",
+            session.name if code == 0 else f"{session.name}, {_ends({'the recorder': code})}",
+            ok=code == 0,
+        )
     took = time.monotonic() - began
     recorded = _check_recording(run, session)
     rrd = _replay(run, session, recorded)
@@ -196,7 +201,7 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     ready = run.wait_until(
         lambda: _motors(client) == dict.fromkeys(DEMO_CARS, "off") and run.truth.keys() == DEMO_CARS.keys()
     )
-    run.check("cars ready", f"motors {_motors(client)}", ok=ready)
+    run.check("cars ready", _listed({car: f"motors {state}" for car, state in _motors(client).items()}), ok=ready)
     if not ready:
         raise click.ClickException("the cars did not get ready: is the machine overloaded?")
 
@@ -204,7 +209,7 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
         outcome = client.car(car).led(r, g, b)
         color = f"#{r:02x}{g:02x}{b:02x}"
         seen = outcome.ok and run.wait_for_truth(car, "led", color)
-        run.check(f"{car} LED", f"asked {color}, truly {run.truth[car].led}", ok=seen)
+        run.check(f"{car} LED", color if seen else f"should be {color}, is {run.truth[car].led}", ok=seen)
 
     readings: list[Reading] = []
 
@@ -231,7 +236,7 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     )
     for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):
         seen = run.wait_for_truth(car, "mode", mode)
-        run.check(f"{car} mode", f"asked {mode}, truly {run.truth[car].mode}", ok=seen)
+        run.check(f"{car} mode", mode if seen else f"should be {mode}, is {run.truth[car].mode}", ok=seen)
     seen = run.wait_until(lambda: _state(client, "red", "mode").verdict == "confirmed")
     run.check("red mode known", _state(client, "red", "mode").evidence, ok=seen)
 
@@ -243,7 +248,9 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     stood = run.wait_until(lambda: run.truth["blue"].motor_left == 0 == run.truth["blue"].motor_right)
     run.check(
         "blue driven",
-        f"{outcome.words or outcome.phase}; moved {moved}, stopped by itself {stood}",
+        "moved, then stopped by itself"
+        if outcome.ok and moved and stood
+        else f"{'moved' if moved else 'did not move'}, {'stopped' if stood else 'did not stop'}: {outcome}",
         ok=outcome.ok and moved and stood,
     )
     lost = run.wait_until(lambda: _state(client, "red", "link").state == "lost")
@@ -261,29 +268,43 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
             and run.truth["red"].mode == "tracking"
         )
     )
-    run.check("red back", f"link {_state(client, 'red', 'link').state}, truly {run.truth['red'].mode} again", ok=back)
+    run.check("red back", f"link {_state(client, 'red', 'link').state}, {run.truth['red'].mode} again", ok=back)
 
     run.say("a person stops all cars; the coordinator leaves them alone")
     outcomes = client.stop()
     run.check(
         "stop",
-        ", ".join(f"{each.car} {each.phase} in {each.took_s:.2f} s" for each in outcomes),
+        f"all three stopped within {max(each.took_s for each in outcomes):.1f} s"
+        if all(each.ok for each in outcomes)
+        else ", ".join(str(each) for each in outcomes if not each.ok),
         ok=all(each.ok for each in outcomes),
     )
     off = run.wait_until(lambda: all(map(_at_rest, run.truth.values())))
     run.check(
         "all motors off",
-        str({car: (truth.motor_left, truth.motor_right) for car, truth in sorted(run.truth.items())}),
+        "as the simulator says" if off else _listed({car: truth.mode for car, truth in run.truth.items()}),
         ok=off,
     )
     moved = run.wait_until(lambda: not all(map(_at_rest, run.truth.values())), 1.5)
     holds = {car: _state(client, car, "safety").hold.by for car in DEMO_CARS}
     run.check(
-        "held", f"on hold by {sorted(set(holds.values()))}, none moved again", ok=not moved and all(holds.values())
+        "hold",
+        f"by {', '.join(sorted(set(holds.values())))}: {'a car moved again' if moved else 'no car moved again'}",
+        ok=not moved and all(holds.values()),
     )
     coordinator.send_signal(signal.SIGTERM)
     code = _ended(coordinator)
-    run.check("coordinator ends", f"exit code {code}", ok=code == 0)
+    run.check("coordinator ends", _ends({"the coordinator": code}), ok=code == 0)
+
+
+def _ends(codes: Mapping[str, int | None]) -> str:
+    """Say how processes have ended."""
+    bad = {name: "did not end" if code is None else f"exit code {code}" for name, code in codes.items() if code != 0}
+    return _listed(bad) if bad else "in order"
+
+
+def _listed(values: Mapping[str, object]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in sorted(values.items()))
 
 
 def _state(client: Fleet, car: str, name: str) -> Any:
@@ -318,7 +339,7 @@ def _check_recording(run: Demo, session: Path) -> Counter[str]:
     words = (
         f"{counted.total()} messages on {len(counted)} keys, none missing"
         if not lost and not gaps
-        else f"missing {lost}, gaps in {gaps}"
+        else f"missing: {_listed(dict(lost))}; gaps: {', '.join(gaps)}"
     )
     run.check("recording complete", words, ok=not lost and not gaps and bool(run.published))
     return counted
@@ -340,7 +361,9 @@ def _replay(run: Demo, session: Path, recorded: Counter[str]) -> Path | None:
     shown = rows(rrd)
     differing = {key: (count, shown[key]) for key, count in recorded.items() if shown[key] != count}
     words = f"{shown.total()} messages read back with Rerun, as many as recorded"
-    run.check("rrd complete", words if not differing else f"recorded and shown differ: {differing}", ok=not differing)
+    run.check(
+        "rrd complete", words if not differing else f"recorded and shown differ: {_listed(differing)}", ok=not differing
+    )
     return rrd
 
 
