@@ -31,9 +31,9 @@ DEFAULT_OUT: Final = Path("sessions")
 DEMO_CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
 DEMO_PLAN: Final = """\
 # Red follows the line, green keeps clear of walls, blue is driven by hand.
-cars:
-  red: tracking
-  green: obstacle_avoidance
+fixed:
+  red: {mode: tracking}
+  green: {mode: obstacle_avoidance}
 """
 LED_COLORS: Final = {"red": (255, 0, 16), "green": (0, 255, 64), "blue": (0, 64, 255)}
 # On a busy machine, a process takes 10 s to start, and a message a second.

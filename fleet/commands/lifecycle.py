@@ -4,14 +4,16 @@ import json
 import os
 import time
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import IO, Any, Final
 
 import click
 
-from fleet.client.client import default_sender
+from fleet.client.client import Fleet, default_sender
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
-from fleet.commands.options import bus_options, json_option
+from fleet.commands.observe import show_cars
+from fleet.commands.options import bus_options, json_option, not_running
 from fleet.supervisor.child import parse_log_line, runs_directory
 from fleet.supervisor.service import ask_service
 from fleet.supervisor.shutdown import NOT_STOPPED
@@ -27,48 +29,54 @@ FLEET_DOWN_POLL_S: Final = 0.2
 LOG_POLL_S: Final = 0.2
 
 
-def _not_up(fleet: str, endpoint: str) -> click.ClickException:
-    return click.ClickException(
-        f"fleet {fleet} is not up at {endpoint}: fleet up starts it, --connect names another bus"
-    )
-
-
-@click.command(epilog="\b\nexample:\n  fleet status --json")
+@click.command(epilog="\b\nexamples:\n  fleet status\n  fleet status --processes")
+@click.option("--processes", is_flag=True, help="Show every process, with its id and restarts.")
 @json_option
 @bus_options
-def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Show the processes of `fleet up`: state, since when, number of restarts and their reason."""
+def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -> None:
+    """Show fleet and session, then the cars, then the services that are not running as they should."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         found = ask_status(bus, fleet)
         if not found:
-            raise _not_up(fleet, bus.endpoint)
+            raise not_running(fleet)
     for each in found:
         if as_json:
             click.echo(messages.to_json(each))
             continue
+        where = f"recording to {each.session}" if each.session else "not recording"
         what = each.fleet_file or "simulated cars"
-        click.echo(f"fleet {fleet} is {each.state}: {what}, process {each.pid} on {each.host}, {each.uptime_s:.0f} s")
-        click.echo(f"logs: {each.directory}")
-        for process in each.processes:
-            pid = f"process {process.pid}" if process.HasField("pid") else "no process"
-            times = "once" if process.restarts == 1 else f"{process.restarts} times"
-            again = f", started again {times}: {process.words}" if process.restarts else ""
-            why = f": {process.words}" if process.words and not process.restarts else ""
-            click.echo(f"  {process.name:14} {process.state:9} {process.since_s:6.0f} s  {pid}{again}{why}")
+        click.echo(f"fleet {fleet} ({what}): {each.state} for {timedelta(seconds=int(each.uptime_s))}, {where}")
+        if processes:
+            click.echo(f"supervisor: process {each.pid} on {each.host}, logs in {each.directory}")
+            for process in each.processes:
+                click.echo(_describe_process(process))
+            continue
+        with Fleet(connect, fleet, kind="person") as client:
+            show_cars(client)
+        for name, why in each.missing.items():
+            click.echo(f"not ready: {name.lstrip('@')} ({why})")
+
+
+def _describe_process(process: Any) -> str:
+    pid = f"process {process.pid}" if process.HasField("pid") else "no process"
+    times = "once" if process.restarts == 1 else f"{process.restarts} times"
+    again = f", started again {times}: {process.words}" if process.restarts else ""
+    why = f": {process.words}" if process.words and not process.restarts else ""
+    return f"  {process.name:14} {process.state:9} {process.since_s:6.0f} s  {pid}{again}{why}"
 
 
 @click.command(epilog="\b\nexample:\n  fleet down")
 @json_option
 @bus_options
 def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """End a fleet that is up, as Ctrl-C there does. Wait, and report the result for each car."""
+    """Stop every car and end `fleet up`, as Ctrl-C there does. Waits, and reports the result for each car."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         received: list[Any] = []
         bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.append(sample.message()))
         if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", default_sender())) is None:
-            raise _not_up(fleet, bus.endpoint)
+            raise not_running(fleet)
         if answer.status == "rejected":
             raise click.ClickException(answer.words)
         last = _until_ended(bus, fleet, received)
@@ -83,7 +91,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
     if not ended:
         raise click.ClickException(
             "`fleet up` ended without reporting. Cars may still be moving: check them. "
-            "Then `fleet status` and `fleet logs recorder`."
+            "Then `fleet status` and `fleet logs supervisor`."
         )
     raise SystemExit(1 if bad else 0)
 
@@ -107,12 +115,12 @@ def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> Any:
 @json_option
 @bus_options
 def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Read the fleet file again and apply changes of cars and plan. Tell which changes need a restart."""
+    """Read the fleet file again and apply changes of cars and plan. Says which changes need a restart."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         answer = ask_service(bus, fleet, "reload", default_sender())
         if answer is None:
-            raise _not_up(fleet, bus.endpoint)
+            raise not_running(fleet)
     if as_json:
         click.echo(messages.to_json(answer))
     else:
@@ -126,7 +134,10 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @json_option
 @bus_options
 def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: bool) -> None:
-    """Show the log of a car's gateway, or of hub, simulator, coordinator or recorder, of the current or last run."""
+    """Show what a car's gateway or a service has logged, in the current or last run.
+
+    Services: supervisor, hub, simulator, coordinator, recorder.
+    """
     directory = _directory(connect, keys.check_name(fleet, "fleet name"))
     found = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]
     path = next((each for each in found if each.parent == directory and _either(each)), None)
@@ -154,7 +165,7 @@ def _directory(connect: str | None, fleet: str) -> Path:
     # A run that was refused has no logs.
     newest = sorted(each for each in place.iterdir() if any(each.glob("*.log"))) if place.is_dir() else []
     if not newest:
-        raise click.ClickException(f"fleet {fleet} has never been up here: there is nothing in {place}")
+        raise click.ClickException(f"No logs yet: fleet {fleet} has not run here. `fleet up` starts it.")
     return newest[-1]
 
 

@@ -22,7 +22,9 @@ from fleet.recording.tools import csv_table
 from schemas import keys, topics
 from schemas.bus import Sample, intersects
 
-_CAR_COLUMNS: Final = ("car", "platform", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
+CAR_COLUMNS: Final = ("car", "platform", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
+OPTIONAL_CAR_COLUMNS: Final = ("platform", "verdict", "driver", "motion")
+"""Columns that a narrow terminal leaves out, in this order."""
 _KEY_COLUMNS: Final = ("key", "type", "unit", "rate", "age")
 _DAY_S: Final = 86_400.0
 _UNHEARD_S: Final = 3.0
@@ -34,7 +36,15 @@ _MAX_SHORTFALL_LINES: Final = 5
 @json_option
 @with_client
 def list_cars(client: Fleet, *, as_json: bool) -> None:
-    """List the cars on the bus: platform, link, mode and its verdict, motion, driver, hold and battery."""
+    """List the cars: platform, link, mode and its verdict, motion, driver, hold and battery.
+
+    On a narrow terminal columns are left out: platform, verdict, driver, motion. --json has them all.
+    """
+    show_cars(client, as_json=as_json)
+
+
+def show_cars(client: Fleet, *, as_json: bool = False) -> None:
+    """Print the table of cars."""
     cars = client.cars()
     latest: dict[str, dict[str, Reading]] = {car: {} for car in cars}
     for reading in client.get("*/*/*"):  # one query, so that a hung gateway delays it only once
@@ -52,7 +62,8 @@ def list_cars(client: Fleet, *, as_json: bool) -> None:
         for row in rows:
             click.echo(json.dumps(row))
         return
-    show_table(_CAR_COLUMNS, [{name: shown(name, row) for name in _CAR_COLUMNS} for row in rows])
+    table = [{name: shown(name, row) for name in CAR_COLUMNS} for row in rows]
+    show_table(CAR_COLUMNS, table, optional=OPTIONAL_CAR_COLUMNS)
     for row in rows:
         for words in row["platform_contradictions"]:
             click.echo(f"fleet: {row['car']} may be no {row['platform']} car: {words}", err=True)

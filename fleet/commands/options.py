@@ -14,6 +14,7 @@ from fleet.client.commands import CommandRequest
 from fleet.client.outcome import Outcome
 from fleet.commands.group import connect_option, fleet_option
 from fleet.commands.params import resolve_cars
+from schemas import keys
 from schemas.bus import BadEndpoint, BusError
 
 _Function = Callable[..., Any]
@@ -48,6 +49,12 @@ def with_client(function: _Function) -> _Function:
             return function(client, *args, **options)
 
     return command
+
+
+def not_running(fleet: str) -> click.ClickException:
+    """Return the error that no supervisor answers."""
+    name = "The fleet" if fleet == keys.DEFAULT_FLEET else f"Fleet {fleet}"
+    return click.ClickException(f"{name} is not running. Start it with `fleet up`.")
 
 
 class WrongFile(click.ClickException):

@@ -1,6 +1,8 @@
 """Output of readings: as a line, a JSON object or a table."""
 
 import json
+import os
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,6 +13,7 @@ import click
 
 from fleet.client.reading import Reading
 from fleet.recording.tools.csv_table import iso
+from fleet.supervisor.car_status import fit
 from schemas import topics
 
 PROGRESS_BAR_DELAY_S: Final = 1.0
@@ -37,13 +40,19 @@ def line(reading: Reading, width: int = 0, *, past: bool = False) -> str:
     return f"{reading.key:<{width}}  {'  '.join(fields)}  {age}"
 
 
-def show_table(columns: Sequence[str], rows: Sequence[Mapping[str, str]]) -> None:
-    """Print a table with aligned columns and a bold header."""
+def show_table(columns: Sequence[str], rows: Sequence[Mapping[str, str]], *, optional: Sequence[str] = ()) -> None:
+    """Print a table with aligned columns and a bold header. On a terminal it is no wider than that."""
     widths = {name: max(len(row[name]) for row in ({name: name}, *rows)) for name in columns}
-    header = "  ".join(name.upper().ljust(widths[name]) for name in columns).rstrip()
+    if sys.stdout.isatty() or "COLUMNS" in os.environ:  # a pipe gets every column
+        widths = fit(widths, shutil.get_terminal_size().columns, optional)
+    header = "  ".join(name.upper().ljust(width) for name, width in widths.items()).rstrip()
     click.echo(click.style(header, bold=True))
     for row in rows:
-        click.echo("  ".join(row[name].ljust(widths[name]) for name in columns).rstrip())
+        click.echo("  ".join(_shortened(row[name], width) for name, width in widths.items()).rstrip())
+
+
+def _shortened(text: str, width: int) -> str:
+    return text.ljust(width) if len(text) <= width else f"{text[: width - 1]}…"
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from typing import Any, Final
 import click
 
 from fleet.client.supervision import ask_status
+from fleet.commands.options import not_running
 from fleet.supervisor.car_status import CarStatus, describe_missing, describe_start
 from schemas import keys
 from schemas.bus import Bus, BusError, Sample
@@ -50,7 +51,7 @@ def wait_ready(connect: str | None, fleet: str, cars: Sequence[str], timeout_s: 
     if as_json:
         click.echo(json.dumps({"ready": ok, "cars": wanted, "missing": missing}))
     elif not wanted:
-        raise click.ClickException("The fleet is not running. Start it with `fleet up`.")
+        raise not_running(fleet)
     else:
         click.echo(describe_start(wanted, missing, ""), err=not ok)
     raise SystemExit(0 if ok else 1)

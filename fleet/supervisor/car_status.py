@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
+MIN_COLUMN_WIDTH: Final = 4
+"""Minimum width of a column that is shortened."""
 MAX_CARS_LISTED: Final = 8
 """Maximum number of cars that one line lists."""
 READY_TIMEOUT_S: Final = 30.0
@@ -117,6 +119,25 @@ class StartProgress:
         if self.fewest is None or missing < self.fewest:
             self.fewest, self.since = missing, now
         return not missing or now - self.since >= (LINK_OPEN_TIMEOUT_S if unreachable else READY_TIMEOUT_S)
+
+
+def fit(widths: Mapping[str, int], width: int, optional: Sequence[str], gap: int = 2) -> dict[str, int]:
+    """Return the columns of a table that fit into `width`, with their widths.
+
+    The optional columns are left out first, in their order. Then the widest column is shortened, again and again.
+    """
+    result = dict(widths)
+
+    def excess() -> int:
+        return sum(result.values()) + gap * (len(result) - 1) - width
+
+    for name in optional:
+        if excess() > 0:
+            result.pop(name, None)
+    while excess() > 0 and max(result.values()) > MIN_COLUMN_WIDTH:
+        widest = max(result, key=lambda name: result[name])
+        result[widest] -= 1
+    return result
 
 
 def describe_missing(row: CarStatus) -> str:

@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.table import Table as Grid
 from rich.text import Text
 
-from fleet.supervisor.car_status import CarStatus
+from fleet.supervisor.car_status import CarStatus, fit
 from fleet.supervisor.restart_policy import RunState
 
 if TYPE_CHECKING:
@@ -22,9 +22,12 @@ DRAW_IDLE_FACTOR: Final = 10.0
 """Minimum pause, as a multiple of the time to draw. A hundred rows take 50 ms."""
 _LINK: Final = {"online": "green", "quiet": "green", "stale": "yellow", "lost": "red"}
 _VERDICT: Final = {"confirmed": "green", "contradicted": "red"}
-_TABLE_COLUMNS: Final = ("car", "link", "mode", "motion", "held, driven by", "battery", "Hz", "last event")
-_FIXED_WIDTH_COLUMNS: Final = frozenset({"car", "link", "motion", "battery", "Hz"})
-"""Columns that are never truncated."""
+_EVENT: Final = "last event"
+"""The column that gets the remaining width."""
+_TABLE_COLUMNS: Final = ("car", "link", "mode", "motion", "held, driven by", "battery", "Hz", _EVENT)
+_OPTIONAL_COLUMNS: Final = ("Hz", _EVENT, "motion")
+"""Columns that a narrow terminal leaves out, in this order."""
+_MIN_EVENT_WIDTH: Final = 16
 
 
 class Table:
@@ -61,18 +64,21 @@ class Table:
     def rendered(self) -> Group:
         """Return the table, with the states of the services below it."""
         grid = Grid(box=None, pad_edge=False, header_style="bold", expand=True)
-        for column in _TABLE_COLUMNS:
-            grid.add_column(
-                column,
-                no_wrap=column in _FIXED_WIDTH_COLUMNS,
-                ratio=1 if column == "last event" else None,
-                min_width=16 if column == "last event" else None,
-            )
-        for name, row in self._supervisor.rows.items():
+        rows = []
+        for name, status in self._supervisor.rows.items():
             process = self._supervisor.processes.get(name)
             running = process is not None and process.status.state is RunState.RUNNING
             state = "" if running else "starting" if process is None else str(process.status.state)
-            grid.add_row(*_cells(row, state))
+            rows.append(dict(zip(_TABLE_COLUMNS, _cells(status, state), strict=True)))
+        widths = {each: max([len(each), *(row[each].cell_len for row in rows)]) for each in _TABLE_COLUMNS}
+        widths[_EVENT] = _MIN_EVENT_WIDTH
+        widths = fit(widths, self._console.width, _OPTIONAL_COLUMNS)
+        for column, width in widths.items():
+            fixed = None if column == _EVENT else width
+            ratio = 1 if column == _EVENT else None
+            grid.add_column(column, no_wrap=True, overflow="ellipsis", width=fixed, ratio=ratio)
+        for row in rows:
+            grid.add_row(*(row[column] for column in widths))
         services = [
             Text.assemble(
                 each.name, " ", (str(each.status.state), "green" if each.status.state is RunState.RUNNING else "yellow")

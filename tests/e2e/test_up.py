@@ -134,8 +134,11 @@ def test_a_second_one_refuses_and_names_the_first(up: Up) -> None:
 
 
 def test_status_and_logs_say_what_runs(up: Up) -> None:
-    shown = up.fleet("status")
-    assert f"process {up.running('red')}" in shown.stdout
+    first, header, *cars = up.fleet("status").stdout.splitlines()
+    assert re.match(r"fleet fleet \(simulated cars\): running for \d:\d\d:\d\d, recording to ", first)
+    assert header.startswith("CAR ")
+    assert [line.split()[0] for line in cars] == ["green", "red"]
+    assert f"process {up.running('red')}" in up.fleet("status", "--processes").stdout
     told = json.loads(up.fleet("status", "--json").stdout)
     assert {"@hub", "@recorder", "@simulator", "red", "green"} == {each["name"] for each in told["processes"]}
     assert "is open. The gateway stops the car first." in up.fleet("logs", "red").stdout

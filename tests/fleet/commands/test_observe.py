@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from fleet.client.reading import Reading
-from fleet.commands.observe import row_of, shown
+from fleet.commands.observe import CAR_COLUMNS, OPTIONAL_CAR_COLUMNS, row_of, shown
+from fleet.commands.output import show_table
 from schemas.gen import fleet_v1_pb2 as pb
 
 
@@ -41,3 +42,23 @@ def test_a_contradicted_platform_is_shown() -> None:
     assert shown("platform", told) == "raspberry_pi (contradicted)"
     assert shown("platform", row(health=pb.Health(platform="arduino"))) == "arduino"
     assert shown("platform", row()) == "-", "an older gateway, or none that answers"
+
+
+@pytest.mark.parametrize(("columns", "left_out"), [("80", {"PLATFORM", "VERDICT"}), ("200", set())])
+def test_the_table_of_cars_fits_a_terminal(
+    columns: str, left_out: set[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    told = row(
+        link=pb.Link(state="stale", last_rx_s=12.2),
+        mode=pb.Mode(asked="obstacle_avoidance", verdict="contradicted"),
+        motion=pb.Motion(motion="spin_left"),
+        safety=pb.Safety(hold=pb.Hold(by="ann@laboratory-desk-4711"), lease=pb.Lease(holder="bob", kind="person")),
+        health=pb.Health(platform="raspberry_pi"),
+        battery=pb.Battery(voltage_v=7.4, level="ok"),
+    )
+    show_table(CAR_COLUMNS, [{name: shown(name, told) for name in CAR_COLUMNS}], optional=OPTIONAL_CAR_COLUMNS)
+    header, line = capsys.readouterr().out.splitlines()
+    assert max(len(header), len(line)) <= int(columns)
+    assert {name.upper() for name in CAR_COLUMNS} - set(header.split()) >= left_out
+    assert "stale (not heard" in line

@@ -16,6 +16,7 @@ from fleet.supervisor.car_status import (
     describe_missing,
     describe_old_stops,
     describe_start,
+    fit,
 )
 from fleet.supervisor.child import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
 from fleet.supervisor.restart_policy import RunState
@@ -156,12 +157,31 @@ def test_the_table_fits_and_names_every_car(width: int) -> None:
         process.status.state = RunState.RUNNING
     for name in ("red", "green"):
         supervisor.rows[name] = CarStatus(name, link="online", mode="obstacle_avoidance", event="x" * 300)
+    supervisor.rows["red"].lease, supervisor.rows["red"].battery = "ann@laboratory-desk-4711", "7.42 V critical"
     console = Console(file=io.StringIO(), width=width)
     console.print(Table(supervisor, console).rendered())
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
     assert all(word in shown for word in ("red", "green", "online", "@hub"))
     assert all(len(line) <= width for line in shown.splitlines())
+    header, red, green, *_ = shown.splitlines()
+    assert (red.split()[0], green.split()[0]) == ("red", "green"), "no line is wrapped"
+    assert ("last event" in header, "Hz" in header) == (width > 80, width > 80)
+    assert "battery" in header
+    assert "obstacle_av" in green
+
+
+@pytest.mark.parametrize(
+    ("width", "columns"),
+    [
+        (100, {"car": 5, "platform": 20, "mode": 30, "battery": 15}),
+        (60, {"car": 5, "mode": 30, "battery": 15}),
+        (40, {"car": 5, "mode": 16, "battery": 15}),
+        (5, {"car": 4, "mode": 4, "battery": 4}),
+    ],
+)
+def test_columns_are_left_out_in_order_and_then_the_widest_is_shortened(width: int, columns: dict[str, int]) -> None:
+    assert fit({"car": 5, "platform": 20, "mode": 30, "battery": 15}, width, ("platform",)) == columns
 
 
 def test_a_log_keeps_its_bounds_and_the_newest_lines(tmp_path: Path) -> None:
