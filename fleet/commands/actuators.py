@@ -123,9 +123,9 @@ def servo(
     take: bool,
     as_json: bool,
 ) -> None:
-    """Move a servo: left, right or reset (vertical: up, down or reset); the front one also to 0..180 degrees.
+    """Move a servo: left, right or reset (vertical: up, down or reset). The front servo also takes 0 to 180 degrees.
 
-    The number is sent unchanged; the front servo goes to 180 minus it.
+    The car turns the front servo to 180 minus the number.
     """
     carry_out(client, request, cars, take=take, as_json=as_json)
 
@@ -136,7 +136,7 @@ def servo(
 @json_option
 @with_client
 def arm(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest], *, take: bool, as_json: bool) -> None:
-    """Move the arm's six joints to 0..180 degrees each."""
+    """Move the six joints of the arm, 0 to 180 degrees each."""
     cars, request = cars_and_request
     carry_out(client, request, cars, take=take, as_json=as_json)
 
@@ -146,7 +146,7 @@ def arm(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest],
 @json_option
 @with_client
 def whistle(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
-    """Sound once."""
+    """Sound the whistle once."""
     carry_out(client, whistle_request(), cars, as_json=as_json)
 
 
@@ -157,7 +157,7 @@ def whistle(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
 @json_option
 @with_client
 def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_json: bool) -> None:
-    """Change the speed by one step: cars have no absolute speed."""
+    """Go faster or slower by one step. Cars have no absolute speed."""
     carry_out(client, speed_request(step), cars, take=take, as_json=as_json)
 
 
@@ -177,5 +177,5 @@ def fan(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest],
 @json_option
 @with_client
 def identify(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
-    """Make cars blink and beep, without moving."""
+    """Blink and beep, without moving: shows which car is which."""
     carry_out(client, find_request(), cars, as_json=as_json)

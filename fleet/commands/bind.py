@@ -57,7 +57,7 @@ A TCP car is named by its address: write that into the file."""
 @listen_option
 @connect_option("The bus (default: the file's, FLEET_ENDPOINT, or port 7447).")
 def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str | None) -> None:
-    """Find out which car is at which link: each blinks and beeps, you say which it was, and the file has it."""
+    """Find out which car is which: each blinks and beeps, you type its name, and the file gets its link."""
     with cli_errors():
         for link in links:
             validate_link(link)
@@ -65,7 +65,8 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
     found = [each for each in look_for(links, seconds) if each.verdict != "busy" and _unknown(each, fleet)]
     if not found:
         raise click.ClickException(
-            "there is no link that may be a car's and is no car's in the file: see what `gateway scan` shows"
+            f"No new car found: all that answered are in {file} already. Is it switched on? "
+            "`fleet scan` shows what was seen."
         )
     with (
         cli_errors(),

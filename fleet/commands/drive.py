@@ -38,13 +38,13 @@ examples:
     type=Duration(MAX_DRIVE_S),
     default="500ms",
     show_default=True,
-    help="Duration, at most 10s or the limit of the car's gateway.",
+    help="How long to drive: at most 10s, or the limit of the car's gateway.",
 )
 @take_option
 @json_option
 @with_client
 def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, take: bool, as_json: bool) -> None:
-    """Hold a motion for a time, then stop. Wait until the drive is over; Ctrl-C stops the car."""
+    """Move for a time, then stop. Wait until the car has stopped; Ctrl-C stops it early."""
     named = resolve_cars(client, cars)
     with signals.sigterm_interrupts():
         try:
@@ -67,7 +67,10 @@ example:
 @json_option
 @with_client
 def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json: bool) -> None:
-    """Bring cars into a mode. `manual` ends every mode in which cars drive by themselves."""
+    """Let cars act by themselves. `manual` ends every other mode, and the car waits for commands.
+
+    To stop cars, use `fleet stop`: after it a running plan leaves them alone.
+    """
     carry_out(client, mode_request(mode), cars, take=take, as_json=as_json)
 
 
@@ -81,7 +84,10 @@ examples:
 @json_option
 @with_client
 def stop(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
-    """Stop these cars, or all, and hold them against the coordinator until someone drives or resumes them."""
+    """Stop these cars now (no name: all). A running plan leaves them alone until you drive or resume them.
+
+    `fleet estop` also makes cars refuse every command. `fleet mode CAR manual` stops without a hold.
+    """
     _end_with_any(client.ask(stop_request(), _named(client, cars)), as_json=as_json)
 
 
@@ -92,11 +98,14 @@ examples:
   fleet estop red --why 'someone is on the track'"""
 )
 @any_cars_argument
-@click.option("--why", default="", help="What happened, for the record.")
+@click.option("--why", default="", metavar="WORDS", help="What happened, for the record.")
 @json_option
 @with_client
 def estop(client: Fleet, cars: tuple[str, ...], why: str, *, as_json: bool) -> None:
-    """Emergency stop of these cars, or of the whole fleet."""
+    """Emergency stop: these cars, or the whole fleet, stop and refuse every command.
+
+    `fleet resume --estops` releases them. `fleet stop` is for every day: cars obey again at once.
+    """
     named = _named(client, cars)
     request = estop_request(why, "fleet" if named is None else "car")
     _end_with_any(client.ask(request, named), as_json=as_json)
@@ -105,24 +114,30 @@ def estop(client: Fleet, cars: tuple[str, ...], why: str, *, as_json: bool) -> N
 @click.command(
     epilog="""\b
 examples:
+  fleet resume
   fleet resume red
   fleet resume red --estops
   fleet resume red blue --id 5f0c2e"""
 )
 @any_cars_argument
 @click.option(
-    "--id", "ids", multiple=True, metavar="ID", help="An e-stop to end, or its beginning; as often as needed."
+    "--id",
+    "ids",
+    multiple=True,
+    metavar="ID",
+    help="Release this emergency stop (the beginning of its id is enough); may be repeated.",
 )
-@click.option("--estops", is_flag=True, help="End every e-stop in force on these cars; they stay on hold.")
+@click.option("--estops", is_flag=True, help="Release every emergency stop of these cars. They stay on hold.")
 @json_option
 @with_client
 def resume(client: Fleet, cars: tuple[str, ...], ids: tuple[str, ...], *, estops: bool, as_json: bool) -> None:
-    """End the hold of cars: the coordinator may use them again. With --id or --estops, end their e-stops.
+    """Let the plan use stopped cars again (no name: all cars).
 
-    An e-stop of the whole fleet ends on every car when it ends on one.
+    --estops also releases emergency stops. The cars stay stopped and wait for a second `resume`. An emergency stop of
+    the whole fleet ends on every car when it ends on one.
     """
     if estops and ids:
-        raise click.UsageError("--estops ends every e-stop: leave --id out")
+        raise click.UsageError("--estops releases every emergency stop: leave --id out")
     named = resolve_cars(client, cars or [ALL_CARS])
     if not estops and not ids:
         carry_out(client, resume_request(), named, as_json=as_json)

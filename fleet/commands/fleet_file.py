@@ -118,9 +118,8 @@ def init(
         cars = _likely_cars(found) if yes else _prompt_cars(found)
     if not cars:
         raise click.ClickException(
-            "no car was found: switch one on, plug it in or pair it, and see what `gateway scan` shows; a car that is "
-            "silent is asked for without --yes; a TCP car is named with --link tcp://HOST:8888; without cars there is "
-            "`fleet up --sim 3`"
+            "No car found. Is it on and in range? `fleet scan` shows what was seen.\n"
+            "Wi-Fi cars: add --link tcp://HOST:8888. No car at hand? `fleet init --sim 3`"
         )
     text = format_new_file(cars)
     try:

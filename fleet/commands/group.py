@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import click
@@ -30,6 +31,25 @@ class CommandGroup(click.Group):
         except click.exceptions.NoSuchCommand:
             near = did_you_mean(args[0], self.list_commands(ctx))
             raise click.UsageError(f'There is no command "{args[0]}". {near}'.rstrip(), ctx) from None
+
+
+class DefaultCommandGroup(CommandGroup):
+    """A group with a command that may be left out: `fleet sessions DIR` is `fleet sessions list DIR`."""
+
+    def __init__(self, *arguments: Any, default_command: str, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self.no_args_is_help = False
+        self._default_command = default_command
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put the default command before the arguments, unless they begin with a command or its misspelling."""
+        first = args[0] if args else "-"
+        if first.startswith("-") and args[-1:] and args[-1] in self.commands:
+            raise click.UsageError(f"Write the command first: {ctx.command_path} {args[-1]}", ctx)
+        is_command = first in {*self.commands, *ctx.help_option_names}
+        if not is_command and (first.startswith("-") or not did_you_mean(first, self.commands) or Path(first).exists()):
+            args = [self._default_command, *args]
+        return super().parse_args(ctx, args)
 
 
 def _from_group(ctx: click.Context, param: click.Parameter, value: Any) -> Any:

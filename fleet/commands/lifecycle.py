@@ -14,6 +14,7 @@ from fleet.client.client import Fleet, default_sender
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
 from fleet.commands.observe import show_cars
 from fleet.commands.options import bus_options, json_option, not_running
+from fleet.commands.params import complete_cars
 from fleet.supervisor.child import parse_log_line, runs_directory
 from fleet.supervisor.service import ask_service
 from fleet.supervisor.shutdown import NOT_STOPPED
@@ -129,7 +130,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
 
 
 @click.command(epilog="\b\nexamples:\n  fleet logs red\n  fleet logs recorder --follow\n  fleet logs red --json")
-@click.argument("name", metavar="CAR")
+@click.argument("name", metavar="CAR|SERVICE", shell_complete=complete_cars)
 @click.option("-f", "--follow", is_flag=True, help="Go on until Ctrl-C.")
 @json_option
 @bus_options

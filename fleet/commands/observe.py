@@ -36,7 +36,7 @@ _MAX_SHORTFALL_LINES: Final = 5
 @json_option
 @with_client
 def list_cars(client: Fleet, *, as_json: bool) -> None:
-    """List the cars: platform, link, mode and its verdict, motion, driver, hold and battery.
+    """List the cars: platform, link, mode and how sure it is, motion, who is in control, hold and battery.
 
     On a narrow terminal columns are left out: platform, verdict, driver, motion. --json has them all.
     """
@@ -131,10 +131,10 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
     epilog="\b\nexamples:\n  fleet get red\n  fleet get red/sensor/range\n  fleet get '*/sensor/battery' --json\n"
     "  fleet get red/sensor/range --last 100\n  fleet get '*/sensor/range' --since 30s --csv > range.csv"
 )
-@click.argument("keyexpr")
+@click.argument("keyexpr", metavar="KEY")
 @click.option("-n", "--last", type=Number(int, 1), help="The last N values of each key, oldest first.")
 @click.option("--since", type=Duration(history.MAX_HISTORY_S), help="The values of this last time, such as 30s or 5m.")
-@click.option("--csv", "as_csv", is_flag=True, help="One CSV table; KEYEXPR must mean one type of message.")
+@click.option("--csv", "as_csv", is_flag=True, help="Print one CSV table. KEY must mean one type of message.")
 @json_option
 @bus_options
 def get(
@@ -147,9 +147,9 @@ def get(
     connect: str | None,
     fleet: str,
 ) -> None:
-    """Print the latest value of every reading that matches KEYEXPR, or its last values from the gateways' memory.
+    """Print the latest value of every matching reading, or its history (--last, --since).
 
-    `red` is every sensor of red, * is any one part.
+    `red` is every sensor of red. `*` stands for any one part of a key.
     """
     written = written_out(keyexpr, fleet)
     under = topics_under(written)
@@ -157,7 +157,7 @@ def get(
         raise click.UsageError("--csv and --json: give one of them")
     if as_csv and len(under) != 1:
         meant = ", ".join(topic.name for topic in under) or "nothing that is ever published"
-        raise click.UsageError(f"a table has one type of message, {written} means {meant}: name one")
+        raise click.UsageError(f"--csv needs one message type, but {written} means {meant}.")
     past = last is not None or since is not None
     why_not = history.describe_missing_history(under) if past else ""
     if why_not:
@@ -193,16 +193,16 @@ def _print_shortfalls(lines: Sequence[str]) -> None:
     epilog="\b\nexamples:\n  fleet watch red\n  fleet watch '*/state/*' --json\n  fleet watch red/event/command\n"
     "  fleet watch '*/sensor/range' --when 'range_m < 0.3'\n  fleet watch red/sensor/light --when left --count 1"
 )
-@click.argument("keyexpr")
-@click.option("--when", metavar="CONDITION", help="Only readings of which it holds, as 'range_m < 0.3'.")
+@click.argument("keyexpr", metavar="KEY")
+@click.option("--when", metavar="CONDITION", help="Only readings for which this is true, such as 'range_m < 0.3'.")
 @click.option("--count", type=Number(int, 1), help="End after N readings.")
 @json_option
 @bus_options
 def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, connect: str | None, fleet: str) -> None:
-    """Print readings that match KEYEXPR as they are published, until Ctrl-C.
+    """Print new values as they come, until Ctrl-C.
 
-    CONDITION is about the fields of one message: < <= > >= == != with numbers, 'words', true and false, a yes/no field
-    by itself, and, or, not, parentheses. A field that was not measured makes a comparison false.
+    CONDITION compares fields of one message (range_m < 0.3), with and, or, not and parentheses. A yes/no field stands
+    alone. A comparison with a value that was not measured is false.
     """
     written = written_out(keyexpr, fleet)
     if when is not None:
@@ -225,7 +225,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     "keys",
     epilog="\b\nexamples:\n  fleet keys\n  fleet keys red\n  fleet keys '*/state/*' --json\n  fleet keys --for 10s",
 )
-@click.argument("keyexpr", required=False)
+@click.argument("keyexpr", required=False, metavar="[KEY]")
 @click.option(
     "--for",
     "look_s",
@@ -237,9 +237,9 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
 @json_option
 @bus_options
 def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str | None, fleet: str) -> None:
-    """List every key in use, or those under KEYEXPR: message type, units, rate and age of the newest value.
+    """List everything that is being published: message type, units, rate and age of the newest value.
 
-    A rate of - means fewer than two messages during the survey; an age of - means no message at all.
+    Rate "-": fewer than two messages while measuring. Age "-": nothing received.
     """
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
     written = [written_out(each, fleet) for each in ([keyexpr] if keyexpr else everything)]

@@ -20,9 +20,9 @@ from schemas.bus import BadEndpoint, BusError
 _Function = Callable[..., Any]
 
 from_option = click.option(
-    "--from", "start", metavar="TIME", help="90s or 1m30s after the start, -60s before the end, or a date."
+    "--from", "start", metavar="TIME", help="Begin here: 90s or 1m30s after the start, -60s before the end, or a date."
 )
-to_option = click.option("--to", "end", metavar="TIME", help="Likewise; messages from then on are left out.")
+to_option = click.option("--to", "end", metavar="TIME", help="End before this time, written as for --from.")
 json_option = click.option("--json", "as_json", is_flag=True, help="One JSON object per line.")
 
 

@@ -1,6 +1,8 @@
 """Types of arguments and options that several subcommands take, and key expressions."""
 
+import logging
 import re
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -8,18 +10,20 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
 from fleet.commands.group import did_you_mean
 from fleet.recording.session_dir import is_session
 from schemas import keys
-from schemas.bus import canon
+from schemas.bus import Bus, canon
 from schemas.duration import parse_duration
 
 N = TypeVar("N", bound=float)
 
 ALL_CARS: Final = "all"
+COMPLETION_TIMEOUT_S: Final = 0.3
 DEFAULT_SESSIONS: Final = Path("sessions")
 _PLACE: Final = "fleet.sessions"
 """Key of the value of --sessions in the context."""
@@ -113,6 +117,39 @@ class CarNames(click.ParamType[tuple[str, ...]]):
                 self.fail(str(error), param, ctx)
         return names
 
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """Return connected cars, and the words of the argument after them: `fleet drive red fo`."""
+        found = [CompletionItem(name) for name in complete_cars(ctx, param, incomplete)]
+        if isinstance(param, click.Argument):
+            words = [each for each in ctx.command.params if isinstance(each, click.Argument) and each is not param]
+            found += [item for each in words[:1] for item in each.shell_complete(ctx, incomplete)]
+        return found
+
+
+def complete_cars(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """Return connected cars for the shell, also after a comma. Never fails, prints, or takes long."""
+    earlier, comma, begin = incomplete.rpartition(",")
+    named = earlier.split(",")
+    names = [*_connected_within(COMPLETION_TIMEOUT_S, ctx), ALL_CARS]
+    return [f"{earlier}{comma}{name}" for name in names if name.startswith(begin) and name not in named]
+
+
+def _connected_within(timeout_s: float, ctx: click.Context) -> list[str]:
+    """Return the connected cars. Empty if the bus does not answer in time."""
+    values = {**ctx.find_root().params, **{name: value for name, value in ctx.params.items() if value}}
+    fleet = values.get("fleet") or keys.DEFAULT_FLEET  # click sets no defaults while it completes
+    found: list[str] = []
+
+    def look() -> None:
+        with suppress(Exception), Bus.open(values.get("connect")) as bus:
+            found.extend(token.rpartition("/")[2] for token in bus.tokens(keys.car_token(fleet, "*")))
+
+    logging.disable()
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    thread.join(timeout_s)
+    return sorted(found)
+
 
 class Color(click.ParamType[tuple[int, int, int]]):
     """A color: a name, or red, green and blue as `#rrggbb`."""
@@ -154,6 +191,12 @@ class SessionPath(click.ParamType[Path]):
         if back >= len(found):
             self.fail(f"{value}: there are only {len(found)} sessions in {place}.", param, ctx)
         return found[back]
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's
+        """Return the names of sessions, or let the shell complete a path."""
+        names = ["latest", *(each.name for each in newest_first(ctx.meta.get(_PLACE) or sessions_place()))]
+        fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
+        return fitting or [CompletionItem(incomplete, type="file")]
 
 
 def sessions_place() -> Path:

@@ -61,7 +61,10 @@ def play(
     cars_only: bool,
     connect: str | None,
 ) -> None:
-    """Publish SESSION again as a fleet of another name, with the original timing. No car moves."""
+    """Publish a session again for your own programs, as a fleet of another name with the original timing.
+
+    No car moves: a replayed fleet takes no commands.
+    """
     from fleet.commands.sessions import part_of
     from fleet.recording import time_spec
     from fleet.recording.reading.session import NoSession, Session

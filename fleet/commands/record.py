@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import click
-from click.core import ParameterSource
 
 from fleet.client.client import default_sender
-from fleet.commands.group import connect_option, fleet_option
+from fleet.commands.group import DefaultCommandGroup, connect_option, fleet_option
 from fleet.commands.options import bus_options, json_option
-from fleet.commands.params import DEFAULT_SESSIONS, Duration
+from fleet.commands.params import DEFAULT_SESSIONS, Choice, Duration
 from schemas import keys, messages
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
@@ -52,16 +51,28 @@ _FILE: Final = click.Path(path_type=Path, dir_okay=False)
 
 
 @click.group(
-    invoke_without_command=True,
+    cls=DefaultCommandGroup,
+    default_command="run",
     epilog="""\b
 examples:
+  fleet record                  record until Ctrl-C, as `fleet record run`
   fleet record --quota 20GB
   fleet record status
-  fleet record stop
-  fleet record start
   fleet mark "the blue one lost the line"
 
-The quota does not remove marked sessions.""",
+`fleet up` records by itself. `fleet record run -h` shows the options.""",
+)
+def record() -> None:
+    """Record without `fleet up`, and command a recorder that runs. Without a command: record until Ctrl-C."""
+
+
+@record.command(
+    epilog="""\b
+examples:
+  fleet record run --quota 20GB
+  fleet record run --sessions /media/disk --segment-time 5m
+
+The quota does not remove marked sessions."""
 )
 @click.option(
     "--sessions",
@@ -76,21 +87,19 @@ The quota does not remove marked sessions.""",
     "--segment-size", type=SizeType(10**6), default="512MB", show_default=True, help="Maximum size of a file."
 )
 @click.option(
-    "--segment-time", type=Duration(_WEEK_S), default="10m", show_default=True, help="Maximum duration of a file."
+    "--segment-time", type=Duration(_WEEK_S), default="10m", show_default=True, help="Start a new file after this time."
 )
 @click.option(
     "--sync",
-    type=click.Choice(("never", "segment", "second")),
+    type=Choice("time to sync", ("never", "segment", "second")),
     default="segment",
     show_default=True,
-    help="When to wait for the disk. A crash of the recorder loses at most a second in any case; a crash of the "
-    "computer loses everything since the last sync.",
+    help="How often data is forced to disk. Matters only if the computer itself crashes.",
 )
 @click.option(
     "--session-size",
     type=SizeType(10**6),
-    help="Maximum size of a session, after which the next one begins. With --quota at most half of it (default: a "
-    "tenth).",
+    help="Maximum size of a session. Then the next one begins. With --quota at most half of it (default: a tenth).",
 )
 @click.option(
     "--quota",
@@ -110,9 +119,7 @@ The quota does not remove marked sessions.""",
 @fleet_option()
 @click.option("--with-parent", is_flag=True, hidden=True, help="End when the process that started this ends.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object per line: when ready, and at the end.")
-@click.pass_context
-def record(
-    ctx: click.Context,
+def run(
     place: Path,
     segment_size: int,
     segment_time: float,
@@ -128,24 +135,16 @@ def record(
     with_parent: bool,
     as_json: bool,
 ) -> None:
-    """Record all messages of a fleet to MCAP until Ctrl-C. Print the session's directory when the recorder is ready."""
-    if ctx.invoked_subcommand is not None:
-        asked = [name for name in ctx.params if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT]
-        if asked:
-            option = "--json" if asked[0] == "as_json" else f"--{asked[0].replace('_', '-')}"
-            raise click.UsageError(f"{option} goes behind {ctx.invoked_subcommand!r}, if it has it", ctx)
-        return
+    """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
     from fleet.recording.session_dir import FLEET_FILE, PLAN_FILE
     from fleet.recording.writing.recorder import AnotherRecorder, Recorder, RecordingFailed
     from fleet.recording.writing.session_writer import Options, Sync
 
     copied = {FLEET_FILE: fleet_file, PLAN_FILE: plan}
     if session_size and quota and session_size > quota // 2:
-        raise click.BadParameter(
-            f"{session_size / 10**6:g} MB is more than half of --quota, which is kept by removing whole sessions: "
-            f"at most {quota / 2 / 10**6:g} MB are allowed",
-            ctx,
-            param_hint="--session-size",
+        raise click.UsageError(
+            f"--session-size: {session_size / 10**6:g} MB is more than half of --quota: at most "
+            f"{quota / 2 / 10**6:g} MB are allowed, because the quota removes whole sessions"
         )
     options = Options(
         segment_bytes=segment_size,
@@ -247,23 +246,23 @@ def _show_status(found: Any, *, as_json: bool) -> None:
             click.echo(words)
 
 
-@record.command()
+@record.command(epilog="\b\nexample:\n  fleet record start")
 @json_option
 @bus_options
 def start(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Start a new session after `stop`."""
+    """Start a new session after `fleet record stop`."""
     _show_status(_query("start", connect, fleet), as_json=as_json)
 
 
-@record.command()
+@record.command(epilog="\b\nexample:\n  fleet record stop")
 @json_option
 @bus_options
 def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Close the session. The recorder keeps running and waits for `start`."""
+    """Close the session. The recorder keeps running and waits for `fleet record start`."""
     _show_status(_query("stop", connect, fleet), as_json=as_json)
 
 
-@record.command()
+@record.command(epilog="\b\nexample:\n  fleet record status")
 @json_option
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
@@ -272,14 +271,14 @@ def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
 
 
 @click.command(epilog="\b\nexample:\n  fleet mark 'the blue one lost the line'")
-@click.argument("text")
+@click.argument("text", metavar="WORDS")
 @click.option("--by", metavar="NAME", help="Author of the mark (default: your sender name).")
 @bus_options
 def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
-    """Write TEXT into the running recording. The quota does not remove a marked session."""
+    """Add a note to the running recording. The quota does not remove a marked session."""
     from fleet.recording.writing.recorder import MAX_MARK_CHARACTERS
 
     if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
-        raise click.UsageError(f"TEXT must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
+        raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
     found = _query("mark", connect, fleet, text=text, by=by or default_sender())
     click.echo(f"marked in {found.session}")

@@ -33,10 +33,9 @@ Exit codes: 0 no difference, 1 some, or nothing to decode."""
 )
 @json_option
 def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_json: bool) -> None:
-    """Decode the raw frames of SESSION again and list the differences to the recorded readings.
+    """Decode the recorded raw bytes with this version and list differences.
 
-    SESSION may also be a vector that `fleet sessions vector` made. Decoding depends on platform and mode: the recorded
-    ones are used.
+    SESSION may also be a vector that `fleet sessions vector` made. Decoding uses the recorded platform and mode.
     """
     from fleet.recording.reading.session import NoSession
     from fleet.replay.analysis.redecode import NoPlatform
@@ -200,9 +199,9 @@ example:
 )
 @click.option("--source", metavar="WORDS", help="Where it is from, in words (default: the session and the car).")
 def vector(session: Path, car: str, start: str | None, end: str | None, out: Path, source: str | None) -> None:
-    """Write a stretch of SESSION as a test vector: raw frames with their times, and what they are decoded to.
+    """Write a part of a session as a test vector: raw frames with their times, and their decoded readings.
 
-    `fleet sessions redecode FILE.jsonl` holds it against today's decoder; tests/vectors/recorded has some.
+    `fleet sessions redecode FILE.jsonl` compares it with the decoder of this version.
     """
     from fleet.commands.sessions import part_of
     from fleet.recording.reading.session import NoSession, Session

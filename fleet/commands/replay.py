@@ -35,7 +35,7 @@ examples:
     "--save",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="OUT.rrd",
-    help="Write a file that carries its layout instead of opening the viewer: `rerun OUT.rrd` shows it.",
+    help="Write a file with its layout instead of opening the viewer. `rerun OUT.rrd` shows it.",
 )
 def replay(
     session: Path,
@@ -44,7 +44,7 @@ def replay(
     end: str | None,
     save: Path | None,
 ) -> None:
-    """Look at SESSION (a directory that `fleet record` made, or an .mcap) in Rerun."""
+    """Look at a session in Rerun: the newest, or a directory or .mcap file that you name."""
     quiet_rerun()
     from fleet.recording.reading.session import NoSession, Session
     from fleet.replay.rerun.viewer import has_display

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from fleet.commands.group import CommandGroup, did_you_mean
+from fleet.commands.group import DefaultCommandGroup
 from fleet.commands.options import from_option, json_option, to_option
 from fleet.commands.output import progress_bar
 from fleet.commands.params import car_option, session_argument, sessions_place
@@ -23,20 +23,9 @@ _PROGRESS_STEP: Final = 1024
 T = TypeVar("T")
 
 
-class _DefaultCommandGroup(CommandGroup):
-    """A group for which `fleet sessions` and `fleet sessions DIR` mean `fleet sessions list`."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        if not args or not (args[0] in {*self.commands, "-h", "--help"} or self._is_misspelled(args[0])):
-            args = ["list", *args]
-        return super().parse_args(ctx, args)
-
-    def _is_misspelled(self, word: str) -> bool:
-        return bool(did_you_mean(word, self.commands)) and not Path(word).exists()
-
-
 @click.group(
-    cls=_DefaultCommandGroup,
+    cls=DefaultCommandGroup,
+    default_command="list",
     subcommand_metavar="[COMMAND | DIR]",
     epilog="""\b
 examples:
@@ -46,7 +35,7 @@ examples:
 """,
 )
 def sessions() -> None:
-    """List, inspect, verify, recover, cut and export recordings. Without a command, list those of a directory."""
+    """List, inspect, check, repair, cut and export recordings. Without a command, list those of a directory."""
 
 
 sessions.add_command(redecode)
@@ -108,7 +97,7 @@ examples:
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
-    """List the sessions in DIR: state, length, size, lost messages, marks and cars."""
+    """List the sessions in DIR (default: sessions): state, length, size, lost messages, marks and cars."""
     from fleet.recording.tools.summary import overviews
 
     place = directory or sessions_place()
@@ -159,7 +148,7 @@ example:
 @session_argument
 @json_option
 def info(session: Path, *, as_json: bool) -> None:
-    """Show the content of SESSION: versions, cars, keys with their rates, marks, lost messages."""
+    """Show what a session holds: versions, cars, keys with their rates, marks, lost messages."""
     from fleet.recording.tools.summary import marks_of, of_session
     from fleet.recording.tools.transform import origin_words
 
@@ -209,9 +198,9 @@ example:
 @session_argument
 @json_option
 def verify(session: Path, *, as_json: bool) -> None:
-    """Check SESSION against its checksums, sequence numbers, today's schemas and the clocks.
+    """Check a recording: checksums, missing messages, schemas, clocks.
 
-    List exactly what is missing. The exit code is 1 if anything is.
+    It lists exactly what is missing. The exit code is 1 if anything is.
     """
     from fleet.recording.tools.summary import growing, total
     from fleet.recording.tools.verify import verify as look
@@ -236,7 +225,7 @@ example:
 @session_argument
 @out_option
 def recover(session: Path, out: Path | None) -> None:
-    """Write every intact chunk of a truncated or damaged SESSION into a new session, which is marked as recovered."""
+    """Repair: copy everything readable from a damaged recording into a new one."""
     from fleet.recording.tools.summary import total
     from fleet.recording.tools.transform import recover as make
 
@@ -268,7 +257,7 @@ examples:
     help="The new session's directory.",
 )
 def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...], out: Path) -> None:
-    """Write a part of SESSION as a session of its own."""
+    """Copy a part of a session into a new one."""
     from fleet.recording.tools.transform import cut as make
 
     with _session_errors():
@@ -297,11 +286,11 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
         except ValueError as error:
             raise click.UsageError(f"{name}: {error}") from None
     selection = Selection(None, *bounds)
-    there = f"{session.path} goes from {time_spec.iso(about.start_ns)} to {time_spec.iso(about.end_ns)}"
+    there = f"{session.path} runs from {time_spec.iso(about.start_ns)} to {time_spec.iso(about.end_ns)}"
     if bounds[0] is not None and bounds[1] is not None and bounds[0] >= bounds[1]:
         raise click.UsageError(f"--from {start} is not before --to {end}: {there}")
     if not selection.overlaps(about.start_ns, about.end_ns):
-        raise click.UsageError(f"nothing lies there: {there}, {time_spec.words(about.length_s)}")
+        raise click.UsageError(f"The time range is empty: {there} ({time_spec.words(about.length_s)}).")
     return selection
 
 
@@ -318,7 +307,7 @@ examples:
     "--parquet", "parquet", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write Parquet here."
 )
 def export(session: Path, csv: Path | None, parquet: Path | None) -> None:
-    """Write SESSION as tidy tables, one file for each type of message, into a new directory.
+    """Write a session as tidy tables, one file for each type of message, into a new directory.
 
     Columns: key, car, log_time, publish_time, sequence, then the fields. Times are UTC. Units are in the columns'
     names, in Parquet also in the fields' metadata. Messages that are not protobuf are in `other`.

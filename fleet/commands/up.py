@@ -46,8 +46,8 @@ Without FILE and --sim it takes ./fleet.yaml. The start ends with one line: all 
 why. With --sim and --json, lines on stdin go to the simulator (gateway sim --help). If a car cannot be stopped at the
 end, fresh gateways try again until the next Ctrl-C.
 
---detach returns when all cars are ready, or when no further car has become ready for 30 s (10 s if only links cannot be
-opened). The fleet runs on in both cases: `fleet logs supervisor` shows its log, `fleet down` ends it.
+--detach returns when all cars are ready. It also returns if no further car becomes ready for 30 s (10 s if only links
+cannot be opened). The fleet runs on in both cases: `fleet logs supervisor` shows its log, `fleet down` ends it.
 
 Exit codes: 0 every car was stopped (--detach: all are ready), 1 one was not or nothing came up, 2 wrong use."""
 )

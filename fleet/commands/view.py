@@ -49,11 +49,11 @@ examples:
 )
 @bus_options
 def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, connect: str | None, fleet: str) -> None:
-    """Show the fleet live in Rerun until its window is closed, or Ctrl-C. Cars and `fleet up` are not affected."""
+    """Show the fleet live in Rerun, until you close its window or press Ctrl-C. Cars go on."""
     import re
 
     if web and save is not None:
-        raise click.UsageError("--web and --save do not go together: name one")
+        raise click.UsageError("Give --web or --save, not both.")
     if not re.fullmatch(r"[1-9]\d*(\.\d+)?([KMG]i?B|%)", memory):
         raise click.UsageError(f"--memory {memory} is not allowed: write 500MB, 1GiB or 25%")
     keys.check_name(fleet, "fleet name")

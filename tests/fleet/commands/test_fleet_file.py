@@ -276,7 +276,7 @@ def test_simulated_cars_overwrite_nothing(command: Command, tmp_path: Path, name
 def test_nothing_found_says_what_to_do(command: Command, port: Port, tmp_path: Path) -> None:
     done = command("init", "--yes", "--for", "0.5", "--link", port.path)
     assert done.returncode == 1
-    for words in ("no car was found", "gateway scan", "--link tcp://", "fleet up --sim"):
+    for words in ("No car found", "fleet scan", "--link tcp://", "fleet init --sim 3"):
         assert words in done.stderr
     assert not (tmp_path / "fleet.yaml").exists()
 
@@ -369,7 +369,7 @@ def test_no_unknown_link(command: Command, port: Port, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{link: {port.path}}}}}")
     done = command("bind", "--for", "0.5", "--link", port.path)
     assert done.returncode == 1
-    assert "no link that may be a car's" in done.stderr
+    assert "No new car found" in done.stderr
     assert port.received() == b""
 
 

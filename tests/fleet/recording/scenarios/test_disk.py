@@ -388,7 +388,7 @@ def test_a_mark_that_cannot_be_is_refused(endpoint: str, bus: Bus, tmp_path: Pat
         (("--keep-free=-1",), "0 to 1000 TB"),
         (("--segment-time", "0s"), "more than 0"),
         (("--quota", "5GB", "--session-size", "3GB"), "at most 2500 MB are allowed"),
-        (("--quota", "5GB", "status"), "--quota goes behind 'status'"),
+        (("--quota", "5GB", "status"), "Write the command first: fleet record status"),
     ],
 )
 def test_options_that_cannot_be_are_one_line(option: tuple[str, ...], words: str) -> None:

@@ -112,11 +112,11 @@ def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
     again = fleet("cut", session, "--out", out)
     assert (again.returncode, "is there already" in again.stderr) == (2, True)
     for arguments, words in (
-        (("--from", "1h"), "nothing lies there"),
+        (("--from", "1h"), "The time range is empty"),
         (("--from", "2s", "--to", "1s"), "is not before"),
         (("--from", "soon"), "is not a time"),
         (("--car", "pink"), "pink is not in"),
-        (("--to", "2026-09-21T14:13:19Z"), "nothing lies there"),
+        (("--to", "2026-09-21T14:13:19Z"), "The time range is empty"),
     ):
         wrong = fleet("cut", session, *arguments, "--out", tmp_path / "other")
         assert (wrong.returncode, words in wrong.stderr) == (2, True), wrong.stderr
