@@ -68,8 +68,10 @@ vectors: .venv/.ready ## write tests/vectors/stops.tsv, the distribution of stop
 proto: .venv/.ready ## generate schemas/gen from schemas/proto
 	$(BIN)/python -m schemas.generate
 
-pictures: .venv/.ready ## the pictures of README and docs, of the newest session (needs a Vulkan driver, which may be software)
-	$(BIN)/python -m tests.tools.screenshots "$$(ls -td sessions/*/ | head -n 1)" .github
+pictures: .venv/.ready ## docs/pictures: the animation, `fleet up`, and Rerun's views (a Vulkan driver, which may be software)
+	@mkdir -p .tmp
+	$(BIN)/python -m tests.tools.hero docs/pictures
+	$(BIN)/python -m tests.tools.screenshots "$$(ls -td .tmp/pictures/sessions/*/ | head -n 1)" docs/pictures
 
 pages: .venv/.ready ## generate the pages and tables of docs/reference, and the numbers in other pages
 	$(BIN)/python -m tests.tools.pages
