@@ -35,9 +35,9 @@ from fleet.supervisor.status_table import Table
 from tests.support.ports import free_endpoint
 
 WIDTH: Final = 960
-COLUMNS: Final = 110
-FONT_SIZE: Final = 14
-LINE_HEIGHT: Final = 21
+COLUMNS: Final = 102
+FONT_SIZE: Final = 15
+LINE_HEIGHT: Final = 22
 MARGIN: Final = 14
 WORLD_HEIGHT: Final = 356
 TERMINAL_ROWS: Final = 5
@@ -102,7 +102,7 @@ class State:
         for row in rows.values():
             row.hold, row.lease = (name.replace(HOST, "laptop") for name in (row.hold, row.lease))
         supervisor: Any = SimpleNamespace(rows=rows, processes=processes)
-        return Table(supervisor, Console(file=io.StringIO())).rendered()
+        return Table(supervisor, Console(file=io.StringIO(), width=COLUMNS)).rendered()
 
 
 class _Processes(list[Any]):
