@@ -129,7 +129,7 @@ def format_new_plan(count: int) -> str:
     """Return the text of a first plan for this number of cars."""
     lines = [
         f"# yaml-language-server: $schema={SCHEMA_URL.format('plan')}",
-        "# What the cars do together. Run it with `fleet up --plan plan.yaml`, or name it in fleet.yaml.",
+        "# What the cars do together. Check it with `fleet check plan.yaml`, run it with `fleet up --plan plan.yaml`.",
         "roles:",
     ]
     if count > 1:

@@ -88,13 +88,14 @@ def test_the_first_minutes_from_the_wheel(tmp_path: Path) -> None:
     assert "1-patrol" in here.succeeds("fleet example list")
     assert "fleet up" in here.succeeds("fleet init --sim 3")
     here.succeeds("fleet check")
+    here.succeeds("fleet check plan.yaml")
     try:
         assert "All 3 cars are ready" in here.succeeds("fleet up --detach")
         here.succeeds("fleet wait --ready")
         here.succeeds("fleet drive red forward --for 0.3s")
         script = "from fleet import Fleet; fleet = Fleet(); print(*fleet.cars()); fleet.close()"
         assert here.succeeds(f'python -c "{script}"') == "blue green red\n"
-        refused = here.run("fleet replay sessions/* --save x.rrd")
+        refused = here.run("fleet replay latest --save x.rrd")
         assert (refused.returncode, refused.stdout) == (1, "")
         assert refused.stderr.endswith("Type: pip install 'zenoh-car-fleet[view]'\n")
         assert refused.stderr.count("\n") == 1
@@ -102,7 +103,7 @@ def test_the_first_minutes_from_the_wheel(tmp_path: Path) -> None:
         down = here.run("fleet down")
     assert down.returncode == 0, down.stderr
     assert sorted(down.stdout.splitlines()) == ["blue: stopped", "green: stopped", "red: stopped"]
-    here.succeeds("fleet sessions verify sessions/*")
+    here.succeeds("fleet sessions verify")
     here.install("view")
-    here.succeeds("fleet replay sessions/* --save x.rrd")
+    here.succeeds("fleet replay latest --save x.rrd")
     assert (here.home / "x.rrd").stat().st_size > 10_000

@@ -246,6 +246,16 @@ def test_any_name_and_any_word_of_a_device_make_a_right_file() -> None:
     assert [(car.name, car.link) for car in fleet.cars.values()] == [(car.name, car.link) for car in cars]
 
 
+@pytest.mark.parametrize("link", [
+    "sim", "/dev/ttyUSB0", "COM3", "ble://A4:C1:38:00:00:01", "ble://name=BT04-blue", "ble://name=my car #1",
+    "serial://?vid=1a86&serial=A50285BI", "tcp://192.168.1.7:8888",
+])  # fmt: skip
+def test_each_link_is_written_as_it_is(link: str) -> None:
+    written = parse_fleet(format_new_file([NewCar("red", link, "auto", "#e01b24")]), Path("f.yaml"))
+    direct = parse_fleet(json.dumps({"cars": {"red": {"link": link}}}), Path("f.yaml"))
+    assert written.cars["red"].link == direct.cars["red"].link
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
 def test_simulated_cars_are_written_with_a_plan_that_uses_all(command: Command, tmp_path: Path, count: int) -> None:
     done = command("init", "--sim", str(count))
