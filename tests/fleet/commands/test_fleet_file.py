@@ -247,7 +247,7 @@ def test_any_name_and_any_word_of_a_device_make_a_right_file() -> None:
 
 
 @pytest.mark.parametrize("link", [
-    "sim", "/dev/ttyUSB0", "COM3", "ble://A4:C1:38:00:00:01", "ble://name=BT04-blue", "ble://name=my car #1",
+    "/dev/ttyUSB0", "COM3", "ble://A4:C1:38:00:00:01", "ble://name=BT04-blue", "ble://name=my car #1",
     "serial://?vid=1a86&serial=A50285BI", "tcp://192.168.1.7:8888",
 ])  # fmt: skip
 def test_each_link_is_written_as_it_is(link: str) -> None:
