@@ -51,12 +51,13 @@ soak: .venv/.ready ## what takes longer than a test may
 	@mkdir -p .tmp
 	$(BIN)/python -m pytest tests -m soak -s --timeout 3600
 
-lint: .venv/.ready ## ruff, mypy, import-linter, generated files up to date
+lint: .venv/.docs ## ruff, mypy, import-linter, generated files up to date, the site without a broken link
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m schemas.generate --check
+	$(MAKE) --no-print-directory docs
 
 bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in the same run
 	@mkdir -p .tmp
@@ -77,11 +78,11 @@ pages: .venv/.ready ## generate the pages and tables of docs/reference, and the 
 	$(BIN)/python -m tests.tools.pages
 
 .venv/.docs: .venv/.ready
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	@touch $@
 
 docs: .venv/.docs ## build the site into .cache/docs/site, and fail on broken links
-	$(BIN)/python -m tests.tools.site .cache/docs
+	@$(BIN)/python -m tests.tools.site .cache/docs
 	$(BIN)/zensical build -f .cache/docs/zensical.toml --strict
 
 clean: ## remove everything that is not tracked

@@ -74,8 +74,7 @@ def shell_lines() -> Iterator[tuple[str, str]]:
                         yield str(path.relative_to(ROOT)), words
 
 
-NOT_YET: Final = ("fleet plan run", "fleet plan set", "fleet plan show", "fleet plan try")
-LINES: Final = sorted(each for each in set(shell_lines()) if not each[1].startswith(NOT_YET))
+LINES: Final = sorted(set(shell_lines()))
 
 
 @pytest.mark.parametrize(("page", "line"), LINES, ids=[line for _, line in LINES])

@@ -53,7 +53,7 @@ class Environment:
         (self.packages,) = (directory / "venv").glob("lib/python*/site-packages")
         (self.metadata,) = self.packages.glob("zenoh_car_fleet-*.dist-info")
         self.install()
-        self._environment = {
+        self.variables = {
             "PATH": f"{self._bin}:/usr/bin:/bin",
             "HOME": str(self.home),
             "FLEET_ENDPOINT": free_endpoint(),
@@ -71,7 +71,7 @@ class Environment:
     def run(self, command: str) -> "subprocess.CompletedProcess[str]":
         """Run a command as a user would type it."""
         return subprocess.run(
-            ["bash", "-c", command], cwd=self.home, env=self._environment, capture_output=True, text=True, check=False
+            ["bash", "-c", command], cwd=self.home, env=self.variables, capture_output=True, text=True, check=False
         )
 
     def succeeds(self, command: str) -> str:
