@@ -91,7 +91,7 @@ def line(decision: Decision) -> str:
     readings = f" ({', '.join(decision.readings)})" if decision.readings else ""
     return (
         f"{decision.subject}: {decision.decided}, because: {decision.why}{readings}; "
-        f"would change with: {decision.would_change}"
+        f"would change if: {decision.would_change}"
     )
 
 

@@ -205,7 +205,7 @@ def _describe(each: "DecisionDifference", origin_ns: int) -> str:
         lines.append(f"  {name}: {decision}, because: {decision.why}")
         lines += [f"        with {reading}" for reading in decision.readings]
         if decision.would_change:
-            lines.append(f"        would change with {decision.would_change}")
+            lines.append(f"        would change if {decision.would_change}")
     return "\n".join(lines)
 
 

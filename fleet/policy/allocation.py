@@ -67,11 +67,11 @@ class Candidates:
         name = role.name
         pinned = self.pinned.get(car)
         if pinned is not None and pinned[0] != name:
-            return Barrier(f"{pinned[1]} leaves it {pinned[0]} only", f"the end of {pinned[1]}")
+            return Barrier(f"{pinned[1]} leaves it {pinned[0]} only", f"{pinned[1]} ends")
         if not self.plan.may(car, role):
-            return Barrier("the plan does not give it to this car", "another plan")
+            return Barrier("the plan does not give it to this car", "another plan is put in force")
         if role.by_rules and pinned is None and not any(name == other.if_none for other in self.plan.roles.values()):
-            return Barrier("only a rule gives it", "such a rule coming true")
+            return Barrier("only a rule gives it", "a rule gives it to the car")
         known = self.snapshot.cars.get(car, UNKNOWN_CAR)
         return find_barrier(known, role, self.now) or self._needy(car, role, known)
 
@@ -82,31 +82,34 @@ class Candidates:
         if settled is not None and settled.value:
             return None
         if settled is not None:
-            return Barrier(f"it needs {role.needs_text}", role.needs_text, role.needs)
+            return Barrier(f"it needs {role.needs_text}", f"{role.needs_text} becomes true", role.needs)
         # Most modes measure little. A car that is in the role's mode already is not taken out of it to find out.
         if self.roles_before.get(car) == role.name or (car not in self.roles_before and known.mode == role.mode):
             return None
-        why, change = f"it needs {role.needs_text}, and that is not known", f"{role.needs_text} being measured"
+        why, change = f"it needs {role.needs_text}, and that is not known", f"{role.needs_text} is measured"
         return Barrier(why, change, role.needs)
 
 
 def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
     """Return what keeps a car from a role whatever its readings, None if nothing does."""
     if known.roles is not None and role.name not in known.roles:
-        return Barrier("the fleet file does not let it take this role", "the fleet file")
+        return Barrier("the fleet file does not let it take this role", "the fleet file lets it")
     profile = known.profile
     if profile is not None and role.mode not in profile.modes:
         knows = ", ".join(sorted(profile.modes))
-        return Barrier(f"{known.platform} cars do not know mode {role.mode}; they know {knows}", "another car")
+        return Barrier(
+            f"{known.platform} cars do not know mode {role.mode}; they know {knows}", "the car has another platform"
+        )
     if known.listed and role.mode not in known.capabilities:
-        return Barrier(f"the fleet file does not let it do mode {role.mode}", "the fleet file")
+        return Barrier(f"the fleet file does not let it do mode {role.mode}", "the fleet file lets it")
     if role.platforms is not None and (profile is None or not {profile.kind, profile.name} & set(role.platforms)):
         return Barrier(
-            f"it wants platform {' or '.join(role.platforms)}, this is {known.platform or 'not known'}", "another car"
+            f"it wants platform {' or '.join(role.platforms)}, this is {known.platform or 'not known'}",
+            "the car has such a platform",
         )
     missing = sorted(role.capabilities - known.capabilities)
     if missing:
-        return Barrier(f"it cannot {', '.join(missing)}", "another car")
+        return Barrier(f"it cannot {', '.join(missing)}", "it becomes able to")
     refused = known.refused
     if (
         refused is not None
@@ -114,7 +117,10 @@ def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
         and refused.reason in _REFUSALS
         and now - refused.at < REFUSED_MODE_RETRY_S
     ):
-        return Barrier(f"it refused mode {refused.mode}: {refused.reason}: {refused.words}", "asking again after 10 s")
+        return Barrier(
+            f"it refused mode {refused.mode}: {refused.reason}: {refused.words}",
+            "it accepts the mode when it is asked again, after 10 s",
+        )
     return None
 
 

@@ -234,21 +234,24 @@ def _is_ready(
 def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
     """Return why the car is left alone and whether a person caused it (then it loses its role at once), or None."""
     if not known.present:
-        return Barrier(f"{car} is not on the bus", "its gateway coming up"), False
+        return Barrier(f"{car} is not on the bus", "its gateway comes up"), False
     if not known.mode:  # nor is it known whether there is a hold
-        return Barrier(f"{car} has not said yet how it is", "its first states"), False
+        return Barrier(f"{car} has not said yet how it is", "its gateway publishes its first states"), False
     if known.estopped_by is not None:
         return Barrier(
-            f"{car} is e-stopped by {known.estopped_by}", "a person or script ending it (fleet resume --estops)"
+            f"{car} is e-stopped by {known.estopped_by}", f"a person or script ends it (`fleet resume {car} --estops`)"
         ), True
     if known.held_by is not None:
-        return Barrier(f"{car} is on hold by {known.held_by}", "a drive, mode or resume by a person or script"), True
+        return Barrier(
+            f"{car} is on hold by {known.held_by}",
+            f"a person or script drives it, gives it a mode, or resumes it (`fleet resume {car}`)",
+        ), True
     if known.driven_by is not None:
-        return Barrier(f"{car} is driven by {known.driven_by}", "the end of that drive"), False
+        return Barrier(f"{car} is driven by {known.driven_by}", "that drive ends"), False
     if known.link == LOST:
-        return Barrier(f"the link of {car} is lost", "its return"), False
+        return Barrier(f"the link of {car} is lost", "its link is back"), False
     if _is_recovering(known):
-        return Barrier(f"{car} is not in a known state yet", "the end of its recovery: a reading from it"), False
+        return Barrier(f"{car} is not in a known state yet", "its recovery ends: a reading comes from it"), False
     return None
 
 

@@ -17,7 +17,7 @@ from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HeldRole
 from gateway.protocol.enums import Mode
 
-_GOES_ON: Final = "`fleet plan restart` or `fleet plan set`"
+_GOES_ON: Final = "a person runs `fleet plan restart` or `fleet plan set`"
 _MAX_REASONS: Final = 4
 """Maximum roles, rules or cars that a reason lists."""
 
@@ -35,16 +35,16 @@ def explain_phase(plan: Plan, state: PhaseState, snapshot: FleetSnapshot) -> Dec
     """Explain the phase, and what ends it."""
     phase, ends = plan.phases[state.name], list[str]()
     if phase.until is not None:
-        ends.append(f"{phase.until.text}{_unmeasured_part(phase.until, snapshot)}: then {phase.next}")
+        ends.append(f"{phase.until.text}{_unmeasured_part(phase.until, snapshot)}: then {phase.next} begins")
     if phase.timeout_s is not None:
-        ends.append(f"{phase.timeout_s:g} s of it being over: then {phase.on_timeout}")
+        ends.append(f"its {phase.timeout_s:g} s are over: then {phase.on_timeout} begins")
     ends += [
-        f"{rule.name}: {rule.when.text}{_unmeasured_part(rule.when, snapshot)}: then {effect.phase}"
+        f"{rule.name}: {rule.when.text}{_unmeasured_part(rule.when, snapshot)}: then {effect.phase} begins"
         for rule in plan.rules
         for effect in rule.effects
         if effect.phase not in (None, state.name) and (rule.during is None or state.name in rule.during)
     ]
-    change = "; or ".join(ends) or "another plan: nothing ends it"
+    change = "; or ".join(ends) or "another plan is put in force: nothing else ends it"
     cause = f"{state.name} since {state.since}"
     return Decision("phase", DecisionKind.PHASE, state.name, cause, state.why, state.used, change)
 
@@ -98,12 +98,12 @@ def explain_stopped_role(name: str, by: str) -> Decision:
 def explain_rule(car: str, override: Override, role: str | None) -> Decision:
     """Explain a mode that a rule gives the car."""
     rule, mode = override.rule, override.effect.mode
-    changes = [f"that no longer being so for {HYSTERESIS_S:g} s, or not known for 5 s"]
+    changes = [f"its condition is false for {HYSTERESIS_S:g} s, or unknown for 5 s"]
     if rule.until is not None:
         changes = [rule.until.text]
     if rule.during is not None:
-        changes.append(f"the end of phase {' or '.join(sorted(rule.during))}")
-    changes.append("a person's stop or drive")
+        changes.append(f"phase {' or '.join(sorted(rule.during))} ends")
+    changes.append("a person stops or drives it")
     why = f"{rule.name}: {rule.when.text}"
     if override.state.that is not None and override.state.that != rule.when.car:
         why += f" (it is so of {override.state.that})"
@@ -143,11 +143,11 @@ def explain_role(
     changes = []
     if role.needs is not None:
         old = describe_unmeasured(role.needs, [(known, role.mode)], ": the last value counts")
-        changes.append(f"{role.needs_text} no longer being so{old}")
-    changes += [f"the end of {pinned[1]}"] if pinned is not None else _rules_for(car, known, role, plan, phase)
+        changes.append(f"{role.needs_text} becomes false{old}")
+    changes += [f"{pinned[1]} ends"] if pinned is not None else _rules_for(car, known, role, plan, phase)
     if any(each.roles is not None and name not in each.roles for each in plan.phases.values()):
-        changes.append(f"the end of phase {phase}")
-    changes.append("a person's stop or drive")
+        changes.append(f"phase {phase} ends")
+    changes.append("a person stops or drives it")
     return _about_car(car, DecisionKind.ROLE, cause, why, held_role.used, changes, name, role.mode)
 
 
@@ -187,7 +187,7 @@ def explain_idle(car: str, candidates: Candidates, allocation: RoleAllocation) -
         if not plan.may(car, role):
             continue
         if name not in candidates.in_force:
-            words, change = "it does not count in this phase", "the next phase"
+            words, change = "it does not count in this phase", "the next phase begins"
         elif (barrier := candidates.barrier(car, role)) is not None:
             words, change = barrier.why, barrier.change
             used += candidates.seen(car, barrier)
@@ -195,13 +195,13 @@ def explain_idle(car: str, candidates: Candidates, allocation: RoleAllocation) -
             holders = allocation.holders(name)
             cars = f"it has its {'car' if len(holders) == 1 else 'cars'}: {', '.join(holders)}"
             words = cars if holders else "no place"
-            change = f"a place in {name}"
+            change = f"a place in {name} becomes free"
         kinds.append(f"{name} {words}")
         if len(whys) < _MAX_REASONS:
             whys.append(f"{name}: {words}")
             changes.append(change)
     why = f"no role for it: {'; '.join(whys)}" if whys else "the plan has no role for it now"
-    readings, changes = tuple(dict.fromkeys(used)), list(dict.fromkeys(changes)) or ["a rule"]
+    readings, changes = tuple(dict.fromkeys(used)), list(dict.fromkeys(changes)) or ["a rule gives it a mode"]
     return _about_car(car, DecisionKind.IDLE, f"idle: {'; '.join(kinds)}", why, readings, changes, None, plan.idle)
 
 
@@ -211,7 +211,7 @@ def explain_contradiction(decision: Decision, evidence: str) -> Decision:
         decision,
         cause=f"{decision.cause}, contradicted",
         why=f"{decision.why}; but the car is not in {decision.mode} ({evidence}): it is asked for again",
-        would_change="a reading with the shape of that mode",
+        would_change="a reading fits that mode",
     )
 
 
@@ -260,11 +260,11 @@ def explain_vacancy(
     instead = f"; {role.if_none} gets the place" if role.if_none is not None else ""
     if others.kinds:
         why = f"{'no car is left for it' if others.has_able else 'no other car can'}: {others.words}"
-        change = "one of them being left for it, or able to" if others.has_able else "one of them being able to"
+        change = "one of them is left for it, or becomes able to" if others.has_able else "one of them becomes able to"
     elif {*candidates.free, *barriers} - {*holders}:
-        why, change = "the plan gives it to no other car that is there", "a car coming up that may have it"
+        why, change = "the plan gives it to no other car that is there", "a car comes up that may have it"
     else:
-        why, change = f"no{' other' if holders else ''} car is there", "another car coming up"
+        why, change = f"no{' other' if holders else ''} car is there", "another car comes up"
     cause = f"{decided}: {'; '.join(others.kinds)}"
     return _about_role(name, DecisionKind.VACANT, decided, cause, why + instead, change, others.used)
 
@@ -274,7 +274,7 @@ def explain_filled(
 ) -> Decision:
     """Explain a role that has all its cars."""
     role, holders = candidates.plan.roles[name], allocation.holders(name)
-    why, change, used = f"its places are taken: {', '.join(holders)}", "one of them dropping out", tuple[str, ...]()
+    why, change, used = f"its places are taken: {', '.join(holders)}", "one of them drops out", tuple[str, ...]()
     if role.count is None:
         others = _list_others(name, candidates, allocation, barriers)
         why = f"{', '.join(holders)} {'have' if len(holders) > 1 else 'has'} it, and "
@@ -283,16 +283,16 @@ def explain_filled(
         else:
             more = {*candidates.free, *barriers} - {*holders}
             why += "the plan gives it to no other car that is there" if more else "no other car is there"
-        change, used = f"another car being left for it, or {change}", others.used
+        change, used = f"another car is left for it, or {change}", others.used
     return _about_role(name, DecisionKind.FILLED, _count(role, allocation), "filled", why, change, used)
 
 
 def explain_inactive(name: str, candidates: Candidates, phase: str) -> Decision:
     """Explain a role that no car should have now."""
     if name not in candidates.in_force:
-        why, change = f"it does not count in phase {phase}", f"the end of phase {phase}"
+        why, change = f"it does not count in phase {phase}", f"phase {phase} ends"
     else:
-        why, change = "no rule gives it to a car now, nor does it stand in for another", "such a rule coming true"
+        why, change = "no rule gives it to a car now, nor does it stand in for another", "a rule gives it to the car"
     return _about_role(name, DecisionKind.OUT, "not wanted", f"out: {why}", why, change)
 
 

@@ -80,7 +80,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
         # Someone's stop: the coordinator leaves the car alone, also when its mode is not the planned one.
         assert client.car("red").stop().ok
         held = lines.until("red", None, "on hold by ann")
-        assert held["would_change"] == "a drive, mode or resume by a person or script"
+        assert held["would_change"] .endswith(" resumes it (`fleet resume red`)")
         assert client.get("red/state/mode")[0].value.asked == "manual"
         # The end of the hold: the mode is asked for again.
         assert client.car("red").resume().ok
@@ -133,7 +133,7 @@ def test_a_car_whose_link_is_lost_is_left_alone_and_brought_to_its_mode_when_it_
     wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
     cars.sim.say({"car": "red", "fault": "link_drop"})
     lost = lines.until("red", None, "the link of red is lost")
-    assert lost["would_change"] == "its return"
+    assert lost["would_change"] == "its link is back"
     cars.sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
     lines.until("red", "tracking", "role tracking")
     wait_for(lambda: cars.state("mode").asked == "tracking", "it is asked for again")
