@@ -80,7 +80,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
         # Someone's stop: the coordinator leaves the car alone, also when its mode is not the planned one.
         assert client.car("red").stop().ok
         held = lines.until("red", None, "on hold by ann")
-        assert held["would_change"] .endswith(" resumes it (`fleet resume red`)")
+        assert held["would_change"].endswith(" resumes it (`fleet resume red`)")
         assert client.get("red/state/mode")[0].value.asked == "manual"
         # The end of the hold: the mode is asked for again.
         assert client.car("red").resume().ok
