@@ -1,6 +1,6 @@
 """Pictures of a session in Rerun's viewer, without a screen: `python -m tests.tools.screenshots SESSION DIRECTORY`.
 
-They are `fleet.png` (the fleet's tab), `car.png` (the first car's) and, of simulated cars, `world.png`. Needs a Vulkan
+They are `car.png` (the lanes of the last car) and, of simulated cars, `world.png`. Needs a Vulkan
 driver that draws in software where there is no graphics card (Debian: `mesa-vulkan-drivers`).
 """
 
@@ -28,6 +28,8 @@ SETTLE_S: Final = 1.0
 DRIVERS: Final = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
 COLOURS: Final = 255
 WORLD: Final = "World, from above"
+LANES: Final = (0, 93, 960, 768)
+"""Of a car's picture: its lanes, in a size in which one can read them, without the viewer's bars."""
 
 
 class NoPicture(Exception):
@@ -81,7 +83,7 @@ def _look(client: Any, rrd: Path, view: str) -> tuple[bytes, Shown]:
     return png, Shown(tuple(each.name for each in views), faults)
 
 
-def pictures(session: Path, folder: Path) -> dict[str, Shown]:
+def pictures(session: Path, folder: Path, car: int = 0) -> dict[str, Shown]:
     """Make those of a session; by file name what is shown. Raises NoPicture, NoSession and ExportFailed."""
     from fleet.recording.reading.session import Session
     from fleet.replay.rerun.export import export
@@ -96,7 +98,7 @@ def pictures(session: Path, folder: Path) -> dict[str, Shown]:
             made["world.png"] = take(rrd, folder / "world.png", WORLD)
         cars = sorted({key.split("/")[1] for key in held} - {key.split("/")[1] for key in held if "/@" in key})
         if cars:
-            export(found, rrd, tab=cars[0])
+            export(found, rrd, tab=cars[car])
             made["car.png"] = take(rrd, folder / "car.png")
     return made
 
@@ -178,15 +180,21 @@ def _connect(viewer: Viewer, port: int) -> Any:
 @click.argument("session", type=click.Path(path_type=Path))
 @click.argument("directory", type=click.Path(exists=True, file_okay=False, path_type=Path))
 def main(session: Path, directory: Path) -> None:
-    """Draw SESSION's fleet tab, a car's tab and the simulated world into PNGs in DIRECTORY."""
+    """Draw the lanes of SESSION's last car and the simulated world into PNGs in DIRECTORY."""
     from fleet.recording.reading.session import NoSession
     from fleet.replay.rerun.export import ExportFailed
 
     try:
-        made = pictures(session, directory)
+        made = pictures(session, directory, -1)
     except (NoPicture, NoSession, ExportFailed) as error:
         raise click.ClickException(str(error)) from None
-    for name, shown in made.items():
+    from PIL import Image
+
+    (directory / "fleet.png").unlink()  # too wide for a page
+    with Image.open(directory / "car.png") as whole:
+        lanes = whole.crop(LANES)
+    lanes.save(directory / "car.png", optimize=True)
+    for name, shown in list(made.items())[1:]:
         click.echo(f"{directory / name}: {(directory / name).stat().st_size} bytes")
         for fault in shown.faults:
             click.echo(f"not shown: {fault}", err=True)
