@@ -197,8 +197,14 @@ class Coordinator:
         for ask, future in [each for each in self._led_commands if each[1].done()]:
             self._led_commands.remove((ask, future))
             outcome = future.result()[0]
-            if not outcome.ok:
-                self.on_failure(f"{ask.car}: the color of a rule: {outcome.reason or outcome.phase}: {outcome.words}")
+            words = (
+                ""
+                if outcome.ok
+                else f"{ask.car}: the color of a rule: {outcome.reason or outcome.phase}: {outcome.words}"
+            )
+            if words and words != self._last_failures.get(f"{ask.car} led"):  # a blinking LED fails every second
+                self.on_failure(words)
+            self._last_failures[f"{ask.car} led"] = words
         observer.forget(now, {*self.plan.named, *self._memory.held_roles, *self._mode_commands})
         result = step(self.plan, observer.snapshot(self._mode_commands), self._memory, now)
         before, self._memory = self._memory, result.memory
@@ -213,6 +219,8 @@ class Coordinator:
         if result.changed or _in_force(before) != _in_force(result.memory):
             self._publish("assignment", _assignment(self.plan, result))
         for ask in result.asks:
+            if ask.blink and any(ask.car == other.car for other, _ in self._led_commands):
+                continue  # its link or the car is slower than the LED should blink
             request = mode_request(ask.mode) if ask.mode is not None else led_request(*(ask.led or (0, 0, 0)))
             future = pool.submit(self.client.ask, request, [ask.car])
             if ask.mode is not None:
@@ -225,6 +233,7 @@ class Coordinator:
         for subject in subjects:
             self._published.pop(("decision", subject), None)
             self._last_failures.pop(subject, None)
+            self._last_failures.pop(f"{subject} led", None)
 
     def _on_outcome(self, observer: FleetObserver, car: str, ask: Ask, outcome: Outcome, now: float) -> None:
         assert ask.mode is not None

@@ -30,8 +30,9 @@ from fleet.policy.explain import (
 from fleet.policy.plan.plan import Effect, Plan, Rule
 from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
 from fleet.policy.snapshot import CONTRADICTED, LOST, UNKNOWN_CAR, CarSnapshot, FleetSnapshot
-from fleet.policy.state import HUB_RETURN_GRACE_S, HeldRole, LedRequest, ModeAttempts, PolicyState
+from fleet.policy.state import HUB_RETURN_GRACE_S, BlinkState, HeldRole, LedRequest, ModeAttempts, PolicyState
 from gateway.protocol.enums import Mode
+from schemas.colors import COLORS, Rgb
 
 MODE_RETRY_MAX_S: Final = 30.0
 """Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""
@@ -44,11 +45,13 @@ _UNKNOWN: Final = "unknown"
 
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """A command for one car: a mode, or the colour of its LED."""
+    """A command for one car: a mode, or the color of its LED."""
 
     car: str
     mode: Mode | None = None
-    led: tuple[int, int, int] | None = None
+    led: Rgb | None = None
+    blink: bool = False
+    """True if the next command comes soon, so this one may be dropped while the car is busy with the last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,18 +138,20 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     decisions = [each.after(memory.decisions.get(each.subject), now) for each in decisions]
     mode_attempts, asks = _command_modes(decisions, snapshot, memory.mode_attempts, now)
     led_requests, led_commands = _command_leds(plan, snapshot, rules, candidates, allocation, memory)
+    blinks, blink_commands = _command_blinks(plan, snapshot, rules, candidates, allocation, memory.blinks)
     return DecisionStep(
         replace(
             memory,
             held_roles=held_roles,
             mode_attempts=mode_attempts,
             led_requests=led_requests,
+            blinks=blinks,
             decisions={each.subject: each for each in decisions},
         ),
         tuple(decisions),
         tuple(each for each in decisions if is_new(each, memory.decisions)),
         tuple(each for each in decisions if is_reworded(each, memory.decisions)),
-        (*asks, *led_commands),
+        (*asks, *blink_commands, *led_commands),
         allocation.roles,
     )
 
@@ -409,7 +414,7 @@ def _command_leds(
     result, asks = set[LedRequest](), []
     for index, state in rules.items():
         for position, effect in enumerate(plan.rules[index].effects):
-            if not state.on or effect.led is None:
+            if not state.on or effect.led is None or effect.blink_s is not None:
                 continue
             before = LedRequest(index, position, state.that, None)
             if before in memory.led_requests:
@@ -423,6 +428,34 @@ def _command_leds(
                     result.add(one)
                     asks.append(Ask(car, led=effect.led))
     return frozenset(result), asks
+
+
+def _command_blinks(
+    plan: Plan,
+    snapshot: FleetSnapshot,
+    rules: Mapping[int, RuleState],
+    candidates: Candidates,
+    allocation: RoleAllocation,
+    before: Mapping[str, BlinkState],
+) -> tuple[dict[str, BlinkState], list[Ask]]:
+    """Switch the LEDs that blink, each when its time is over, and switch off those that blink no more."""
+    subjects = tuple(sorted({*candidates.free, *candidates.reserved}))
+    now, result, asks = candidates.now, dict[str, BlinkState](), list[Ask]()
+    for _, _, state, effect in _effects_in_force(plan, rules):
+        if effect.led is None or effect.blink_s is None:
+            continue
+        for car in targets(effect, state, subjects, allocation.roles):
+            if car in result or car not in candidates.free or not _obeys_led(snapshot.cars.get(car, UNKNOWN_CAR)):
+                continue  # the first rule counts
+            last = before.get(car)
+            if last is not None and last.color == effect.led and now - last.at < effect.blink_s:
+                result[car] = last
+                continue
+            result[car] = BlinkState(effect.led, last is None or last.color != effect.led or not last.on, now)
+            asks.append(Ask(car, led=effect.led if result[car].on else COLORS["off"], blink=True))
+    ended = [car for car, last in before.items() if last.on and car not in result and car in candidates.free]
+    asks += [Ask(car, led=COLORS["off"]) for car in ended if _obeys_led(snapshot.cars.get(car, UNKNOWN_CAR))]
+    return result, asks
 
 
 def _obeys_led(known: CarSnapshot) -> bool:

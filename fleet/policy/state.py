@@ -10,6 +10,7 @@ from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
 from gateway.protocol.enums import Mode
+from schemas.colors import Rgb
 
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Reason for a role that a car had before a restart of the coordinator."""
@@ -67,6 +68,15 @@ class LedRequest:
 
 
 @dataclass(frozen=True, slots=True)
+class BlinkState:
+    """A blinking LED: its color, whether it is on, and the time of the last change."""
+
+    color: Rgb
+    on: bool
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
 class PolicyState:
     """Everything that the next decision needs besides the snapshot. Times are seconds on one monotonic clock."""
 
@@ -81,6 +91,8 @@ class PolicyState:
     needs: Mapping[tuple[str, str], Settled] = field(default_factory=dict)
     mode_attempts: Mapping[str, ModeAttempts] = field(default_factory=dict)
     led_requests: frozenset[LedRequest] = frozenset()
+    blinks: Mapping[str, BlinkState] = field(default_factory=dict)
+    """By car."""
     decisions: Mapping[str, Decision] = field(default_factory=dict)
     """The last decision of each subject."""
     stopped_by: str = ""

@@ -13,6 +13,7 @@ from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from fleet.policy.state import HUB_RETURN_GRACE_S, PolicyState, carry_over, on_hub_back, restore, to_persisted
+from schemas.colors import format_color
 from tests.fleet.policy.cars import GONE, HERE, PolicyRun
 
 FIXED = parse("fixed: {red: {mode: tracking}}")
@@ -280,6 +281,33 @@ rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led:
     run.memory = restore(plan, FleetSnapshot(run.cars), kept, run.now, 100.0)
     until(12.0)
     assert coloured == [2.1], "nor by a coordinator that takes over"
+
+
+def test_an_led_blinks_while_its_rule_is_in_force_and_is_off_afterwards() -> None:
+    plan = parse("""
+fixed: {red: {mode: manual}}
+rules: [{when: {car: red, is: light.left}, then: {who: this_car, led: {color: red, blink_s: 0.5}}}]
+""")
+    run, told = PolicyRun(plan, "red"), list[tuple[float, str]]()
+
+    def until(end: float, light: bool) -> None:
+        while run.now < end:
+            run.sees("red", light={"left": light})
+            for ask in run.at(round(run.now + 0.1, 6)).asks:
+                if ask.led is not None:
+                    told.append((run.now, format_color(ask.led)))
+
+    until(1.6, light=True)
+    assert told == [(0.1, "red"), (0.6, "black"), (1.1, "red"), (1.6, "black")]
+    run.change("red", held_by="ann")
+    until(2.5, light=True)
+    assert len(told) == 4, "a car that a person has stopped is left alone"
+    run.change("red", held_by=None)
+    until(2.7, light=True)
+    assert told[4:] == [(2.6, "red")]
+    until(9.0, light=False)
+    assert [color for _, color in told[5:]][-1] == "black"
+    assert told[-1][0] < 5.0, "the rule ends 1.5 s after its condition, and the LED with it"
 
 
 @pytest.mark.parametrize("priority", [-1, 0, 1])
