@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Final
 
-from schemas.links import LINK_FORMS, WINDOWS_PORT, BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl, parse_link
+from schemas.links import WINDOWS_PORT, BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl, parse_link
 
 LINK_SIM: Final = "sim"
 """The link of a car that `fleet up` simulates."""
-ALLOWED_LINKS: Final = f"allowed are {LINK_FORMS}, or {LINK_SIM}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from typing import Final
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
+CAR_TCP_PORT: Final = 8888
+"""The port on which the program of a Raspberry Pi car listens (docs/reference/protocol.md#platforms)."""
 BAUD: Final = 9600  # docs/reference/protocol.md#framing: UART 9600 8N1
 LINK_FORMS: Final = (
     "/dev/ttyUSB0 or COM3 (also as serial:///dev/ttyUSB0?baud=9600), "
@@ -105,11 +107,24 @@ def parse_link(text: str) -> LinkUrl:
         return _serial(parts.netloc, parts.path, parts.query)
     if parts.scheme == "tcp":
         if not parts.hostname or not port:
-            raise BadLink("a host and a port from 1 to 65535 are needed")
+            if parts.hostname and not parts.netloc.rpartition("]")[2].count(":"):
+                raise BadLink(f"the port is missing. Write tcp://{parts.hostname}:{CAR_TCP_PORT}")
+            raise BadLink(f"it needs a host and a port from 1 to 65535. Write tcp://192.168.1.7:{CAR_TCP_PORT}")
         if parts.path or parts.query or parts.fragment or parts.username is not None:
             raise BadLink("nothing may follow the port")
         return TcpUrl(parts.hostname, port)
-    raise BadLink(f"{parts.scheme}:// is no kind of link" if parts.scheme else "it is neither a URL nor a device path")
+    raise BadLink(f"this is not a link. {_likely_link(text)}`fleet scan` lists the links that are there.")
+
+
+def _likely_link(text: str) -> str:
+    """Return the link that a text without a scheme probably means, as a question; empty if unknown."""
+    if re.fullmatch(r"(tty|cu\.|rfcomm)[\w.-]*", text):
+        return f"Did you mean /dev/{text}? "
+    if _BLE_ADDRESS.fullmatch(text.upper()):
+        return f"Did you mean ble://{text.upper()}? "
+    if host := re.fullmatch(r"((?:\d{1,3}\.){3}\d{1,3}|\w[\w.-]*(?=:))(:\d{1,5})?", text):
+        return f"Did you mean tcp://{host[1]}{host[2] or f':{CAR_TCP_PORT}'}? "
+    return ""
 
 
 def _serial(netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:

@@ -10,14 +10,15 @@ import click
 
 from fleet.commands.options import cli_errors
 from fleet.commands.params import Duration, Number
-from fleet.fleetfile.fleet_file import PALETTE, FleetFile, parse_fleet, read_fleet
-from fleet.fleetfile.models import schema, validate_color, validate_link, validate_name, validate_platform
+from fleet.fleetfile.fleet_file import FleetFile, default_color, parse_fleet, read_fleet
+from fleet.fleetfile.models import FileEntry, validate_color, validate_link, validate_name, validate_platform
 from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, format_new_plan, scan
 from fleet.links import LINK_SIM
 from fleet.supervisor.spec import MAX_SIMULATED_CARS
 from schemas.atomic_file import write_atomically
 from schemas.yaml_document.document import BadFile
 
+SCHEMAS: Final = ("fleet", "plan")
 DEFAULT_FILE: Final = Path("fleet.yaml")
 DEFAULT_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "violet", "orange", "teal", "brown")
 """Default names, in the order of the palette."""
@@ -54,15 +55,19 @@ def print_errors(error: BadFile, *, as_json: bool = False) -> None:
         click.echo(str(error), err=True)
 
 
-@click.command("schema", epilog="\b\nexample:\n  fleet schema > fleet.schema.json")
-def print_schema() -> None:
-    """Print the JSON Schema of fleet files, with which an editor completes and checks them."""
-    click.echo(schema_text(), nl=False)
+@click.command("schema", epilog="\b\nexamples:\n  fleet schema fleet > fleet.schema.json\n  fleet schema plan")
+@click.argument("kind", type=click.Choice(SCHEMAS), default="fleet", metavar="fleet|plan|world")
+def print_schema(kind: str) -> None:
+    """Print the JSON Schema of fleet files, plans or worlds. Editors complete and check files with it."""
+    click.echo(schema_text(kind), nl=False)
 
 
-def schema_text() -> str:
-    """Return the JSON Schema as it is checked in."""
-    return json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
+def schema_text(kind: str) -> str:
+    """Return the JSON Schema of a kind of file as it is checked in."""
+    from fleet.policy.plan.models import PlanEntry
+
+    model = {"fleet": FileEntry, "plan": PlanEntry}[kind]
+    return json.dumps(schema_of(model, f"{kind} file"), indent=2, ensure_ascii=False) + "\n"
 
 
 @click.command(
@@ -111,7 +116,7 @@ def init(
     if not out.absolute().parent.is_dir():
         raise click.UsageError(f"{out}: there is no such directory")
     if simulated:
-        cars = [NewCar(_default_name(index), LINK_SIM, "arduino", _color(index)) for index in range(simulated)]
+        cars = [_new_car(index, LINK_SIM, "arduino") for index in range(simulated)]
         write(plan, format_new_plan(simulated))
     else:
         found = look_for(links, seconds)
@@ -158,16 +163,14 @@ def _default_name(index: int) -> str:
     return DEFAULT_CAR_NAMES[index] if index < len(DEFAULT_CAR_NAMES) else f"car{index + 1}"
 
 
-def _color(index: int) -> str:
-    return PALETTE[index % len(PALETTE)]
+def _new_car(index: int, link: str, platform: str, words: str = "") -> NewCar:
+    name = _default_name(index)
+    return NewCar(name, link, platform, default_color(name, index), words)
 
 
 def _likely_cars(found: list[FoundLink]) -> list[NewCar]:
     likely = [each for each in found if each.verdict in LIKELY_VERDICTS]
-    return [
-        NewCar(_default_name(index), each.url, each.platform, _color(index), each.words)
-        for index, each in enumerate(likely)
-    ]
+    return [_new_car(index, each.url, each.platform, each.words) for index, each in enumerate(likely)]
 
 
 def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:
@@ -180,9 +183,8 @@ def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:
         if name == _SKIP:
             continue
         platform = click.prompt("  its platform", default=each.platform, value_proc=_checked(validate_platform))
-        colour = PALETTE[DEFAULT_CAR_NAMES.index(name) if name in DEFAULT_CAR_NAMES else len(cars) % len(PALETTE)]
-        colour = click.prompt("  its colour", default=colour, value_proc=_checked(validate_color))
-        cars.append(NewCar(name, each.url, platform, colour, each.words))
+        color = click.prompt("  its color", default=default_color(name, len(cars)), value_proc=_checked(validate_color))
+        cars.append(NewCar(name, each.url, platform, color, each.words))
     return cars
 
 

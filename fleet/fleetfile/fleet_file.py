@@ -18,16 +18,18 @@ from fleet.fleetfile.models import (
     BatteryAction,
     FileEntry,
     LimitsEntry,
+    RecordEntry,
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
 from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_platform_option
+from schemas.colors import COLORS, parse_color
 from schemas.links import BadLink
 from schemas.yaml_document.document import Document, read_text
 from schemas.yaml_document.messages import Where, quote_value, suggest
 
 PALETTE: Final = ("#e01b24", "#33d17a", "#3584e4", "#f6d32d", "#9141ac", "#ff7800", "#2ec7c0", "#986a44")
 """Colors of cars without one, in the order of the file."""
-PATHS: Final = ("plan", "recordings", "world")
+PATHS: Final = ("plan", "world")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,7 @@ class Limits:
 class FleetCar:
     """One car with its type and the defaults resolved.
 
-    link, platform: values for `gateway run --link` and `--platform`. colour: #rrggbb. capabilities: words for modes and
+    link, platform: values for `gateway run --link` and `--platform`. color: #rrggbb. capabilities: words for modes and
     parts; for platform `auto` by default those of all platforms, until its gateway detects the platform. roles: the
     roles that it may take; None: any.
     """
@@ -58,7 +60,7 @@ class FleetCar:
     name: str
     link: str
     platform: str
-    colour: str
+    color: str
     capabilities: frozenset[str]
     limits: Limits = Limits()
     roles: tuple[str, ...] | None = None
@@ -68,7 +70,8 @@ class FleetCar:
 class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
-    endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. unlinked: cars without a link, if those are allowed.
+    endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: none.
+    groups: the cars of each. unlinked: cars without a link, if those are allowed.
     """
 
     name: str
@@ -76,10 +79,12 @@ class FleetFile:
     cars: Mapping[str, FleetCar]
     plan: Path | None
     recordings: Path | None
+    quota: str
     record: bool
     world: Path | None
     text: str
     path: Path
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     unlinked: Mapping[str, FleetCar] = field(default_factory=dict)
 
     @property
@@ -108,12 +113,16 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
     assert file is not None  # else the document had ended
     merged = {name: _merge_layers(tree, car) for name, car in tree["cars"].items()}
     places = {name: _resolve_path(path, tree.get(name)) for name in PATHS}
+    record = file.record if isinstance(file.record, RecordEntry) else None
     cars = {name: _resolve_car(name, car, index) for index, (name, car) in enumerate(merged.items())}
     return FleetFile(
         name=file.name,
         endpoint=file.endpoint or None,
         cars=MappingProxyType({name: car for name, car in cars.items() if car.link}),
-        record=file.record,
+        record=file.record is not False,
+        recordings=_resolve_path(path, record.to or None if record else None),
+        quota=record.quota if record else "",
+        groups=MappingProxyType({name: tuple(cars) for name, cars in file.groups.items()}),
         text=text,
         path=path.absolute(),
         unlinked=MappingProxyType({name: car for name, car in cars.items() if not car.link}),
@@ -131,17 +140,33 @@ def profile_capabilities(platform: str) -> frozenset[str]:
 
 
 def _resolve_car(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
-    platform = car.get("platform", AUTO)
+    platform = car.get("platform", AUTO).lower()
     limits = LimitsEntry.model_validate(car.get("limits", {}))
     return FleetCar(
         name=name,
         link=car.get("link", ""),
         platform=platform,
-        colour=car.get("colour", PALETTE[index % len(PALETTE)]).lower(),
-        capabilities=frozenset(car["capabilities"]) if "capabilities" in car else profile_capabilities(platform),
+        color=_color_code(car["color"]) if "color" in car else default_color(name, index),
+        capabilities=frozenset(word for word in profile_capabilities(platform) if not _is_listed(word, car)),
         limits=Limits(**dict(limits)),
         roles=tuple(car["roles"]) if "roles" in car else None,
     )
+
+
+def _is_listed(word: str, car: Mapping[str, Any]) -> bool:
+    """Return True if the car is without this mode or part. `servo` stands for all servos."""
+    without = car.get("without", ())
+    return word in without or ("servo" in without and word.startswith("servo_"))
+
+
+def default_color(name: str, index: int) -> str:
+    """Return the color of a car without one, as #rrggbb: that of its name, or one of the palette."""
+    return _color_code(name) if name in COLORS else PALETTE[index % len(PALETTE)]
+
+
+def _color_code(text: str) -> str:
+    red, green, blue = parse_color(text)
+    return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 def _merge_layers(tree: Mapping[str, Any], car: Mapping[str, Any]) -> dict[str, Any]:
@@ -174,16 +199,20 @@ def _find_contradictions(
         if isinstance(kind, str) and kind not in types:
             yield ("cars", name, "type"), f"there is no type {quote_value(kind)}. {suggest(kind, types)}"
         if "link" not in car and not unbound:
-            words = "is missing: how the car is reached; `gateway scan` shows links, `fleet bind` finds out which it is"
+            words = "is missing. `fleet scan` lists links, `fleet bind` finds out which car is which."
             yield ("cars", name, "link"), words
         yield from _find_car_contradictions(tree, name, car)
     yield from _find_shared_ports(cars)
+    for group, members in _as_mapping(tree.get("groups")).items():
+        for index, car in enumerate(members if isinstance(members, list) else ()):
+            if isinstance(car, str) and car not in cars:
+                yield ("groups", group, index), f"there is no car {quote_value(car)}. {suggest(car, cars)}"
     for entry in () if moved else ("plan", "world"):
         given = tree.get(entry)
         if isinstance(given, str) and given and given.isprintable():
             there = _resolve_path(path, given)
             if there is not None and not there.is_file():
-                yield (entry,), f"{quote_value(given)}: there is no such file beside this one"
+                yield (entry,), f"there is no file {quote_value(given)} beside this one"
 
 
 def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:
@@ -200,20 +229,20 @@ def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[st
         )
         at = next(where for (where, _), there in zip(layers, given_limits, strict=True) if there)
         yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}: it is at most that"
-    platform, given = merged.get("platform", AUTO), merged.get("capabilities")
-    if car.get("link") == LINK_SIM and str(platform).partition("+")[0] in (AUTO, Platform.UNKNOWN):
+    platform, given = str(merged.get("platform", AUTO)).lower(), merged.get("without")
+    if car.get("link") == LINK_SIM and platform.partition("+")[0] in (AUTO, Platform.UNKNOWN):
         kinds = ", ".join(kind for kind in Platform if kind is not Platform.UNKNOWN)
-        yield ("cars", name, "platform"), f"a simulated car is of some platform: {kinds}, with +arm, +imu"
-    if not isinstance(platform, str) or not isinstance(given, list):
+        yield ("cars", name, "platform"), f"a simulated car needs a platform. There are {kinds}."
+    if not isinstance(given, list):
         return
     try:
         had = profile_capabilities(platform)
     except ValueError:
         return  # reported as a fault of the platform
     if missing := [word for word in given if isinstance(word, str) and word in CAPABILITIES and word not in had]:
-        at = next(where for where, layer in layers if {"platform", "capabilities"} & _as_mapping(layer).keys())
-        words = f"{', '.join(missing)}: no {platform} car has it; allowed are {', '.join(sorted(had))}"
-        yield (*at, "capabilities") if "capabilities" in _as_mapping(dict(layers)[at]) else at, words
+        at = next(where for where, layer in layers if {"platform", "without"} & _as_mapping(layer).keys())
+        words = f"no {platform} car has {', '.join(missing)}, so it is without it anyway"
+        yield (*at, "without") if "without" in _as_mapping(dict(layers)[at]) else at, words
 
 
 def _find_shared_ports(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[Where, str]]:
@@ -226,7 +255,7 @@ def _find_shared_ports(cars: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[
             except BadLink:
                 continue  # reported as a fault of the link
     for first, second in shared_ports(links):
-        words = f"{quote_value(cars[second]['link'])} may be the port of {first}: every car has a port of its own"
+        words = f"{first} and {second} have the same port. Each car needs its own."
         yield ("cars", second, "link"), words
 
 

@@ -1,17 +1,19 @@
-"""The models of a fleet file, field by field, and its JSON Schema for editors. Pure.
+"""The models of a fleet file, field by field. Pure.
 
 fleet_file.py checks contradictions between fields.
 """
 
+import re
 from enum import StrEnum
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
-from fleet.links import ALLOWED_LINKS, parse_fleet_link
+from fleet.links import parse_fleet_link
 from gateway.protocol.enums import Mode
 from gateway.protocol.platforms import AUTO, OPTIONS, Platform, parse_platform, parse_platform_option
 from schemas import bus, keys
+from schemas.colors import COLOR_PATTERN, parse_color
 from schemas.links import BadLink
 from schemas.yaml_document.document import Entry
 from schemas.yaml_document.messages import quote_value
@@ -39,7 +41,7 @@ def validate_link(text: str) -> str:
     try:
         parse_fleet_link(text)
     except BadLink as error:
-        raise ValueError(f"{quote_value(text)} is not allowed, {error}: {ALLOWED_LINKS}") from None
+        raise ValueError(f"{quote_value(text)}: {error}") from None
     return text
 
 
@@ -59,12 +61,16 @@ def _bad_endpoint() -> str:
 
 
 def validate_color(text: str) -> str:
-    """Return a color as #rrggbb in lower case; raises ValueError."""
-    if len(text) != 7 or text[0] != "#" or set(text[1:].lower()) - set("0123456789abcdef"):
-        raise ValueError(
-            f'{quote_value(text)} is not allowed: a colour in quotes as "#e01b24", red, green and blue from 00 to ff'
-        )
-    return text.lower()
+    """Return a color if it is a name, or #rrggbb; raises ValueError."""
+    parse_color(text)
+    return text
+
+
+def validate_size(text: str) -> str:
+    """Return a size such as 20GB if it is valid; raises ValueError."""
+    if _SIZE.match(text) is None:
+        raise ValueError(f"{quote_value(text)} is not a size. Write 500MB or 20GB.")
+    return text
 
 
 def validate_path(text: str) -> str:
@@ -77,6 +83,7 @@ def validate_path(text: str) -> str:
 PARTS: Final = frozenset().union(*(parse_platform(f"{kind}+arm+imu").capabilities for kind in Platform))
 CAPABILITIES: Final = tuple(sorted(PARTS | set(Mode)))
 Capability = StrEnum("Capability", {word: word for word in CAPABILITIES})  # type: ignore[misc]  # the words are the platforms' own
+_SIZE: Final = re.compile("^[1-9][0-9]{0,5} ?[MGT]B$")
 _PLATFORMS: Final = f"^({'|'.join((AUTO, *Platform))})([+]({'|'.join(sorted(OPTIONS))}))*$"
 
 _Name = Annotated[
@@ -84,7 +91,8 @@ _Name = Annotated[
 ]
 _Link = Annotated[str, AfterValidator(validate_link), Field(examples=["/dev/ttyUSB0", "tcp://192.168.1.7:8888"])]
 _Platform = Annotated[str, AfterValidator(validate_platform), Field(json_schema_extra={"pattern": _PLATFORMS})]
-_Colour = Annotated[str, AfterValidator(validate_color), Field(json_schema_extra={"pattern": "^#[0-9a-fA-F]{6}$"})]
+_Color = Annotated[str, AfterValidator(validate_color), Field(json_schema_extra={"pattern": COLOR_PATTERN})]
+_Size = Annotated[str, AfterValidator(validate_size), Field(json_schema_extra={"pattern": _SIZE.pattern})]
 _Path = Annotated[str, AfterValidator(validate_path)]
 _Volts = Annotated[float, Field(ge=EMPTY_V, le=FULL_V)]
 
@@ -109,9 +117,13 @@ class CommonEntry(Entry):
 
     # Defaults are for editors only, or empty. fleet_file.py merges the layers from the text.
     platform: _Platform = Field(default=AUTO, description="its program, with +arm, +imu; auto: its gateway finds out")
-    colour: _Colour = Field(default_factory=str, description='in tables and pictures, in quotes: "#e01b24"')
-    capabilities: list[Capability] = Field(
-        default_factory=list, description="modes and parts to use, fewer than it has"
+    color: _Color = Field(
+        default_factory=str,
+        description='in pictures: red, or "#e01b24" in quotes; left out: the color that is the car\'s name',
+    )
+    without: list[Capability] = Field(
+        default_factory=list,
+        description="modes and parts that the plan does not use, because they are broken or absent",
     )
     limits: LimitsEntry = Field(default_factory=LimitsEntry, description="its limits")
     roles: list[_Name] = Field(default_factory=list, description="roles of the plan that it may take; left out: any")
@@ -124,6 +136,15 @@ class CarEntry(CommonEntry):
     link: _Link = Field(default_factory=str, description="address of the car; `gateway scan` shows links")
 
 
+class RecordEntry(Entry):
+    """Where `fleet up` records, and how much it keeps."""
+
+    to: _Path = Field(default_factory=str, description="the directory of sessions, from the place of this file")
+    quota: _Size = Field(
+        default_factory=str, description="maximum size of all sessions there: 20GB; the oldest ones are removed"
+    )
+
+
 class FileEntry(Entry):
     """A fleet of cars, for `fleet up`."""
 
@@ -132,26 +153,15 @@ class FileEntry(Entry):
         default_factory=str, description="the bus, tcp/HOST:PORT; left out: FLEET_ENDPOINT, or loopback"
     )
     plan: _Path = Field(default_factory=str, description="what the fleet should do, a file")
-    record: bool = Field(default=True, description="whether `fleet up` records")
-    recordings: _Path = Field(default_factory=str, description="the directory of recordings")
+    record: bool | RecordEntry = Field(
+        default=True, description="false: `fleet up` does not record; or where to, and how much"
+    )
     world: _Path = Field(default_factory=str, description="the world of simulated cars, a file")
     defaults: CommonEntry = Field(default_factory=CommonEntry, description="for every car")
     types: dict[_Name, CommonEntry] = Field(
         default_factory=dict, description="kinds of cars, which override the defaults"
     )
+    groups: dict[_Name, list[_Name]] = Field(
+        default_factory=dict, description="groups of cars, `a: [red, blue]`, for commands: `fleet stop @a`"
+    )
     cars: dict[_Name, CarEntry] = Field(description="at least one car, as `red: {link: /dev/ttyUSB0}`", min_length=1)
-
-
-def schema() -> dict[str, Any]:
-    """Return the JSON Schema of fleet files, for editors."""
-    made = _untitled(FileEntry.model_json_schema())
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "fleet file", **made}
-
-
-def _untitled(part: Any) -> Any:
-    """Remove the titles that pydantic makes of names: editors show them instead of the descriptions."""
-    if isinstance(part, list):
-        return [_untitled(each) for each in part]
-    if not isinstance(part, dict):
-        return part
-    return {name: _untitled(each) for name, each in part.items() if name != "title" or not isinstance(each, str)}

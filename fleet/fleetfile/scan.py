@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fleet.fleetfile.fleet_file import PALETTE
+from fleet.fleetfile.fleet_file import default_color
 from fleet.links import parse_fleet_link
 from gateway.protocol.platforms import AUTO, Platform
 from schemas.links import SerialUrl, UsbUrl
@@ -42,7 +42,7 @@ class NewCar:
     name: str
     link: str
     platform: str
-    colour: str
+    color: str
     words: str = ""
 
 
@@ -105,8 +105,8 @@ def format_new_file(cars: Sequence[NewCar]) -> str:
         lines.append(f"    link: {_scalar(car.link)}" + (f"  # {about}" if about else ""))
         if car.platform != AUTO:
             lines.append(f"    platform: {car.platform}")
-        if car.colour != PALETTE[index % len(PALETTE)]:
-            lines.append(f"    colour: {quote(car.colour)}")
+        if car.color != default_color(car.name, index):
+            lines.append(f"    color: {quote(car.color)}")
     lines += [
         "",
         "defaults:                   # for every car",
@@ -115,7 +115,7 @@ def format_new_file(cars: Sequence[NewCar]) -> str:
         "    on_battery_low: warn    # below 7.0 V: warn, refuse or stop",
         "",
         "# plan: plan.yaml           # what the cars do together",
-        "# recordings: sessions      # where `fleet up` records; `record: false` records nothing",
+        "# record: {to: sessions, quota: 20GB}   # where `fleet up` records, and how much it keeps; false: it does not",
     ]
     return "\n".join(lines) + "\n"
 

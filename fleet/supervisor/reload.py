@@ -11,6 +11,7 @@ _FIXED_PROPERTIES: Final[Mapping[str, str]] = {
     "endpoint": "the endpoint",
     "world": "the world",
     "recordings": "where recordings go",
+    "quota": "how much it keeps",
     "record": "whether it records",
 }
 """Properties that cannot change while the fleet is running, with their names in messages."""
@@ -61,7 +62,15 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         for name in cars
         if name not in restarted and (difference := _describe_difference(old.listed.get(name), listed.get(name)))
     ]
-    spec = replace(old, cars=cars, plan=new.plan, plan_text=new.plan_text, listed=listed, warnings=new.warnings)
+    spec = replace(
+        old,
+        cars=cars,
+        groups=new.groups,
+        plan=new.plan,
+        plan_text=new.plan_text,
+        listed=listed,
+        warnings=new.warnings,
+    )
     return SpecChange(spec, removed, tuple(restarted), tuple(words))
 
 
@@ -69,6 +78,6 @@ def _describe_difference(before: CoordinatorCar | None, now: CoordinatorCar | No
     """Describe changes of a car that concern the coordinator. Return an empty string if there are none."""
     if before is None or now is None:
         return ""
-    fields = ("platform", "capabilities", "roles")
+    fields = ("platform", "without", "roles")
     changed = [name for name in fields if getattr(before, name) != getattr(now, name)]
     return f"its {' and '.join(changed)} changed, for the coordinator" if changed else ""

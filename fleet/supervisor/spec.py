@@ -67,8 +67,8 @@ class CoordinatorCar:
     """The coordinator's entry for one car in the fleet file."""
 
     platform: str
-    capabilities: tuple[str, ...] | None = None
-    """None: the capabilities of the platform."""
+    without: tuple[str, ...] = ()
+    """The modes and parts of its platform that it does not use."""
     roles: tuple[str, ...] | None = None
     """None: any role."""
 
@@ -85,6 +85,10 @@ class FleetSpec:
     """The checked text of the plan. Later changes of the file take effect at a reload."""
     record: bool = True
     recordings: Path = RECORDINGS
+    quota: str = ""
+    """Maximum size of all sessions, as 20GB; empty: none."""
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """The cars of each group."""
     file: Path | None = None
     """The fleet file. The recorder stores a copy of it."""
     world: Path | None = None
@@ -136,6 +140,8 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         plan=options.plan or (file.plan if file else None),
         record=(file.record if file else True) if options.record is None else options.record,
         recordings=options.out or (file.recordings if file else None) or RECORDINGS,
+        quota=file.quota if file else "",
+        groups=file.groups if file else {},
         file=file.path if file else None,
         world=options.world or (file.world if file else None),
         insecure_lan=options.insecure_lan,
@@ -184,8 +190,9 @@ def _car(spec: FleetCar) -> CarProcessSpec:
 def _listed(spec: FleetCar | None, platform: str) -> CoordinatorCar:
     if spec is None:
         return CoordinatorCar(platform)
-    fewer = spec.capabilities != profile_capabilities(spec.platform)
-    return CoordinatorCar(spec.platform, tuple(sorted(spec.capabilities)) if fewer else None, spec.roles)
+    return CoordinatorCar(
+        spec.platform, tuple(sorted(profile_capabilities(spec.platform) - spec.capabilities)), spec.roles
+    )
 
 
 def coordinator_fleet_file(spec: FleetSpec) -> str:
@@ -194,7 +201,7 @@ def coordinator_fleet_file(spec: FleetSpec) -> str:
     cars = {
         name: {
             "platform": car.platform,
-            **({} if car.capabilities is None else {"capabilities": car.capabilities}),
+            **({"without": car.without} if car.without else {}),
             **({} if car.roles is None else {"roles": car.roles}),
         }
         for name, car in spec.listed.items()
@@ -238,7 +245,8 @@ def recorder_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
     where = ("--fleet", spec.fleet, "--connect", endpoint, "--with-parent")
     files = {"--fleet-file": spec.file, "--plan": spec.plan}
     copies = [word for option, path in files.items() if path is not None for word in (option, str(path))]
-    return module("fleet.cli", "record", "--sessions", str(spec.recordings), "--json", *copies, *where)
+    quota = ("--quota", spec.quota) if spec.quota else ()
+    return module("fleet.cli", "record", "--sessions", str(spec.recordings), "--json", *quota, *copies, *where)
 
 
 def coordinator_command(spec: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:

@@ -3,15 +3,15 @@
 from importlib.util import find_spec
 
 from gateway.link.base import BadUrl
-from schemas.links import LINK_FORMS, BadLink, BleUrl, LinkUrl, parse_link
+from schemas.links import BadLink, BleUrl, LinkUrl, parse_link
 
 
 def parse_url(text: str) -> LinkUrl:
-    """Return the link with this URL or bare device path; raise BadUrl, whose message lists the allowed forms."""
+    """Return the link with this URL or bare device path; raise BadUrl."""
     try:
         url = parse_link(text)
     except BadLink as error:
-        raise BadUrl(f"link {text!r} is not allowed, {error}: give {LINK_FORMS}") from None
+        raise BadUrl(f"link {text!r}: {error}") from None
     # Refused here, so that no gateway starts for a link that it can never open.
     if isinstance(url, BleUrl) and find_spec("bleak") is None:
         raise BadUrl(f"link {text!r} needs Bluetooth, which is not installed: pip install 'zenoh-car-fleet[ble]'")

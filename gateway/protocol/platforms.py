@@ -3,6 +3,7 @@
 Every number cites its row of docs/reference/protocol.md. The times are in `timing` and `modes`.
 """
 
+import difflib
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -247,22 +248,24 @@ AUTO: Final = "auto"
 
 def parse_platform_option(text: str) -> tuple[Profile, bool]:
     """Return the profile, and True if the gateway has to detect the platform: `auto` starts as `unknown`."""
+    text = text.lower()
     auto = text.partition("+")[0] == AUTO
     try:
         return parse_platform(text.replace(AUTO, Platform.UNKNOWN, 1) if auto else text), auto
     except ValueError as error:
-        raise ValueError(f"{error}; or auto, to find out") from None
+        raise ValueError(f"{error} Leave it out to detect it.") from None
 
 
 def parse_platform(text: str) -> Profile:
-    """Return the profile of a platform such as `arduino` or `raspberry_pi+arm+imu`; raise ValueError."""
-    kind, *options = text.split("+")
-    allowed = f"allowed are {', '.join(Platform)}, each with +arm, +imu or both"
+    """Return the profile of a platform such as `arduino` or `raspberry_pi+arm+imu` in any case; raise ValueError."""
+    kind, *options = text.lower().split("+")
     if kind not in set(Platform):
-        raise ValueError(f"platform {text!r}: {kind!r} is not known, {allowed}")
+        near = difflib.get_close_matches(kind, Platform, n=1)
+        hint = f"Did you mean {near[0]}?" if near else f"There are {', '.join(Platform)}."
+        raise ValueError(f'Unknown platform "{kind[:40]}". {hint}')
     for option in options:
         if option not in OPTIONS:
-            raise ValueError(f"platform {text!r}: option {option!r} is not known, {allowed}")
+            raise ValueError(f'Unknown option "+{option[:40]}" of a platform. There are +arm and +imu.')
     return _profile(Platform(kind), frozenset(options))
 
 

@@ -69,6 +69,21 @@ class Entry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+def schema_of(model: type[BaseModel], title: str) -> dict[str, Any]:
+    """Return the JSON Schema of a file, for editors."""
+    made = _without_titles(model.model_json_schema())
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **made}
+
+
+def _without_titles(part: Any) -> Any:
+    """Remove the titles that pydantic makes of names: editors show them instead of the descriptions."""
+    if isinstance(part, list):
+        return [_without_titles(each) for each in part]
+    if not isinstance(part, dict):
+        return part
+    return {name: _without_titles(each) for name, each in part.items() if name != "title" or not isinstance(each, str)}
+
+
 def read_yaml(text: str, source: str, model: type[_Model]) -> _Model:
     """Read a model from a text; raises BadFile. `source` is its name in errors, usually the path as typed."""
     document = Document(text, source)

@@ -1,6 +1,7 @@
 """What deploy/ offers: read by our own eyes, and by the tools whose files they are where this computer has them."""
 
 import configparser
+import json
 import os
 import re
 import shutil
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.commands.fleet_file import schema_text
+from fleet.commands.fleet_file import SCHEMAS, schema_text
 from fleet.examples import EXAMPLES
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
@@ -36,10 +37,23 @@ def test_there_is_one_for_each_start() -> None:
     assert [path.name for path in FILES] == ["bluetooth.yaml", "mixed.yaml", "sim.yaml"]
 
 
-def test_the_schema_is_up_to_date() -> None:
-    assert (DEPLOY / "fleet.schema.json").read_text(encoding="utf-8") == schema_text(), (
-        "fleet schema > deploy/fleet.schema.json"
+@pytest.mark.parametrize("kind", SCHEMAS)
+def test_the_schema_is_up_to_date(kind: str) -> None:
+    assert (DEPLOY / f"{kind}.schema.json").read_text(encoding="utf-8") == schema_text(kind), (
+        f"fleet schema {kind} > deploy/{kind}.schema.json"
     )
+
+
+@pytest.mark.parametrize("kind", SCHEMAS)
+def test_every_example_names_its_schema_and_every_field_has_a_description(kind: str) -> None:
+    examples = sorted((EXAMPLES / f"{kind}s").glob("*.yaml"))
+    assert examples
+    for path in examples:
+        assert path.read_text(encoding="utf-8").splitlines()[0].endswith(f"/main/deploy/{kind}.schema.json"), path
+    schema = json.loads(schema_text(kind))
+    for name, part in {"": schema, **schema["$defs"]}.items():
+        for field, each in part.get("properties", {}).items():
+            assert "description" in each, f"{name}.{field}"
 
 
 _PART = re.compile(r'(?P<key>[A-Z]+(?:\{[A-Za-z0-9_]+\})?)(?P<op>==|!=|\+=|-=|:=|=)"(?P<value>[^"]*)"')

@@ -294,7 +294,7 @@ def test_nothing_found_says_what_to_do(command: Command, port: Port, tmp_path: P
 def test_a_link_that_is_none_is_wrong_use(command: Command) -> None:
     done = command("init", "--yes", "--link", "11:22:33:44:55:66")
     assert done.returncode == 2
-    assert "neither a URL nor a device path" in done.stderr
+    assert "is not a link" in done.stderr
 
 
 def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: Any, port: Port, tmp_path: Path) -> None:
@@ -310,9 +310,9 @@ def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: An
     init.type("rosa")
     init.until("its platform [arduino]: ")
     init.type("arduno")
-    init.until("'arduno' is not known")
+    init.until('Unknown platform "arduno". Did you mean arduino?')
     init.type("stm32+arm")
-    init.until("its colour [#e01b24]: ")
+    init.until("its color [#e01b24]: ")
     init.type("#FF00aa")
     init.until("silent")
     init.until("its name (- to leave it out) [-]: ")
@@ -320,7 +320,7 @@ def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: An
     init.until("Wrote fleet.yaml with rosa")
     assert init.wait() == 0
     (rosa,) = read_fleet(tmp_path / "fleet.yaml").cars.values()
-    assert (rosa.name, rosa.platform, rosa.colour) == ("rosa", "stm32+arm", "#ff00aa")
+    assert (rosa.name, rosa.platform, rosa.color) == ("rosa", "stm32+arm", "#ff00aa")
 
 
 def test_who_does_not_want_it_written_over_keeps_it(terminal: Callable[..., Terminal], tmp_path: Path) -> None:
@@ -339,7 +339,7 @@ UNBOUND = """\
 cars:
   red:   # the old one
     platform: arduino
-  green: {platform: arduino, colour: "#00ff00"}   # the fast one
+  green: {platform: arduino, color: "#00ff00"}   # the fast one
   blue:
     link: /dev/nothing-of-this-name   # was unplugged
 """
@@ -410,7 +410,7 @@ def test_the_text_is_cut_not_made_anew(text: str, car: str, after: str | None) -
 
 
 def test_a_link_that_is_another_cars_is_not_written() -> None:
-    with pytest.raises(BadFile, match="may be the port of red"):
+    with pytest.raises(BadFile, match="have the same port"):
         set_link("cars: {red: {link: COM9}, blue: {link: COM2}}", Path("f.yaml"), "blue", "com9")
 
 

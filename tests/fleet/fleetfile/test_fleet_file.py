@@ -11,27 +11,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, Limits, parse_fleet, profile_capabilities, read_fleet
-from fleet.fleetfile.models import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V, BatteryAction, schema
+from fleet.fleetfile.models import CRITICAL_V, DEFAULT_MAX_DRIVE_S, EMPTY_V, FULL_V, LOW_V, BatteryAction, FileEntry
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link, shared_ports
 from gateway.bus import requests
 from gateway.control.estimate import battery
 from gateway.link import BadUrl, parse_url
 from schemas.links import BadLink, parse_link
-from schemas.yaml_document.document import BadFile
+from schemas.yaml_document.document import BadFile, schema_of
 
 LAYERS = """\
 name: lab
 endpoint: tcp/127.0.0.1:7000
 plan: plan.yaml
-recordings: ../kept
-record: false
+record: {to: ../kept, quota: 20GB}
+groups: {a: [red, blue]}
 defaults: {platform: arduino, roles: [patrol, guard], limits: {longest_drive_s: 5, battery_low_v: 7.2}}
 types:
-  slow: {limits: {speed_max: 0.5, longest_drive_s: 3}, colour: "#00FF00", roles: [guard]}
+  slow: {limits: {speed_max: 0.5, longest_drive_s: 3}, color: "#00FF00", roles: [guard]}
 cars:
   red: {link: /dev/ttyUSB7}
   green: {type: slow, link: tcp://Pi:8888, limits: {on_battery_low: stop}}
-  blue: {type: slow, platform: raspberry_pi+arm, link: ble://aa:bb:cc:dd:ee:ff, capabilities: [drive], roles: []}
+  blue: {type: slow, platform: raspberry_pi+arm, link: ble://aa:bb:cc:dd:ee:ff, without: [servo, tracking], roles: []}
 """
 
 
@@ -50,18 +50,21 @@ def test_a_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> Non
     path = tmp_path / "fleet.yaml"
     path.write_text(LAYERS)
     fleet = read_fleet(path)
-    assert (fleet.name, fleet.endpoint, fleet.record, fleet.text) == ("lab", "tcp/127.0.0.1:7000", False, LAYERS)
+    assert (fleet.name, fleet.endpoint, fleet.record, fleet.text) == ("lab", "tcp/127.0.0.1:7000", True, LAYERS)
+    assert (fleet.quota, dict(fleet.groups)) == ("20GB", {"a": ("red", "blue")})
     assert (fleet.plan, fleet.recordings) == (tmp_path / "plan.yaml", tmp_path.parent / "kept")
     assert list(fleet.cars) == ["red", "green", "blue"]
     red, green, blue = fleet.cars.values()
     assert red.limits == Limits(longest_drive_s=5, battery_low_v=7.2)
-    assert (red.roles, red.colour) == (("patrol", "guard"), "#e01b24")
+    assert (red.roles, red.color) == (("patrol", "guard"), "#ff0000")
     assert red.capabilities == profile_capabilities("arduino")
     slow = Limits(longest_drive_s=3, battery_low_v=7.2, speed_max=0.5, on_battery_low=BatteryAction.STOP)
     assert green == FleetCar(
         "green", "tcp://Pi:8888", "arduino", "#00ff00", profile_capabilities("arduino"), slow, ("guard",)
     )
-    assert (blue.platform, blue.capabilities, blue.roles) == ("raspberry_pi+arm", frozenset({"drive"}), ())
+    assert (blue.platform, blue.roles) == ("raspberry_pi+arm", ())
+    servos = {word for word in profile_capabilities("raspberry_pi+arm") if word.startswith("servo")}
+    assert blue.capabilities == profile_capabilities("raspberry_pi+arm") - servos
 
 
 def test_what_is_not_said() -> None:
@@ -86,7 +89,7 @@ name: Lab
 plan: nope.yaml
 defaults: {platform: arduino, limits: {battery_low_v: 6.5}}
 types:
-  small: {capabilities: [drive, servo_vertical], colour: red}
+  small: {without: [drive, servo_vertical], color: rad}
 cars:
   red: {type: smal, link: /dev/ttyUSB0}
   green: {type: small, link: "serial:///dev/ttyUSB0?baud=9600", limits: {on_battery_low: stp}}
@@ -99,8 +102,8 @@ cars:
         ["1:7", "name"],
         ["2:7", "plan"],
         ["3:39", "defaults.limits"],
-        ["5:25", "types.small.capabilities"],
-        ["5:58", "types.small.colour"],
+        ["5:20", "types.small.without"],
+        ["5:52", "types.small.color"],
         ["7:15", "cars.red.type"],
         ["8:30", "cars.green.link"],
         ["8:90", "cars.green.limits.on_battery_low"],
@@ -111,7 +114,7 @@ cars:
         ["11:32", "cars.black.platform"],
     ]
     assert "Did you mean small?" in found[5]
-    assert "may be the port of red" in found[6]
+    assert "red and green have the same port" in found[6]
     assert "Did you mean platform?" in found[10]
     assert "fleet bind" in found[11]
 
@@ -139,7 +142,7 @@ def test_two_cars_on_one_port(one: str, other: str, same: bool) -> None:
     if same:
         (line,) = _faults(text)
         assert "cars.b.link" in line
-        assert "may be the port of a" in line
+        assert "have the same port" in line
     else:
         assert len(_fleet(text).cars) == 2
 
@@ -148,7 +151,7 @@ def test_a_port_behind_two_names(tmp_path: Path) -> None:
     (tmp_path / "tty").touch()
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
     (line,) = _faults(f"cars: {{a: {{link: {tmp_path}/tty}}, b: {{link: {tmp_path}/by-id}}}}")
-    assert "may be the port of a" in line
+    assert "have the same port" in line
 
 
 _PORTS = [parse_fleet_link(each) for each in ("/dev/a", "/dev/b", "tcp://a:1", "tcp://a:2", "ble://name=a", "sim")] + [
@@ -271,7 +274,7 @@ def test_only_fleet_files_know_simulated_links() -> None:
 
 
 def test_the_schema_is_one_for_editors() -> None:
-    made = schema()
+    made = schema_of(FileEntry, "fleet file")
     assert made["required"] == ["cars"]
     car = made["$defs"]["CarEntry"]["properties"]
     assert car["platform"]["pattern"] == "^(auto|arduino|stm32|raspberry_pi|unknown)([+](arm|imu))*$"

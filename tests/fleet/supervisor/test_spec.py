@@ -24,8 +24,7 @@ from fleet.supervisor.spec import (
 FILE = """
 name: lab
 endpoint: tcp/127.0.0.1:7999
-recordings: kept
-record: false
+record: {to: kept, quota: 20GB}
 defaults: {limits: {longest_drive_s: 3}}
 cars:
   ann: {link: /dev/ttyUSB0, platform: stm32+imu}
@@ -35,8 +34,9 @@ cars:
 
 def test_a_file_says_it_all(tmp_path: Path) -> None:
     spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions())
-    assert (spec.fleet, spec.endpoint, spec.record) == ("lab", "tcp/127.0.0.1:7999", False)
-    assert spec.recordings == tmp_path / "kept"
+    assert (spec.fleet, spec.endpoint, spec.record) == ("lab", "tcp/127.0.0.1:7999", True)
+    assert (spec.recordings, spec.quota) == (tmp_path / "kept", "20GB")
+    assert "--quota 20GB" in " ".join(recorder_command(spec, "tcp/127.0.0.1:7999"))
     assert [(car.name, car.link, car.platform) for car in spec.cars.values()] == [
         ("ann", "/dev/ttyUSB0", "stm32+imu"),
         ("bob", "tcp://192.168.1.7:8888", "auto"),

@@ -59,9 +59,9 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "it is neither a URL nor a device path"),
-        ("ttyUSB0", "it is neither a URL nor a device path"),
-        ("COM", "it is neither a URL nor a device path"),
+        ("", "this is not a link"),
+        ("ttyUSB0", "this is not a link"),
+        ("COM", "this is not a link"),
         ("serial://", "it names no device"),
         ("serial:///", "it names no device"),
         ("serial://dev/ttyUSB0", "three slashes come before a device path"),

@@ -200,7 +200,7 @@ def test_a_tcp_car_is_named_and_warned_of(command: Command) -> None:
     [
         (["--for", "0"], "--for: 0 is too short: at least 500ms"),
         (["--for", "nan"], '--for: "nan" is not a duration'),
-        (["--link", "usb"], "neither a URL nor a device path"),
+        (["--link", "usb"], "this is not a link"),
     ],
 )
 def test_wrong_use_is_one_line(command: Command, arguments: list[str], words: str) -> None:

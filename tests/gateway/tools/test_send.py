@@ -98,10 +98,10 @@ def test_why_a_text_is_no_frame(text: str, words: str) -> None:
         (["#"], "do not know a lone '#'"),
         (["\u20ac"], "'\u20ac' is no byte"),
         (["", "--raw"], "frame '' is empty"),
-        ([STOP, "--platform", "pi"], "'pi' is not known"),
+        ([STOP, "--platform", "pi"], 'Unknown platform "pi"'),
         ([STOP, "--wait", "-1"], '--wait: "-1" is not a duration'),
         ([STOP, "--wait", "nan"], '--wait: "nan" is not a duration'),
-        ([STOP, "--link", "ws://x"], "ws:// is no kind of link"),
+        ([STOP, "--link", "ws://x"], "this is not a link"),
     ],
 )
 def test_what_is_not_sent_opens_no_link(command: Command, arguments: list[str], words: str) -> None:

@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from fleet.fleetfile import fleet_file
-from fleet.fleetfile import models as fleet_models
+from fleet.fleetfile.models import FileEntry
 from fleet.policy.plan import lint, parser
-from fleet.policy.plan import models as plan_models
+from fleet.policy.plan.models import PlanEntry
 from gateway.sim import world_file
+from schemas.yaml_document.document import schema_of
 from tests.tools.pages.command_line import escape
 
 SchemaMaker = Callable[[], dict[str, Any]]
@@ -97,12 +98,12 @@ def about(each: dict[str, Any]) -> str:
 
 def fleet_schema() -> dict[str, Any]:
     """Return the schema of fleet files."""
-    return fleet_models.schema()
+    return schema_of(FileEntry, "fleet file")
 
 
 def plan_schema() -> dict[str, Any]:
     """Return the schema of plans."""
-    return plan_models.PlanEntry.model_json_schema()
+    return schema_of(PlanEntry, "plan file")
 
 
 def problems(kind: str, text: str) -> list[str]:

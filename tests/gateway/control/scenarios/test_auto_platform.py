@@ -71,7 +71,7 @@ def test_auto_is_the_unknown_platform_until_then(told: str, name: str) -> None:
 
 
 def test_a_platform_that_is_none_says_which_there_are() -> None:
-    with pytest.raises(ValueError, match=r"'uno' is not known, allowed are arduino.*; or auto, to find out"):
+    with pytest.raises(ValueError, match=r'Unknown platform "uno"\. .* Leave it out to detect it\.'):
         parse_platform_option("uno")
 
 
