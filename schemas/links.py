@@ -8,12 +8,6 @@ from urllib.parse import parse_qs, quote, unquote, urlsplit
 CAR_TCP_PORT: Final = 8888
 """The port on which the program of a Raspberry Pi car listens (docs/reference/protocol.md#platforms)."""
 BAUD: Final = 9600  # docs/reference/protocol.md#framing: UART 9600 8N1
-LINK_FORMS: Final = (
-    "/dev/ttyUSB0 or COM3 (also as serial:///dev/ttyUSB0?baud=9600), "
-    "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://HOST:PORT, "
-    "ble://AA:BB:CC:DD:EE:FF (macOS: a UUID), ble://name=BT04 (`gateway scan` shows them)"
-)
-"""All forms of a link, for a message or help text."""
 _BAUDS: Final = range(300, 4_000_001)
 WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
 _USB_ID: Final = re.compile(r"(?:0[xX])?([0-9a-fA-F]{4})")
@@ -153,7 +147,7 @@ def _serial(netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:
 
 def _baud(text: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) < 10) or int(text) not in _BAUDS:
-        raise BadLink(f"baud={text} is not from {_BAUDS.start} to {_BAUDS.stop - 1}")
+        raise BadLink(f"baud={text[:20]} is not from {_BAUDS.start} to {_BAUDS.stop - 1}")
     return int(text)
 
 

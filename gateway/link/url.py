@@ -11,7 +11,7 @@ def parse_url(text: str) -> LinkUrl:
     try:
         url = parse_link(text)
     except BadLink as error:
-        raise BadUrl(f"link {text!r}: {error}") from None
+        raise BadUrl(f"link {text[:80]!r}: {error}") from None
     # Refused here, so that no gateway starts for a link that it can never open.
     if isinstance(url, BleUrl) and find_spec("bleak") is None:
         raise BadUrl(f"link {text!r} needs Bluetooth, which is not installed: pip install 'zenoh-car-fleet[ble]'")

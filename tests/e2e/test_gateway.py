@@ -586,7 +586,7 @@ def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProces
         (["--fleet", "a/b"], 2, "fleet name 'a/b' is not allowed"),
         (["--platform", "esp32"], 2, 'Unknown platform "esp32". There are arduino, stm32, raspberry_pi, unknown.'),
         (["--platform", "arduino+wings"], 2, 'Unknown option "+wings"'),
-        (["--link", "usb://x"], 2, "usb:// is no kind of link: give /dev/ttyUSB0"),
+        (["--link", "usb://x"], 2, "this is not a link. `fleet scan` lists"),
         (["--link", "tcp://host"], 2, "a host and a port from 1 to 65535 are needed"),
         (["--link", "ttyUSB0"], 2, "this is not a link"),
         (["--connect", "127.0.0.1:7447"], 2, "write it as tcp/HOST:PORT"),

@@ -31,7 +31,7 @@ types:
 cars:
   red: {link: /dev/ttyUSB7}
   green: {type: slow, link: tcp://Pi:8888, limits: {on_battery_low: stop}}
-  blue: {type: slow, platform: raspberry_pi+arm, link: ble://aa:bb:cc:dd:ee:ff, without: [servo, tracking], roles: []}
+  blue: {type: slow, platform: raspberry_pi+arm, link: ble://aa:bb:cc:dd:ee:ff, without: [servo], roles: []}
 """
 
 

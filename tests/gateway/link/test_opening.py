@@ -60,7 +60,7 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
     ("text", "why"),
     [
         ("", "this is not a link"),
-        ("ttyUSB0", "this is not a link"),
+        ("ttyUSB0", "this is not a link. Did you mean /dev/ttyUSB0? `fleet scan` lists"),
         ("COM", "this is not a link"),
         ("serial://", "it names no device"),
         ("serial:///", "it names no device"),
@@ -87,8 +87,8 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
         ("ble://name=", "a name has 1 to 248 bytes, and can be printed"),
         ("ble://name=a%0Ab", "a name has 1 to 248 bytes, and can be printed"),
         ("ble://name=" + "x" * 249, "a name has 1 to 248 bytes"),
-        ("tcp://", "a host and a port from 1 to 65535 are needed"),
-        ("tcp://host", "a host and a port"),
+        ("tcp://", "it needs a host and a port from 1 to 65535"),
+        ("tcp://host", "the port is missing. Write tcp://host:8888"),
         ("tcp://:8888", "a host and a port"),
         ("tcp://host:0", "a host and a port"),
         ("tcp://host:65536", "Port out of range"),
@@ -97,7 +97,7 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
         ("tcp://host:8888?x=1", "nothing may follow the port"),
         ("tcp://me@host:8888", "nothing may follow the port"),
         ("tcp://[::1:8888", "Invalid IPv6 URL"),
-        ("http://host:80", "http:// is no kind of link"),
+        ("http://host:80", "this is not a link. `fleet scan`"),
         ("/dev/tty\nUSB0", "it has characters that cannot be printed"),
         ("/dev/tty\x00USB0", "it has characters that cannot be printed"),
         ("tcp://ho\nst:80", "it has characters that cannot be printed"),
@@ -108,11 +108,7 @@ def test_what_is_no_url_is_refused_with_what_is(text: str, why: str) -> None:
         parse_url(text)
     words = str(caught.value)
     assert why in words
-    assert words.endswith(
-        "give /dev/ttyUSB0 or COM3 (also as serial:///dev/ttyUSB0?baud=9600), "
-        "serial://?vid=1a86&pid=7523&serial=ABC (one of the three is enough), tcp://HOST:PORT, "
-        "ble://AA:BB:CC:DD:EE:FF (macOS: a UUID), ble://name=BT04 (`gateway scan` shows them)"
-    )
+    assert len(words) < 200
     assert "\n" not in words
 
 

@@ -224,7 +224,7 @@ def test_a_tcp_car_is_warned_of_before_it_is_connected(start: Started) -> None:
     [
         ([], "one of the arguments --link --from is required"),
         (["--link", "/dev/ttyUSB0", "--from", "x"], "not allowed with argument"),
-        (["--link", "usb:1"], "usb:// is no kind of link"),
+        (["--link", "usb:1"], "this is not a link"),
         (["--link", "/dev/ttyUSB0", "--platform", "pi"], 'Unknown platform "pi"'),
         (["--from", "nothing"], "nothing: the file cannot be read: No such file or directory"),
         (["--from", "/"], "/: this is a directory"),
