@@ -24,7 +24,7 @@ def parse_color(text: str) -> Rgb:
     if match is not None:
         return int(match[1], 16), int(match[2], 16), int(match[3], 16)
     near = difflib.get_close_matches(text.lower(), COLORS, n=1)
-    hint = f"Did you mean {near[0]}?" if near else 'Write a name as red, or "#rrggbb" in quotes.'
+    hint = f"Did you mean {near[0]}?" if near else f"Choose from: {', '.join(COLORS)}, or write '#ff8000'."
     raise ValueError(f'"{text[:40]}" is not a color. {hint}')
 
 

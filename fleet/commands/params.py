@@ -14,10 +14,12 @@ from click.shell_completion import CompletionItem
 
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
+from fleet.client.supervision import ask_status
 from fleet.commands.group import did_you_mean
 from fleet.recording.session_dir import is_session
 from schemas import keys
 from schemas.bus import Bus, canon
+from schemas.colors import parse_color
 from schemas.duration import parse_duration
 
 N = TypeVar("N", bound=float)
@@ -28,17 +30,6 @@ DEFAULT_SESSIONS: Final = Path("sessions")
 _PLACE: Final = "fleet.sessions"
 """Key of the value of --sessions in the context."""
 _SESSION_STAMP: Final = re.compile(r"\d{8}T\d{6}Z", re.ASCII)
-COLORS: Final = {
-    "red": (255, 0, 0),
-    "green": (0, 255, 0),
-    "blue": (0, 0, 255),
-    "yellow": (255, 255, 0),
-    "cyan": (0, 255, 255),
-    "magenta": (255, 0, 255),
-    "white": (255, 255, 255),
-    "off": (0, 0, 0),
-}
-"""Names of colors of the LED: those of the light."""
 
 
 class Duration(click.ParamType[float]):
@@ -160,14 +151,10 @@ class Color(click.ParamType[tuple[int, int, int]]):
         """Return three numbers, 0..255."""
         if isinstance(value, tuple):
             return value
-        if (named := COLORS.get(str(value))) is not None:
-            return named
-        match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", str(value))
-        if match is None:
-            near = did_you_mean(str(value), COLORS)
-            rest = near or f"Choose from: {', '.join(COLORS)}, or write '#ff8000'."
-            self.fail(f'"{value}" is not a color. {rest}', param, ctx)
-        return int(match[1], 16), int(match[2], 16), int(match[3], 16)
+        try:
+            return parse_color(str(value))
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
 
 
 class SessionPath(click.ParamType[Path]):
@@ -280,9 +267,21 @@ def resolve_cars(client: Fleet, written: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _members(client: Fleet, group: str) -> list[str]:  # noqa: ARG001 - groups come from the running fleet
-    """Return the cars of a group. Raises click's errors."""
-    raise click.ClickException(f'There is no group "{group}".')
+def _members(client: Fleet, group: str) -> Sequence[str]:
+    """Return the cars of a group, from the running fleet, or else from the fleet file here. Raises click's errors."""
+    status = ask_status(client.bus, client.name)
+    groups: Mapping[str, Sequence[str]] = {
+        name: [car for car in cars.split(",") if car] for each in status for name, cars in each.groups.items()
+    }
+    if not status and Path("fleet.yaml").is_file():
+        from fleet.fleetfile.fleet_file import read_fleet
+
+        with suppress(ValueError):  # a BadFile
+            groups = read_fleet(Path("fleet.yaml"), unbound=True).groups
+    if group not in groups:
+        there = f"Groups: {', '.join(groups)}." if groups else "fleet.yaml can have some: `groups: {a: [red, blue]}`."
+        raise click.ClickException(f'There is no group "{group}". {did_you_mean(group, groups) or there}')
+    return groups[group]
 
 
 def written_out(keyexpr: str, fleet: str) -> str:

@@ -510,6 +510,7 @@ class Supervisor:
             became=self._shutdown.results,
             missing=self.missing(),
             session=self._session,
+            groups={name: ",".join(cars) for name, cars in self._spec.groups.items()},
         )
         for process in self.processes:
             life = process.status

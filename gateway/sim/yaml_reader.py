@@ -28,23 +28,23 @@ class MarkedYaml:
         self._source = source
         self._problems: list[tuple[int, int, str]] = []
         if len(text.encode(errors="surrogatepass")) > MAX_WORLD_BYTES:
-            raise BadWorld(f"{source}:1:1: has more than {MAX_WORLD_BYTES // 1024} KiB: no world needs so much")
+            raise BadWorld(f"{source}:1:1: error: has more than {MAX_WORLD_BYTES // 1024} KiB: no world needs so much")
         try:
             _check_events(text)
             self._loader = CoreLoader(text)
             root = self._loader.get_single_node()
         except yaml.reader.ReaderError as error:
             line, column = text.count("\n", 0, error.position) + 1, error.position - text.rfind("\n", 0, error.position)
-            raise BadWorld(f"{source}:{line}:{column}: a character that is not allowed in YAML") from None
+            raise BadWorld(f"{source}:{line}:{column}: error: a character that is not allowed in YAML") from None
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             line, column = (1, 1) if mark is None else (mark.line + 1, mark.column + 1)
             words = " ".join((error.problem or error.context or "it cannot be read").split())
-            raise BadWorld(f"{source}:{line}:{column}: is no YAML that is allowed here: {words}") from None
+            raise BadWorld(f"{source}:{line}:{column}: error: is no YAML that is allowed here: {words}") from None
         except ValueError:  # PyYAML's error for a directive such as %YAML 999999…
-            raise BadWorld(f"{source}:1:1: is no YAML: a directive with a number that is too long") from None
+            raise BadWorld(f"{source}:1:1: error: is no YAML: a directive with a number that is too long") from None
         if root is None or (isinstance(root, yaml.ScalarNode) and not root.value):
-            raise BadWorld(f"{source}:1:1: is empty")
+            raise BadWorld(f"{source}:1:1: error: is empty")
         self.root: yaml.Node = root
 
     @property
@@ -60,7 +60,7 @@ class MarkedYaml:
     def end(self) -> None:
         """Raise BadWorld if there was a fault."""
         found = sorted(set(self._problems))
-        lines = [f"{self._source}:{line}:{column}: {words}" for line, column, words in found[:_MAX_FAULTS]]
+        lines = [f"{self._source}:{line}:{column}: error: {words}" for line, column, words in found[:_MAX_FAULTS]]
         if len(found) > _MAX_FAULTS:
             lines.append(f"{self._source}: and {len(found) - _MAX_FAULTS} more")
         if lines:

@@ -13,7 +13,7 @@ from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.plan.lint_conflicts import find_conflicts, implies
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanPhase, Role, Rule
 from fleet.policy.plan.reachability import ModeReachability, Outlook, can_be_true, list_unmeasured
-from fleet.policy.snapshot import CarSnapshot
+from fleet.policy.snapshot import CarSnapshot, topic_of
 from gateway.protocol.enums import Mode
 from schemas.yaml_document.document import BadFile, Problem
 from schemas.yaml_document.messages import suggest
@@ -171,6 +171,8 @@ class _Check:
                     yield PlanFault(Severity.ERROR, rule.name, f"it never {word}. {assess.never}")
                 elif assess.only:
                     yield PlanFault(Severity.WARNING, rule.name, f"it {word} only by {assess.only}")
+                elif condition is rule.when and (words := self._blind(rule)):
+                    yield PlanFault(Severity.WARNING, rule.name, words)
             if rule.until is not None and implies(rule.when, rule.until):
                 words = f"it never fires. Its `until` ({rule.until.text}) is true whenever it begins."
                 yield PlanFault(Severity.ERROR, rule.name, words)
@@ -178,6 +180,27 @@ class _Check:
                 yield from self._useless(rule, effect)
         yield from self._conflicts()
         yield from self._self_ending()
+
+    def _blind(self, rule: Rule) -> str:
+        """Say which cars a rule never sees, because their role's mode does not measure what it looks at."""
+        when = rule.when
+        topics = {topic_of(name) for name in when.expression.names}
+        for role in self._plan.roles.values():
+            about = when.car is None and when.role in (None, role.name) and self._in_some_phase(role, rule.during)
+            # A rule about what a role needs is for the cars that lack it, and so have no role.
+            needed = role.needs is not None and topics & {topic_of(name) for name in role.needs.names}
+            kinds = [
+                kind
+                for car in self._reach.cars
+                if self._reach.can_have(car, role)
+                for kind in self._reach.profiles(car)
+            ]
+            if not about or needed or role.by_rules or not kinds:
+                continue
+            if not any(can_be_true(when.expression, kind, role.mode) for kind in kinds):
+                missing = ", ".join(list_unmeasured(when.expression, kinds[0], role.mode))
+                return f"it never sees cars with role {role.name}: in {role.mode} they do not measure {missing}."
+        return ""
 
     def _out_of_phase(self, rule: Rule) -> Iterator[PlanFault]:
         """Report a rule about a role, or for one, that counts in none of the rule's phases."""

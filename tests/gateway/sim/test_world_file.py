@@ -98,39 +98,44 @@ def test_cars_without_a_place_begin_where_there_is_room_before_those_that_have_o
 
 
 FAULTS = [
-    ("room: {width_m: 6, depth_m: 0}", ["1:29: room.depth_m: '0' is not allowed: a number from 0.02 to 100"]),
-    ("room: {width_m: 6}", ["1:7: room.depth_m: is missing"]),
-    ("room: 5", ["1:7: room: '5' is not allowed: write fields"]),
-    ("rooms: {}", ["1:1: rooms: is not known here: use room, walls"]),
-    ("cars_meet: yes", ["1:12: cars_meet: 'yes' is not allowed: true or false"]),
-    ("cars_meet: true\ncars_meet: false", ["2:1: cars_meet: is given twice, first in line 1"]),
+    ("room: {width_m: 6, depth_m: 0}", ["1:29: error: room.depth_m: '0' is not allowed: a number from 0.02 to 100"]),
+    ("room: {width_m: 6}", ["1:7: error: room.depth_m: is missing"]),
+    ("room: 5", ["1:7: error: room: '5' is not allowed: write fields"]),
+    ("rooms: {}", ["1:1: error: rooms: is not known here: use room, walls"]),
+    ("cars_meet: yes", ["1:12: error: cars_meet: 'yes' is not allowed: true or false"]),
+    ("cars_meet: true\ncars_meet: false", ["2:1: error: cars_meet: is given twice, first in line 1"]),
     (
         "walls: [[1, 2, 3], [0, 0, 0, 0], [1, 2, 3, .inf], 7]",
-        ["1:9: walls[0]: has 3 numbers, not 4", "1:20: walls[1]:", "1:44: walls[2][3]: '.inf'", "1:51: walls[3]: '7'"],
+        [
+            "1:9: error: walls[0]: has 3 numbers, not 4",
+            "1:20: error: walls[1]:",
+            "1:44: error: walls[2][3]",
+            "1:51: error: walls[3]",
+        ],
     ),
-    ("walls: {}", ["1:8: walls: a mapping is not allowed: write a list"]),
-    ("line: [[0, 0], [1, 0]]", ["1:7: line: is a closed loop: at least 3 points"]),
+    ("walls: {}", ["1:8: error: walls: a mapping is not allowed: write a list"]),
+    ("line: [[0, 0], [1, 0]]", ["1:7: error: line: is a closed loop: at least 3 points"]),
     (
         "line: {width_m: 2, depth_m: 1, radius_m: 0.6}",
-        ["1:42: line.radius_m: 0.6 is not allowed: up to half of the shorter side, 0.5"],
+        ["1:42: error: line.radius_m: 0.6 is not allowed: up to half of the shorter side, 0.5"],
     ),
-    ("lamps: {a: {x_m: 1}}", ["1:12: lamps.a.y_m: is missing"]),
-    ("lamps: {A: {x_m: 1, y_m: 1}}", ["1:12: lamps: name 'A' is not allowed"]),
-    ("lamps: {1: {x_m: 1, y_m: 1}}", ["1:9: lamps: key '1' is no word: write it in quotes"]),
+    ("lamps: {a: {x_m: 1}}", ["1:12: error: lamps.a.y_m: is missing"]),
+    ("lamps: {A: {x_m: 1, y_m: 1}}", ["1:12: error: lamps: name 'A' is not allowed"]),
+    ("lamps: {1: {x_m: 1, y_m: 1}}", ["1:9: error: lamps: key '1' is no word: write it in quotes"]),
     (
         "lamps: {a: {x_m: 1, y_m: 1, on: 1, reach_m: 0, brightness: true}}",
         [
-            "1:33: lamps.a.on: '1'",
-            "1:45: lamps.a.reach_m: '0' is not allowed: a number above 0 and up to 100",
-            "1:60: lamps.a.brightness: 'true'",
+            "1:33: error: lamps.a.on: '1'",
+            "1:45: error: lamps.a.reach_m: '0' is not allowed: a number above 0 and up to 100",
+            "1:60: error: lamps.a.brightness: 'true'",
         ],
     ),
     (
         "lamps: {a: {carried_by: pink}}",
-        ["1:25: lamps.a.carried_by: no car or thing 'pink' is simulated here: use red, green"],
+        ["1:25: error: lamps.a.carried_by: no car or thing 'pink' is simulated here: use red, green"],
     ),
-    ("things: {a: {x_m: 1, y_m: 1}}", ["1:13: things.a: is a disc or a box"]),
-    ("things: {a: {x_m: 1, y_m: 1, radius_m: 1, width_m: 1}}", ["1:13: things.a: is a disc or a box"]),
+    ("things: {a: {x_m: 1, y_m: 1}}", ["1:13: error: things.a: is a disc or a box"]),
+    ("things: {a: {x_m: 1, y_m: 1, radius_m: 1, width_m: 1}}", ["1:13: error: things.a: is a disc or a box"]),
     ("things: {a: {x_m: 1, y_m: 1, width_m: 1}}", ["things.a.depth_m: is missing: a box has both"]),
     (
         "things: {a: {radius_m: 1}}",
@@ -138,11 +143,11 @@ FAULTS = [
     ),
     (
         "things: {a: {radius_m: 1, path: [[0, 0], [0, 0]]}}",
-        ["1:33: things.a.path: has at least 2 points [x, y] that differ"],
+        ["1:33: error: things.a.path: has at least 2 points [x, y] that differ"],
     ),
     (
         "things: {a: {radius_m: 1, x_m: 0, y_m: 0, speed_m_s: 0.1}}",
-        ["1:54: things.a.speed_m_s: is not allowed without a path"],
+        ["1:54: error: things.a.speed_m_s: is not allowed without a path"],
     ),
     (
         "things: {a: {radius_m: 1, path: [[0, 0], [1, 0]], speed_m_s: 0.6, x_m: 1, carried_by: red}}",
@@ -152,34 +157,40 @@ FAULTS = [
             "things.a.carried_by: is not allowed beside",
         ],
     ),
-    ("room: {width_m: 2, depth_m: 2}\ncars: {red: {x_m: 1.5, y_m: 0}}", ["2:13: cars.red: begins outside the room"]),
+    (
+        "room: {width_m: 2, depth_m: 2}\ncars: {red: {x_m: 1.5, y_m: 0}}",
+        ["2:13: error: cars.red: begins outside"],
+    ),
     (
         "boxes: [{x_m: 1, y_m: 0, width_m: 1, depth_m: 1}]\ncars: {red: {x_m: 1, y_m: 0}}",
-        ["2:13: cars.red: begins in a wall"],
+        ["2:13: error: cars.red: begins in a wall"],
     ),
-    ("cars: {red: {x_m: 0}}", ["1:13: cars.red.y_m: is missing"]),
+    ("cars: {red: {x_m: 0}}", ["1:13: error: cars.red.y_m: is missing"]),
     (
         "cars: {red: {x_m: 0, y_m: 0}, green: {x_m: 0.2, y_m: 0}}",
-        ["1:38: cars.green: begins 0.2 m from red: at least 0.26 m"],
+        ["1:38: error: cars.green: begins 0.2 m from red: at least 0.26 m"],
     ),
-    ("walls: [[0, 0, 1, 0]]\ncars: {red: {x_m: 0, y_m: 0.1}}", ["2:13: cars.red: begins in a wall"]),
+    ("walls: [[0, 0, 1, 0]]\ncars: {red: {x_m: 0, y_m: 0.1}}", ["2:13: error: cars.red: begins in a wall"]),
     (
         "things: {b: {x_m: 0, y_m: 0, width_m: 1, depth_m: 1}}\ncars: {red: {x_m: 0.1, y_m: 0.1}}",
-        ["2:13: cars.red: begins in b"],
+        ["2:13: error: cars.red: begins in b"],
     ),
-    ("cars: &a {red: {x_m: 0, y_m: 0}}\nlamps: *a", ["1:7: is no YAML that is allowed here: anchors and aliases"]),
-    ("cars: !!map {}", ["1:7: is no YAML that is allowed here: tags"]),
-    ("[" * 5000, ["1:9: is no YAML that is allowed here: nested more than 8 deep"]),
-    ("room:\n\t- 1", ["2:1: is no YAML"]),
-    ("a: 1\n---\nb: 2", ["2:1: is no YAML"]),
-    ("", ["1:1: is empty"]),
-    ("# nothing", ["1:1: is empty"]),
-    ("\x00", ["1:1: a character that is not allowed"]),
+    (
+        "cars: &a {red: {x_m: 0, y_m: 0}}\nlamps: *a",
+        ["1:7: error: is no YAML that is allowed here: anchors"],
+    ),
+    ("cars: !!map {}", ["1:7: error: is no YAML that is allowed here: tags"]),
+    ("[" * 5000, ["1:9: error: is no YAML that is allowed here: nested more than 8 deep"]),
+    ("room:\n\t- 1", ["2:1: error: is no YAML"]),
+    ("a: 1\n---\nb: 2", ["2:1: error: is no YAML"]),
+    ("", ["1:1: error: is empty"]),
+    ("# nothing", ["1:1: error: is empty"]),
+    ("\x00", ["1:1: error: a character that is not allowed"]),
     ("%YAML " + "9" * 5000 + ".1\n---\na: 1", ["is no YAML"]),
-    ("room: {width_m: " + "9" * 5000 + ", depth_m: 1}", ["1:17: room.width_m: '9999"]),
-    ("#" * (MAX_WORLD_BYTES + 1), ["1:1: has more than 64 KiB"]),
+    ("room: {width_m: " + "9" * 5000 + ", depth_m: 1}", ["1:17: error: room.width_m: '9999"]),
+    ("#" * (MAX_WORLD_BYTES + 1), ["1:1: error: has more than 64 KiB"]),
     ("walls: [" + "[0, 0, 1, 1], " * 250 + "]", ["walls: has 250 of them: at most 200"]),
-    ("- 1", ["1:1: a list is not allowed: write fields"]),
+    ("- 1", ["1:1: error: a list is not allowed: write fields"]),
 ]
 
 
@@ -198,7 +209,7 @@ def test_all_faults_are_told_at_once_in_their_order() -> None:
     text = EVERYTHING.replace("width_m: 6", "width_m: six").replace("on: false", "on: maybe")
     with pytest.raises(BadWorld) as error:
         read_world(text, "w.yaml", ["red"])
-    assert [line.split(": ")[:2] for line in str(error.value).splitlines()] == [
+    assert [line.split(": ")[0:3:2] for line in str(error.value).splitlines()] == [
         ["w.yaml:1:17", "room.width_m"],
         ["w.yaml:15:57", "lamps.sun.on"],
     ]
@@ -278,7 +289,7 @@ def test_a_good_file_with_something_changed_is_a_world_or_a_list_of_faults(chanc
         ("nothing.yaml", None, "No such file or directory: write room, open or the path of a file"),
         ("bytes.yaml", b"room: \xff", "is no UTF-8"),
         pytest.param("large.yaml", b"\xff" * 2 * MAX_WORLD_BYTES, "has more than 64 KiB", id="large.yaml"),
-        ("faulty.yaml", b"foo: 1\nbar: 2\n", "faulty.yaml:2:1: bar: is not known here"),
+        ("faulty.yaml", b"foo: 1\nbar: 2\n", "faulty.yaml:2:1: error: bar: is not known here"),
         ("carried.yaml", b"lamps: {a: {carried_by: blue}}", "no car or thing 'blue' is simulated here: use red"),
     ],
 )

@@ -157,6 +157,13 @@ def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> Non
         ),
         ("roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {p: {roles: [x]}}", "no phase has it"),
         (
+            (
+                "roles: {patrol: {mode: obstacle_avoidance}, rest: {mode: manual}}\n"
+                "rules: [{when: battery_v < 7, then: {who: this_car, mode: manual}}]"
+            ),
+            "it never sees cars with role patrol: in obstacle_avoidance they do not measure battery.voltage_v.",
+        ),
+        (
             SCOUT
             + "rules:\n  - {when: {any_car: line.left_outer}, then: {who: red, mode: manual}}\n"
             + "  - {when: {any_car: line.right_outer}, then: {who: red, mode: following}}",

@@ -1,0 +1,47 @@
+"""Groups of cars, where commands take cars: `@a`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+import zenoh
+
+from fleet.client.client import Fleet
+from fleet.commands.params import resolve_cars
+from schemas.bus import reply_message, router_config
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.support.ports import free_endpoint
+
+FILE = "groups: {lab: [blue, green]}\ncars: {red: {link: COM1}, blue: {link: COM2}, green: {link: COM3}}\n"
+
+
+@pytest.fixture
+def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
+    monkeypatch.chdir(tmp_path)
+    endpoint = free_endpoint()
+    with zenoh.open(router_config(endpoint)), Fleet(endpoint, kind="person") as fleet:
+        yield fleet
+
+
+def test_without_a_supervisor_the_fleet_file_here_has_the_groups(client: Fleet) -> None:
+    with pytest.raises(click.ClickException, match='There is no group "lab"'):
+        resolve_cars(client, ["@lab"])
+    Path("fleet.yaml").write_text(FILE, encoding="utf-8")
+    assert resolve_cars(client, ["red", "@lab", "blue"]) == ["red", "blue", "green"]
+    with pytest.raises(click.ClickException, match="Did you mean lab"):
+        resolve_cars(client, ["@lap"])
+
+
+def test_the_running_fleet_has_the_groups(client: Fleet) -> None:
+    Path("fleet.yaml").write_text(FILE, encoding="utf-8")
+    key = "fleet/@supervisor/status"
+
+    def answer(query: zenoh.Query) -> bool:
+        reply_message(query, key, pb.Supervision(groups={"a": "red,blue"}), as_json=False)
+        return True
+
+    client.bus.queryable(key, answer)
+    assert resolve_cars(client, ["@a"]) == ["red", "blue"]
+    with pytest.raises(click.ClickException, match="Groups: a"):
+        resolve_cars(client, ["@lab"])
