@@ -161,7 +161,7 @@ def test_what_moves_a_car_can_be_taken(several: FleetProcesses, car: str, verb: 
     ann = operator(several, "ann", "drive", car, "forward", "--for", LONG)
     wait_for(lambda: drives(several, "ann@", car), "ann drives")
     code, words = ended(operator(several, "bob", verb, car, *more))
-    assert (code, words.endswith("(--take)")) == (1, True), words
+    assert (code, "(--take)" in words) == (1, True), words
     assert ended(operator(several, "bob", verb, car, *more, "--take"))[0] == 0
     code, words = ended(ann)
     assert code == 1
@@ -176,7 +176,8 @@ def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> No
 
     ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "10s")
     assert script.wait() == 1
-    assert script.stderr.startswith("lost: red was taken by ann@"), script.stderr
+    # The gateway ends the lease, or refuses its next renewal: which of the two the script sees first is a race.
+    assert script.stderr.startswith(("lost: red was taken by ann@", "lost: red is driven by ann@")), script.stderr
     wait_for(lambda: driving(sim), "ann's frame is obeyed")
     assert drives(fleet, "ann@"), "the script that went stopped what ann drives"
     assert fleet.ask("drive", motion="back", sender="bot", kind="script")["reason"] == "leased"

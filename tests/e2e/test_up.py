@@ -411,7 +411,7 @@ def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: Flee
         file.write_text("cars:\n  red: {lnk: nowhere}\n  blue: {link: 7}\n")
         refused = started.fleet("reload")
         assert refused.returncode == 2
-        assert refused.stderr.startswith("nothing was changed: ")
+        assert refused.stderr.endswith("Nothing was changed.\n")
         assert "cars.red.lnk" in refused.stderr
         assert "cars.blue.link" in refused.stderr
         assert {car: started.running(car) for car in before} == before
@@ -457,7 +457,7 @@ def test_the_coordinator_goes_by_what_was_accepted_not_by_what_the_files_have_be
     pid = job.running("@coordinator")
     (job.directory / "fleet.yaml").write_text("cars: [\n")
     (job.directory / "plan.yaml").unlink()
-    assert job.fleet("reload").stderr.startswith("nothing was changed: ")
+    assert job.fleet("reload").stderr.endswith("Nothing was changed.\n")
     job.kill(pid)
     assert job.running("@coordinator", but=pid)
 
@@ -533,7 +533,7 @@ def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(job: Up) -> None:
     ("arguments", "words"),
     [
         ((), "There is no fleet.yaml here. `fleet init` creates one"),
-        (("--sim", "0"), "0 is not in the range 1<=x<=200"),
+        (("--sim", "0"), "--sim: 0 is too small: at least 1"),
         (("none.yaml",), "none.yaml"),
         (("--sim", "1", "--plan", "none.yaml"), "none.yaml:1:1: error: there is no such file"),
         (("--sim", "1", "--fleet", "Über"), "fleet name"),

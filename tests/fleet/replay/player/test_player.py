@@ -202,7 +202,7 @@ def test_a_name_that_is_a_living_fleets_is_refused(fleet: FleetProcesses, sessio
 def test_the_recorded_fleet_is_not_spoken_for(fleet: FleetProcesses, session: Path) -> None:
     player = play(fleet, session, "--as", "fleet")
     assert player.wait() == 2
-    assert "--as fleet: so the recorded fleet is called" in player.stderr
+    assert "--as fleet is the recorded fleet's own name" in player.stderr
 
 
 def test_commands_of_a_recording_are_not_given_again(fleet: FleetProcesses, tmp_path: Path) -> None:
@@ -237,8 +237,8 @@ def test_a_hub_that_is_killed_is_replaced(fleet: FleetProcesses, session: Path) 
     [
         (("--as", "Not a name"), "fleet name (--as) 'Not a name' is not allowed"),
         (("--offset", "9h"), "is not within what is played"),
-        (("--skip-gaps", "soon"), "--skip-gaps: 'soon' is not a time"),
-        (("--skip-gaps", "0s"), "a pause is longer than 0"),
+        (("--skip-gaps", "soon"), '--skip-gaps: "soon" is not a duration'),
+        (("--skip-gaps", "0s"), "--skip-gaps: 0s is too short: more than 0"),
         (("--save", "x.rrd"), "--save"),
         (("--rate", "0"), "--rate"),
         (("--car", "nobody"), "nobody is not in"),

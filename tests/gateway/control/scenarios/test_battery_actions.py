@@ -34,7 +34,7 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
     for what in (FORWARD, SetMode(Mode.TRACKING)):
         refused = desk.ask(what)
         assert (refused.status, refused.reason) == (Phase.REJECTED, Reason.BATTERY_LOW)
-        assert "charge it" in refused.words
+        assert "Charge it" in refused.words
     for still in (Drive(Motion.STOP), SetMode(Mode.MANUAL), Stop(), OneShot(General(Motion.STOP, light=Light.RED))):
         assert desk.ask(still).status is not Phase.REJECTED
         desk.run(3.0)
