@@ -1,4 +1,7 @@
-"""Plot the distances of a session: `python -m fleet.examples.programs.distance_over_time latest red distance.png`."""
+"""Plot the distances of a session.
+
+`python -m fleet.examples.programs.distance_over_time latest red distance.png`
+"""
 
 import sys
 

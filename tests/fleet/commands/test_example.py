@@ -68,6 +68,6 @@ def test_names_are_completed() -> None:
 
     from fleet.commands.example import example
 
-    found = ShellComplete(example, {}, "fleet example", "_X").get_completions(["show"], "d")
+    found = ShellComplete(example, {}, "fleet example", "_X").get_completions(["show"], "drive")
     assert [each.value for each in found] == ["drive_one"]
     assert "drive_one" in examples()
