@@ -13,6 +13,7 @@ from typing import Final
 import pytest
 
 from tests.e2e.test_wheel import Environment
+from tests.support.processes import wait_for
 
 ROOT: Final = Path(__file__).parents[2]
 README: Final = ROOT / "README.md"
@@ -66,12 +67,21 @@ class Newcomer:
         self._environment = environment
 
     def type(self, command: str) -> str:
-        """Run a command; return what it printed."""
+        """Run a command that must succeed; return what it printed."""
         self.typed.add(command)
         if command.startswith("cd "):
             self.place = self.place / command.removeprefix("cd ")
             return ""
-        done = subprocess.run(
+        done = self._run(command)
+        assert done.returncode == 0, (command, done.stdout, done.stderr)
+        return done.stdout
+
+    def succeeds(self, command: str) -> bool:
+        """Return True if a command succeeds."""
+        return self._run(command).returncode == 0
+
+    def _run(self, command: str) -> "subprocess.CompletedProcess[str]":
+        return subprocess.run(
             ["bash", "-c", command],
             capture_output=True,
             timeout=280,
@@ -80,8 +90,6 @@ class Newcomer:
             env=self._environment,
             text=True,
         )
-        assert done.returncode == 0, (command, done.stdout, done.stderr)
-        return str(done.stdout)
 
     def glance(self, program: str) -> str:
         """Run a program that does not end until it prints a line; return that line."""
@@ -128,6 +136,10 @@ def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
     plan, plan_end = until(list(blocks(PLAN)), "fleet down")
     programs, plot = until(list(blocks(PYTHON)), "fleet down")
     readme, export = until(list(blocks(README)), "fleet sessions export")
+    start, first = until(first, "fleet list")
+    newcomer.follow(*start)
+    # A person types slower than a busy machine starts the coordinator.
+    wait_for(lambda: newcomer.succeeds("fleet why"), "a plan in force", 120.0)
     printed = newcomer.follow(*first)
     try:
         assert [line.split()[0] for line in printed["fleet list"].splitlines()[1:]] == ["blue", "green", "red"]
