@@ -5,6 +5,7 @@ docs/reference/protocol.md#blocking-times. Pages of docs/ link to each other wit
 the repository with the address of its `main`. README.md has addresses only: package indexes show it, too.
 """
 
+import ast
 import re
 import tomllib
 from collections import Counter
@@ -16,6 +17,7 @@ from typing import Any, Final
 
 import pytest
 
+from tests.test_style import PRODUCT, parsed, source_files
 from tests.tools.site import CONFIGURATION, FROM_TOP
 
 ROOT: Final = Path(__file__).parent.parent
@@ -179,6 +181,31 @@ def test_words_are_plain(page: Path) -> None:
     faults += [word for word in refused if re.search(rf"\b{re.escape(word)}s?\b", text, re.IGNORECASE)]
     if "<!-- begin" not in page.read_text(encoding="utf-8") and page.parent != CLI:
         faults += BRITISH.findall(text)
+    assert faults == []
+
+
+def messages(tree: ast.Module) -> Iterator[str]:
+    """Yield the texts in a module that are no docstrings; X stands for a value in a text."""
+    parts: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            parts |= {id(each) for each in node.values}
+            yield "".join(str(each.value) if isinstance(each, ast.Constant) else "X" for each in node.values)
+        elif isinstance(node, ast.Expr):
+            parts.add(id(node.value))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in parts:
+            yield node.value
+
+
+def test_messages_are_plain() -> None:
+    faults = []
+    for path in source_files(*PRODUCT):
+        for text in messages(parsed(path)):
+            found = [match[0] for match in NOUNS.finditer(text)]
+            pieces = re.split(r"\n\s*\n|\n  |(?<=[.!?;:])\s+", text)
+            found += [piece for piece in pieces if len(piece.split()) > MAX_WORDS]
+            faults += [f"{path.relative_to(ROOT)}: {each}" for each in found]
     assert faults == []
 
 

@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME:PLATFORM:LINK",
         help="PLATFORM: arduino, stm32 or raspberry_pi, with +arm, +imu; LINK: pty, pty:PATH or tcp://HOST:PORT",
     )
-    parser.add_argument("--seed", type=int, default=0, help="same seed and same bytes: same behaviour (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="same seed and same bytes: same behavior (default: 0)")
     parser.add_argument(
         "--world",
         metavar="WORLD",
