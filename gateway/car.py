@@ -190,6 +190,9 @@ class CarGateway:
             self._control.link_down("the gateway was ended twice", self._loop.time())
         self._ending = True
         self._control.shut_down(self._loop.time())
+        if not self._control.stops.finished:
+            words = "%s: stopping. It takes up to %g s until the car confirms it. A second Ctrl-C ends at once."
+            log.info(words, self._settings.car, SHUTDOWN_S)
         self._wake.set()
 
     async def _check_rival(self) -> None:

@@ -88,15 +88,13 @@ def expand(expression: str, fleet: str = DEFAULT_FLEET) -> str:
     text = expression.strip("/")
     if not text or "//" in text or set(text) & set("#? \t\n"):
         raise BadKey(
-            f"key expression {expression!r} is not allowed: chunks separated by single /, "
-            "* for one chunk, ** for any number; for example red, red/sensor/range or '*/sensor/battery'"
+            f'"{expression}" is not a key. Write parts with one / between: red, red/sensor/range, '
+            "'*/sensor/battery' (* is one part, ** any number)."
         )
     chunks = text.split("/")
     for chunk in chunks:
         if "*" in chunk.replace("$*", "") and chunk not in ("*", "**"):
-            raise BadKey(
-                f"key expression {expression!r} is not allowed: * and ** stand alone between /, inside a chunk write $*"
-            )
+            raise BadKey(f'"{expression}" is not a key. * and ** stand alone between /; within a part write $*.')
     if chunks[0] in (fleet, "**"):
         chunks = chunks[1:] if chunks[0] == fleet else chunks
         if not chunks:

@@ -7,7 +7,6 @@ checked by the gateway's state.
 
 import errno
 import os
-import re
 import socket
 import stat
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from fleet.fleetfile.fleet_file import FleetCar
 from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link
 from gateway.protocol.platforms import Platform
 from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
+from schemas.process import port_lock
 
 if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo
@@ -28,8 +28,6 @@ HOST_TIMEOUT_S: Final = 3.0
 """Timeout for the reply of a host."""
 CLOSED_PORT: Final = 9
 """A TCP port without a listener (discard): a reachable host refuses a connection at once."""
-_LOCK: Final = re.compile(r"FLOCK .* (?P<pid>-?\d+) (?P<major>[0-9a-f]+):(?P<minor>[0-9a-f]+):(?P<inode>\d+) ")
-_LOCKS: Final = Path("/proc/locks")
 _BRIDGED_PLATFORMS: Final = (Platform.ARDUINO, Platform.STM32)
 """Platforms without a network: their TCP port belongs to a bridge, which outlives its clients."""
 
@@ -94,10 +92,10 @@ def check_device(path: str) -> tuple[bool, str]:
     if not os.access(path, os.R_OK | os.W_OK):
         group = _group_name(file_stat.st_gid)
         return False, f"no permission: join the group {group} (sudo usermod -aG {group} $USER), then log in again"
-    holder = _lock_holder(file_stat)
+    holder = port_lock.find_holder(file_stat)
     if holder is not None:
-        return False, f"in use by another program{holder}: end that first"
-    free = "free" if _LOCKS.exists() else "whether it is free is not known here"
+        return False, f"in use by {holder}. Stop that first."
+    free = "free" if port_lock.LOCKS.exists() else "whether it is free is not known here"
     return True, f"there, permitted, {free}; not opened, which can reset a car"
 
 
@@ -110,20 +108,6 @@ def _group_name(number: int) -> str:
         return grp.getgrgid(number).gr_name
     except KeyError:
         return str(number)
-
-
-def _lock_holder(file_stat: os.stat_result) -> str | None:
-    """Return which process has locked a device, as gateways do; None if none has, or it is unknown (not Linux)."""
-    try:
-        locks = _LOCKS.read_text(encoding="ascii", errors="replace")
-    except OSError:
-        return None
-    place = (os.major(file_stat.st_dev), os.minor(file_stat.st_dev), file_stat.st_ino)
-    for line in locks.splitlines():
-        lock = _LOCK.search(line)
-        if lock and (int(lock["major"], 16), int(lock["minor"], 16), int(lock["inode"])) == place:
-            return f" (process {lock['pid']})" if int(lock["pid"]) > 0 else ""
-    return None
 
 
 def _list_ports() -> "list[ListPortInfo]":

@@ -84,10 +84,10 @@ def parse(request: ParsedRequest) -> Command:
     verb = request.verb
     blank = Command(_id(request), verb, Sender(), Stop(), asked_ns=request.now_ns, streamed=request.streamed)
     if verb not in COMMANDS:
-        words = f"{verb!r} is no command; there are: {', '.join(COMMANDS)}"
+        words = f"{verb!r} is no command. Commands: {', '.join(COMMANDS)}"
         raise BadRequest(Reason.UNSUPPORTED, words, blank)
     if request.by_wildcard and verb not in WILDCARD_VERBS:
-        words = f"{verb} cannot be asked by wildcard: name one car (only {', '.join(WILDCARD_VERBS)} can)"
+        words = f"{verb} takes no wildcard: name one car (only {', '.join(WILDCARD_VERBS)} take one)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
     if request.unread:
         if verb not in STOPS:
@@ -107,7 +107,7 @@ def parse(request: ParsedRequest) -> Command:
 def _stop_anyway(command: Command, words: str, request: ParsedRequest) -> Command:
     """Return the stop of an invalid stop or e-stop: the car stops whatever the error is."""
     what = Stop() if request.verb == "stop" else _readable_estop(request)
-    return replace(command, what=what, note=f"the stop is carried out all the same: {words}")
+    return replace(command, what=what, note=f"the gateway stops the car in spite of an error: {words}")
 
 
 def _id(request: ParsedRequest) -> str:
@@ -191,7 +191,7 @@ def _word(field: str, value: str, kind: Any) -> Any:
     try:
         return kind(value)
     except ValueError:
-        problem = f"{field} {value!r}" if value else f"no {field} given"
+        problem = f"{field} {value!r}" if value else f"{field} is missing"
         raise ValueError(f"{problem}: allowed are {', '.join(kind)}") from None
 
 
@@ -215,7 +215,7 @@ def _mode(message: Any) -> Action:
 def _led(message: Any) -> Action:
     missing = [name for name in "rgb" if not message.HasField(name)]
     if missing:
-        raise ValueError(f"no {', '.join(missing)} given: r, g and b are needed, 0..255 each")
+        raise ValueError(f"{', '.join(missing)} is missing: r, g and b are needed, 0..255 each")
     return _checked(ColorLed(message.r, message.g, message.b))
 
 
@@ -236,7 +236,7 @@ def _servo(message: Any) -> Action:
         raise ValueError(f"servo {servo!r}: allowed are {', '.join(_SERVO_ACTIONS)}")
     if message.HasField("deg"):
         if servo != "front" or message.action:
-            raise ValueError("deg: only the front servo takes degrees, and no action beside them")
+            raise ValueError("deg: only the front servo takes degrees, and then no action")
         return _checked(Ptz(message.deg))
     if message.action not in _SERVO_ACTIONS[servo]:
         raise ValueError(

@@ -139,7 +139,7 @@ class BleLink(Link):
         self._claim = self._claim or _claim(self._url, device.address)
         client = BleakClient(device, self._on_disconnected)
         self._stage = (
-            f"{device.address} is there, but does not connect: is a phone or another computer connected to it?"
+            f"{device.address} is there, but does not connect. Is a phone or another computer connected to it?"
         )
         try:
             await client.connect()
@@ -154,9 +154,9 @@ class BleLink(Link):
         chosen = choose(client.services)
         if chosen is None:
             there = _listed(sorted(service.uuid for service in client.services)) or "none"
-            raise CannotOpen(f"{self._url}: it has no UART service that is known (FFE0, Nordic's), but: {there}")
+            raise CannotOpen(f"{self._url}: no known UART service (FFE0, Nordic's). It has: {there}")
         from_car, self._to_car = chosen
-        self._stage = f"{address} is connected, but its notifications do not begin: switch it off and on again"
+        self._stage = f"{address} is connected, but sends nothing. Switch it off and on again."
         await client.start_notify(from_car, self._on_notification)
         if self._lost is not None:
             raise CannotOpen(f"{self._lost}, while it was opened")
@@ -187,7 +187,7 @@ class BleLink(Link):
                 await asyncio.wait({pieces}, timeout=BLE_WRITE_TIMEOUT_S)
             finally:
                 if not pieces.done():
-                    self._lose(f"{self._url} takes no bytes: out of range, or stuck?")
+                    self._lose(f"{self._url} accepts no bytes: out of range, or stuck?")
                     await asyncio.wait({pieces})
             if not pieces.cancelled() and (error := pieces.exception()) is not None:
                 self._lose(f"{self._url} is gone: {_cause(error)}")
@@ -235,7 +235,7 @@ class BleLink(Link):
             self._data += data
             self._came.set()
             if len(self._data) > MAX_BUFFERED_BYTES:
-                self._lose(f"{self._url} sends more than is read: {MAX_BUFFERED_BYTES} bytes wait")
+                self._lose(f"{self._url} sends faster than the gateway reads: {MAX_BUFFERED_BYTES} bytes wait")
 
     def _on_disconnected(self, client: BleakClient) -> None:
         if client is self._client:  # not a client that we have disconnected
@@ -301,17 +301,16 @@ def _claim(url: BleUrl, address: str) -> socket.socket | None:
     except OSError as error:
         claim.close()
         if error.errno == errno.EADDRINUSE:
-            raise Busy(f"{url}: {address} is in use by another program (a second gateway?): end that first") from None
+            raise Busy(f"{url}: {address} is in use by another program (a second gateway?). Stop that first.") from None
         raise
     return claim
 
 
 def _not_found(url: BleUrl, others: Mapping[str, str]) -> str:
-    hint = ": macOS tells no addresses, give the UUID of `gateway scan`, or ble://name=" if _is_mac_without(url) else ""
+    hint = " (macOS has no addresses: use the UUID of `fleet scan`, or ble://name=)" if _is_mac_without(url) else ""
     there = _listed(f"{address} ({name})" for address, name in others.items())
-    return f"no such device was heard{hint}: is it on, in range, and no phone connected to it? " + (
-        f"There are: {there}" if there else "No other UART module was heard either"
-    )
+    found = f"Found: {there}." if there else "No other car module was found."
+    return f"no such device found{hint}. Is it on, in range, and no phone connected to it? {found}"
 
 
 def _is_mac_without(url: BleUrl) -> bool:

@@ -20,6 +20,7 @@ import serial
 from gateway.link.base import CLOSE_S, Busy, CannotOpen, Link, LinkLost
 from gateway.link.usb import UsbSerialPort, check_same_device, choose, list_usb_ports, port_at
 from schemas.links import SerialUrl, UsbUrl
+from schemas.process import port_lock
 
 SERIAL_WRITE_TIMEOUT_S: Final = 0.25
 """Timeout of pyserial's own write, used on Windows only."""
@@ -291,16 +292,24 @@ def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
     code = getattr(error, "errno", None)
     which = f"{url}: " if isinstance(url, SerialUrl) else f"{url}: {path}: "
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return f"{which}there is no such port; {_ports()}"
+        windows = " (COM... is Windows)" if path.upper().startswith("COM") and os.name == "posix" else ""
+        return f"{which}no such port on this computer{windows}. {_ports()}"
     if code in (errno.EACCES, errno.EPERM):
-        return f"{which}no permission; {_group(path)}"
+        return f"{which}no permission. {_group(path)}"
     if code in _BUSY:
-        return f"{which}the port is in use by another program (a second gateway?): end that one first"
+        return f"{which}in use by {_holder(path)}. Stop that first."
     if code == errno.EISDIR or os.path.isdir(path):  # noqa: PTH112 - a device path, not a file to work with
-        return f"{which}this is a directory, not a serial port; {_ports()}"
+        return f"{which}this is a directory, not a serial port. {_ports()}"
     if not isinstance(error, ValueError) and os.path.exists(path):  # noqa: PTH110 - likewise
-        return f"{which}this is not a serial port ({_cause(error)}); {_ports()}"
-    return f"{which}the port cannot be opened ({_cause(error)}); {_ports()}"
+        return f"{which}this is not a serial port ({_cause(error)}). {_ports()}"
+    return f"{which}the port cannot be opened ({_cause(error)}). {_ports()}"
+
+
+def _holder(path: str) -> str:
+    try:
+        return port_lock.find_holder(os.stat(path)) or "another program"  # noqa: PTH116 - a device path
+    except (OSError, ValueError):
+        return "another program"
 
 
 def _why_gone(error: Exception) -> str:
@@ -333,7 +342,7 @@ def _ports() -> str:
         found = sorted(port.device for port in list_usb_ports())
     except CannotOpen as error:
         return str(error)
-    return f"there are: {', '.join(found)}" if found else "no serial port is plugged in"
+    return f"Found: {', '.join(found)}. `fleet scan` checks them." if found else "No serial port is plugged in."
 
 
 def _group(path: str) -> str:
@@ -342,8 +351,8 @@ def _group(path: str) -> str:
 
         group = grp.getgrgid(os.stat(path).st_gid).gr_name  # noqa: PTH116 - a device path, not a file to work with
     except (ImportError, OSError, KeyError):
-        return "ask for access to the port"
-    return f"it belongs to group {group}: `sudo usermod -aG {group} $USER`, then log in again"
+        return "Ask the administrator for access to the port."
+    return f"It belongs to group {group}: `sudo usermod -aG {group} $USER`, then log in again"
 
 
 def _exclusive() -> bool | None:

@@ -57,7 +57,7 @@ class TcpLink(asyncio.Protocol, Link):
             raise LinkLost(self._lost or f"{self._url} is closed")
         if transport.get_write_buffer_size():
             # The buffered frame would go out together with this one, and a car obeys only the first in a segment.
-            self._lost = f"{self._url} takes no bytes: the car or its bridge has stopped reading"
+            self._lost = f"{self._url} accepts no bytes: the car or its bridge has stopped reading"
             self._came.set()
             transport.abort()
             raise LinkLost(self._lost)
@@ -110,7 +110,7 @@ class TcpLink(asyncio.Protocol, Link):
         why = "the car closed it" if exc is None else _cause(exc)
         if not self._has_received and (exc is None or isinstance(exc, ConnectionResetError)):
             # A car serves one client and rejects the next.
-            why += " before it sent anything: perhaps its gateway, or another program, has it"
+            why += " before it sent anything. Perhaps another gateway or program is connected to it."
         self._lost = self._lost or f"{self._url} is gone: {why}"
         self._came.set()
         self._ended.set()
@@ -122,13 +122,13 @@ async def open_tcp(url: TcpUrl, timeout_s: float) -> Link:
         async with asyncio.timeout(timeout_s):
             return await connect_first(url, await _look_up(url))
     except TimeoutError:
-        raise CannotOpen(f"{url}: no answer within {timeout_s:g} s: is the car on, and in this network?") from None
+        raise CannotOpen(f"{url}: no answer within {timeout_s:g} s. Is the car on, and in this network?") from None
     except (socket.gaierror, UnicodeError):  # UnicodeError: a label too long for a host name
-        raise CannotOpen(f"{url}: there is no host {url.host!r}: check the name, or give its address") from None
+        raise CannotOpen(f"{url}: there is no host {url.host!r}. Check the name, or use its address.") from None
     except ConnectionRefusedError:
         reason = (
-            "nothing listens on that port (a Raspberry Pi car's program dies with its last client: its motors stay as "
-            "they were and nothing can reach them, so look whether it drives, switch it off, restart the program there)"
+            "nothing listens on that port. If its program died (Raspberry Pi), the car may be driving: look at it, "
+            "switch it off, and restart its program."
         )
         raise CannotOpen(f"{url}: {reason}") from None
     except OSError as error:

@@ -94,6 +94,6 @@ def test_a_stop_with_a_broken_payload_stops(fleet: FleetProcesses) -> None:
     began = time.monotonic()
     answer = fleet.ask("stop", kind="boss", sender="a/b")
     assert answer["status"] in TAKEN
-    assert "the stop is carried out all the same: stop: sender 'a/b' is not allowed" in answer["words"]
+    assert "the gateway stops the car in spite of an error: stop: sender 'a/b' is not allowed" in answer["words"]
     wait_for(lambda: not driving(sim), "it stands")
     assert time.monotonic() - began < 8

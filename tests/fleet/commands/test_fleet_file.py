@@ -190,7 +190,7 @@ def test_a_port_that_somebody_has(command: Command, port: Port, tmp_path: Path) 
     done = command("check")
     if Path("/proc/locks").exists():
         assert done.returncode == 1
-        assert "in use by another program" in done.stdout
+        assert f"in use by process {os.getpid()} (" in done.stdout
         fcntl.flock(port.device, fcntl.LOCK_UN)
         assert "there, permitted, free" in command("check").stdout
     else:

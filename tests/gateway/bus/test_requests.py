@@ -115,11 +115,11 @@ def test_every_verb_of_the_table_is_known_here() -> None:
 @pytest.mark.parametrize(
     ("verb", "payload", "reason", "words"),
     [
-        ("jump", {}, Reason.UNSUPPORTED, "'jump' is no command; there are: drive, "),
+        ("jump", {}, Reason.UNSUPPORTED, "'jump' is no command. Commands: drive, "),
         ("", {}, Reason.UNSUPPORTED, "'' is no command"),
         ("drive", None, Reason.BAD_VALUE, "drive without a payload: give fleet.v1.DriveCommand or its JSON"),
         ("resume", None, Reason.BAD_VALUE, "only stop and estop need none"),
-        ("drive", {}, Reason.BAD_VALUE, "no motion given: allowed are stop, forward, "),
+        ("drive", {}, Reason.BAD_VALUE, "motion is missing: allowed are stop, forward, "),
         ("drive", {"motion": "Forward"}, Reason.BAD_VALUE, "motion 'Forward': allowed are "),
         ("drive", {"motion": "forward", "duration_s": 0}, Reason.BAD_VALUE, "duration_s 0: allowed are more than 0"),
         ("drive", {"motion": "forward", "duration_s": -1}, Reason.BAD_VALUE, "duration_s -1"),
@@ -136,19 +136,19 @@ def test_every_verb_of_the_table_is_known_here() -> None:
         ("drive", {"motion": "forward", "sender": "a\nb"}, Reason.BAD_VALUE, "no control characters"),
         ("drive", {"motion": "forward", "id": "x" * 129}, Reason.BAD_VALUE, "id of 129 characters is too long"),
         ("mode", {"mode": "parking"}, Reason.BAD_VALUE, "mode 'parking': allowed are manual, "),
-        ("led", {"r": 1, "b": 1}, Reason.BAD_VALUE, "no g given: r, g and b are needed, 0..255 each"),
+        ("led", {"r": 1, "b": 1}, Reason.BAD_VALUE, "g is missing: r, g and b are needed, 0..255 each"),
         ("led", {"r": 1, "g": 256, "b": 1}, Reason.BAD_VALUE, "g: 256, allowed are whole numbers 0..255"),
         ("light", {"light": "pink"}, Reason.BAD_VALUE, "light 'pink'"),
         ("servo", {}, Reason.BAD_VALUE, "allowed are left, right, reset, or deg 0..180"),
         ("servo", {"deg": 181}, Reason.BAD_VALUE, "deg: 181, allowed are whole numbers 0..180"),
         ("servo", {"deg": -1}, Reason.BAD_VALUE, "deg"),
-        ("servo", {"deg": 9, "action": "left"}, Reason.BAD_VALUE, "no action beside them"),
+        ("servo", {"deg": 9, "action": "left"}, Reason.BAD_VALUE, "and then no action"),
         ("servo", {"servo": "vertical", "deg": 9}, Reason.BAD_VALUE, "only the front servo takes degrees"),
         ("servo", {"servo": "vertical", "action": "left"}, Reason.BAD_VALUE, "allowed are up, down, reset"),
         ("servo", {"servo": "rear", "action": "left"}, Reason.BAD_VALUE, "servo 'rear'"),
         ("arm", {"joint_deg": [1, 2]}, Reason.BAD_VALUE, "joint_deg: 2 values, allowed are 6"),
         ("arm", {"joint_deg": [1, 2, 3, 4, 5, 999]}, Reason.BAD_VALUE, "joint_deg[5]: 999"),
-        ("speed", {}, Reason.BAD_VALUE, "no step given: allowed are up, down"),
+        ("speed", {}, Reason.BAD_VALUE, "step is missing: allowed are up, down"),
         ("fan", {"state": "fast"}, Reason.BAD_VALUE, "allowed are on, off, or none to toggle"),
     ],
 )
@@ -172,7 +172,7 @@ def test_what_is_no_command_is_refused_with_words(verb: str, payload: Any, reaso
 def test_a_stop_is_a_stop_whatever_is_wrong_with_its_words(payload: Any, words: str) -> None:
     stop = ask("stop", payload)
     assert stop.what == Stop()
-    assert stop.note.startswith("the stop is carried out all the same: stop: ")
+    assert stop.note.startswith("the gateway stops the car in spite of an error: stop: ")
     assert words in stop.note
     assert ask("estop", payload).what == EmergencyStop()
 
@@ -181,7 +181,7 @@ def test_a_stop_is_a_stop_whatever_is_wrong_with_its_words(payload: Any, words: 
 def test_an_e_stop_in_which_something_is_wrong_keeps_its_scope_and_its_reason(wrong: dict[str, Any]) -> None:
     stop = ask("estop", {"why": "smoke", "scope": "fleet", **wrong})
     assert stop.what == EmergencyStop("smoke", fleet_wide=True)
-    assert "the stop is carried out all the same" in stop.note
+    assert "the gateway stops the car in spite of an error" in stop.note
     as_message = pb.EstopCommand(why="smoke", scope="fleet", kind="boss").SerializeToString()
     assert ask("estop", as_message, f"{PROTOBUF};fleet.v1.EstopCommand").what == EmergencyStop("smoke", fleet_wide=True)
 
@@ -230,7 +230,7 @@ def test_another_verbs_message_is_refused() -> None:
 def test_zero_bytes_are_a_message_without_fields(encoding: str) -> None:
     assert ask("whistle", b"", encoding).what == general(whistle=True)
     assert ask("stop", b"", encoding).what == Stop()
-    assert "no motion given" in refused("drive", b"", encoding).words
+    assert "motion is missing" in refused("drive", b"", encoding).words
 
 
 @pytest.mark.parametrize("verb", COMMANDS)
@@ -238,7 +238,7 @@ def test_only_stop_estop_and_resume_may_be_asked_by_wildcard(verb: str) -> None:
     if verb in ("stop", "estop", "resume"):
         assert ask(verb, {}, by_wildcard=True).verb == verb
     else:
-        assert "cannot be asked by wildcard: name one car" in refused(verb, {}, by_wildcard=True).words
+        assert "takes no wildcard: name one car" in refused(verb, {}, by_wildcard=True).words
 
 
 @pytest.mark.parametrize(
@@ -315,5 +315,5 @@ def test_what_was_not_read_is_refused_and_a_stop_is_obeyed() -> None:
     error = refused("drive", None, unread="it is too large")
     assert (error.reason, error.words) == (Reason.BAD_VALUE, "drive: it is too large")
     stop = ask("stop", None, unread="it is too large")
-    assert (stop.what, stop.note) == (Stop(), "the stop is carried out all the same: it is too large")
+    assert (stop.what, stop.note) == (Stop(), "the gateway stops the car in spite of an error: it is too large")
     assert ask("estop", None, unread="it is too large", by_wildcard=True).what == EmergencyStop()

@@ -122,22 +122,22 @@ async def refused(url: LinkUrl, timeout_s: float = 20.0) -> str:
 
 
 async def test_a_serial_port_that_cannot_be_opened(tmp_path: Path) -> None:
-    assert "there is no such port; " in await refused(SerialUrl(str(tmp_path / "ttyUSB9")))
-    assert "there is no such port; " in await refused(SerialUrl(str(tmp_path / "no" / "ttyUSB9")))
-    assert "this is a directory, not a serial port; " in await refused(SerialUrl(str(tmp_path)))
+    assert "no such port on this computer" in await refused(SerialUrl(str(tmp_path / "ttyUSB9")))
+    assert "no such port on this computer" in await refused(SerialUrl(str(tmp_path / "no" / "ttyUSB9")))
+    assert "this is a directory, not a serial port. " in await refused(SerialUrl(str(tmp_path)))
     regular = tmp_path / "file"
     regular.write_text("not a port")
     assert "this is not a serial port (" in await refused(SerialUrl(str(regular)))
     assert "this is not a serial port (" in await refused(SerialUrl("/dev/null"))
-    assert "there is no such port; " in await refused(SerialUrl("COM99"))
-    assert "the port cannot be opened (embedded null byte); " in await refused(SerialUrl("/dev/tty\0"))
+    assert "no such port on this computer" in await refused(SerialUrl("COM99"))
+    assert "the port cannot be opened (embedded null byte). " in await refused(SerialUrl("/dev/tty\0"))
     await no_threads()
 
 
 async def test_a_port_that_another_program_has(tmp_path: Path) -> None:
     peer = PtyPeer(tmp_path)
     with serial.Serial(str(tmp_path / "tty"), exclusive=True):
-        assert "in use by another program (a second gateway?): end that one first" in await refused(peer.url)
+        assert f"in use by process {os.getpid()} (" in await refused(peer.url)
     link = await open_link(peer.url)
     await link.close()
     peer.close()
@@ -173,7 +173,7 @@ def test_a_port_that_we_may_not_open_names_its_group(tmp_path: Path) -> None:
     )
     assert done.stderr == ""
     assert done.stdout == (
-        f"serial://{port}: no permission; it belongs to group {group}: "
+        f"serial://{port}: no permission. It belongs to group {group}: "
         f"`sudo usermod -aG {group} $USER`, then log in again\n"
     )
     peer.close()
@@ -183,8 +183,11 @@ async def test_a_tcp_car_that_cannot_be_reached() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # bound, not listening: refused, and nobody else gets the port
         words = await refused(TcpUrl("127.0.0.1", taken.getsockname()[1]))
-        assert "nothing listens on that port (a Raspberry Pi car's program dies with its last client" in words
-    assert "there is no host 'no.such.car.invalid': check the name" in await refused(TcpUrl("no.such.car.invalid", 1))
+        assert (
+            "nothing listens on that port. If its program died (Raspberry Pi), the car may be driving: look at it"
+            in words
+        )
+    assert "there is no host 'no.such.car.invalid'. Check the name" in await refused(TcpUrl("no.such.car.invalid", 1))
     assert "there is no host" in await refused(TcpUrl("a" * 64, 8888))
     assert "there is no host" in await refused(TcpUrl("a..b", 8888))
 
@@ -268,7 +271,7 @@ def test_a_name_server_that_does_not_answer_holds_one_thread_and_not_the_end_of_
     done = subprocess.run(
         [sys.executable, "-c", WITH_A_SILENT_NAME_SERVER], capture_output=True, text=True, timeout=60, check=False
     )
-    words = "tcp://car.local:8888: no answer within 0.1 s: is the car on, and in this network?\n"
+    words = "tcp://car.local:8888: no answer within 0.1 s. Is the car on, and in this network?\n"
     assert (done.stdout, done.stderr) == (3 * words + "1\n", "")
 
 
@@ -303,7 +306,7 @@ async def test_a_tcp_car_that_does_not_answer() -> None:
             each.connect_ex(where)
             waiting.append(each)
         words = await refused(TcpUrl(*where), timeout_s=0.5)
-        assert words.endswith("no answer within 0.5 s: is the car on, and in this network?")
+        assert words.endswith("no answer within 0.5 s. Is the car on, and in this network?")
         for each in waiting:
             each.close()
 

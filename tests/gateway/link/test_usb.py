@@ -174,7 +174,7 @@ async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: 
     with pytest.raises(CannotOpen, match=f"another device is there, {path(peer)}, of which the system says nothing;"):
         await open_link(peer.url)
     peer.close()
-    with pytest.raises(CannotOpen, match="there is no such port"):
+    with pytest.raises(CannotOpen, match="no such port on this computer"):
         await open_link(peer.url)
 
 
@@ -192,7 +192,10 @@ async def test_its_port_has_an_error_of_its_own(tmp_path: Path, plug: Usb) -> No
     plug(UsbSerialPort(gone, 1, 2, "3"))
     with pytest.raises(CannotOpen) as caught:
         await open_link(UsbUrl(serial="3"))
-    assert str(caught.value) == f"serial://?serial=3: {gone}: there is no such port; there are: {gone}"
+    assert (
+        str(caught.value)
+        == f"serial://?serial=3: {gone}: no such port on this computer. Found: {gone}. `fleet scan` checks them."
+    )
 
 
 async def test_a_path_by_id_leads_to_the_port_that_the_device_has_now(tmp_path: Path) -> None:

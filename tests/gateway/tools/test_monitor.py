@@ -245,7 +245,7 @@ def test_a_link_that_cannot_be_had_leaves_no_file(command: Command, tmp_path: Pa
     kept = tmp_path / "kept"
     done = command("monitor", "--link", "/dev/nope", "--raw", kept)
     assert done.returncode == 1
-    assert done.stderr.startswith("gateway monitor: serial:///dev/nope: there is no such port")
+    assert done.stderr.startswith("gateway monitor: serial:///dev/nope: no such port")
     assert len(done.stderr.splitlines()) == 1
     assert not kept.exists()
 

@@ -164,7 +164,7 @@ def test_a_link_that_is_not_there_fails_and_the_others_are_shown(
     found, done = _scan(command, "/dev/nope", link, more=("--for", "4"))
     assert done.returncode == 1
     assert found["serial:///dev/nope"]["verdict"] == "failed"
-    assert "there is no such port" in found["serial:///dev/nope"]["words"]
+    assert "no such port" in found["serial:///dev/nope"]["words"]
     assert found[link]["verdict"] == "car"
     assert done.stderr == "gateway scan: could not listen to serial:///dev/nope\n"
 

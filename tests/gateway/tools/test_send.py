@@ -116,7 +116,7 @@ def test_a_link_that_cannot_be_had_is_one_line(command: Command) -> None:
     done = command("send", "--link", "/dev/nope", STOP)
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
-    assert "there is no such port" in done.stderr
+    assert "no such port" in done.stderr
 
 
 def test_a_tcp_car_that_nothing_could_stop_is_not_set_going(command: Command) -> None:
