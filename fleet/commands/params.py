@@ -19,7 +19,7 @@ from fleet.commands.group import did_you_mean
 from fleet.recording.session_dir import is_session
 from schemas import keys
 from schemas.bus import Bus, canon
-from schemas.colors import parse_color
+from schemas.colors import COLORS, parse_color
 from schemas.duration import parse_duration
 
 N = TypeVar("N", bound=float)
@@ -149,12 +149,14 @@ class Color(click.ParamType[tuple[int, int, int]]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int, int]:
         """Return three numbers, 0..255."""
-        if isinstance(value, tuple):
-            return value
         try:
-            return parse_color(str(value))
+            return value if isinstance(value, tuple) else parse_color(str(value))
         except ValueError as error:
             self.fail(str(error), param, ctx)
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's
+        """Return names of colors."""
+        return [CompletionItem(name) for name in COLORS if name.startswith(incomplete)]
 
 
 class SessionPath(click.ParamType[Path]):

@@ -83,7 +83,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("mode red track", '"track" is not a mode. Did you mean tracking?'),
         ("led red blu", '"blu" is not a color. Did you mean blue?'),
         ("led red #ff00", '"#ff00" is not a color. Choose from: red, green, '),
-        ("light red pink", '"pink" is not a color. Choose from: '),
+        ("light red pnik", '"pnik" is not a color. Did you mean pink?'),
         ("servo red middle left", '"middle" is not a servo. Choose from: front, vertical, horizontal.'),
         ("servo red front 181", "deg 181 is not allowed: a whole number, 0 to 180"),
         ("servo red front \u0669", "'\u0669' is not allowed for servo front: left, right, reset or 0 to 180"),

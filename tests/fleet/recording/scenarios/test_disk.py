@@ -334,7 +334,7 @@ def test_a_file_in_the_way_is_one_line(endpoint: str, tmp_path: Path) -> None:
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert len(errors.splitlines()) == 1
-    assert "name another with --out" in errors
+    assert "Name another place with --sessions." in errors
 
 
 def test_it_is_stopped_started_and_marked_over_the_bus(endpoint: str, bus: Bus, tmp_path: Path) -> None:

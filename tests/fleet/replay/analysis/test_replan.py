@@ -146,7 +146,7 @@ def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp
 
 
 def test_a_session_without_cars_that_were_decided_on_is_refused(recorded: Path, tmp_path: Path) -> None:
-    for source, out, more in ((recorded, "red", ["--cars", "red"]), (tmp_path / "red", "part", ["--from", "1s"])):
+    for source, out, more in ((recorded, "red", ["--car", "red"]), (tmp_path / "red", "part", ["--from", "1s"])):
         assert run("sessions", "cut", source, *more, "--out", tmp_path / out).exit_code == 0
         result = run("plan", "try", tmp_path / out)
         assert result.exit_code == 1
