@@ -5,6 +5,7 @@ that starts takes seconds.
 """
 
 import re
+import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,8 @@ PLAN: Final = ROOT / "docs/tutorials/3-two-cars-one-plan.md"
 PYTHON: Final = ROOT / "docs/tutorials/4-sensors-from-python.md"
 DRIVE: Final = ROOT / "docs/how-to/drive-from-python.md"
 TRIED: Final = (README, FIRST, OWN_CAR, PLAN, PYTHON, DRIVE)
+
+LEFT_OUT: Final = (".git", ".venv", ".cache", ".tmp", ".state", "sessions", ".hypothesis", "*_cache", "__pycache__")
 
 NOT_RUN: Final = {
     "git clone https://github.com/zenoh-car-fleet/zenoh-car-fleet.git": "this checkout is the clone",
@@ -169,3 +172,14 @@ def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
         for command in commands(body)
     }
     assert every - newcomer.typed == set(NOT_RUN), "neither run, nor in the list with a reason"
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+def test_make_demo_on_a_machine_that_has_nothing(tmp_path: Path) -> None:
+    """Its first command sets everything up."""
+    clone = tmp_path / "zenoh-car-fleet"
+    shutil.copytree(ROOT, clone, ignore=shutil.ignore_patterns(*LEFT_OUT))
+    done = subprocess.run(["make", "demo"], cwd=clone, capture_output=True, text=True, timeout=800, check=False)
+    assert done.returncode == 0, (done.stdout, done.stderr)
+    assert re.search(r"(\d+) of \1 checks passed", done.stdout)
