@@ -1,7 +1,7 @@
 """`stop` at random moments in every mode and load: the longest announced, and the worst that the motors showed.
 
 On virtual time, so a figure is the same on every machine. `make vectors` writes the same distribution into
-tests/vectors/stops.tsv for the README; the soak plays more moments.
+tests/vectors/stops.tsv for docs/reference/stopping-times.md; the soak plays more moments.
 """
 
 from tests.bench.measured import Measured, Scale

@@ -46,6 +46,9 @@ NOT_RUN: Final = {
 }
 """Commands of README and tutorials that this test does not run, and why."""
 
+DIFFERENCES: Final = {"fleet plan try latest plan.yaml": 1}
+"""Commands with a second exit code: the plan of the tutorial may decide otherwise than those before it."""
+
 Block = tuple[str, str, str]
 """A block of code: its language, its title and its text."""
 
@@ -76,7 +79,8 @@ class Newcomer:
             self.place = self.place / command.removeprefix("cd ")
             return ""
         done = self._run(command)
-        assert done.returncode == 0, (command, done.stdout, done.stderr)
+        assert done.returncode in (0, DIFFERENCES.get(command)), (command, done.stdout, done.stderr)
+        assert "Traceback" not in done.stderr, done.stderr
         return done.stdout
 
     def succeeds(self, command: str) -> bool:
@@ -160,7 +164,9 @@ def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
     finally:
         down = newcomer.type("fleet down")
     assert all(car in down for car in ("red", "green", "blue"))
-    newcomer.follow(*(block for block in (*end, *plan_end, *export, *plot) if "fleet down" not in block[2]))
+    newcomer.follow(
+        *((kind, title, body.replace("fleet down\n", "")) for kind, title, body in (*end, *plan_end, *export, *plot))
+    )
     assert (newcomer.place / "session.rrd").stat().st_size > 10_000
     assert (newcomer.place / "distance.png").stat().st_size > 1_000
     assert list((newcomer.place / "tables").glob("*.csv"))

@@ -1,6 +1,6 @@
 """`stop` at random moments in every mode and load: what is played, and what the simulated car's motors say of it.
 
-`rows` gives the distribution per state, for the soak's table and for whoever wants the numbers (the README's page on
+`rows` gives the distribution per state, for the soak's table and for whoever wants the numbers (the page on
 what happens when). A state is what control can tell apart; many loads lead to each.
 """
 

@@ -1,4 +1,4 @@
-"""tests/vectors/stops.tsv: the distribution of stops, of which the README tells; `make vectors` writes it.
+"""tests/vectors/stops.tsv: the distribution of stops; `make vectors` writes it.
 
 Control and the simulated cars play it on virtual time, so that each machine writes the same table.
 """
