@@ -51,8 +51,8 @@ def message_tables() -> str:
         if fields:
             rows = ["| field | type | unit | what |", "|---|---|---|---|"]
             for name, kind, words in fields:
-                unit = topic.units.get(name, "") if topic else ""
-                rows.append(f"| `{name}` | {escape(kind)} | {unit or _unit(name)} | {cell(words)} |")
+                unit = (topic.units.get(name, "") if topic else "") or _unit(name)
+                rows.append(f"| `{name}` | {escape(kind)} | {unit} | {cell(words.removeprefix(unit + ', '))} |")
             lines.append("\n".join(rows))
         elif is_command:
             lines.append("It has only the common fields of commands.")
