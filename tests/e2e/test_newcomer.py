@@ -4,6 +4,7 @@ What is not run stands in NOT_RUN with its reason. The tutorials share one fleet
 that starts takes seconds.
 """
 
+import ast
 import re
 import shutil
 import subprocess
@@ -178,6 +179,15 @@ def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
         for command in commands(body)
     }
     assert every - newcomer.typed == set(NOT_RUN), "neither run, nor in the list with a reason"
+
+
+def test_each_program_of_the_docs_is_run_or_at_least_python() -> None:
+    """A program with a name is run above; what has none is a fragment."""
+    for page in (README, *(ROOT / "docs").rglob("*.md")):
+        for language, title, body in blocks(page):
+            if language == "python":
+                assert not title or page in TRIED, f"{page.name}: {title} is not run"
+                compile(body, str(page), "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
 
 
 @pytest.mark.soak
