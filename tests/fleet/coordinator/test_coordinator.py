@@ -222,7 +222,7 @@ def test_why_says_what_was_decided_and_a_plan_can_be_replaced_wholly_or_not_at_a
 
 PHASES = """
 roles: {line: {mode: tracking, cars: [red]}, light: {mode: light_seeking, cars: [red]}}
-phases: {first: {roles: [line], next: second}, second: {roles: [light]}}
+phases: {first: {roles: [line], timeout_s: 600, next: second}, second: {roles: [light]}}
 """
 
 
@@ -250,6 +250,7 @@ def test_a_person_goes_on_to_the_next_phase_stops_the_plan_and_restarts_it(cars:
     lines.until("red", None, "stopped the plan")
     lines.process.kill()
     lines.process.wait()
+    wait_for(lambda: not cars.bus.tokens("fleet/@coordinator"), "the hub has noticed")
     again = Lines(coordinator(cars, tmp_path / "plan.yaml", PHASES))
     again.until("red", None, "stopped the plan")
     assert truth(cars, "red") == "manual"
