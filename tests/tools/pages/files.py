@@ -59,8 +59,9 @@ def _value(each: dict[str, Any], definitions: dict[str, Any]) -> str:
     if kind == "array":
         items = each.get("items", each.get("prefixItems", [{}])[0] if each.get("prefixItems") else {})
         return f"list of {_value(items, definitions)}"
-    if kind == "object" and isinstance(each.get("additionalProperties"), dict):
-        return f"by name: {_value(each['additionalProperties'], definitions)}"
+    if kind == "object":
+        below = next(iter(each.get("patternProperties", {}).values()), each.get("additionalProperties", {}))
+        return f"by name: {_value(below, definitions)}"
     return f"{ {'string': 'text', 'boolean': 'true, false', 'integer': 'whole number'}.get(kind, kind) }{_bounds(each)}"
 
 
