@@ -83,7 +83,7 @@ def validate_path(text: str) -> str:
 PARTS: Final = frozenset().union(*(parse_platform(f"{kind}+arm+imu").capabilities for kind in Platform))
 CAPABILITIES: Final = tuple(sorted(PARTS | set(Mode)))
 Capability = StrEnum("Capability", {word: word for word in CAPABILITIES})  # type: ignore[misc]  # the words are the platforms' own
-_SIZE: Final = re.compile("^[1-9][0-9]{0,5} ?[MGT]B$")
+_SIZE: Final = re.compile("^([1-9][0-9]{0,5} ?[MG]|[1-9][0-9]{0,2} ?T)B$")
 _PLATFORMS: Final = f"^({'|'.join((AUTO, *Platform))})([+]({'|'.join(sorted(OPTIONS))}))*$"
 
 _Name = Annotated[

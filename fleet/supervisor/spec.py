@@ -246,7 +246,7 @@ def recorder_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
     files = {"--fleet-file": spec.file, "--plan": spec.plan}
     copies = [word for option, path in files.items() if path is not None for word in (option, str(path))]
     quota = ("--quota", spec.quota) if spec.quota else ()
-    return module("fleet.cli", "record", "--sessions", str(spec.recordings), "--json", *quota, *copies, *where)
+    return module("fleet.cli", "record", "run", "--sessions", str(spec.recordings), "--json", *quota, *copies, *where)
 
 
 def coordinator_command(spec: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from fleet.commands import record
 from fleet.fleetfile.fleet_file import parse_fleet
 from fleet.supervisor.reload import compare
 from fleet.supervisor.spec import (
@@ -36,12 +37,21 @@ def test_a_file_says_it_all(tmp_path: Path) -> None:
     spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions())
     assert (spec.fleet, spec.endpoint, spec.record) == ("lab", "tcp/127.0.0.1:7999", True)
     assert (spec.recordings, spec.quota) == (tmp_path / "kept", "20GB")
-    assert "--quota 20GB" in " ".join(recorder_command(spec, "tcp/127.0.0.1:7999"))
     assert [(car.name, car.link, car.platform) for car in spec.cars.values()] == [
         ("ann", "/dev/ttyUSB0", "stm32+imu"),
         ("bob", "tcp://192.168.1.7:8888", "auto"),
     ]
     assert not spec.simulated
+
+
+@pytest.mark.parametrize(("quota", "size"), [("20GB", 20e9), ("1 MB", 1e6), ("999999GB", 999_999e9), ("999TB", 999e12)])
+def test_the_recorder_takes_any_quota_and_place_of_a_file(quota: str, size: float, tmp_path: Path) -> None:
+    spec = build_spec(parse_fleet(FILE.replace("20GB", quota), tmp_path / "fleet.yaml"), UpOptions())
+    interpreter, _, program, *words = recorder_command(spec, "tcp/127.0.0.1:7999")
+    assert (interpreter, program, words[:2]) == (sys.executable, "fleet.cli", ["record", "run"])
+    given = record.run.make_context("run", words[2:]).params
+    assert (given["place"], given["quota"]) == (tmp_path / "kept", size)
+    assert given["fleet_file"] == tmp_path / "fleet.yaml"
 
 
 def test_the_command_line_wins(tmp_path: Path) -> None:
