@@ -20,7 +20,7 @@ COMMANDS: Final = {
         "init": ("fleet.commands.fleet_file:init", "Create fleet.yaml: find the cars and name them."),
         "example": ("fleet.commands.example:example", "Fleet files, plans, worlds and programs to start from."),
         "check": ("fleet.commands.check:check", "Check fleet files, plans and worlds for mistakes."),
-        "schema": ("fleet.commands.fleet_file:print_schema", "Print the JSON Schema of fleet files, for editors."),
+        "schema": ("fleet.commands.fleet_file:print_schema", "Print the JSON Schema of fleet files, plans or worlds."),
         "bind": (
             "fleet.commands.bind:bind",
             "Find out which car is which: each blinks, you type its name.",

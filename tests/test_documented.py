@@ -14,7 +14,7 @@ import pytest
 from fleet.cli import cli
 from gateway.control.commands import Reason
 from gateway.protocol.enums import Mode
-from gateway.sim import world_file
+from schemas import world
 from schemas.commands import COMMANDS
 from tests.tools.pages import files, proto
 from tests.tools.pages.command_line import commands, gateway_parsers, options, shown_action, subcommands
@@ -117,14 +117,14 @@ def test_each_field_of_a_file_is_described(page: str, schema: files.SchemaMaker)
 
 
 def test_each_field_of_a_world_is_described() -> None:
-    for heading, fields in (
-        ("Fields", {*world_file._TOP, "lamps", "things"}),
-        ("Boxes", world_file._BOX),
-        ("Cars", world_file._CAR),
-        ("Things", world_file._THING),
-        ("Lamps", world_file._LAMP),
+    for heading, entry in (
+        ("Fields", world.WorldEntry),
+        ("Boxes", world.BoxEntry),
+        ("Cars", world.StartEntry),
+        ("Things", world.ThingEntry),
+        ("Lamps", world.LampEntry),
     ):
-        assert rows("docs/reference/world-file.md", heading) == set(fields), heading
+        assert rows("docs/reference/world-file.md", heading) == set(entry.model_fields), heading
 
 
 @pytest.mark.parametrize(

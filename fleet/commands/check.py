@@ -25,10 +25,10 @@ from fleet.policy.plan.models import PlanEntry
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.policy.snapshot import CarSnapshot
 from schemas import bus
+from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, read_text
 
 _CHECK_THREADS: Final = 16
-_WORLD_FIELDS: Final = frozenset({"room", "walls", "boxes", "line", "lamps", "things", "cars_meet", "cars"})
 _Cars = Mapping[str, CarSnapshot] | None
 
 
@@ -175,7 +175,7 @@ def recognize(text: str) -> FileKind:
     fields = {
         FileKind.FLEET: frozenset(FileEntry.model_fields),
         FileKind.PLAN: frozenset(each.alias or name for name, each in PlanEntry.model_fields.items()),
-        FileKind.WORLD: _WORLD_FIELDS,
+        FileKind.WORLD: frozenset(WorldEntry.model_fields),
     }
     if _is_world(found.get("cars")):
         return FileKind.WORLD

@@ -16,9 +16,10 @@ from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed,
 from fleet.links import LINK_SIM
 from fleet.supervisor.spec import MAX_SIMULATED_CARS
 from schemas.atomic_file import write_atomically
+from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, Entry, schema_of
 
-SCHEMAS: Final = ("fleet", "plan")
+SCHEMAS: Final = ("fleet", "plan", "world")
 DEFAULT_FILE: Final = Path("fleet.yaml")
 DEFAULT_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "violet", "orange", "teal", "brown")
 """Default names, in the order of the palette."""
@@ -55,10 +56,13 @@ def print_errors(error: BadFile, *, as_json: bool = False) -> None:
         click.echo(str(error), err=True)
 
 
-@click.command("schema", epilog="\b\nexamples:\n  fleet schema fleet > fleet.schema.json\n  fleet schema plan")
-@click.argument("kind", type=click.Choice(SCHEMAS), default="fleet", metavar="fleet|plan")
+@click.command(
+    "schema",
+    epilog="\b\nexamples:\n  fleet schema fleet > fleet.schema.json\n  fleet schema plan\n  fleet schema world",
+)
+@click.argument("kind", type=click.Choice(SCHEMAS), default="fleet", metavar="fleet|plan|world")
 def print_schema(kind: str) -> None:
-    """Print the JSON Schema of fleet files or plans. Editors complete and check files with it."""
+    """Print the JSON Schema of fleet files, plans or worlds. Editors complete and check files with it."""
     click.echo(schema_text(kind), nl=False)
 
 
@@ -66,7 +70,7 @@ def schema_text(kind: str) -> str:
     """Return the JSON Schema of a kind of file as it is checked in."""
     from fleet.policy.plan.models import PlanEntry
 
-    models: dict[str, type[Entry]] = {"fleet": FileEntry, "plan": PlanEntry}
+    models: dict[str, type[Entry]] = {"fleet": FileEntry, "plan": PlanEntry, "world": WorldEntry}
     return json.dumps(schema_of(models[kind], f"{kind} file"), indent=2, ensure_ascii=False) + "\n"
 
 

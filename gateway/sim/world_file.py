@@ -1,7 +1,7 @@
 """Reads a world file (YAML 1.2): checks its fields, their ranges, and contradictions between them. Pure.
 
-Distances in meters, speeds in m/s, angles in degrees counter-clockwise from x. The example world
-`follow` (fleet/examples/worlds/follow.yaml) has a comment for each field.
+Distances in meters, speeds in m/s, angles in degrees counter-clockwise from x. schemas/world.py
+has the fields.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,31 +18,17 @@ from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
 from gateway.sim.yaml_reader import MarkedYaml
 from schemas import keys
+from schemas.world import BoxEntry, LampEntry, LineEntry, RoomEntry, StartEntry, ThingEntry, WorldEntry
+from schemas.yaml_document.document import Entry
 
 MIN_SIZE_M: Final = 0.02
 MAX_ITEMS: Final = 200
 """Maximum of walls, boxes, things or lamps, and of the points of a path or line."""
 
-_TOP: Final = {"room": False, "walls": False, "boxes": False, "line": False, "cars_meet": False, "cars": False}
-_BOX: Final = {"x_m": True, "y_m": True, "width_m": True, "depth_m": True}
-_LAMP: Final = dict.fromkeys(("x_m", "y_m", "reach_m", "brightness", "on", "overhead", "carried_by"), False)
-_THING: Final = dict.fromkeys(
-    (
-        "x_m",
-        "y_m",
-        "heading_deg",
-        "radius_m",
-        "width_m",
-        "depth_m",
-        "path",
-        "there_and_back",
-        "speed_m_s",
-        "waits_for_m",
-        "carried_by",
-    ),
-    False,
-)
-_CAR: Final = {"x_m": True, "y_m": True, "heading_deg": False}
+
+def _fields(entry: type[Entry]) -> dict[str, bool]:
+    """Return the names of the fields of an entry, True for a required one."""
+    return {name: field.is_required() for name, field in entry.model_fields.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +67,15 @@ class _WorldParser:
 
     def read(self) -> WorldSpec:
         marks = self._marks
-        top = marks.fields(marks.root, "", {**_TOP, "lamps": False, "things": False})
+        top = marks.fields(marks.root, "", _fields(WorldEntry))
         if "room" in top:
-            parts = marks.fields(top["room"], "room", {"width_m": True, "depth_m": True})
+            parts = marks.fields(top["room"], "room", _fields(RoomEntry))
             room = self._size(parts, "width_m", "room"), self._size(parts, "depth_m", "room")
             if not marks.faulty:  # otherwise every car would start outside the room as well
                 self._room = room
                 self._walls += box(0.0, 0.0, *room)
         for field, node in self._few(top, "boxes"):
-            parts = marks.fields(node, field, _BOX)
+            parts = marks.fields(node, field, _fields(BoxEntry))
             x, y = self._place(parts, "x_m", field), self._place(parts, "y_m", field)
             self._boxes.append((x, y, self._size(parts, "width_m", field), self._size(parts, "depth_m", field)))
             self._walls += box(*self._boxes[-1])
@@ -119,7 +105,7 @@ class _WorldParser:
             if len(set(points)) < 3:
                 marks.complain(node, "line", "is a closed loop: at least 3 points [x, y]")
             return points
-        parts = marks.fields(node, "line", {"width_m": True, "depth_m": True, "radius_m": True})
+        parts = marks.fields(node, "line", _fields(LineEntry))
         width, depth, radius = (self._size(parts, name, "line") for name in ("width_m", "depth_m", "radius_m"))
         if radius > min(width, depth) / 2:
             marks.complain(
@@ -131,7 +117,7 @@ class _WorldParser:
 
     def _thing(self, name: str, node: yaml.Node) -> MovingObject:
         marks, field = self._marks, f"things.{name}"
-        parts = marks.fields(node, field, _THING)
+        parts = marks.fields(node, field, _fields(ThingEntry))
         disc, boxed = "radius_m" in parts, {"width_m", "depth_m"} <= parts.keys()
         if isinstance(node, yaml.MappingNode) and disc == bool({"width_m", "depth_m"} & parts.keys()):
             marks.complain(node, field, "is a disc or a box: write radius_m, or width_m and depth_m")
@@ -173,7 +159,7 @@ class _WorldParser:
 
     def _lamp(self, name: str, node: yaml.Node, things: Mapping[str, MovingObject]) -> Lamp:
         marks, field = self._marks, f"lamps.{name}"
-        parts = marks.fields(node, field, _LAMP)
+        parts = marks.fields(node, field, _fields(LampEntry))
         carried_by = ""
         if "carried_by" in parts:
             carried_by = marks.word(parts["carried_by"], f"{field}.carried_by")
@@ -200,7 +186,7 @@ class _WorldParser:
         marks, found, nodes = self._marks, {}, self._named(top, "cars")
         for name, node in nodes.items():
             field = f"cars.{name}"
-            parts = marks.fields(node, field, _CAR)
+            parts = marks.fields(node, field, _fields(StartEntry))
             x, y = (self._place(parts, at, field) for at in ("x_m", "y_m"))
             pose = Pose(x, y, self._heading(parts, field))
             if not parts.keys() >= {"x_m", "y_m"}:

@@ -3,6 +3,7 @@
 import random
 import subprocess
 import sys
+from functools import partial
 from itertools import combinations
 from math import hypot, radians
 from pathlib import Path
@@ -14,10 +15,12 @@ from hypothesis import strategies as st
 from fleet.examples import EXAMPLES
 from gateway.sim.model.car_body import CarBody
 from gateway.sim.model.firmware import Pose
-from gateway.sim.model.objects import Lamp, MovingObject
+from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
-from gateway.sim.world_file import WorldSpec, read_world
+from gateway.sim.world_file import MAX_ITEMS, MIN_SIZE_M, WorldSpec, read_world
 from gateway.sim.yaml_reader import MAX_WORLD_BYTES, BadWorld
+from schemas.world import WorldEntry
+from schemas.yaml_document.document import BadFile, read_yaml
 
 WORLDS = EXAMPLES / "worlds"
 EVERYTHING = """\
@@ -95,6 +98,37 @@ def test_cars_without_a_place_begin_where_there_is_room_before_those_that_have_o
     cart = world.where(world.things[0], 0.0)
     assert cart is not None
     assert all(hypot(place.x_m - cart.x_m, place.y_m - cart.y_m) > RADIUS_M for place in places)
+
+
+LIMITS = [
+    ("lamps: {a: {x_m: VALUE, y_m: 0}}", FAR_M),
+    ("lamps: {a: {x_m: 0, y_m: VALUE}}", -FAR_M),
+    ("lamps: {a: {x_m: 0, y_m: 0, reach_m: VALUE}}", FAR_M),
+    ("lamps: {a: {x_m: 0, y_m: 0, brightness: VALUE}}", 100),
+    ("lamps: {a: {x_m: 0, y_m: 0, brightness: VALUE}}", 0),
+    ("things: {a: {x_m: 0, y_m: 0, radius_m: VALUE}}", MIN_SIZE_M),
+    ("things: {a: {path: [[0, 0], [VALUE, 0]], radius_m: 1}}", FAR_M),
+    ("things: {a: {path: [[0, 0], [1, 0]], radius_m: 1, speed_m_s: VALUE}}", FASTEST_M_S),
+    ("things: {a: {path: [[0, 0], [1, 0]], radius_m: 1, waits_for_m: VALUE}}", FAR_M),
+    ("cars: {a: {x_m: 0, y_m: 0, heading_deg: VALUE}}", 360),
+    ("room: {width_m: VALUE, depth_m: 1}", MIN_SIZE_M),
+    ("walls: [[0, 0, 1, VALUE]]", -FAR_M),
+]
+
+
+def test_the_schema_for_editors_accepts_what_the_reader_accepts() -> None:
+    for text in (EVERYTHING, *(path.read_text() for path in WORLDS.glob("*.yaml"))):
+        read_yaml(text, "w.yaml", WorldEntry)
+    for text, limit in LIMITS:
+        step = -1e-6 if limit in (0, MIN_SIZE_M, -FAR_M) else 1e-6
+        for read in (read_world, partial(read_yaml, model=WorldEntry)):
+            read(text.replace("VALUE", f"{limit:f}"), "w.yaml")
+            with pytest.raises(ValueError, match=r"^w\.yaml:1:"):
+                read(text.replace("VALUE", f"{limit + step:f}"), "w.yaml")
+    walls = "walls: [" + "[0, 0, 1, 1], " * MAX_ITEMS + "{more}]"
+    read_yaml(walls.format(more=""), "w.yaml", WorldEntry)
+    with pytest.raises(BadFile):
+        read_yaml(walls.format(more="[0, 0, 1, 1]"), "w.yaml", WorldEntry)
 
 
 FAULTS = [

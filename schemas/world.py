@@ -1,0 +1,109 @@
+"""The fields of a world file. gateway/sim/world_file.py reads one and checks what no single field shows. Pure."""
+
+from typing import Annotated, Final
+
+from pydantic import Field
+
+from schemas.yaml_document.document import Entry
+
+_MAX_ITEMS: Final = 200
+
+_Place = Annotated[float, Field(ge=-100, le=100)]
+_Size = Annotated[float, Field(ge=0.02, le=100)]
+_Degrees = Annotated[float, Field(ge=-360, le=360)]
+_Point = tuple[_Place, _Place]
+_Wall = tuple[_Place, _Place, _Place, _Place]
+_Name = Annotated[str, Field(pattern="^[a-z0-9][a-z0-9_-]{0,31}$")]
+
+
+class RoomEntry(Entry):
+    """Four walls around (0, 0)."""
+
+    width_m: _Size = Field(description="its size along x, meters")
+    depth_m: _Size = Field(description="its size along y, meters")
+
+
+class BoxEntry(Entry):
+    """A solid box that does not move."""
+
+    x_m: _Place = Field(description="its middle, meters to the right of (0, 0)")
+    y_m: _Place = Field(description="its middle, meters up from (0, 0)")
+    width_m: _Size = Field(description="its size along x, meters")
+    depth_m: _Size = Field(description="its size along y, meters")
+
+
+class LineEntry(Entry):
+    """A line on the floor: a rectangle with round corners, around (0, 0)."""
+
+    width_m: _Size = Field(description="its size along x, meters")
+    depth_m: _Size = Field(description="its size along y, meters")
+    radius_m: _Size = Field(description="of its corners, meters: at most half of the shorter side")
+
+
+class StartEntry(Entry):
+    """Where a car begins."""
+
+    x_m: _Place = Field(description="meters to the right of (0, 0)")
+    y_m: _Place = Field(description="meters up from (0, 0)")
+    heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
+
+
+class ThingEntry(Entry):
+    """A disc or a box that stands, moves along a path, or is carried by a car."""
+
+    # Defaults without a value are for editors only. gateway/sim/world_file.py finds out what is missing or too much.
+    x_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, ahead of the car's middle")
+    y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, to the left of the car's middle")
+    heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
+    radius_m: _Size = Field(default_factory=float, description="a disc with this radius, meters")
+    width_m: _Size = Field(default_factory=float, description="a box with this width, meters, instead of a disc")
+    depth_m: _Size = Field(default_factory=float, description="a box with this depth, meters")
+    path: list[_Point] = Field(
+        default_factory=list,
+        min_length=2,
+        max_length=_MAX_ITEMS,
+        description="points [x, y] that it moves along, and then begins again",
+    )
+    there_and_back: bool = Field(default=False, description="true: it turns round at the end of the path")
+    speed_m_s: float = Field(default=0.0, ge=0, le=0.5, description="its speed along the path")
+    waits_for_m: float = Field(
+        default_factory=float, ge=0, le=100, description="it moves only while a car is within this distance, meters"
+    )
+    carried_by: _Name = Field(default_factory=str, description="the car that it moves with")
+
+
+class LampEntry(Entry):
+    """A lamp that the light sensors see, if nothing is in between."""
+
+    x_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, ahead of its carrier's middle")
+    y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, to the left of that")
+    reach_m: float = Field(default=1.5, gt=0, le=100, description="it is seen from this far with a brightness of 1")
+    brightness: float = Field(default=1.0, ge=0, le=100, description="4 is seen from twice as far")
+    on: bool = Field(default=True, description="whether it is lit")
+    overhead: bool = Field(default=False, description="true: nothing throws a shadow")
+    carried_by: _Name = Field(default_factory=str, description="the thing or car that it moves with")
+
+
+class WorldEntry(Entry):
+    """Where simulated cars drive. Meters, m/s, and degrees counter-clockwise from x; the room's middle is (0, 0)."""
+
+    room: RoomEntry = Field(
+        default_factory=RoomEntry.model_construct, description="four walls around (0, 0); left out: no walls"
+    )
+    walls: list[_Wall] = Field(
+        default_factory=list, max_length=_MAX_ITEMS, description="single walls, each [x1, y1, x2, y2]"
+    )
+    boxes: list[BoxEntry] = Field(default_factory=list, max_length=_MAX_ITEMS, description="boxes that do not move")
+    line: Annotated[list[_Point], Field(min_length=3, max_length=_MAX_ITEMS)] | LineEntry = Field(
+        default_factory=list, description="the line on the floor: a closed loop of points, or a round rectangle"
+    )
+    cars_meet: bool = Field(default=True, description="cars see each other and are in each other's way")
+    cars: dict[_Name, StartEntry] = Field(
+        default_factory=dict, description="where each car begins; a car that is not named begins on the line"
+    )
+    lamps: dict[_Name, LampEntry] = Field(
+        default_factory=dict, max_length=_MAX_ITEMS, description="lamps that light sensors see"
+    )
+    things: dict[_Name, ThingEntry] = Field(
+        default_factory=dict, max_length=_MAX_ITEMS, description="discs and boxes: seen, bumped into, followed"
+    )
