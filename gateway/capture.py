@@ -62,13 +62,13 @@ def read(path: Path) -> Iterator[CapturedBytes]:
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISFIFO(mode)):
         kind = "directory" if stat.S_ISDIR(mode) else "device"
-        raise BadCapture(f"{path}: this is a {kind}, not a file that `gateway monitor --raw` kept")
+        raise BadCapture(f"{path}: this is a {kind}, not a file of `gateway monitor --raw`")
     with path.open("rb") as file:
         first = file.readline(MAX_LINE_BYTES)
         if not first:
-            raise BadCapture(f"{path}: the file is empty, not one that `gateway monitor --raw` kept")
+            raise BadCapture(f"{path}: the file is empty, not one of `gateway monitor --raw`")
         if _parse(path, 1, first).get("format") != FORMAT:
-            raise BadCapture(f"{path}: not a file that `gateway monitor --raw` kept: its first line is not {FORMAT!r}")
+            raise BadCapture(f"{path}: not a file of `gateway monitor --raw`: its first line is not {FORMAT!r}")
         number, last = 1, 0.0
         while line := file.readline(MAX_LINE_BYTES):
             number += 1

@@ -13,9 +13,9 @@ from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio
 
 COMMANDS: Final = {
-    "sim": ("gateway.sim.cli", "simulated cars that behave like the real ones, hazards included"),
-    "scan": ("gateway.tools.scan", "the ports and Bluetooth devices there are, and which of them speak as a car does"),
-    "monitor": ("gateway.tools.monitor", "what a car says, decoded beside the raw bytes"),
+    "sim": ("gateway.sim.cli", "simulated cars that behave like real ones, hazards included"),
+    "scan": ("gateway.tools.scan", "the ports and Bluetooth devices there are, and which of them are cars"),
+    "monitor": ("gateway.tools.monitor", "what a car sends, decoded beside the raw bytes"),
     "send": ("gateway.tools.send", "one frame to a car on the desk, checked against the table"),
 }
 """Subcommand: the module with its `add_arguments` and `run`, imported when called, and its line in the help."""

@@ -136,11 +136,11 @@ class Profile:
             case ModeOpen(mode):
                 if mode in self.modes and mode is not Mode.MANUAL:
                     return None
-                return f"mode {mode} cannot be opened on {self._these}: {self._known(self.modes - {Mode.MANUAL})}"
+                return f"{self._these} do not know mode {mode}; {self._known(self.modes - {Mode.MANUAL})}"
             case ModeClose(mode):
                 if "mode" in self.capabilities or (self.kind is Platform.UNKNOWN and mode is Mode.MANUAL):
                     return None
-                return f"{self._these} are not known to obey the frame that closes mode {mode}"
+                return f"{self._these} may ignore the frame that closes mode {mode}"
             case ArmSet():
                 return self._unless("arm", "the arm frame (an option: +arm)")
             case Reset():
@@ -207,7 +207,7 @@ class Profile:
             return tuple(found)
         if self.kind is Platform.RASPBERRY_PI:
             if not _whole_cm(event):
-                found.append("decimals in CSB; a raspberry_pi car sends whole centimetres")
+                found.append("decimals in CSB; a raspberry_pi car sends whole centimeters")
             if event.voltage_v not in {None, _PI_VOLTAGE_V}:
                 found.append("PV is not 8.4, the constant of a raspberry_pi car")
             if event.grayscale not in {None, _PI_GRAYSCALE}:
@@ -216,7 +216,7 @@ class Profile:
         if _pi_constants(event):
             found.append("PV8.4 and GS0, the constants of a raspberry_pi car")
         if self.kind is Platform.ARDUINO and _whole_cm(event):
-            found.append("whole centimetres in CSB; an arduino car sends decimals in mode 0")
+            found.append("whole centimeters in CSB; an arduino car sends decimals in mode 0")
         return tuple(found)
 
     def _may_be_constant(self, event: Sensors) -> bool:
@@ -224,11 +224,11 @@ class Profile:
 
     def _general_refusal(self, frame: General) -> str | None:
         if frame.sing:
-            return "sing is not supported by any car (the table: temporarily not supported)"
+            return "no car can sing (in the table: temporarily not supported)"
         if frame.servo and frame.servo not in self.servos:
-            return f"servo action {frame.servo} is not known to {self._these}: {self._known(self.servos)}"
+            return f"{self._these} do not know servo action {frame.servo}; {self._known(self.servos)}"
         if frame.light and frame.light not in self.lights:
-            return f"light {frame.light} is not known to {self._these}: {self._known(self.lights)}"
+            return f"{self._these} do not know light {frame.light}; {self._known(self.lights)}"
         return None
 
     def _unless(self, capability: str, what: str) -> str | None:

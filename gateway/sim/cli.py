@@ -32,21 +32,21 @@ Prints one JSON line per car: {"car", "platform", "link"}; give the link to `gat
 under another name is printed again: a plain pty after each link_drop; pty:PATH keeps its name.
 
 faults, on the command line (AMOUNT is seconds, for garbage bytes; --fault may be repeated):
-  --fault red:link_drop@5+2             gone for 2 s; without +2 until it is ended
+  --fault red:link_drop@5+2             gone for 2 s; without +2 until you end it
   --fault red:rename@5+2                comes back as another device: pty:PATH points to a new one, a plain pty and TCP
                                         have a new link; ,path=/tmp/other: back at that path instead
   --fault red:cut_write@5+2,bytes=7     of the next frame to the car 7 bytes come through, then the link is gone for 2 s
   --fault red:slow@5+10,factor=0.1      both ways at a tenth of 960 bytes/s, byte by byte
   --fault red:lossy@5+10,share=0.2      a fifth of the bytes is lost; ,to=car or ,to=host: one way only
   --fault red:stuck@5+10                stops reading: writes block (pty), or pile up in the system's buffers (TCP)
-  --fault red:deaf@5+10                 takes what is written and drops it
-  --fault red:mute@5+10                 hears and obeys, nothing comes from it
-  --fault red:echo@5+10                 sends back all that comes, and obeys it
+  --fault red:deaf@5+10                 reads every byte and ignores it
+  --fault red:mute@5+10                 obeys, and sends nothing
+  --fault red:echo@5+10                 sends every byte back, and obeys it
   --fault red:firehose@5+10,rate=1e6    random bytes/s besides its readings; ,of=frame: a frame that never ends
   --fault red:garbage@5+200             200 random bytes to the host; ,to=car: the other way
-  --fault brownout@10                   resets; without a name every car is hit
-faults on stdin, one JSON object a line, each answered by one line on stdout; "for_s": 0 ends what lasts (rename and
-cut_write end as link_drop does); without "for_s" it lasts until then:
+  --fault brownout@10                   every car resets; red:brownout@10: only red
+faults on stdin, one JSON object a line, each answered by one line on stdout; "for_s": 0 ends a fault (rename and
+cut_write end as link_drop does); without "for_s" a fault lasts until then:
   {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}
 infrared remote, which only an Arduino or STM32 car in mode remote_control obeys; buttons: forward, back, left, right,
 spin_left, spin_right, stop, whistle, faster, slower; a motion holds until the next button:
@@ -55,11 +55,11 @@ worlds: lamps that light sensors see, things to bump into and to follow, cars th
 other's way come from a file; `fleet example copy follow` writes one with a comment for each field. On stdin:
   {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (of a carried one: ahead, left)
   {"thing": "cart", "x_m": 1, "y_m": 0} stays there, off its path; or "speed_m_s" along it
-what is so:
+the true state:
   {"car": "red", "ask": "truth"}        mode, motors, pose, ...; of a replay: bytes sent and ignored, rounds
   {"ask": "world"}                      every lamp and thing: where, whether it is on, how large, how fast
-replay: a file that `gateway monitor --raw` kept plays as a car, with its timing; what is written to it is ignored. Over
-TCP it begins when a host connects, over a pty at once:
+replay: a file of `gateway monitor --raw` plays as a car, with its timing. It ignores what you send to it. Over TCP it
+begins when a host connects, over a pty at once:
   gateway sim --replay red.raw:red:tcp --loop --rate 2
 """
 
@@ -92,10 +92,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="[CAR:]FAULT@S[+AMOUNT][,FIELD=VALUE]",
-        help="what happens S seconds after the start, see below",
+        help="a fault S seconds after the start, see below",
     )
     parser.add_argument(
-        "--ir", action="append", default=[], metavar="[CAR:]BUTTON@S", help="a button of the infrared remote is pressed"
+        "--ir", action="append", default=[], metavar="[CAR:]BUTTON@S", help="press a button of the infrared remote"
     )
     parser.add_argument(
         "--replay",
@@ -105,10 +105,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a capture as a car (default: replay, on a pty)",
     )
     parser.add_argument("--loop", action="store_true", help="play captures over and over, 1 s between two rounds")
-    parser.add_argument("--rate", type=float, metavar="FACTOR", help="play captures so many times as fast (default: 1)")
-    parser.add_argument("--fleet", default=keys.DEFAULT_FLEET, help="fleet that the truth is published under")
+    parser.add_argument("--rate", type=float, metavar="FACTOR", help="speed of captures, as a factor (default: 1)")
     parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="hub for the truth (default: FLEET_ENDPOINT, else loopback)"
+        "--fleet", default=keys.DEFAULT_FLEET, help="fleet under which the cars publish their true state"
+    )
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", help="hub for the true state (default: FLEET_ENDPOINT, else loopback)"
     )
     parser.add_argument("--no-truth", action="store_true", help="publish nothing, use no bus")
     parser.add_argument("--with-parent", action="store_true", help=argparse.SUPPRESS)

@@ -28,7 +28,7 @@ def print_json(line: dict[str, object]) -> None:
         stdio.silence(sys.stdout)
         if not isinstance(error, BrokenPipeError):  # a closed pipe needs no message
             sys.stderr.write(
-                f"gateway sim: stdout cannot be written ({error.strerror}): the cars go on, and no more is said there\n"
+                f"gateway sim: stdout cannot be written ({error.strerror}). The cars go on, without further output.\n"
             )
 
 

@@ -131,7 +131,7 @@ class PtyEndpoint:
         try:
             return self._openpty()
         except OSError as error:
-            raise EndpointError(f"no pseudo terminal to be had: {error.strerror}") from None
+            raise EndpointError(f"The system has no free pseudo terminal: {error.strerror}") from None
 
     def _point(self, path: Path) -> None:
         """Create the symlink. Replace only the leftover of a killed simulator."""

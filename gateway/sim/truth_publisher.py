@@ -97,8 +97,8 @@ class TruthPublisher:
             if loop.time() >= warn_at:
                 warn_at = inf
                 self._warn(
-                    f"there is no hub at {self._endpoint} yet, so nobody can see what is true of the cars: "
-                    "gateway run and fleet up start one (--no-truth: publish nothing)"
+                    f"There is no hub at {self._endpoint} yet, so nobody can see the true state of the cars. "
+                    "`gateway run` and `fleet up` start a hub; --no-truth needs none."
                 )
             opened: asyncio.Future[Bus | None] = loop.create_future()
             threading.Thread(target=self._try, args=(loop, opened), daemon=True).start()

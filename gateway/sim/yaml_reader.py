@@ -28,7 +28,9 @@ class MarkedYaml:
         self._source = source
         self._problems: list[tuple[int, int, str]] = []
         if len(text.encode(errors="surrogatepass")) > MAX_WORLD_BYTES:
-            raise BadWorld(f"{source}:1:1: error: has more than {MAX_WORLD_BYTES // 1024} KiB: no world needs so much")
+            raise BadWorld(
+                f"{source}:1:1: error: the file has more than {MAX_WORLD_BYTES // 1024} KiB, the limit for a world"
+            )
         try:
             _check_events(text)
             self._loader = CoreLoader(text)
@@ -40,11 +42,11 @@ class MarkedYaml:
             mark = error.problem_mark or error.context_mark
             line, column = (1, 1) if mark is None else (mark.line + 1, mark.column + 1)
             words = " ".join((error.problem or error.context or "it cannot be read").split())
-            raise BadWorld(f"{source}:{line}:{column}: error: is no YAML that is allowed here: {words}") from None
+            raise BadWorld(f"{source}:{line}:{column}: error: this YAML is not allowed: {words}") from None
         except ValueError:  # PyYAML's error for a directive such as %YAML 999999…
-            raise BadWorld(f"{source}:1:1: error: is no YAML: a directive with a number that is too long") from None
+            raise BadWorld(f"{source}:1:1: error: this is not YAML: a directive has too long a number") from None
         if root is None or (isinstance(root, yaml.ScalarNode) and not root.value):
-            raise BadWorld(f"{source}:1:1: error: is empty")
+            raise BadWorld(f"{source}:1:1: error: the file is empty")
         self.root: yaml.Node = root
 
     @property
@@ -170,9 +172,9 @@ def _check_events(text: str) -> None:
     for event in yaml.parse(text, yaml.SafeLoader):
         words = ""
         if isinstance(event, yaml.AliasEvent) or (isinstance(event, yaml.NodeEvent) and event.anchor is not None):
-            words = "anchors and aliases: write the value out"
+            words = "an anchor or alias. Write the value out"
         elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag not in (None, "!"):
-            words = "tags: leave it out"
+            words = "a tag. Leave it out"
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_WORLD_DEPTH:

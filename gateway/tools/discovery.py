@@ -94,17 +94,15 @@ async def ble_devices(seconds: float) -> list[BleDevice]:
 
         from gateway.link.ble import UART_SERVICES
     except ImportError:
-        raise NoBluetooth(
-            "Bluetooth was not looked at: pip install 'zenoh-car-fleet[ble]' adds what that takes"
-        ) from None
+        raise NoBluetooth("Bluetooth was not searched. Type: pip install 'zenoh-car-fleet[ble]'") from None
     try:
         async with asyncio.timeout(seconds + BLE_START_TIMEOUT_S):
             found = await BleakScanner.discover(timeout=seconds, return_adv=True)
     except TimeoutError:
-        raise NoBluetooth("Bluetooth was not looked at: it does not answer: is its service running?") from None
+        raise NoBluetooth("Bluetooth was not searched: its service does not answer. Is it running?") from None
     except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, `scan` still lists the ports
         words = " ".join(str(error).split()) or type(error).__name__
-        raise NoBluetooth(f"Bluetooth was not looked at: {words}: is there an adapter, and is it on?") from None
+        raise NoBluetooth(f"Bluetooth was not searched: {words}. Is there an adapter, and is it on?") from None
     devices = [_device(address, device.name, advert, UART_SERVICES) for address, (device, advert) in found.items()]
     return sorted(devices, key=lambda device: (device.uart is None, -(device.rssi or -999), device.address))
 

@@ -21,15 +21,15 @@ from gateway.protocol.platforms import Profile
 from gateway.tools import cli_support
 from gateway.tools.statistics import LinkStatistics, describe
 
-DESCRIPTION: Final = "What a car says, decoded beside the raw bytes. It only listens; Ctrl-C ends it."
+DESCRIPTION: Final = "Show what a car sends, decoded beside the raw bytes. Send nothing; Ctrl-C ends."
 EPILOG: Final = """\
 examples:
   gateway monitor --link /dev/ttyUSB0 --platform arduino
-  gateway monitor --link /dev/ttyUSB0 --raw morning.jsonl       keep the bytes with their times
-  gateway monitor --from morning.jsonl --json                   look at them again
+  gateway monitor --link /dev/ttyUSB0 --raw morning.jsonl       save the bytes with their times
+  gateway monitor --from morning.jsonl --json                   show them again
 
-Only what the frame's mode measures is shown; the rest of the frame is filler. Times are seconds since the start.
-Opening a serial port can reset an Arduino that is on a USB cable; it speaks again after about three seconds."""
+A line has only what the frame's mode measures; the rest of the frame is filler. Times are seconds since the start.
+Opening a serial port can reset an Arduino that is on a USB cable; it sends again after about three seconds."""
 
 _RAW_WIDTH: Final = 46  # a sensors frame in its longest observed spelling
 
@@ -39,10 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     cli_support.describe(parser, DESCRIPTION, EPILOG)
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--link", metavar="URL", help=cli_support.LINK_HELP)
-    source.add_argument("--from", dest="file", type=Path, metavar="FILE", help="look at a file that --raw kept")
+    source.add_argument("--from", dest="file", type=Path, metavar="FILE", help="show a file that --raw wrote")
     parser.add_argument("--platform", default="unknown", help=cli_support.PLATFORM_HELP + "; decides what is filler")
-    parser.add_argument("--raw", type=Path, metavar="FILE", help="keep the bytes with their times in a new file")
-    parser.add_argument("--json", action="store_true", help="one JSON object an event, and one of the whole at the end")
+    parser.add_argument("--raw", type=Path, metavar="FILE", help="save the bytes with their times in a new file")
+    parser.add_argument("--json", action="store_true", help="one JSON object per event, and a summary at the end")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,7 +56,7 @@ def _run(arguments: argparse.Namespace) -> None:
         _run_live(parse_url(arguments.link), arguments.raw, lines)
         return
     if arguments.raw is not None:
-        raise cli_support.WrongUse("--raw keeps what comes over a --link; the bytes of --from are in a file already")
+        raise cli_support.WrongUse("--raw saves the bytes of a --link. Those of --from are in a file already.")
     lines.begin(0.0)
     for piece in _pieces(arguments.file):
         lines.feed(piece)

@@ -19,17 +19,16 @@ from gateway.tools import cli_support
 from gateway.tools.discovery import BleDevice, NoBluetooth, ble_devices, serial_ports
 from gateway.tools.probe import LinkProbe, LinkVerdict
 
-DESCRIPTION: Final = "The serial ports and Bluetooth LE devices there are, and which of them speak as a car does."
+DESCRIPTION: Final = "List the serial ports and Bluetooth LE devices, and find the cars among them."
 EPILOG: Final = """\
 examples:
   gateway scan                              list and listen; nothing is sent
   gateway scan --json                       one JSON object a line
-  gateway scan --link /dev/ttyUSB0 --probe  stop what is there, and ask it if it is silent
+  gateway scan --link /dev/ttyUSB0 --probe  stop the car there; wake a silent one
 
-Opening a serial port can reset an Arduino that is on a USB cable. A port that another program has is left alone.
-Bluetooth devices are only listed, not connected to. A TCP car is never looked for: the connection ends its program.
---probe stops every car that it finds and closes whatever mode it is in. Ports that send something else are not
-probed."""
+Opening a serial port can reset an Arduino that is on a USB cable. scan skips ports that another program uses. It
+lists Bluetooth devices without connecting. It never searches for TCP cars: a connection ends their program.
+--probe stops every car that it finds and closes its mode. It sends nothing to ports that send other data."""
 
 # Opening its port resets an Arduino, which starts within 2 s. In mode 0 a car reports once a second, and three readings
 # show its platform.
@@ -41,9 +40,7 @@ PROGRESS_INTERVAL_S: Final = 0.5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     cli_support.describe(parser, DESCRIPTION, EPILOG)
-    parser.add_argument(
-        "--link", action="append", metavar="URL", help=f"look at this link, and at no other; {cli_support.LINK_HELP}"
-    )
+    parser.add_argument("--link", action="append", metavar="URL", help=f"check only this link; {cli_support.LINK_HELP}")
     parser.add_argument(
         "--for",
         dest="listen",
@@ -51,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DURATION",
         help=f"how long to listen (default {DEFAULT_LISTEN_S:g}s)",
     )
-    parser.add_argument("--probe", action="store_true", help="send cars and silent ones an unknown car's stop")
+    parser.add_argument("--probe", action="store_true", help="send a stop to cars and silent ports")
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
 
 
@@ -129,7 +126,7 @@ class _Scan:
             if probe.trouble is None and probe.verdict in (LinkVerdict.SILENT, LinkVerdict.CAR)
         ]
         if not probed:
-            cli_support.print_note("nothing to probe: nothing is open, or what is sends something else")
+            cli_support.print_note("nothing to probe: no port is open and is a car or silent")
             return
         frames = ", ".join(encode(step.frame).decode() for step in UNKNOWN.steps)
         where = ", ".join(str(probe.url) for probe in probed)
@@ -222,9 +219,9 @@ def _words(probe: LinkProbe) -> str:
         case LinkVerdict.OTHER:
             return f"no car: {probe.statistics.words()}"
         case LinkVerdict.SILENT if probe.probed:
-            return "silent, also when probed: no car, one that is off or wedged, or its fan runs"
+            return "silent, even after the probe: no car, or the car is off or hangs, or its fan runs"
         case LinkVerdict.SILENT:
-            return "silent: no car, one that is off, in a silent mode, or with its fan on (--probe asks it)"
+            return "silent: no car, or the car is off or in a silent mode, or its fan runs (--probe finds out)"
         case LinkVerdict.BUSY:
             return "in use by another program (its gateway?): not listened to"
         case LinkVerdict.FAILED:

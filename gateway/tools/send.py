@@ -56,10 +56,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     cli_support.describe(parser, DESCRIPTION, EPILOG)
     parser.add_argument("--link", required=True, metavar="URL", help=cli_support.LINK_HELP)
-    platform_help = cli_support.PLATFORM_HELP + "; decides which frames are sent"
+    platform_help = cli_support.PLATFORM_HELP + "; decides which frames the command sends"
     parser.add_argument("--platform", default="unknown", help=platform_help)
     parser.add_argument("--wait", metavar="DURATION", help="time between opening the link and sending")
-    parser.add_argument("--raw", action="store_true", help="send the text as it is, whatever it is")
+    parser.add_argument("--raw", action="store_true", help="send the text unchecked")
     parser.add_argument("frame", metavar="FRAME", help=f"for example '{_STOP}', in single quotes")
 
 
@@ -164,34 +164,34 @@ def moves(frame: Frame) -> bool:
 def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
     """Return for a person what the car may do now and how to stop it."""
     again = f"gateway send --link {shlex.quote(link)}"
-    lines = ["cars do not answer; `gateway monitor` shows what it says"]
+    lines = ["cars do not answer; `gateway monitor` shows what the car sends"]
     match frame:
         case General(motion) as general:
             if motion is Motion.STOP:
                 lines.append("its motors are off, if it is in mode 0 and was not busy: in another mode it ignores this")
             else:
-                lines.append(f"it drives ({motion}) until it is told otherwise, also when the link is gone")
+                lines.append(f"it drives ({motion}) until the next command, even without a link")
             if general.fan:
-                lines.append("its fan was toggled; while it runs, an arduino car sends no readings")
+                lines.append("its fan is toggled; while the fan runs, an arduino car sends no readings")
         case ModeOpen(mode):
             lines.append(
-                f"it is opening mode {mode}, which takes up to {LONGEST_BLOCK_S:g} s, and keeps its motors as they "
-                "were for that"
+                f"it is opening mode {mode}, which takes up to {LONGEST_BLOCK_S:g} s. Until then its motors "
+                "stay as they were"
             )
             then = "obeys" if mode in (Mode.REMOTE_CONTROL, Mode.COLOR_LED) else "drives by itself, and obeys"
-            lines.append(f"then it {then} only a mode frame; stop it, and back to mode 0: {again} '{_MANUAL}'")
+            lines.append(f"then it {then} only a mode frame. To stop it, in mode 0: {again} '{_MANUAL}'")
         case ModeClose():
             lines.append("its motors are off and it is in mode 0, as soon as it is not busy (4.3 s in avoidance)")
         case Ptz() | ColorLed() | ArmSet():
             lines.append("its motors are as they were; in a mode other than 0 it ignores this")
         case Reset():
-            lines.append("half a frame in its buffer was ended, and may have been obeyed")
+            lines.append("this ended half a frame in its buffer, which the car may have obeyed")
         case None:
             lines.append(
-                "this is not in the table: what the car does is not known. It may drive, or ignore what follows"
+                "this frame is not in the table: its effect is unknown. The car may drive, or ignore the next frames"
             )
     if frame is None or (isinstance(frame, General) and moves(frame)):
         lines.append(f"stop it: {again} '{_STOP}'")
         if profile.stop_style is not StopStyle.RASPBERRY_PI:
-            lines.append(f"     or: {again} '{_MANUAL}', obeyed in every mode, but a Raspberry Pi car knows none")
+            lines.append(f"     or: {again} '{_MANUAL}', which works in every mode, but not on a Raspberry Pi car")
     return lines

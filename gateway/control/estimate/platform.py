@@ -18,7 +18,7 @@ _MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi car
 _MEASURED_READINGS: Final = (
     "mode-0 readings with decimals in CSB, or without the constants PV8.4 and GS0 of a raspberry_pi car"
 )
-_CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimetres, the constants of a raspberry_pi car"
+_CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimeters, the constants of a raspberry_pi car"
 _WITH_MODES: Final = "arduino (or stm32: their bytes are the same)"
 
 

@@ -90,7 +90,7 @@ def test_json_has_every_event_and_the_whole(command: Command, kept: Path) -> Non
 def test_what_speaks_against_the_platform_is_told_once(command: Command, kept: Path) -> None:
     done = command("monitor", "--from", kept, "--platform", "raspberry_pi")
     assert done.stdout.splitlines()[1].endswith("not as the platform sends it")
-    assert "2 times against the platform: decimals in CSB; a raspberry_pi car sends whole centimetres" in done.stderr
+    assert "2 times against the platform: decimals in CSB; a raspberry_pi car sends whole centimeters" in done.stderr
 
 
 def _live(start: Started, link: str, *more: str | Path) -> GatewayProcess:
@@ -230,7 +230,7 @@ def test_a_tcp_car_is_warned_of_before_it_is_connected(start: Started) -> None:
         (["--from", "/"], "/: this is a directory"),
         (["--from", "/dev/zero"], "/dev/zero: this is a device"),
         (["--from", sys.executable], "1: not a JSON object"),
-        (["--from", "x", "--raw", "y"], "--raw keeps what comes over a --link"),
+        (["--from", "x", "--raw", "y"], "--raw saves the bytes of a --link"),
         (["--link", "/dev/nope", "--raw", "/nowhere/x"], "/nowhere/x: the file cannot be made: No such file"),
     ],
 )

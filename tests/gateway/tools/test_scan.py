@@ -303,4 +303,4 @@ def test_without_bluetooth_the_ports_are_still_shown(monkeypatch: pytest.MonkeyP
     assert done.returncode == 0
     assert done.stdout
     assert len(done.stderr.splitlines()) == 1
-    assert "Bluetooth was not looked at" in done.stderr
+    assert "Bluetooth was not searched" in done.stderr

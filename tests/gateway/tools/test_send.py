@@ -24,10 +24,10 @@ def test_a_car_drives_until_it_is_stopped_as_it_says(simulate: Callable[..., Any
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines() == [
         f"sent {RUN} to {link}",
-        "cars do not answer; `gateway monitor` shows what it says",
-        "it drives (forward) until it is told otherwise, also when the link is gone",
+        "cars do not answer; `gateway monitor` shows what the car sends",
+        "it drives (forward) until the next command, even without a link",
         f"stop it: gateway send --link {link} '{STOP}'",
-        f"     or: gateway send --link {link} '$4WD,MODE00#', obeyed in every mode, but a Raspberry Pi car knows none",
+        f"     or: gateway send --link {link} '$4WD,MODE00#', which works in every mode, but not on a Raspberry Pi car",
     ]
     wait_for(lambda: driving(sim), "the car drives")
     done = command("send", "--link", link, STOP)
@@ -39,7 +39,7 @@ def test_a_mode_is_opened_and_closed_as_it_says(simulate: Callable[..., Any], co
     sim, [link] = simulate("red:arduino:pty")
     done = command("send", "--link", link, "--platform", "arduino", "--wait", "1", "$4WD,MODE21#")
     assert done.returncode == 0
-    assert f"stop it, and back to mode 0: gateway send --link {link} '$4WD,MODE00#'" in done.stdout
+    assert f"To stop it, in mode 0: gateway send --link {link} '$4WD,MODE00#'" in done.stdout
     wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["mode"] == "tracking", "the car tracks")
     assert command("send", "--link", link, "--wait", "4", "$4WD,MODE00#").returncode == 0
     wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["mode"] == "manual", "the car is in mode 0")
@@ -94,7 +94,7 @@ def test_why_a_text_is_no_frame(text: str, words: str) -> None:
     [
         (["bash,0,1,0,0,0,0,0,0#"], "single quotes"),
         (["$4WD,PTZ90#"], "cars of an unknown platform do not know the pan/tilt frame"),
-        (["$4WD,MODE21#", "--platform", "raspberry_pi"], "mode tracking cannot be opened on raspberry_pi cars"),
+        (["$4WD,MODE21#", "--platform", "raspberry_pi"], "raspberry_pi cars do not know mode tracking"),
         (["#"], "do not know a lone '#'"),
         (["\u20ac"], "'\u20ac' is no byte"),
         (["", "--raw"], "frame '' is empty"),
