@@ -260,7 +260,7 @@ def parse_platform(text: str) -> Profile:
     """Return the profile of a platform such as `arduino` or `raspberry_pi+arm+imu` in any case; raise ValueError."""
     kind, *options = text.lower().split("+")
     if kind not in set(Platform):
-        near = difflib.get_close_matches(kind, Platform, n=1)
+        near = difflib.get_close_matches(kind, Platform, n=1, cutoff=0.7)
         hint = f"Did you mean {near[0]}?" if near else f"There are {', '.join(Platform)}."
         raise ValueError(f'Unknown platform "{kind[:40]}". {hint}')
     for option in options:

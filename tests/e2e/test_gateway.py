@@ -588,7 +588,7 @@ def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProces
         (["--platform", "esp32"], 2, 'Unknown platform "esp32". There are arduino, stm32, raspberry_pi, unknown.'),
         (["--platform", "arduino+wings"], 2, 'Unknown option "+wings"'),
         (["--link", "usb://x"], 2, "this is not a link. `fleet scan` lists"),
-        (["--link", "tcp://host"], 2, "a host and a port from 1 to 65535 are needed"),
+        (["--link", "tcp://host"], 2, "the port is missing. Write tcp://host:8888"),
         (["--link", "ttyUSB0"], 2, "this is not a link"),
         (["--connect", "127.0.0.1:7447"], 2, "write it as tcp/HOST:PORT"),
         (["--connect", "tcp/127.0.0.1:0"], 2, "port 1 to 65535"),

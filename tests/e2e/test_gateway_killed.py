@@ -40,7 +40,7 @@ def test_a_raspberry_pi_car_whose_gateway_was_killed_drives_on_and_it_is_said(fl
         outcome = client.car("red").stop()
         assert not outcome.ok
         assert outcome.words == 'NOT STOPPED: No car named "red". No car is connected. If it moves, go to the car.'
-    words = "its motors stay as they were and nothing can reach them, so look whether it drives, switch it off"
+    words = "If its program died (Raspberry Pi), the car may be driving: look at it, switch it off,"
     wait_for(lambda: not sim.say({"car": "red", "ask": "truth"})["alive"], "its program has died")
     again = fleet.gateway(link, platform="raspberry_pi")
     assert again.wait() == 1

@@ -4,6 +4,7 @@ A session is a directory (session_dir.py) or a single .mcap file of any writer. 
 """
 
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator
 from copy import copy
@@ -44,8 +45,9 @@ def find_session(session: str | PathLike[str], root: Path = ROOT) -> Path:
     """
     path = Path(session)
     nth = re.fullmatch(rf"{LATEST}(?:~(\d+))?", str(session))
-    if path.exists() or nth is None:
-        return root / path if not path.exists() and (root / path).exists() else path
+    # `os.path.exists` is false for a path that is too long or may not be read. The reader then says why.
+    if os.path.exists(path) or nth is None:  # noqa: PTH110
+        return root / path if not os.path.exists(path) and os.path.exists(root / path) else path  # noqa: PTH110
     recorded = [
         (info.started, each)
         for each in (root.iterdir() if root.is_dir() else ())

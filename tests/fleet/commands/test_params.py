@@ -117,7 +117,7 @@ def test_without_a_directory_here_the_fleet_file_names_the_place(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place.rename(tmp_path / "elsewhere")
-    (tmp_path / "fleet.yaml").write_text("cars: {red: {link: /dev/ttyUSB0}}\nrecordings: elsewhere\n")
+    (tmp_path / "fleet.yaml").write_text("cars: {red: {link: /dev/ttyUSB0}}\nrecord: {to: elsewhere}\n")
     monkeypatch.chdir(tmp_path)
     seen: list[Any] = []
     command = click.command()(session_argument(lambda session: seen.append(session)))  # noqa: PLW0108 - click calls it by name

@@ -146,7 +146,7 @@ def test_a_platform_at_a_glance(platform: str, modes: int, stop: StopStyle, obse
     ("text", "words"),
     [
         ("", 'Unknown platform "". There are arduino, stm32, raspberry_pi, unknown.'),
-        ("esp32", 'Unknown platform "esp32". Did you mean stm32?'),
+        ("esp32", 'Unknown platform "esp32". There are arduino, stm32, raspberry_pi, unknown.'),
         ("arduno", 'Unknown platform "arduno". Did you mean arduino?'),
         ("arduino imu", 'Unknown platform "arduino imu". Did you mean arduino?'),
         ("arduino+", 'Unknown option "+" of a platform. There are +arm and +imu.'),

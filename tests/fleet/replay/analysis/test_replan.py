@@ -245,4 +245,4 @@ def test_a_sessions_fleet_file_may_name_its_plan_otherwise(tmp_path: Path) -> No
     other.write_text(text, encoding="utf-8")
     named = run("plan", "try", tmp_path, "--fleet-file", other)
     assert named.exit_code == 2
-    assert "plan: 'p2.yaml': there is no such file beside this one" in named.output
+    assert "plan: there is no file 'p2.yaml' beside this one" in named.output
