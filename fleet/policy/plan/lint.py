@@ -142,6 +142,8 @@ class _Check:
             ):
                 words = f"it wants {role.count} cars, and only {', '.join(sorted(can_have))} can have it"
                 yield PlanFault(Severity.WARNING, part, words)
+            if can_have and (blind := self._reach.blind_to(role)):
+                yield PlanFault(Severity.WARNING, part, f"it may never get a car: {blind}")
             if role.by_rules and not self._is_called(role):
                 yield PlanFault(
                     Severity.ERROR,

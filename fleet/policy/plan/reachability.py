@@ -110,6 +110,25 @@ class ModeReachability:
             return ""
         return f"it needs {role.needs}, and never measures {_first_missing(role.needs, self.profiles(car), Mode)}"
 
+    def blind_to(self, role: Role) -> str:
+        """Say why no car can measure what this role needs before it has the role; empty if one can."""
+        needs, modes, kinds = role.needs, dict[Mode, None](), dict[Profile, None]()
+        if needs is None:
+            return ""
+        for car in (car for car in self.cars if self.can_have(car, role)):
+            kinds |= dict.fromkeys(self.profiles(car))
+            for phase in self._phases(None):
+                others = [each for each in self._roles(car, phase) if each.name != role.name]
+                modes |= dict.fromkeys(each.mode for each in others)
+                for rule in self._in_force(phase):
+                    modes |= dict.fromkeys(effect.mode for effect in rule.effects if effect.mode is not None)
+                given = [each for each in others if not each.by_rules and each.needs is None]
+                if not self._has_place_always(car, phase, given):
+                    modes[Mode.MANUAL] = None  # the coordinator brings a car without a role there
+        if not modes or any(can_be_true(needs, kind, mode) for kind in kinds for mode in modes if mode in kind.modes):
+            return ""
+        return f"until then they are in {_or(modes)}, and do not measure {_first_missing(needs, kinds, modes)}."
+
     def assess(self, condition: PlanCondition, during: Iterable[str] | None) -> Outlook:
         """Assess whether a condition can be true in one of these phases (None: any) while cars follow the plan."""
         if why := explain_impossible(condition.expression):

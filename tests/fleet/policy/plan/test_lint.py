@@ -164,6 +164,10 @@ def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> Non
             "it never sees cars with role patrol: in obstacle_avoidance they do not measure battery.voltage_v.",
         ),
         (
+            "roles: {patrol: {mode: obstacle_avoidance, count: all}, guide: {mode: tracking, needs: battery_v > 7}}",
+            "it may never get a car: until then they are in obstacle_avoidance, and do not measure battery.voltage_v.",
+        ),
+        (
             SCOUT
             + "rules:\n  - {when: {any_car: line.left_outer}, then: {who: red, mode: manual}}\n"
             + "  - {when: {any_car: line.right_outer}, then: {who: red, mode: following}}",
@@ -175,6 +179,19 @@ def test_what_works_only_half_is_a_warning(text: str, told: str) -> None:
     found = check(parse(text), FLEET)
     assert [each.severity for each in found if told in each.words] == [Severity.WARNING], [str(each) for each in found]
     assert not [each for each in found if each.severity is Severity.ERROR]
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        "patrol: {mode: obstacle_avoidance, needs: battery_v > 6, count: all}",  # until it is measured: manual
+        "patrol: {mode: obstacle_avoidance, count: all, priority: -1}, rest: {mode: manual}",
+        "patrol: {mode: obstacle_avoidance, cars: [green], count: all}",
+    ],
+)
+def test_a_need_that_cars_measure_before_they_have_the_role_is_let_alone(others: str) -> None:
+    plan = parse(f"roles: {{{others}, guide: {{mode: tracking, needs: battery_v > 7}}}}")
+    assert [each.words for each in check(plan, {**FLEET, "blue": listed("arduino")}) if "never get" in each.words] == []
 
 
 def test_a_good_plan_is_let_alone_with_and_without_a_fleet_file() -> None:
