@@ -11,7 +11,7 @@ import click
 from fleet.commands.options import cli_errors
 from fleet.commands.params import Duration, Number
 from fleet.fleetfile.fleet_file import FleetFile, default_color, parse_fleet, read_fleet
-from fleet.fleetfile.models import FileEntry, validate_color, validate_link, validate_name, validate_platform
+from fleet.fleetfile.models import FileEntry, validate_car_name, validate_color, validate_link, validate_platform
 from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, format_new_plan, scan
 from fleet.links import LINK_SIM
 from fleet.supervisor.spec import MAX_SIMULATED_CARS
@@ -199,7 +199,7 @@ def prompt_name(words: str, offered: str | None, taken: set[str]) -> str:
         name = name.strip()
         if name in taken:
             raise click.UsageError(f"{name} is another car's name already")
-        return name if name == _SKIP else _checked(validate_name)(name)
+        return name if name == _SKIP else _checked(validate_car_name)(name)
 
     name: str = click.prompt(words, default=offered, value_proc=check_name)
     return name

@@ -14,9 +14,18 @@ from fleet.client.condition import KeyCondition, topics_under
 from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
 from fleet.client.reading import Reading, Watch
 from fleet.client.wait import NotInTime
+from fleet.commands.group import did_you_mean
 from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.output import json_text, line, show_table
-from fleet.commands.params import Duration, Number, describe_available, warn_if_missing, written_out
+from fleet.commands.params import (
+    Duration,
+    Number,
+    any_cars_argument,
+    describe_available,
+    resolve_cars,
+    warn_if_missing,
+    written_out,
+)
 from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
@@ -32,25 +41,31 @@ _UNHEARD_S: Final = 3.0
 _MAX_SHORTFALL_LINES: Final = 5
 
 
-@click.command("list", epilog="\b\nexample:\n  fleet list --json")
+@click.command("list", epilog="\b\nexamples:\n  fleet list --json\n  fleet list @a")
+@any_cars_argument
 @json_option
 @with_client
-def list_cars(client: Fleet, *, as_json: bool) -> None:
-    """List the cars: platform, link, mode and how sure it is, motion, who is in control, hold and battery.
+def list_cars(client: Fleet, cars: Sequence[str], *, as_json: bool) -> None:
+    """List cars: platform, link, mode and how sure it is, motion, who is in control, hold and battery.
 
     On a narrow terminal columns are left out: platform, verdict, driver, motion. --json has them all.
     """
-    show_cars(client, as_json=as_json)
+    show_cars(client, resolve_cars(client, cars), as_json=as_json)
 
 
-def show_cars(client: Fleet, *, as_json: bool = False) -> None:
-    """Print the table of cars."""
+def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False) -> None:
+    """Print the table of cars. `only`: those of these names."""
     cars = client.cars()
     latest: dict[str, dict[str, Reading]] = {car: {} for car in cars}
     for reading in client.get("*/*/*"):  # one query, so that a hung gateway delays it only once
         key = keys.parse(reading.key)
         if key is not None:
             latest.setdefault(key.car, {})[key.topic] = reading
+    if missing := [car for car in only if car not in latest]:
+        there = f"Connected: {', '.join(sorted(latest))}." if latest else "No car is."
+        raise click.ClickException(f"{', '.join(missing)}: not connected. {did_you_mean(missing[0], latest) or there}")
+    if only:
+        latest = {car: latest[car] for car in only}
     if not latest:
         raise click.ClickException("No car is connected.")
     rows = [row_of(car, values) for car, values in sorted(latest.items())]
@@ -345,7 +360,10 @@ def wait(
     if ready:
         cars = [car for word in words for car in word.split(",") if car != "all"]
         for name in (fleet, *cars):
-            keys.check_name(name)
+            keys.check_name(name.removeprefix("@"))
+        if any(car.startswith("@") for car in cars):
+            with Fleet(connect, fleet, kind="person") as client:
+                cars = resolve_cars(client, cars)
         wait_ready(connect, fleet, cars, timeout_s or for_s or READY_WAIT_S, as_json=as_json)
         return
     if len(words) != 2:

@@ -281,8 +281,13 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
         with suppress(ValueError):  # a BadFile
             groups = read_fleet(Path("fleet.yaml"), unbound=True).groups
     if group not in groups:
-        there = f"Groups: {', '.join(groups)}." if groups else "fleet.yaml can have some: `groups: {a: [red, blue]}`."
-        raise click.ClickException(f'There is no group "{group}". {did_you_mean(group, groups) or there}')
+        near = did_you_mean(group, groups).replace("mean ", "mean @")
+        there = (
+            f"Groups: @{', @'.join(sorted(groups))}."
+            if groups
+            else "fleet.yaml can have some: `groups: {a: [red, blue]}`."
+        )
+        raise click.ClickException(f'There is no group "@{group}". {near or there}')
     return groups[group]
 
 

@@ -36,6 +36,13 @@ def validate_name(name: str) -> str:
     return keys.check_name(name, "name")
 
 
+def validate_car_name(name: str) -> str:
+    """Return the name of a car if it is valid; raises ValueError."""
+    if name == "all":
+        raise ValueError("no car can be called all: `fleet stop all` stops every car")
+    return validate_name(name)
+
+
 def validate_link(text: str) -> str:
     """Return a link if parse_fleet_link accepts it; raises ValueError."""
     try:
@@ -88,6 +95,9 @@ _PLATFORMS: Final = f"^({'|'.join((AUTO, *Platform))})([+]({'|'.join(sorted(OPTI
 
 _Name = Annotated[
     str, AfterValidator(validate_name), Field(json_schema_extra={"pattern": "^[a-z0-9][a-z0-9_-]{0,31}$"})
+]
+_CarName = Annotated[
+    str, AfterValidator(validate_car_name), Field(json_schema_extra={"pattern": "^(?!all$)[a-z0-9][a-z0-9_-]{0,31}$"})
 ]
 _Link = Annotated[str, AfterValidator(validate_link), Field(examples=["/dev/ttyUSB0", "tcp://192.168.1.7:8888"])]
 _Platform = Annotated[str, AfterValidator(validate_platform), Field(json_schema_extra={"pattern": _PLATFORMS})]
@@ -164,4 +174,4 @@ class FileEntry(Entry):
     groups: dict[_Name, list[_Name]] = Field(
         default_factory=dict, description="groups of cars, `a: [red, blue]`, for commands: `fleet stop @a`"
     )
-    cars: dict[_Name, CarEntry] = Field(description="at least one car, as `red: {link: /dev/ttyUSB0}`", min_length=1)
+    cars: dict[_CarName, CarEntry] = Field(description="at least one car, as `red: {link: /dev/ttyUSB0}`", min_length=1)

@@ -119,6 +119,11 @@ cars:
     assert "fleet bind" in found[11]
 
 
+def test_no_car_is_called_all() -> None:
+    (found,) = _faults("cars:\n  all: {link: COM1}\n")
+    assert found.startswith("/nowhere/f.yaml:2:3: error: cars.all: no car can be called all")
+
+
 @pytest.mark.parametrize(
     ("one", "other", "same"),
     [
