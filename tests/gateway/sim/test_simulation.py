@@ -567,7 +567,7 @@ async def test_truth_that_nobody_can_see_is_said_once(monkeypatch: pytest.Monkey
     simulation = Simulation(parse_cars(["red:arduino:tcp://127.0.0.1:0"]), seed=1)
     publishing = asyncio.create_task(TruthPublisher(simulation, free_endpoint(), "fleet", said.put_nowait).run())
     words = await asyncio.wait_for(said.get(), 20)
-    assert words.startswith("there is no hub at tcp/127.0.0.1:")
+    assert words.startswith("There is no hub at tcp/127.0.0.1:")
     await asyncio.sleep(3 * HUB_RETRY_DELAY_S)
     publishing.cancel()
     await asyncio.gather(publishing, return_exceptions=True)
