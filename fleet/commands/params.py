@@ -282,11 +282,10 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
             groups = read_fleet(Path("fleet.yaml"), unbound=True).groups
     if group not in groups:
         near = did_you_mean(group, groups).replace("mean ", "mean @")
-        there = (
-            f"Groups: @{', @'.join(sorted(groups))}."
-            if groups
-            else "fleet.yaml can have some: `groups: {a: [red, blue]}`."
-        )
+        there = f"Groups: @{', @'.join(sorted(groups))}." if groups else ""
+        if not groups:
+            whose = "The running fleet has none: its file" if status else "fleet.yaml"
+            there = f"{whose} can have some, `groups: {{a: [red, blue]}}`."
         raise click.ClickException(f'There is no group "@{group}". {near or there}')
     return groups[group]
 

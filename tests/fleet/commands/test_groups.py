@@ -40,14 +40,18 @@ def test_without_a_supervisor_the_fleet_file_here_has_the_groups(client: Fleet) 
 def test_the_running_fleet_has_the_groups(client: Fleet) -> None:
     Path("fleet.yaml").write_text(FILE, encoding="utf-8")
     key = "fleet/@supervisor/status"
+    groups = {"b": "green", "a": "red,blue"}
 
     def answer(query: zenoh.Query) -> bool:
-        reply_message(query, key, pb.Supervision(groups={"b": "green", "a": "red,blue"}), as_json=False)
+        reply_message(query, key, pb.Supervision(groups=groups), as_json=False)
         return True
 
     client.bus.queryable(key, answer)
     assert resolve_cars(client, ["@a"]) == ["red", "blue"]
     with pytest.raises(click.ClickException, match="Groups: @a, @b"):
+        resolve_cars(client, ["@lab"])
+    groups.clear()
+    with pytest.raises(click.ClickException, match="The running fleet has none"):
         resolve_cars(client, ["@lab"])
 
 
