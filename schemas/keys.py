@@ -33,6 +33,11 @@ def check_name(name: str, what: str = "car name") -> str:
     return name
 
 
+def describe_fleet(fleet: str) -> str:
+    """Return a fleet's name for a person. The default name is left out."""
+    return "the fleet" if fleet == DEFAULT_FLEET else f"fleet {fleet}"
+
+
 @dataclass(frozen=True, slots=True)
 class Key:
     """The parts of a concrete key: `fleet/red/sensor/range` is (fleet, red, sensor/range)."""

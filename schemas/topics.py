@@ -148,7 +148,7 @@ CAR_TOPICS: Final = (
     Topic(
         "state/link",
         "fleet.v1.Link",
-        "whether the car is heard, and counters",
+        "the state of the link, and counters",
         Qos.STATE,
         1.0,
         _STATE,
@@ -171,7 +171,7 @@ CAR_TOPICS: Final = (
     Topic(
         "state/motion",
         "fleet.v1.Motion",
-        "the motion that is held, and by whom",
+        "the current motion, and its sender",
         Qos.STATE,
         1.0,
         _STATE,

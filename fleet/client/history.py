@@ -62,7 +62,7 @@ def describe_shortfalls(
     """
     lines, states = [], 0
     every = list(readings)
-    lines += [f"{key}: {count} in between were lost on the way, ask again" for key, count in gaps(every).items()]
+    lines += [f"{key}: {count} in between were lost on the way. Try again." for key, count in gaps(every).items()]
     for key, group in itertools.groupby(every, key=lambda reading: reading.key):
         found, topic = list(group), topics.of_key(key)
         if topic is None or topic.history_size <= 1:
@@ -75,10 +75,10 @@ def describe_shortfalls(
             if full and oldest_s < since_s and (last is None or last > topic.history_size):
                 lines.append(f"{key}: goes back {oldest_s:.1f} s of {since_s:g} s, {keeps}")
         elif last is not None and len(found) < last:
-            more = keeps if full else "its gateway has had no more"
+            more = keeps if full else "its gateway has no more"
             lines.append(f"{key}: {len(found)} of {last}, {more}")
     if states and last != 1:
-        lines.append("of states gateways keep only the latest; a recording has all (fleet record)")
+        lines.append("Gateways keep only the latest value of a state. A recording has all (`fleet record`).")
     return lines
 
 
@@ -88,4 +88,4 @@ def describe_missing_history(under: Iterable[topics.Topic]) -> str:
     if not listed or any(topic.history_size for topic in listed):
         return ""
     names = ", ".join(topic.name for topic in listed)
-    return f"gateways keep no history of {names}, only of sensor/*; a recording has everything (fleet record)"
+    return f"Gateways keep no history of {names}, only of sensor/*. A recording has everything (`fleet record`)."

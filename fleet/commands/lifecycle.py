@@ -47,7 +47,9 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
             continue
         where = f"recording to {each.session}" if each.session else "not recording"
         what = each.fleet_file or "simulated cars"
-        click.echo(f"fleet {fleet} ({what}): {each.state} for {timedelta(seconds=int(each.uptime_s))}, {where}")
+        click.echo(
+            f"{keys.describe_fleet(fleet)} ({what}): {each.state} for {timedelta(seconds=int(each.uptime_s))}, {where}"
+        )
         if processes:
             click.echo(f"supervisor: process {each.pid} on {each.host}, logs in {each.directory}")
             for process in each.processes:
@@ -166,7 +168,7 @@ def _directory(connect: str | None, fleet: str) -> Path:
     # A run that was refused has no logs.
     newest = sorted(each for each in place.iterdir() if any(each.glob("*.log"))) if place.is_dir() else []
     if not newest:
-        raise click.ClickException(f"No logs yet: fleet {fleet} has not run here. `fleet up` starts it.")
+        raise click.ClickException(f"No logs yet: {keys.describe_fleet(fleet)} has not run here. `fleet up` starts it.")
     return newest[-1]
 
 

@@ -136,7 +136,7 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
     if name == "platform" and row["platform_contradictions"]:
         return f"{row['platform']} (contradicted)"
     if name == "link" and row["unheard"]:
-        silence = "never heard" if row["last_rx_s"] is None else f"not heard for {row['last_rx_s']:.0f} s"
+        silence = "no reading yet" if row["last_rx_s"] is None else f"silent for {row['last_rx_s']:.0f} s"
         return f"{row['link']} ({silence})"
     old = " (stale)" if name in ("link", "mode", "motion") and f"state/{name}" in row["stale"] else ""
     return f"{row[name]}{old}" if row[name] else "-"
@@ -261,7 +261,7 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
     with Fleet(connect, fleet, kind="person") as client:
         found = _alive(client, written, look_s)
         if not found:
-            what = f"under {written[0]}" if keyexpr else f"of fleet {fleet}"
+            what = f"under {written[0]}" if keyexpr else f"of {keys.describe_fleet(fleet)}"
             raise click.ClickException(f"no key {what} is alive; {describe_available(client, written[0])}")
     if as_json:
         for each in found:

@@ -53,8 +53,7 @@ def with_client(function: _Function) -> _Function:
 
 def not_running(fleet: str) -> click.ClickException:
     """Return the error that no supervisor answers."""
-    name = "The fleet" if fleet == keys.DEFAULT_FLEET else f"Fleet {fleet}"
-    return click.ClickException(f"{name} is not running. Start it with `fleet up`.")
+    return click.ClickException(f"{keys.describe_fleet(fleet).capitalize()} is not running. Start it with `fleet up`.")
 
 
 class WrongFile(click.ClickException):

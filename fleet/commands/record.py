@@ -163,9 +163,17 @@ def run(
             recorder = Recorder(bus, fleet, place, options, notify=_warn)
             session = recorder.start()
             if full := recorder.full:
-                _say(as_json, {"session": str(session), "state": "full"}, f"fleet {fleet} waits for room: {full}")
+                _say(
+                    as_json,
+                    {"session": str(session), "state": "full"},
+                    f"{keys.describe_fleet(fleet)} is not recorded until there is room: {full}",
+                )
             else:
-                _say(as_json, {"session": str(session), "state": "recording"}, f"recording fleet {fleet} to {session}")
+                _say(
+                    as_json,
+                    {"session": str(session), "state": "recording"},
+                    f"recording {keys.describe_fleet(fleet)} to {session}",
+                )
             _wait(bus, stop, recorder.ended, parent)
             outcome = recorder.close()
     except (BadEndpoint, keys.BadKey) as error:
@@ -221,7 +229,7 @@ def _query(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
                 raise click.ClickException(f"the recorder says: {answer.words}")
             return answer.message()
         raise click.ClickException(
-            f"no recorder of fleet {fleet!r} is on the bus at {bus.endpoint}: `fleet record` starts one"
+            f"No recorder of {keys.describe_fleet(fleet)} is on the bus at {bus.endpoint}. `fleet record` starts one."
         )
 
 

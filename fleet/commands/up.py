@@ -241,7 +241,7 @@ async def _serve(
             case signal.SIGINT:
                 supervisor.end("Ctrl-C")
             case signal.SIGTERM:
-                supervisor.end("told to end", CAR_STOP_RETRY_S)
+                supervisor.end("SIGTERM", CAR_STOP_RETRY_S)
             case _:
                 supervisor.end("the terminal was closed", CAR_STOP_RETRY_S)
 

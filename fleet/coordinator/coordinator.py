@@ -68,7 +68,7 @@ _EVENTS: Final = {
 }
 """Code and words of the event for each request, whose sender stands before the words."""
 _PLAN_SET: Final = "plan_set"
-_UNSAVED: Final = "It cannot be saved: a coordinator that is started again does not know it."
+_UNSAVED: Final = "It cannot be saved: a restarted coordinator will not know it."
 
 
 @dataclass(frozen=True, slots=True)
@@ -460,8 +460,9 @@ class Coordinator:
             raise AnotherCoordinator(self._describe(others))
 
     def _describe(self, others: list[str]) -> str:
-        who = ", ".join(others) or "one that does not say who it is"
-        return f"fleet {self.client.name} has a coordinator already ({who}): stop that one first"
+        who = ", ".join(others) or "without a name"
+        fleet = keys.describe_fleet(self.client.name).capitalize()
+        return f"{fleet} has a coordinator already ({who}). Stop that one first."
 
     def _publish(self, name: str, message: Any) -> None:
         publisher = self._publisher(name)

@@ -222,4 +222,4 @@ class ProcessSet:
         over = process.leaving and process.status.state in (RunState.ENDED, RunState.REFUSED)
         if over and self._processes.get(process.name) is process:
             del self._processes[process.name]
-            self._on_event(process.name, "ended: no longer wanted")
+            self._on_event(process.name, "ended: no longer needed")

@@ -33,7 +33,7 @@ class SpecChange:
 def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
     """Return the changes from `old` to `new`."""
     words = [
-        f"{what} cannot be changed while running (fleet down, fleet up)"
+        f"{what} cannot change while the fleet runs. Restart it: `fleet down`, `fleet up`."
         for name, what in _FIXED_PROPERTIES.items()
         if getattr(old, name) != getattr(new, name)
     ]
@@ -44,15 +44,17 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         if car == before:
             cars[name] = car
         elif SIMULATED in (car.link, before.link if before else ""):
-            words.append(f"{name}, a simulated car, cannot be changed while running (fleet down, fleet up)")
+            words.append(
+                f"{name}, a simulated car, cannot change while the fleet runs. Restart it: `fleet down`, `fleet up`."
+            )
             if before is not None:
                 cars[name] = before
         else:
             cars[name] = car
             restarted.append(name)
-            words.append(f"{name} is {'begun anew' if before else 'added'}")
+            words.append(f"{name} is {'restarted' if before else 'added'}")
     removed = tuple(name for name in old.cars if name not in cars)
-    words += [f"{name} is taken out" for name in removed]
+    words += [f"{name} is removed" for name in removed]
     # If a car cannot change, the coordinator's entry for it does not change either.
     unchanged = {name for name, car in cars.items() if car != new.cars.get(name)}
     listed = {name: entry for name, entry in new.listed.items() if name in cars and name not in unchanged}
@@ -80,4 +82,4 @@ def _describe_difference(before: CoordinatorCar | None, now: CoordinatorCar | No
         return ""
     fields = ("platform", "without", "roles")
     changed = [name for name in fields if getattr(before, name) != getattr(now, name)]
-    return f"its {' and '.join(changed)} changed, for the coordinator" if changed else ""
+    return f"the coordinator takes its new {' and '.join(changed)}" if changed else ""

@@ -115,7 +115,7 @@ class ProcessState:
         silent = self.silent_s(now, listening_since)
         allowed = self.patience.start_s if self.state is RunState.STARTING else self.patience.silence_s
         if silent > max(allowed, leave_s):
-            return self._kill(f"{HUNG}: not heard for {silent:.1f} s")
+            return self._kill(f"{HUNG}: no heartbeat for {silent:.1f} s")
         return RestartAction.NOTHING
 
     def on_started(self, now: float) -> None:

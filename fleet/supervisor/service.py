@@ -149,22 +149,22 @@ class SupervisorService:
         except (ReloadRefused, messages.BadPayload) as error:
             result.status, result.reason, result.words = "rejected", "bad_value", str(error)
         except Exception as error:  # noqa: BLE001 - reply to every query, whatever the error
-            result.status, result.words = "rejected", f"it went wrong: {type(error).__name__}: {error}"
+            result.status, result.words = "rejected", f"internal error: {type(error).__name__}: {error}"
             _log.exception("%s went wrong", verb)
         with query:
             reply_message(query, self._key(f"@cmd/{verb}"), result, as_json=is_json_wanted(query))
 
     def _command(self, query: zenoh.Query, verb: str, encoding: str) -> Any:
         if verb not in SUPERVISOR_COMMANDS:
-            raise ReloadRefused(f"there is no {verb}: allowed are {', '.join(SUPERVISOR_COMMANDS)}")
+            raise ReloadRefused(f"There is no command {verb}. There are {', '.join(SUPERVISOR_COMMANDS)}.")
         if query.payload is None:
-            raise ReloadRefused("there is no payload: send a message, {} is enough")
+            raise ReloadRefused("The payload is missing. Send a message: {} is enough.")
         return messages.parse(SUPERVISOR_COMMANDS[verb], query.payload.to_bytes(), encoding)
 
     def _another_supervisor(self, other: Any) -> AnotherSupervisor:
         return AnotherSupervisor(
-            f"fleet {self.fleet} is up already: process {other.pid} on {other.host} "
-            f"({other.fleet_file or 'simulated cars'}); end that first (fleet down), or name this one with --fleet"
+            f"{keys.describe_fleet(self.fleet).capitalize()} is up already: process {other.pid} on {other.host} "
+            f"({other.fleet_file or 'simulated cars'}). End it first: `fleet down`. Or name this one with --fleet."
         )
 
 

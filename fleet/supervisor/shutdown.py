@@ -72,7 +72,7 @@ class GatewayShutdown:
         elif process.status.alive:
             self._end(process)
         elif process.child is None:
-            self._finish(process, "nothing was sent to it: its gateway had not been started")
+            self._finish(process, "its gateway had not started, so it got no command")
         elif process.status.state is RunState.REFUSED:
             self._finish(process, f"{NOT_STOPPED}: no gateway was running ({process.status.words})")
         else:
@@ -154,7 +154,7 @@ class GatewayShutdown:
 
     def _replace(self, process: ManagedProcess, why: str) -> None:
         tried = self._tries[process.name] = self._tries.get(process.name, 0) + 1
-        until = "" if tried == 1 else " until Ctrl-C is pressed or fleet down is called again"
+        until = "" if tried == 1 else " until you press Ctrl-C or run `fleet down` again"
         self._on_result(process.name, f"{why.rstrip('.')}. A fresh gateway tries to stop the car{until}.")
         self._awaited.add(process.name)
         process.urgent = True
@@ -174,5 +174,5 @@ class GatewayShutdown:
 
 def _why(process: ManagedProcess) -> str:
     if process.code is not None and process.code < 0:
-        return "its gateway was killed: the car may be moving"
+        return "the car may be moving: its gateway was killed"
     return process.why.removeprefix(f"{process.name}: ") or f"its gateway ended with exit code {process.code}"

@@ -119,7 +119,7 @@ class Supervisor:
         """
         if self._shutdown_requested.is_set():
             waiting = ", ".join(process.name for process in self.processes if process.status.alive)
-            self._say("end", SELF, f"{why}: is ending already, waits for {waiting or 'nothing'}")
+            self._say("end", SELF, f"{why}: the fleet is ending already, and waits for {waiting or 'nothing'}")
             self._shutdown.hurry()
             return
         self._say("end", SELF, f"{why}: stopping every car, then closing the recording")
@@ -235,7 +235,7 @@ class Supervisor:
         due = hub.status.state is RunState.WAITING and now >= hub.status.due
         refused = hub.status.state is RunState.REFUSED  # no hub of ours on a network: the router there is back
         if (refused and linked) or (due and await asyncio.to_thread(accepts, self.endpoint)):
-            hub.status.served_elsewhere(now, f"somebody else's listens at {self.endpoint}")
+            hub.status.served_elsewhere(now, f"another program's hub listens at {self.endpoint}")
         elif hub.status.state is RunState.ELSEWHERE and is_lost and not await asyncio.to_thread(accepts, self.endpoint):
             hub.status.schedule(now)
 
@@ -295,13 +295,13 @@ class Supervisor:
             command = self._coordinator_of(self._spec, plan.text)
         except OSError as error:
             if given:
-                words = f"was given over the bus, and cannot be kept for a coordinator after this one: {error.strerror}"
+                words = f"is in force, but cannot be saved: a restarted coordinator will not know it ({error.strerror})"
                 self._say("process", COORDINATOR, f"plan {plan.version} {words}")
             return
         if command != coordinator.command:
             coordinator.command = command
             if given:
-                words = f"plan {plan.version} was given over the bus: it is in force until a reload"
+                words = f"plan {plan.version} came over the bus. It is in force until `fleet reload`."
                 self._say("process", COORDINATOR, words)
 
     async def _set_plan(self, service: SupervisorService, old: FleetSpec, command: tuple[str, ...]) -> str:
@@ -310,16 +310,16 @@ class Supervisor:
         if not command or coordinator is None:
             if command:
                 self.processes.add(COORDINATOR, ProcessKind.COORDINATOR, command)
-                return "there is a plan now"
+                return "the fleet has a plan now"
             self.processes.remove(COORDINATOR, SERVICE_EXIT_TIMEOUT_S)
-            return "there is no plan any more: cars keep their modes" if coordinator is not None else ""
+            return "the fleet has no plan any more. Cars keep their modes." if coordinator is not None else ""
         text = self._spec.plan_text
-        words = "" if text == old.plan_text else "the plan is changed"
+        words = "" if text == old.plan_text else "the plan has changed"
         in_force = None
         if coordinator.status.state is RunState.RUNNING:
             in_force = await asyncio.to_thread(service.plan_in_force)
         if in_force is not None and in_force.text not in (text, old.plan_text):
-            words = f"plan {in_force.version}, which was given over the bus, is replaced by {self._spec.plan}"
+            words = f"{self._spec.plan} replaces plan {in_force.version}, which came over the bus"
         is_in_force = in_force is not None and in_force.text == text
         if (
             in_force is not None
@@ -485,7 +485,7 @@ class Supervisor:
         await asyncio.wait([stop_query], timeout=SERVICE_EXIT_TIMEOUT_S)
         left = ", ".join(self._shutdown.not_stopped)
         words = "every car that was started is stopped" if self._shutdown.results else "no car had been started"
-        self._say("end", SELF, f"not stopped: {left}: look whether they drive" if left else words)
+        self._say("end", SELF, f"NOT STOPPED: {left}. They may be moving: go to them." if left else words)
 
     async def _until_ended(self, processes: list[ManagedProcess]) -> None:
         while self._shutdown.pending or any(process.status.alive for process in processes):

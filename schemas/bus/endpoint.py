@@ -100,8 +100,8 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
         return
     if not is_loopback(endpoint):
         raise NoFleet(
-            f"nothing listens at {endpoint}, and a hub is started on loopback only: start a Zenoh router there "
-            "(or fleet up --insecure-lan), or name another endpoint with --connect"
+            f"Nothing listens at {endpoint}, and a hub starts by itself on loopback only. Start a Zenoh router there "
+            "(or `fleet up --insecure-lan`), or name another place with --connect."
         )
     import subprocess
 
@@ -116,7 +116,7 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not accepts(endpoint):
         if time.monotonic() > deadline:
-            raise BusError(f"no hub came up at {endpoint} within {timeout_s:g} s: is the port used by something else?")
+            raise BusError(f"No hub came up at {endpoint} within {timeout_s:g} s. Does another program use the port?")
         # If two hubs start at once, the loser ends, and the winner listens in a moment.
         with contextlib.suppress(subprocess.TimeoutExpired):
             hub.wait(0.02)

@@ -98,7 +98,7 @@ def test_cars_that_nothing_reaches_are_named_at_the_end_and_told_on_until_they_s
             words = {each["name"]: each["words"] for each in ended if each["what"] == "end"}
             assert words["red"] == "stopped"
             assert words["blue"].startswith("not stopped: ")
-            assert words["@supervisor"] == "not stopped: blue: look whether they drive"
+            assert words["@supervisor"] == "NOT STOPPED: blue. They may be moving: go to them."
             assert by_name["blue"].true_mode == MODES["obstacle_avoidance"]
             for name in by_name:
                 assert "may still be moving" in up.fleet("logs", name).stdout

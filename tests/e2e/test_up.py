@@ -76,7 +76,7 @@ def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
     os.kill(pid, signal.SIGSTOP)
     wait_for(lambda: not _exists(pid), f"{name} is killed")
     up.running(name, but=pid)
-    assert up.state(name).words.startswith("hung: not heard for")
+    assert up.state(name).words.startswith("hung: no heartbeat for")
     for car in ("red", "green"):
         up.ready(car)
 
@@ -129,13 +129,13 @@ def test_a_second_one_refuses_and_names_the_first(up: Up) -> None:
     for more in ((), ("--detach",)):
         second = up.fleet("up", "--sim", "1", "--no-record", *more)
         assert second.returncode == 1
-        assert second.stderr.startswith(f"fleet: fleet fleet is up already: process {up.process.pid} on ")
+        assert second.stderr.startswith(f"fleet: The fleet is up already: process {up.process.pid} on ")
         assert second.stderr.count("\n") == 1
 
 
 def test_status_and_logs_say_what_runs(up: Up) -> None:
     first, header, *cars = up.fleet("status").stdout.splitlines()
-    assert re.match(r"fleet fleet \(simulated cars\): running for \d:\d\d:\d\d, recording to ", first)
+    assert re.match(r"the fleet \(simulated cars\): running for \d:\d\d:\d\d, recording to ", first)
     assert header.startswith("CAR ")
     assert [line.split()[0] for line in cars] == ["green", "red"]
     assert f"process {up.running('red')}" in up.fleet("status", "--processes").stdout
@@ -153,7 +153,7 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
 
 
 def test_a_command_that_is_none_is_refused(up: Up) -> None:
-    for verb, payload, words in (("up", "{}", "allowed are down, reload"), ("down", "{", "is not the JSON")):
+    for verb, payload, words in (("up", "{}", "There are down, reload"), ("down", "{", "is not the JSON")):
         selector = f"fleet/@supervisor/@cmd/{verb}?format=json"
         (answer,) = up.bus.query(selector, payload=payload.encode(), timeout_s=PATIENCE_S)
         assert isinstance(answer, bus.Sample)
@@ -245,7 +245,7 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
             os.write(master, b"\x03")
             wait_for(lambda: b"Ctrl-C: stopping every car" in shown, "it ends")
             os.write(master, b"\x03")
-            wait_for(lambda: b"Ctrl-C: is ending already, waits for" in shown, "it has heard it")
+            wait_for(lambda: b"Ctrl-C: the fleet is ending already, and waits for" in shown, "it has heard it")
             os.kill(waited_for, signal.SIGCONT)
             wait_for(lambda: not truths["red"].message().motor_left, "red stands")  # type: ignore[attr-defined]
             assert process.wait(PATIENCE_S) == 0
@@ -318,14 +318,14 @@ def test_the_end_stops_cars_whose_gateways_hang_or_were_killed_and_says_which_it
             assert time.monotonic() - began < IN_ITS_PLACE_S + STARTS_S
         for _ in range(2):
             tried = started.until("end", "blue", "A fresh gateway tries to stop the car")
-        assert tried["words"].endswith(" until Ctrl-C is pressed or fleet down is called again.")
+        assert tried["words"].endswith(" until you press Ctrl-C or run `fleet down` again.")
         started.process.popen.send_signal(signal.SIGINT)
         assert started.process.wait() == 1
         ended = [*started.heard, *map(json.loads, started.process.lines())]
         said = {each["name"]: each["words"] for each in ended if each["what"] == "end"}
         assert (said["red"], said["green"]) == ("stopped", "stopped")
         assert said["blue"].startswith("not stopped: ")
-        assert said["@supervisor"] == "not stopped: blue: look whether they drive"
+        assert said["@supervisor"] == "NOT STOPPED: blue. They may be moving: go to them."
 
 
 def test_a_car_that_cannot_be_reached_at_the_end_is_told_by_fresh_gateways_until_it_is_stopped(
@@ -392,7 +392,7 @@ def test_a_car_that_is_taken_out_is_stopped_though_its_gateway_hangs(fleet: Flee
         wait_for(lambda: driving(sim, "green"), "green drives")
         os.kill(started.running("green"), signal.SIGSTOP)
         file.write_text(_text(red=links[0]))
-        assert started.fleet("reload").stdout == "green is taken out\n"
+        assert started.fleet("reload").stdout == "green is removed\n"
         began = time.monotonic()
         wait_for(lambda: not driving(sim, "green"), "green is stopped")
         assert time.monotonic() - began < IN_ITS_PLACE_S + STARTS_S
@@ -419,16 +419,16 @@ def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: Flee
         file.write_text(_text(red=red, blue=blue).replace("cars:", "name: lab\ncars:"))
         done = started.fleet("reload")
         assert done.returncode == 0, done.stderr
-        assert "the fleet's name cannot be changed while running" in done.stdout
+        assert "the fleet's name cannot change while the fleet runs" in done.stdout
         assert "blue is added" in done.stdout
-        assert "green is taken out" in done.stdout
+        assert "green is removed" in done.stdout
         started.ready("blue")
         wait_for(lambda: started.state("green") is None, "green's gateway has ended")
         assert started.running("red") == before["red"]
 
         file.write_text(_text(red=red, blue=blue).replace("blue: {", "blue: {limits: {longest_drive_s: 3}, "))
         pid = started.running("blue")
-        assert "blue is begun anew" in started.fleet("reload").stdout
+        assert "blue is restarted" in started.fleet("reload").stdout
         started.running("blue", but=pid)
         started.ready("blue")
         answer = started.ask("drive", "blue", motion="forward", duration_s=4)
@@ -444,7 +444,7 @@ def test_another_plan_is_taken_by_the_coordinator_that_runs_and_a_bad_one_by_nob
     assert refused.returncode == 2
     assert "trakking" in refused.stderr
     plan.write_text("roles: {follow: {mode: light_seeking}, seek: {mode: light_seeking}}\n")
-    assert job.fleet("reload").stdout == "the plan is changed\n"
+    assert job.fleet("reload").stdout == "the plan has changed\n"
     wait_for(lambda: _asked(job, "ann") == "light_seeking", "ann seeks light")
     assert job.running("@coordinator") == pid
     job.kill(pid)
@@ -471,7 +471,7 @@ def test_simulated_cars_that_have_no_link_yet_do_a_plan(tmp_path: Path) -> None:
 def test_reload_tells_the_coordinator_what_the_cars_may_do_now(job: Up) -> None:
     _job(job.directory, ann="seek", bob="follow")
     told = job.fleet("reload").stdout
-    assert told == "ann: its roles changed, for the coordinator\nbob: its roles changed, for the coordinator\n"
+    assert told == "ann: the coordinator takes its new roles\nbob: the coordinator takes its new roles\n"
     wait_for(lambda: _asked(job, "bob") == "tracking", "bob follows")
     assert job.fleet("reload").stdout == "nothing has changed\n"
 
@@ -480,7 +480,7 @@ def test_reload_restores_a_plan_that_was_replaced_over_the_bus(job: Up) -> None:
     pid = _given_another_job(job)
     wait_for(lambda: _asked(job, "ann") == "obstacle_avoidance", "ann does as the plan over the bus says")
     told = job.fleet("reload").stdout
-    assert "which was given over the bus, is replaced by " in told
+    assert "replaces plan " in told
     wait_for(lambda: _asked(job, "ann") == "tracking", "ann follows again")
     assert job.running("@coordinator") == pid
     assert job.fleet("reload").stdout == "nothing has changed\n"
@@ -488,7 +488,7 @@ def test_reload_restores_a_plan_that_was_replaced_over_the_bus(job: Up) -> None:
 
 def test_a_plan_that_was_given_over_the_bus_outlives_its_coordinator(job: Up) -> None:
     pid = _given_another_job(job)
-    job.until("process", "@coordinator", "was given over the bus: it is in force until a reload")
+    job.until("process", "@coordinator", "came over the bus. It is in force until `fleet reload`.")
     job.kill(pid)
     assert job.running("@coordinator", but=pid)
     plan = wait_for(lambda: job.get("@coordinator/plan"), "a coordinator answers")
@@ -513,7 +513,7 @@ def test_reload_on_a_full_disk_changes_nothing(job: Up) -> None:
         run.with_name("away").rename(run)
     done = job.fleet("reload")
     assert "eve is added" in done.stdout
-    assert "the plan is changed" in done.stdout
+    assert "the plan has changed" in done.stdout
     wait_for(lambda: _asked(job, "ann") == "obstacle_avoidance", "ann does as the new plan says")
 
 

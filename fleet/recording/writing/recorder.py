@@ -182,12 +182,14 @@ class Recorder:
     def _refuse_a_second(self) -> None:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
             return
-        where = "it does not say where to"
+        where = "to an unknown place"
         for answer in self._bus.query(f"{self._fleet}/{STATUS_TOPIC.name}", timeout_s=STATUS_TIMEOUT_S):
             if isinstance(answer, Sample):
                 message: Any = answer.message()
                 where = f"to {message.session}"
-        raise AnotherRecorder(f"fleet {self._fleet!r} is being recorded already, {where}: one recorder is enough")
+        raise AnotherRecorder(
+            f"{keys.describe_fleet(self._fleet).capitalize()} is recorded already, {where}. One recorder is enough."
+        )
 
     def _on_query(self, query: zenoh.Query) -> bool:
         """Queue a query, on a Zenoh thread. Return False if too many are pending."""
@@ -305,7 +307,7 @@ class Recorder:
         self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
         self._drops = self._session.drops
         if not self._session.full:
-            self._notify(f"recording fleet {self._fleet} to {self._session.path}")
+            self._notify(f"recording {keys.describe_fleet(self._fleet)} to {self._session.path}")
 
     def _end_session(self, session: SessionWriter) -> None:
         """Close a session, and report its last news."""
@@ -397,7 +399,9 @@ class Recorder:
 
     def _start_session(self) -> None:
         if self._recording:
-            raise _CommandRefused(f"fleet {self._fleet!r} is being recorded already, to {self._session.path}")
+            raise _CommandRefused(
+                f"{keys.describe_fleet(self._fleet).capitalize()} is recorded already, to {self._session.path}"
+            )
         try:
             self._begin_session()
         except OSError as error:

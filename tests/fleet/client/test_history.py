@@ -119,7 +119,7 @@ def test_what_a_gateway_no_longer_has_is_said(remembered: Remembered) -> None:
     assert b" s of 3600 s, its gateway keeps the last 1500\n" in done.stderr
     done = get(remembered, "red/state/mode", "--last", "5")
     assert (done.returncode, done.stdout.count(b"\n")) == (0, 1)
-    assert b"of states gateways keep only the latest" in done.stderr
+    assert b"Gateways keep only the latest value of a state" in done.stderr
 
 
 def test_several_keys_each_keep_their_order(remembered: Remembered) -> None:
@@ -163,7 +163,7 @@ def test_any_zenoh_client_gets_the_same(remembered: Remembered) -> None:
         ("red/sensor/range --last ten", 2, '--last: "ten" is not a whole number'),
         ("red/sensor/range --since -3s", 2, '--since: "-3s" is not a duration: write it as 500ms, 2s, 1m30s or 1h'),
         ("red/sensor/range --since 8760h", 2, "--since: 8760h is too long: at most 168h"),
-        ("red/event/command --last 3", 2, "gateways keep no history of event/command, only of sensor/*"),
+        ("red/event/command --last 3", 2, "Gateways keep no history of event/command, only of sensor/*"),
         ("red/sensor/arm --last 3", 1, "nothing under fleet/red/sensor/arm; red has sensor/battery"),
         ("purple/sensor/range --since 1m", 1, "of the last 60 s; connected: red"),
     ],
@@ -228,14 +228,14 @@ def test_what_one_answer_lost_another_has() -> None:
     assert history.merge(first, second, last=3) == blue + numbered(4, 5, 6)
     assert history.gaps(numbered(900) + numbered(3, boot="z")) == {}, "a gateway that began anew counts anew"
     told = history.describe_shortfalls(numbered(1, 2, 5), NOW, last=3)
-    assert told == ["fleet/red/sensor/range: 2 in between were lost on the way, ask again"]
+    assert told == ["fleet/red/sensor/range: 2 in between were lost on the way. Try again."]
 
 
 @pytest.mark.parametrize(
     ("count", "last", "since_s", "told"),
     [
         (40, 40, None, []),
-        (40, 100, None, ["fleet/red/sensor/range: 40 of 100, its gateway has had no more"]),
+        (40, 100, None, ["fleet/red/sensor/range: 40 of 100, its gateway has no more"]),
         (1500, 2000, None, ["fleet/red/sensor/range: 1500 of 2000, its gateway keeps the last 1500"]),
         (1500, None, 1499.0, []),
         (1500, None, 2000.0, ["fleet/red/sensor/range: goes back 1499.0 s of 2000 s, its gateway keeps the last 1500"]),

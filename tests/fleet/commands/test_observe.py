@@ -23,9 +23,9 @@ def row(**messages: Any) -> dict[str, Any]:
         (pb.Link(state="online", last_rx_s=0.04), "off", False, "online"),
         (pb.Link(state="quiet", last_rx_s=40), "on", False, "quiet"),
         (pb.Link(state="lost", last_rx_s=40), "unknown", False, "lost"),
-        (pb.Link(state="stale", last_rx_s=12.2), "off", True, "stale (not heard for 12 s)"),
-        (pb.Link(state="stale"), "unknown", True, "stale (never heard)"),
-        (pb.Link(state="online", last_rx_s=24), "unknown", True, "online (not heard for 24 s)"),
+        (pb.Link(state="stale", last_rx_s=12.2), "off", True, "stale (silent for 12 s)"),
+        (pb.Link(state="stale"), "unknown", True, "stale (no reading yet)"),
+        (pb.Link(state="online", last_rx_s=24), "unknown", True, "online (silent for 24 s)"),
         (pb.Link(state="online", last_rx_s=1), "unknown", False, "online"),
     ],
 )
@@ -61,4 +61,4 @@ def test_the_table_of_cars_fits_a_terminal(
     header, line = capsys.readouterr().out.splitlines()
     assert max(len(header), len(line)) <= int(columns)
     assert {name.upper() for name in CAR_COLUMNS} - set(header.split()) >= left_out
-    assert "stale (not heard" in line
+    assert "stale (silent for" in line

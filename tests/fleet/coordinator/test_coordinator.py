@@ -104,8 +104,8 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
 
     second = coordinator(cars, tmp_path / "second.yaml")
     assert second.wait() == 1
-    assert "fleet: fleet fleet has a coordinator already (coordinator-" in second.stderr
-    assert f"-{process.pid}): stop that one first" in second.stderr
+    assert "fleet: The fleet has a coordinator already (coordinator-" in second.stderr
+    assert f"-{process.pid}). Stop that one first." in second.stderr
 
     assert process.end(signal.SIGINT) == 0
     assert "Traceback" not in process.stderr

@@ -119,7 +119,7 @@ def test_who_is_silent_hangs_if_it_could_have_been_heard(
     state = running(100.0)
     assert state.turn(now, listening_since) is act
     if act is RestartAction.KILL:
-        assert state.words.startswith("hung: not heard for ")
+        assert state.words.startswith("hung: no heartbeat for ")
         assert state.killed
         assert state.turn(now + 10, listening_since) is RestartAction.NOTHING, "once is enough"
         state.on_exit(-9, "", now + 0.1, 0.5)

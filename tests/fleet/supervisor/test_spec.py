@@ -118,7 +118,7 @@ def test_cars_come_go_and_change() -> None:
     assert found.removed == ("ann",)
     assert found.restarted == ("bob", "eve")
     assert found.spec.cars == cars
-    assert found.words == ("bob is begun anew", "eve is added", "ann is taken out")
+    assert found.words == ("bob is restarted", "eve is added", "ann is removed")
 
 
 @pytest.mark.parametrize(
@@ -137,4 +137,4 @@ def test_cars_come_go_and_change() -> None:
 def test_what_the_processes_are_bound_to_stays_and_is_said(new: FleetSpec, words: str) -> None:
     found = compare(OLD, new)
     assert found.spec == OLD
-    assert found.words == (f"{words} cannot be changed while running (fleet down, fleet up)",)
+    assert found.words == (f"{words} cannot change while the fleet runs. Restart it: `fleet down`, `fleet up`.",)

@@ -377,7 +377,7 @@ def test_a_mark_that_cannot_be_is_refused(endpoint: str, bus: Bus, tmp_path: Pat
     process.send_signal(signal.SIGTERM)
     assert process.communicate(timeout=60)[1] == ""
     assert fleet(endpoint, "mark", " ").returncode == 2
-    assert "no recorder of fleet" in fleet(endpoint, "record", "status").stderr
+    assert "No recorder of " in fleet(endpoint, "record", "status").stderr
 
 
 @pytest.mark.parametrize(
