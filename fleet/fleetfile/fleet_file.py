@@ -24,7 +24,7 @@ from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
 from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_platform_option
 from schemas.colors import COLORS, parse_color
 from schemas.links import BadLink
-from schemas.yaml_document.document import Document, read_text
+from schemas.yaml_document.document import BadFile, Document, read_text
 from schemas.yaml_document.messages import Where, quote_value, suggest
 
 PALETTE: Final = ("#e01b24", "#33d17a", "#3584e4", "#f6d32d", "#9141ac", "#ff7800", "#2ec7c0", "#986a44")
@@ -71,7 +71,7 @@ class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
     endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: none.
-    groups: the cars of each. unlinked: cars without a link, if those are allowed.
+    groups: the cars of each. colors: of cars that have one in the file. unlinked: cars without a link, if allowed.
     """
 
     name: str
@@ -85,6 +85,7 @@ class FleetFile:
     text: str
     path: Path
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    colors: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
     unlinked: Mapping[str, FleetCar] = field(default_factory=dict)
 
     @property
@@ -100,6 +101,14 @@ def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) 
     """
     path = Path(path)
     return parse_fleet(read_text(path), path, unbound=unbound, moved=moved)
+
+
+def read_colors(path: Path) -> Mapping[str, tuple[int, int, int]]:
+    """Return the colors that a fleet file gives to cars. Empty if it cannot be read."""
+    try:
+        return read_fleet(path, unbound=True, moved=True).colors
+    except BadFile:
+        return {}
 
 
 def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = False) -> FleetFile:
@@ -123,6 +132,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
         recordings=_resolve_path(path, record.to or None if record else None),
         quota=record.quota if record else "",
         groups=MappingProxyType({name: tuple(cars) for name, cars in file.groups.items()}),
+        colors=MappingProxyType({name: parse_color(car["color"]) for name, car in merged.items() if "color" in car}),
         text=text,
         path=path.absolute(),
         unlinked=MappingProxyType({name: car for name, car in cars.items() if not car.link}),

@@ -1,7 +1,6 @@
 """Builds the layout of a session in Rerun's viewer: a tab for the fleet and one per car, without empty views."""
 
 from collections.abc import Iterable, Mapping
-from collections.abc import Set as AbstractSet
 from typing import Any, Final
 
 import numpy as np
@@ -10,8 +9,8 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from fleet.replay import colors, panels
-from fleet.replay.colors import Rgb, color
-from fleet.replay.panels import Contents, Curve, Panel, StateTrack
+from fleet.replay.colors import Rgb
+from fleet.replay.panels import Curve, Panel, StateTrack
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.lenses import component
 from fleet.replay.rerun.staleness import PUBLISH_TIMELINE
@@ -38,7 +37,7 @@ def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.
     `last_s` is the time span in view before the cursor; None: the whole time.
     """
     session = drawing.contents()
-    builder = _RerunLayout(session, colors.leds(drawing.leds), drawing.tracks, _axis(drawing.span_ns, last_s))
+    builder = _RerunLayout(drawing, _axis(drawing.span_ns, last_s))
     tabs = [builder.fleet_tab(drawing.ground()), *(builder.car_tab(car) for car in session.cars)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=1 + list(session.cars).index(tab) if tab else 0),
@@ -53,12 +52,11 @@ def layout(drawing: Drawing, tab: str = "", last_s: float | None = None) -> rrb.
 class _RerunLayout:
     """Builder of the tabs of one session."""
 
-    def __init__(
-        self, session: Contents, leds: Mapping[str, int], drawn: AbstractSet[tuple[str, str]], axis: rrb.TimeAxis
-    ) -> None:
-        self._session = session
-        self._leds = leds
-        self._drawn = drawn
+    def __init__(self, drawing: Drawing, axis: rrb.TimeAxis) -> None:
+        self._session = drawing.contents()
+        self._leds = colors.leds(drawing.leds)
+        self._drawn = drawing.tracks
+        self._color = drawing.color
         self._axis = axis
 
     def fleet_tab(self, ground: tuple[tuple[float, float], tuple[float, float]] | None) -> _View:
@@ -78,7 +76,7 @@ class _RerunLayout:
             right.append(rrb.Tabs(*tracks, active_tab=0))
         for name, curve in panels.FLEET_CURVES:
             overrides = {
-                self._entity(car, curve.topic): [_curve(curve, car, color(car, index))]
+                self._entity(car, curve.topic): [_curve(curve, car, self._color(car, index))]
                 for index, (car, topics) in enumerate(session.cars.items())
                 if curve.topic in topics
             }
@@ -148,7 +146,7 @@ class _RerunLayout:
         alone = sum(curve.derivation is None for curve in panel.curves) == 1
         for curve in panel.curves:
             if self._has(car, curve.topic):
-                own = color(car, sorted(self._session.cars).index(car)) if alone and car else None
+                own = self._color(car, sorted(self._session.cars).index(car)) if alone and car else None
                 rgb = _THRESHOLDS.get(curve.derivation, own) if curve.derivation is not None else own
                 overrides.setdefault(self._entity(car, curve.topic), []).append(_curve(curve, curve.name, rgb))
         for track in panel.tracks:

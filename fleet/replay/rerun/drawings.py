@@ -5,7 +5,7 @@ contents of the session for the layout.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from math import cos, sin
 from typing import Any, Final
 
@@ -42,10 +42,14 @@ _MAX_LEDS: Final = 256
 
 
 class Drawing:
-    """Derived chunks and contents of a session. `limit` is the maximum of points per path; None: no limit."""
+    """Derived chunks and contents of a session. `limit` is the maximum of points per path; None: no limit.
 
-    def __init__(self, limit: int | None = None) -> None:
+    `car_colors`: those of the fleet file, by car.
+    """
+
+    def __init__(self, limit: int | None = None, car_colors: Mapping[str, Rgb] | None = None) -> None:
         self._limit = limit
+        self._car_colors = car_colors or {}
         self._paths: dict[str, Any] = {}
         self._parts: dict[str, list[Any]] = {}
         self._static: dict[str, Any] = {}
@@ -94,6 +98,10 @@ class Drawing:
             first, last = self.span_ns or (ends["min"], ends["max"])
             self.span_ns = min(first, ends["min"]), max(last, ends["max"])
 
+    def color(self, car: str, index: int) -> Rgb:
+        """Return the color of a car."""
+        return self._car_colors.get(car) or color(car, index)
+
     def contents(self) -> panels.Contents:
         """Return the contents of the session so far."""
         return panels.contents(frozenset(self.counts))
@@ -112,10 +120,10 @@ class Drawing:
             if points is None:
                 continue
             strip = rr.LineStrips3D.columns(
-                strips=[triples(points[:, 0], points[:, 1])], colors=_tints([color(car, index)]), radii=[0.012]
+                strips=[triples(points[:, 0], points[:, 1])], colors=_tints([self.color(car, index)]), radii=[0.012]
             )
             name = rr.Arrows3D.columns(
-                colors=_tints([color(car, index)]), radii=[0.035], labels=[car], show_labels=[True]
+                colors=_tints([self.color(car, index)]), radii=[0.035], labels=[car], show_labels=[True]
             )
             yield rrc.Chunk.from_columns(f"{panels.entity(key)}/way", indexes=[], columns=strip)
             yield rrc.Chunk.from_columns(panels.entity(key), indexes=[], columns=name)

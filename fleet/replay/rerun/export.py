@@ -17,7 +17,9 @@ from typing import Final
 import rerun as rr
 import rerun.chunk as rrc
 
+from fleet.fleetfile.fleet_file import read_colors
 from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.session_dir import FLEET_FILE
 from fleet.replay import panels
 from fleet.replay.rerun import blueprint
 from fleet.replay.rerun.drawings import Drawing
@@ -79,7 +81,7 @@ def export(
 
     `tab` names the car whose tab is in front. `seen` is called with the number of messages read since its last call.
     """
-    drawing = Drawing()
+    drawing = Drawing(car_colors=read_colors(session.path / FLEET_FILE))
     readers = [part.reader(segment) for segment in session.segments]
     stream = rrc.LazyChunkStream.merge(*(reader.stream() for reader in readers))
     stream = rrc.LazyChunkStream.from_iter(drawing.follow(_count_rows(stream, seen))).lenses(

@@ -1,6 +1,7 @@
 """A session becomes an .rrd with its layout; what is in it is counted by Rerun's own reader."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from click.testing import CliRunner
 
 from fleet.commands.replay import replay
 from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.session_dir import FLEET_FILE
 from fleet.replay import panels
 from fleet.replay.rerun import export, lenses
 from schemas.topics import TOPICS
@@ -40,6 +42,19 @@ def test_the_rrd_holds_every_message_and_its_layout(made: tuple[Path, Counter[st
     assert recording.application_id == layout.application_id == export.APPLICATION
     assert recording.recording_id == Session(path).name
     assert list(tmp_path.iterdir()) == [out]
+
+
+def test_cars_have_the_colors_of_the_fleet_file(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+    shutil.copy(made[0], tmp_path)
+    cars = "cars: {red: {link: COM1, color: '#010203'}, blue: {link: COM2}}\n"
+    (tmp_path / FLEET_FILE).write_text(cars, encoding="utf-8")
+    export.export(Session(tmp_path), tmp_path / "out.rrd")
+    found = set()
+    for chunk in rrc.RrdReader(tmp_path / "out.rrd").store().stream():
+        batch = chunk.to_record_batch()
+        if "Arrows3D:colors" in batch.schema.names:
+            found |= {f"{each:08x}" for row in batch.column("Arrows3D:colors").to_pylist() for each in row or ()}
+    assert found >= {"010203ff"}, found
 
 
 def test_what_is_drawn_says_what_the_messages_say(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:

@@ -15,13 +15,14 @@ import psutil
 import pytest
 import rerun as rr
 import rerun.chunk as rrc
+import zenoh
 from click.testing import CliRunner
 
 from fleet.commands.view import view
 from fleet.replay.rerun import export, live
 from fleet.replay.rerun.live import Live
 from fleet.replay.rerun.viewer import Viewer, free_port
-from schemas.bus import Bus
+from schemas.bus import Bus, reply_message, router_config
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint
@@ -74,6 +75,21 @@ def viewers(process: GatewayProcess) -> list[psutil.Process]:
     """Rerun's programs below a process."""
     below = psutil.Process(process.pid).children(recursive=True)
     return [each for each in below if each.name().startswith("rerun")]
+
+
+def test_cars_have_the_colors_of_the_running_fleets_file(tmp_path: Path) -> None:
+    file, key = tmp_path / "fleet.yaml", "fleet/@supervisor/status"
+    file.write_text("cars: {red: {link: COM1, color: '#010203'}}\n", encoding="utf-8")
+
+    def answer(query: zenoh.Query) -> bool:
+        reply_message(query, key, pb.Supervision(fleet_file=str(file)), as_json=False)
+        return True
+
+    endpoint = free_endpoint()
+    with zenoh.open(router_config(endpoint)), Bus.open(endpoint) as bus:
+        bus.queryable(key, answer)
+        with following_of(bus, lambda recording: recording.save(tmp_path / "out.rrd")) as following:
+            assert following._drawing.color("red", 0) == (1, 2, 3)
 
 
 def test_what_is_on_the_bus_is_in_the_file(fleet: FleetProcesses, tmp_path: Path) -> None:
