@@ -33,6 +33,7 @@ COMMANDS: Final = {
             "fleet.commands.observe:list_cars",
             "The cars: link, mode, motion, who is in control, battery.",
         ),
+        "console": ("fleet.commands.console:console", "The fleet as a web page: watch, drive, STOP."),
         "status": ("fleet.commands.lifecycle:status", "Processes, session and hub at a glance."),
         "reload": ("fleet.commands.lifecycle:reload", "Apply changes in fleet.yaml without a restart."),
         "logs": ("fleet.commands.lifecycle:logs", "What a car's gateway or a service has logged."),

@@ -1,0 +1,6 @@
+"""The console: a web page that shows the fleet, drives cars and stops them. One more client of the bus.
+
+Read `server` first: it serves the page and one WebSocket per page, and `console` wires the rest. `operator` sends the
+commands, `page_link` the messages to a page. Pure: `presses` (how long a car drives: the dead-man), `guard` (which
+requests are answered), `requests`, `car_view`, `abilities` and `stop_report`.
+"""

@@ -1,0 +1,245 @@
+"""What the pages show of each car, from the messages of the bus. Pure: time is an argument (s, monotonic)."""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
+from schemas import topics
+
+TREND_WINDOW_S: Final = 240.0
+"""Time over which the trend of a battery is measured."""
+TREND_SAMPLE_INTERVAL_S: Final = 5.0
+_MIN_TREND_S: Final = 30.0
+"""Minimum time before a trend is shown."""
+TREND_STEADY_V: Final = 0.03
+"""Maximum change of a steady battery. The readings have steps of 0.01 V."""
+MAX_LEDGER_ENTRIES: Final = 60
+"""Maximum commands and log records of a car that a page can show."""
+_LINES: Final = ("left_outer", "left_inner", "right_inner", "right_outer")
+_SIDES: Final = ("left", "right")
+
+
+@dataclass(slots=True)
+class BatteryTrend:
+    """The change of a battery's voltage over some minutes."""
+
+    _samples: deque[tuple[float, float]] = field(default_factory=deque)
+
+    def add(self, voltage_v: float, now: float) -> None:
+        """Add a voltage. Most are left out: a trend needs few."""
+        if self._samples and now - self._samples[-1][0] < TREND_SAMPLE_INTERVAL_S:
+            return
+        self._samples.append((now, voltage_v))
+        while now - self._samples[0][0] > TREND_WINDOW_S:
+            self._samples.popleft()
+
+    @property
+    def words(self) -> str:
+        """`falling`, `steady`, `rising`, or empty if it is too early to tell."""
+        if not self._samples or self._samples[-1][0] - self._samples[0][0] < _MIN_TREND_S:
+            return ""
+        half = len(self._samples) // 2
+        voltages = [voltage for _, voltage in self._samples]
+        change = sum(voltages[half:]) / (len(voltages) - half) - sum(voltages[:half]) / half
+        if abs(change) < TREND_STEADY_V:
+            return "steady"
+        return "rising" if change > 0 else "falling"
+
+
+class CarView:
+    """The newest messages of one car."""
+
+    def __init__(self, name: str, color: str) -> None:
+        self.name = name
+        self.color = color
+        self.ledger: deque[dict[str, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
+        """Commands and log records, the newest last."""
+        self._newest: dict[str, tuple[Any, float]] = {}
+        self._trend = BatteryTrend()
+        self._present = False
+        self._changed_at: float | None = None
+        """When the gateway joined or left the bus."""
+
+    def on_message(self, topic: str, value: Any, now: float) -> None:
+        """Handle a message of this car. topic: such as `sensor/range`."""
+        match topic:
+            case "event/command":
+                self._on_command(value)
+            case "event/log":
+                words = value.message.removeprefix(f"{self.name} ")
+                level = "error" if value.level >= 4 else "warning" if value.level == 3 else "info"
+                self._note(value.timestamp, words, level)
+            case _:
+                self._newest[topic] = (value, now)
+                if topic == "sensor/battery":
+                    self._trend.add(value.voltage_v, now)
+
+    def on_presence(self, now: float, *, present: bool) -> None:
+        """Handle that the car's gateway is on the bus, or not."""
+        if present is not self._present or self._changed_at is None:
+            self._present, self._changed_at = present, now
+
+    @property
+    def motors(self) -> tuple[str, str]:
+        """State of the motors and what it rests on."""
+        safety = self._newest.get("state/safety")
+        return ("unknown", "") if safety is None else (safety[0].motors, safety[0].motors_basis)
+
+    def as_dict(self, now: float, sender: str) -> dict[str, Any]:
+        """Return what a page shows of the car, as JSON values. Numbers are rounded, so that most are equal next time.
+
+        sender: the console's own name, which the page shows as "this console".
+        """
+        shown: dict[str, Any] = {"name": self.name, "color": self.color, "gateway": self._present}
+        if not self._present and self._changed_at is not None:
+            shown["gone_s"] = int(now - self._changed_at)
+        for part in (self._link, self._mode, self._motion, self._safety, self._health, self._sensors):
+            shown |= part(now, sender)
+        if self.ledger:
+            shown["event"] = self.ledger[-1]
+        return shown
+
+    def _get(self, topic: str) -> Any:
+        found = self._newest.get(topic)
+        return None if found is None else found[0]
+
+    def _fresh(self, topic: str, now: float) -> Any:
+        """Return the newest message. None if there is none, or if it is stale."""
+        found = self._newest.get(topic)
+        stale_after_s = topics.TOPICS[topic].stale_after_s
+        if found is None or (stale_after_s is not None and now - found[1] > stale_after_s):
+            return None
+        return found[0]
+
+    def _link(self, now: float, _: str) -> dict[str, Any]:
+        found = self._newest.get("state/link")
+        if found is None:
+            return {"link": {"state": "unknown", "reason": "", "since_s": 0}}
+        link, at = found
+        shown = {"state": link.state, "reason": link.reason, "since_s": int(link.since_s + now - at)}
+        if link.state == "online":
+            shown["since_s"] = 0  # a growing number that nobody needs would draw the card each second
+        return {"link": shown}
+
+    def _mode(self, _: float, __: str) -> dict[str, Any]:
+        mode = self._get("state/mode")
+        if mode is None:
+            return {"mode": {"asked": "unknown", "inferred": "unknown", "verdict": "assumed", "evidence": ""}}
+        return {
+            "mode": {
+                "asked": mode.asked,
+                "inferred": mode.inferred,
+                "verdict": mode.verdict,
+                "evidence": mode.evidence,
+            }
+        }
+
+    def _motion(self, now: float, sender: str) -> dict[str, Any]:
+        motion = self._fresh("state/motion", now)
+        if motion is None:
+            return {"motion": {"motion": "unknown", "owner": "", "speed": None, "fan": False, "servo_deg": None}}
+        shown = {
+            "motion": motion.motion,
+            "source": motion.source,
+            "owner": _name(motion.owner, sender),
+            "speed": round(motion.speed, 2),
+            "fan": motion.fan,
+            "servo_deg": round(motion.servo_deg) if motion.HasField("servo_deg") else None,
+        }
+        return {"motion": shown}
+
+    def _safety(self, _: float, sender: str) -> dict[str, Any]:
+        safety = self._get("state/safety")
+        state, basis = self.motors
+        shown: dict[str, Any] = {"motors": {"state": state, "basis": basis}, "hold": None, "lease": None, "estops": []}
+        if safety is None:
+            return shown
+        if safety.HasField("hold"):
+            shown["hold"] = _name(safety.hold.by, sender)
+        if safety.HasField("lease"):
+            shown["lease"] = {"holder": _name(safety.lease.holder, sender), "kind": safety.lease.kind}
+        shown["estops"] = [
+            {
+                "id": each.id,
+                "by": _name(each.by, sender),
+                "why": each.why,
+                "scope": each.scope,
+                "since": each.stamp.seconds,
+            }
+            for each in safety.estops
+        ]
+        return shown
+
+    def _health(self, _: float, __: str) -> dict[str, Any]:
+        health = self._get("state/health")
+        if health is None:
+            return {"platform": "", **UNKNOWN_ABILITIES.as_dict()}
+        return {
+            "platform": health.platform,
+            **abilities_of(health.platform, tuple(health.capabilities)).as_dict(),
+        }
+
+    def _sensors(self, now: float, _: str) -> dict[str, Any]:
+        shown: dict[str, Any] = {}
+        if (battery := self._fresh("sensor/battery", now)) is not None:
+            shown["battery"] = {
+                "v": round(battery.voltage_v, 1),
+                "charge": round(battery.charge, 1) if battery.HasField("charge") else None,
+                "level": battery.level,
+                "trend": self._trend.words,
+            }
+        if (range_ := self._fresh("sensor/range", now)) is not None:
+            shown["range_m"] = round(range_.range_m, 2) if range_.HasField("range_m") else None
+        if (line := self._fresh("sensor/line", now)) is not None:
+            shown["line"] = [getattr(line, name) for name in _LINES]
+        for name in ("obstacle", "light"):
+            if (pair := self._fresh(f"sensor/{name}", now)) is not None:
+                shown[name] = [getattr(pair, side) for side in _SIDES]
+        return shown
+
+    def _on_command(self, event: Any) -> None:
+        words = f"{event.verb} {event.phase}"
+        if event.reason or event.words:
+            words += f": {event.words or event.reason}"
+        level = "warning" if event.phase in ("failed", "rejected", "expired") else "info"
+        self._note(event.stamp, f"{words} ({event.sender})", level)
+
+    def _note(self, stamp: Any, words: str, level: str) -> None:
+        at_ms = stamp.seconds * 1000 + stamp.nanos // 1_000_000
+        self.ledger.append({"at_ms": at_ms, "words": words, "level": level})
+
+
+def _name(sender: str, ours: str) -> str:
+    return "this console" if sender == ours else sender
+
+
+class FleetView:
+    """The cars that the console knows: all that were on the bus since it started."""
+
+    def __init__(self, sender: str, color_of: Any) -> None:
+        self._sender = sender
+        self._color_of = color_of
+        self._cars: dict[str, CarView] = {}
+
+    def car(self, name: str) -> CarView:
+        """Return the view of a car. A new one is added."""
+        if name not in self._cars:
+            self._cars[name] = CarView(name, self._color_of(name, len(self._cars)))
+        return self._cars[name]
+
+    @property
+    def names(self) -> list[str]:
+        """The names of all cars."""
+        return sorted(self._cars)
+
+    def on_presence(self, present: Iterable[str], now: float) -> None:
+        """Handle the names of the cars whose gateways are on the bus."""
+        there = set(present)
+        for name in there | set(self._cars):
+            self.car(name).on_presence(now, present=name in there)
+
+    def as_list(self, now: float) -> list[dict[str, Any]]:
+        """Return what a page shows of each car, by name."""
+        return [self._cars[name].as_dict(now, self._sender) for name in self.names]

@@ -1,0 +1,212 @@
+"""The console's state: pages, presses, and the views of the cars. It wires the pure parts to the bus and the pages."""
+
+import asyncio
+import json
+import logging
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from dataclasses import asdict
+from typing import Any, Final
+
+from fleet.aio import Fleet
+from fleet.console.car_view import FleetView
+from fleet.console.operator import ConsoleOperator
+from fleet.console.page_link import PageLink
+from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
+from fleet.console.requests import MAX_REASON_LENGTH, BadRequest, PageMessage
+from fleet.replay.colors import color
+from schemas import keys, messages
+from schemas.bus import Handover, Latest, Sample
+from schemas.commands import STOPS
+
+MAX_PAGES: Final = 32
+"""Maximum number of connected pages."""
+_MAX_EVENTS: Final = 4096
+
+log = logging.getLogger("fleet")
+
+
+class TooManyPages(Exception):
+    """No more pages may connect."""
+
+
+class Console:
+    """Everything that the pages share. All methods run on the loop."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._presses = PressBook()
+        self._view = FleetView(fleet.sync.sender, _hex_color)
+        self.operator = ConsoleOperator(fleet, self._on_stop)
+        self._pages: dict[int, PageLink] = {}
+        self._last_page = 0
+        self._readings: Latest[Sample] = Latest()
+        self._events: Handover[Sample] = Handover(
+            asyncio.get_running_loop(), self._on_event, limit=_MAX_EVENTS, newest=True
+        )
+
+    # ------------------------------------------------------------------ the bus
+
+    async def run(self) -> None:
+        """Serve the pages until the task is cancelled."""
+        bus, name = self._fleet.sync.bus, self._fleet.sync.name
+        for family in ("sensor", "state"):
+            bus.subscribe(f"{name}/*/{family}/*", lambda sample: self._readings(sample.key, sample))
+        bus.subscribe(f"{name}/*/event/*", self._events)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._tick())
+            tasks.create_task(self.operator.renew_leases())
+
+    async def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        next_at = loop.time()
+        while True:
+            now = time.monotonic()
+            for press in self._presses.expire(now):
+                self._end(press, "The page did not answer for 0.3 s.")
+            tick = f'{{"t":"tick","n":{self._presses.tick(now)}}}'
+            for page in self._pages.values():
+                page.show("tick", tick)
+            self._take_readings(now)
+            if self._pages:
+                state = self._state(now)
+                for page in self._pages.values():
+                    page.show("state", state)
+            next_at = max(next_at + TICK_INTERVAL_S, loop.time())
+            await asyncio.sleep(next_at - loop.time())
+
+    def _take_readings(self, now: float) -> None:
+        for sample in self._readings.take().values():
+            with suppress(messages.BadPayload, KeyError):
+                key = keys.parse(sample.key)
+                if key is not None:
+                    self._view.car(key.car).on_message(key.topic, sample.message(), now)
+        self._view.on_presence(self._fleet.sync.cars(), now)
+
+    def _state(self, now: float) -> str:
+        report = self.operator.report
+        state = {
+            "t": "state",
+            "fleet": self._fleet.sync.name,
+            "hub": self._fleet.sync.bus.connected,
+            "pages": len(self._pages),
+            "cars": self._view.as_list(now),
+            "stop": None if report is None else report.as_dict(),
+        }
+        return json.dumps(state, separators=(",", ":"))
+
+    def _on_event(self, sample: Sample) -> None:
+        try:
+            event: Any = sample.message()
+        except (messages.BadPayload, KeyError):
+            return
+        key = keys.parse(sample.key)
+        if key is None:
+            return
+        now = time.monotonic()
+        self._view.car(key.car).on_message(key.topic, event, now)
+        if key.topic == "event/command" and event.sender == self._fleet.sync.sender and self.operator.report:
+            self.operator.report.on_event(key.car, event, now)
+
+    # ------------------------------------------------------------------ the pages
+
+    def add_page(self, send: Callable[[str], Awaitable[None]]) -> PageLink:
+        """Add a page. Raises TooManyPages."""
+        if len(self._pages) >= MAX_PAGES:
+            raise TooManyPages
+        self._last_page += 1
+        page = self._pages[self._last_page] = PageLink(self._last_page, send)
+        page.answer(t="hello", page=page.number, sender=self._fleet.sync.sender, fleet=self._fleet.sync.name)
+        return page
+
+    def remove_page(self, page: PageLink) -> None:
+        """Remove a page that has gone, and stop the cars that it drives."""
+        self._pages.pop(page.number, None)
+        for press in self._presses.drop_client(page.number):
+            self._end(press, "The page has gone.")
+        self.operator.release_leases(page.number)
+
+    def on_text(self, page: PageLink, text: str) -> None:
+        """Handle one message of a page. A bad one is answered, and changes nothing."""
+        try:
+            self._on_message(page, PageMessage.of(text))
+        except BadRequest as error:
+            log.warning("page %d sent a bad message: %s", page.number, error)
+            page.answer(t="bad", words=str(error))
+
+    def stop_all(self, stop_id: str, *, estop: bool = False, why: str = "") -> None:
+        """Stop every car, once for each id."""
+        present = {*self._fleet.sync.cars(), *self._view.names}
+        self.operator.stop_all(stop_id, present, estop=estop, why=why)
+
+    def _on_message(self, page: PageLink, message: PageMessage) -> None:
+        now = time.monotonic()
+        match message.kind:
+            case "echo":
+                press = self._presses.echo(page.number, message.number("press"), message.number("n"), now)
+                if press is not None:
+                    self.operator.renew_press(press, now)
+            case "press":
+                self._on_press(page, message, now)
+            case "release":
+                released = self._presses.release(page.number, message.number("press"))
+                if released is not None:
+                    self.operator.end_press(released)
+            case "stop":
+                self.stop_all(message.text("id"))
+            case "estop":
+                self.stop_all(message.text("id"), estop=True, why=message.text("why", MAX_REASON_LENGTH))
+            case "take":
+                self.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
+            case "give_back":
+                self._stop_presses(set(message.cars()), "The car was given back.")
+                self.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
+            case "do":
+                request, cars = message.request(), message.cars()
+                if request.verb in (*STOPS, "mode"):
+                    self._stop_presses(set(cars), "The car was stopped.")
+                self.operator.command(request, cars, self._answer_to(page, message))
+            case kind:
+                raise BadRequest(f"unknown message {kind!r}")
+
+    def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
+        press_id, cars, motion = message.number("press"), message.cars(), message.motion()
+        before = self._presses.current(page.number)
+        try:
+            press = self._presses.begin(page.number, press_id, cars, motion, message.number("n"), now)
+        except PressRefused as error:
+            page.answer(t="over", press=press_id, words=str(error))
+            return
+        if before is not None:  # another direction: a stop in between only for cars that are no longer driven
+            self.operator.end_press(before, [car for car in before.cars if car not in cars])
+        self.operator.begin_press(
+            press, lambda outcome: page.answer(t="refused", press=press_id, outcome=asdict(outcome))
+        )
+
+    def _answer_to(self, page: PageLink, message: PageMessage) -> Callable[[list[dict[str, Any]]], None]:
+        request_id = message.number("id")
+        return lambda outcomes: page.answer(t="done", id=request_id, outcomes=outcomes)
+
+    def _on_stop(self) -> None:
+        for press in self._presses.on_stop(time.monotonic()):
+            self._end(press, "All cars were stopped.")
+
+    def _stop_presses(self, cars: set[str], words: str) -> None:
+        for press in self._presses.drop_cars(cars):
+            self._end(press, words)
+
+    def _end(self, press: HeldPress, words: str) -> None:
+        self.operator.end_press(press)
+        if (page := self._pages.get(press.client)) is not None:
+            page.answer(t="over", press=press.id, words=words)
+
+    async def close(self) -> None:
+        """Stop the cars that pages drive, and wait for their outcomes."""
+        for press in self._presses.alive:
+            self.operator.end_press(press)
+        await self.operator.close()
+
+
+def _hex_color(car: str, index: int) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*color(car, index))

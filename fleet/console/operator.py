@@ -1,0 +1,185 @@
+"""Sends the commands of the pages: the stream of a held press, STOP, and single commands. One client of the bus."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from fleet.aio import Fleet
+from fleet.client.commands import CommandRequest, drive_request, estop_request, lease_request, stop_request
+from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
+from fleet.client.outcome import Outcome
+from fleet.console.presses import HeldPress
+from fleet.console.stop_report import StopReport
+from schemas import keys, messages
+from schemas.bus import BusError
+from schemas.commands import COMMANDS
+
+# The gateway is the watchdog outside our loop: if the loop blocks, the last drive expires.
+DRIVE_TTL_S: Final = 0.5
+"""Duration of each drive of a press. Without another one the gateway stops the car."""
+STREAM_INTERVAL_S: Final = 0.15
+"""Minimum interval of the drives of one press."""
+STREAM_MAX_AGE_S: Final = 0.3
+"""Maximum age of a drive when it arrives at the gateway."""
+_MAX_STOP_IDS: Final = 256
+"""Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
+
+log = logging.getLogger("fleet")
+
+
+class ConsoleOperator:
+    """The console's side of the bus."""
+
+    def __init__(self, fleet: Fleet, on_stop: Callable[[], object]) -> None:
+        self._fleet = fleet
+        self._on_stop = on_stop
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._stop_ids: dict[str, None] = {}
+        self._streams: dict[tuple[int, int], tuple[float, int]] = {}
+        """Time of the last drive and number of drives, by press."""
+        self._leases: dict[str, int] = {}
+        """The cars that a page has taken, and the page."""
+        self._numbers = 0
+        self.report: StopReport | None = None
+        """The course of the last STOP."""
+
+    # ------------------------------------------------------------------ driving
+
+    def begin_press(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
+        """Start the cars of a press. A refusal of a car is reported; the other cars drive."""
+        self._streams.pop((press.client, press.id), None)
+        self.renew_press(press, time.monotonic())
+        self.spawn(self._ask_first_drive(press, on_refusal))
+
+    def renew_press(self, press: HeldPress, now: float) -> None:
+        """Send the next drive of a press, unless the last one is recent."""
+        sent_at, count = self._streams.get((press.client, press.id), (float("-inf"), 0))
+        if now - sent_at < STREAM_INTERVAL_S:
+            return
+        self._streams[(press.client, press.id)] = now, count + 1
+        self._stream(press.cars, drive_request(press.motion, DRIVE_TTL_S), STREAM_MAX_AGE_S, count + 1)
+
+    def end_press(self, press: HeldPress, cars: Iterable[str] | None = None) -> None:
+        """Stop the cars of a press, or some of them: at once in the stream, and by a query whose outcome is known."""
+        stopped = tuple(press.cars if cars is None else cars)
+        _, count = self._streams.pop((press.client, press.id), (0.0, 0))
+        if stopped:
+            self._stream(stopped, drive_request("stop"), None, count + 1)
+            self.spawn(self._ask_to_end(stopped))
+
+    def _stream(self, cars: Sequence[str], request: CommandRequest, ttl_s: float | None, sequence: int) -> None:
+        message = request.message
+        message.sender, message.kind = self._fleet.sync.sender, self._fleet.sync.kind
+        message.asked.seconds, message.asked.nanos = divmod(time.time_ns(), 1_000_000_000)
+        if ttl_s is not None:
+            message.ttl_s = ttl_s
+        payload = message.SerializeToString()
+        encoding = messages.encoding_of(COMMANDS["drive"].message)
+        for car in cars:
+            self._fleet.sync.bus.put_command(
+                keys.command_key(self._fleet.sync.name, car, "drive"), payload, encoding, sequence
+            )
+
+    async def _ask_first_drive(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
+        # A stream is rejected without words from the second time on, a query never.
+        outcomes = await self._fleet.ask(drive_request(press.motion, DRIVE_TTL_S, wait=False), press.cars)
+        for outcome in outcomes:
+            if not outcome.ok and outcome.reason != "superseded":
+                on_refusal(outcome)
+        if (press.client, press.id) not in self._streams:  # this query may have overtaken the end of the press
+            await self._ask_to_end(press.cars)
+
+    async def _ask_to_end(self, cars: Sequence[str]) -> None:
+        await self._fleet.ask(drive_request("stop"), cars)
+
+    # ------------------------------------------------------------------ STOP
+
+    def stop_all(self, stop_id: str, present: Iterable[str], *, estop: bool = False, why: str = "") -> None:
+        """Stop every car, once for each id: a page sends each STOP twice, over its socket and by fetch."""
+        if stop_id in self._stop_ids:
+            return
+        self._stop_ids[stop_id] = None
+        if len(self._stop_ids) > _MAX_STOP_IDS:
+            del self._stop_ids[next(iter(self._stop_ids))]
+        self._on_stop()
+        request = estop_request(why, "fleet") if estop else stop_request()
+        self._numbers += 1
+        now = time.monotonic()
+        self.report = StopReport(self._numbers, request.verb, present, now, time.time_ns() // 1_000_000)
+        self.spawn(self._stop(request, self.report))
+
+    async def _stop(self, request: CommandRequest, report: StopReport) -> None:
+        outcomes = await self._fleet.ask(request)
+        report.on_outcomes(outcomes, time.monotonic())
+
+    # ------------------------------------------------------------------ the rest
+
+    def command(
+        self, request: CommandRequest, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]
+    ) -> None:
+        """Send one command to some cars and report the outcomes."""
+        self.spawn(self._command(request, cars, on_outcomes))
+
+    async def _command(
+        self, request: CommandRequest, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]
+    ) -> None:
+        on_outcomes([asdict(outcome) for outcome in await self._fleet.ask(request, cars)])
+
+    def take_lease(
+        self, client: int, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]
+    ) -> None:
+        """Take cars over for a page, and keep them until it gives them back or has gone."""
+
+        def keep(outcomes: list[dict[str, Any]]) -> None:
+            self._leases.update({outcome["car"]: client for outcome in outcomes if outcome["ok"]})
+            on_outcomes(outcomes)
+
+        self.command(lease_request(take=True), cars, keep)
+
+    def release_leases(
+        self,
+        client: int,
+        cars: Iterable[str] | None = None,
+        on_outcomes: Callable[[list[dict[str, Any]]], object] = lambda _: None,
+    ) -> None:
+        """Give cars back (None: all that this page has taken)."""
+        taken = [car for car, by in self._leases.items() if by == client]
+        released = taken if cars is None else list(cars)
+        for car in released:
+            self._leases.pop(car, None)
+        if released:
+            self.command(lease_request(release=True), released, on_outcomes)
+
+    async def renew_leases(self) -> None:
+        """Renew the leases of the pages until the task is cancelled. A lease that another sender has taken is lost."""
+        while True:
+            await asyncio.sleep(LEASE_RENEWAL_INTERVAL_S)
+            if not self._leases:
+                continue
+            try:
+                outcomes = await self._fleet.ask(lease_request(), list(self._leases))
+            except BusError as error:
+                log.warning("leases not renewed: %s", error)
+                continue
+            for outcome in outcomes:
+                if not outcome.ok:
+                    self._leases.pop(outcome.car, None)
+
+    def spawn(self, work: Any) -> None:
+        """Run a coroutine. Its errors go to the log, never to the socket that began it."""
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._on_done)
+
+    async def close(self) -> None:
+        """Wait for the commands that still run."""
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=3.0)
+
+    def _on_done(self, task: "asyncio.Task[None]") -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.error("a command of the console failed: %s", error)

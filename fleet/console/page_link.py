@@ -1,0 +1,47 @@
+"""The messages to one page: a bounded queue for answers, and only the newest tick and the newest state.
+
+A page that does not read holds up no other page.
+"""
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+SEND_TIMEOUT_S: Final = 5.0
+"""Timeout of one message. A page that reads nothing for this long is disconnected."""
+_MAX_ANSWERS: Final = 256
+"""Maximum number of queued answers. More are dropped, the oldest first."""
+
+
+class PageLink:
+    """One connected page."""
+
+    def __init__(self, number: int, send: Callable[[str], Awaitable[None]]) -> None:
+        self.number = number
+        self._send = send
+        self._answers: deque[str] = deque(maxlen=_MAX_ANSWERS)
+        self._newest: dict[str, str] = {}
+        self._not_empty = asyncio.Event()
+
+    def answer(self, **fields: Any) -> None:
+        """Queue an answer to this page."""
+        self._answers.append(json.dumps(fields, separators=(",", ":")))
+        self._not_empty.set()
+
+    def show(self, kind: str, text: str) -> None:
+        """Set the newest message of a kind (`tick`, `state`). An unsent older one is left out."""
+        self._newest[kind] = text
+        self._not_empty.set()
+
+    async def run(self) -> None:
+        """Send until the page has gone. Raises TimeoutError if it does not read."""
+        while True:
+            await self._not_empty.wait()
+            self._not_empty.clear()
+            while self._newest or self._answers:
+                # The tick first: its echo keeps a car driving.
+                kind = "tick" if "tick" in self._newest else next(iter(self._newest), "")
+                text = self._answers.popleft() if self._answers and kind != "tick" else self._newest.pop(kind)
+                await asyncio.wait_for(self._send(text), SEND_TIMEOUT_S)

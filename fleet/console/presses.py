@@ -1,0 +1,127 @@
+"""Hold to drive: the dead-man of the pages. Pure: time is an argument (s, monotonic).
+
+The server numbers its ticks. While the finger is down, the page echoes each tick with the id of its press.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+TICK_INTERVAL_S: Final = 0.1
+"""Interval of ticks."""
+# A frozen browser still answers pings. A thawed page or a healed link delivers old messages in a burst. Therefore only
+# an echo of a new tick counts, by the server's own clock. Measured: no false trip on a phone throttled by 6.
+MAX_TICK_AGE_S: Final = 0.3
+"""Maximum age of a tick when its echo arrives."""
+MAX_ECHO_GAP_S: Final = 0.3
+"""Maximum time without an echo. After it, the press is over."""
+# A gateway rejects the stream of a sender that has not paused for 0.5 s since a stop (gateway.control.senders).
+AFTER_STOP_S: Final = 0.6
+"""Minimum time from a STOP to the next press."""
+_MAX_TICKS: Final = 16
+"""Number of remembered ticks: more than fit into the maximum age."""
+
+
+class PressRefused(Exception):
+    """A press that may not begin. The text is for a person."""
+
+
+@dataclass(slots=True)
+class HeldPress:
+    """A page holds a motion of some cars."""
+
+    client: int
+    id: int
+    cars: tuple[str, ...]
+    motion: str
+    last_echo_at: float
+
+
+class PressBook:
+    """The presses that are alive, at most one for each page."""
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._ticks: dict[int, float] = {}
+        self._presses: dict[int, HeldPress] = {}
+        self._newest_ids: dict[int, int] = {}
+        self._stopped_at = float("-inf")
+
+    @property
+    def alive(self) -> list[HeldPress]:
+        """All presses that are alive."""
+        return list(self._presses.values())
+
+    def tick(self, now: float) -> int:
+        """Issue a tick and return its number."""
+        self._number += 1
+        self._ticks[self._number] = now
+        self._ticks.pop(self._number - _MAX_TICKS, None)
+        return self._number
+
+    def begin(self, client: int, press_id: int, cars: tuple[str, ...], motion: str, tick: int, now: float) -> HeldPress:
+        """Begin a press. It replaces the page's earlier press. Raises PressRefused.
+
+        An id counts once: a press that is over, or a late message of it, never begins again.
+        """
+        if press_id <= self._newest_ids.get(client, -1):
+            raise PressRefused("This press is over. Press again.")
+        self._newest_ids[client] = press_id
+        if not self._is_new(tick, now):
+            raise PressRefused("The connection to the console is slow. Press again.")
+        if now - self._stopped_at < AFTER_STOP_S:
+            raise PressRefused("The cars were stopped just now. Press again.")
+        for other in self._presses.values():
+            if other.client != client and (shared := set(cars) & set(other.cars)):
+                raise PressRefused(f"Another page drives {' and '.join(sorted(shared))}.")
+        press = self._presses[client] = HeldPress(client, press_id, cars, motion, now)
+        return press
+
+    def echo(self, client: int, press_id: int, tick: int, now: float) -> HeldPress | None:
+        """Handle the echo of a tick. Return the press, None if the press is over or the tick is old."""
+        press = self._presses.get(client)
+        if press is None or press.id != press_id or not self._is_new(tick, now):
+            return None
+        if now - press.last_echo_at > MAX_ECHO_GAP_S:  # `expire` has not run yet
+            return None
+        press.last_echo_at = now
+        return press
+
+    def release(self, client: int, press_id: int) -> HeldPress | None:
+        """End a press: the finger was lifted. Return the press, None if it was over."""
+        self._newest_ids[client] = max(press_id, self._newest_ids.get(client, -1))
+        press = self._presses.get(client)
+        if press is None or press.id > press_id:
+            return None
+        return self._presses.pop(client)
+
+    def expire(self, now: float) -> list[HeldPress]:
+        """End the presses without a recent echo and return them."""
+        return self._end(lambda press: now - press.last_echo_at > MAX_ECHO_GAP_S)
+
+    def drop_client(self, client: int) -> list[HeldPress]:
+        """End the press of a page that has gone, and forget the page."""
+        self._newest_ids.pop(client, None)
+        return self._end(lambda press: press.client == client)
+
+    def on_stop(self, now: float) -> list[HeldPress]:
+        """End every press: all cars were stopped."""
+        self._stopped_at = now
+        return self._end(lambda _: True)
+
+    def drop_cars(self, cars: set[str]) -> list[HeldPress]:
+        """End every press of these cars: they were stopped."""
+        return self._end(lambda press: bool(cars & set(press.cars)))
+
+    def current(self, client: int) -> HeldPress | None:
+        """Return the press of a page."""
+        return self._presses.get(client)
+
+    def _is_new(self, tick: int, now: float) -> bool:
+        return now - self._ticks.get(tick, float("-inf")) <= MAX_TICK_AGE_S
+
+    def _end(self, ends: Callable[[HeldPress], bool]) -> list[HeldPress]:
+        over = [press for press in self._presses.values() if ends(press)]
+        for press in over:
+            del self._presses[press.client]
+        return over

@@ -1,0 +1,146 @@
+"""The messages of a page, checked and turned into command requests. Pure.
+
+A page is not trusted: each value is checked here, and the gateway decides.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final, Self
+
+from fleet.client import commands
+from gateway.protocol.enums import Light, Mode, Motion
+from schemas import keys
+
+MAX_CARS: Final = 128
+"""Maximum number of cars in one message."""
+MAX_REASON_LENGTH: Final = 200
+"""Maximum length of the reason of an e-stop."""
+_MAX_NUMBER: Final = 2**53
+MOTIONS: Final = frozenset(str(motion) for motion in Motion if motion is not Motion.STOP)
+
+
+class BadRequest(ValueError):
+    """A message of a page that is not allowed."""
+
+
+@dataclass(frozen=True, slots=True)
+class PageMessage:
+    """One message of a page, with checked access to its fields."""
+
+    fields: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, text: str) -> Self:
+        """Parse a message. Raises BadRequest."""
+        try:
+            fields = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise BadRequest(f"not JSON: {error}") from None
+        if not isinstance(fields, dict):
+            raise BadRequest("not a JSON object")
+        return cls(fields)
+
+    @property
+    def kind(self) -> str:
+        """What the page wants."""
+        return self.text("t", 16)
+
+    def text(self, name: str, longest: int = 64) -> str:
+        """Return a text. Raises BadRequest."""
+        value = self.fields.get(name, "")
+        if not isinstance(value, str) or len(value) > longest:
+            raise BadRequest(f"{name} is not a text of at most {longest} characters")
+        return value
+
+    def number(self, name: str) -> int:
+        """Return a whole number from 0. Raises BadRequest."""
+        value = self.fields.get(name)
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < _MAX_NUMBER:
+            raise BadRequest(f"{name} is not a whole number")
+        return value
+
+    def cars(self) -> tuple[str, ...]:
+        """Return names of cars, at least one. Raises BadRequest."""
+        value = self.fields.get("cars")
+        if not isinstance(value, list) or not 0 < len(value) <= MAX_CARS:
+            raise BadRequest("cars is not a list of names")
+        try:
+            return tuple(dict.fromkeys(keys.check_name(name) for name in value if isinstance(name, str)))
+        except keys.BadKey as error:
+            raise BadRequest(str(error)) from None
+
+    def motion(self) -> str:
+        """Return a motion that moves the car. Raises BadRequest."""
+        return self._one_of("motion", MOTIONS)
+
+    def _one_of(self, name: str, allowed: frozenset[str]) -> str:
+        value = self.text(name)
+        if value not in allowed:
+            raise BadRequest(f"{name} {value!r} is not allowed")
+        return value
+
+    def _numbers(self, name: str, count: int) -> list[int]:
+        value = self.fields.get(name)
+        if not isinstance(value, list) or len(value) != count:
+            raise BadRequest(f"{name} is not a list of {count} numbers")
+        return [PageMessage({name: each}).number(name) for each in value]
+
+    def request(self) -> commands.CommandRequest:
+        """Return the command that the page wants. Raises BadRequest."""
+        verb = self.text("verb", 16)
+        build = _BUILDERS.get(verb)
+        if build is None:
+            raise BadRequest(f"the console has no command {verb!r}")
+        try:
+            request = build(self)
+        except ValueError as error:
+            raise BadRequest(str(error)) from None
+        return replace(request, take=self.fields.get("take") is True)
+
+
+def _mode(message: PageMessage) -> commands.CommandRequest:
+    return commands.mode_request(message._one_of("mode", frozenset(map(str, Mode))))
+
+
+def _led(message: PageMessage) -> commands.CommandRequest:
+    red, green, blue = message._numbers("rgb", 3)
+    return commands.led_request(red, green, blue)
+
+
+def _light(message: PageMessage) -> commands.CommandRequest:
+    return commands.light_request(message._one_of("light", frozenset(map(str, Light))))
+
+
+def _servo(message: PageMessage) -> commands.CommandRequest:
+    if message.fields.get("deg") is not None:
+        return commands.servo_request("front", deg=message.number("deg"))
+    servo = message._one_of("servo", frozenset({"front", "vertical", "horizontal"}))
+    return commands.servo_request(servo, message._one_of("action", frozenset({"left", "right", "up", "down", "reset"})))
+
+
+def _arm(message: PageMessage) -> commands.CommandRequest:
+    return commands.arm_request(message._numbers("joint_deg", 6))
+
+
+def _resume(message: PageMessage) -> commands.CommandRequest:
+    ids = message.fields.get("ids", [])
+    if not isinstance(ids, list) or len(ids) > MAX_CARS or not all(isinstance(each, str) for each in ids):
+        raise BadRequest("ids is not a list of ids")
+    return commands.resume_request([each[:64] for each in ids])
+
+
+_BUILDERS: Final[Mapping[str, Callable[[PageMessage], commands.CommandRequest]]] = {
+    "mode": _mode,
+    "led": _led,
+    "light": _light,
+    "servo": _servo,
+    "arm": _arm,
+    "resume": _resume,
+    "whistle": lambda _: commands.whistle_request(),
+    "speed": lambda message: commands.speed_request(message._one_of("step", frozenset({"up", "down"}))),
+    "fan": lambda _: commands.fan_request(),
+    "find": lambda _: commands.find_request(),
+    "stop": lambda _: commands.stop_request(),
+    "estop": lambda message: commands.estop_request(message.text("why", MAX_REASON_LENGTH), "car"),
+}

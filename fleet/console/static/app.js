@@ -1,0 +1,120 @@
+// The page: navigation, the STOP bar in the same place on every page, and the keys that stop.
+
+import { estopAll, setTexts, stopAll, store, subscribe } from "./console.js";
+import { DrivePage } from "./drive-page.js";
+import { FleetPage } from "./fleet-page.js";
+import { stopStates, t } from "./texts.js";
+import { Component, html, render, useState, Verdict } from "./ui.js";
+
+const SHOW_REPORT_MS = 30_000;
+const SAME_PRESS_MS = 1000;
+
+const PAGES = { "#/": [t.fleet, FleetPage], "#/drive": [t.drive, DrivePage] };
+
+// ---------------------------------------------------------------- STOP
+
+window.addEventListener(
+  "keydown",
+  (event) => {
+    const focus = document.activeElement;
+    const free = focus === null || focus === document.body || focus.id === "stop" || focus.id === "content";
+    if (event.key !== "Escape" && !(event.key === " " && free)) return;
+    event.preventDefault();
+    if (!event.repeat) stopAll();
+  },
+  { capture: true },
+);
+
+let pointerAt = -Infinity;
+const onStopDown = () => {
+  pointerAt = performance.now();
+  stopAll();
+};
+// A screen reader sends a click alone. The click after a pointer is the same press.
+const onStopClick = () => {
+  if (performance.now() - pointerAt > SAME_PRESS_MS) stopAll();
+};
+
+let reportSeen = [0, 0];
+function Report({ report }) {
+  if (report === null) return null;
+  if (reportSeen[0] !== report.number) reportSeen = [report.number, performance.now()];
+  const failed = report.cars.some((car) => car.state === "failed");
+  if (report.over && !failed && performance.now() - reportSeen[1] > SHOW_REPORT_MS) return null;
+  return html`<div class="report">
+    <p role="status"><strong>${report.verb === "estop" ? t.estopped : "STOP"}</strong>: ${t.stopSummary(report.cars)}</p>
+    <ul class="plain chips">
+      ${report.cars.map(
+        (car) => html`<li key=${car.name} class=${`chip stop-${car.state}`} data-stop=${car.name} title=${car.words}>
+          <strong>${car.name}</strong>${" "}<${Verdict} table=${stopStates} name=${car.state} detail=${t.took(car.took_s)} />
+          ${car.state === "failed" ? ` ${car.words}` : ""}
+        </li>`,
+      )}
+    </ul>
+  </div>`;
+}
+
+function StopBar({ report }) {
+  const [asking, setAsking] = useState(false);
+  const [why, setWhy] = useState("");
+  const estop = () => {
+    estopAll(why);
+    setAsking(false);
+    setWhy("");
+  };
+  return html`<section class="stopbar" aria-label="STOP">
+    <${Report} report=${report} />
+    ${asking &&
+    html`<div class="estop">
+      <label>${t.estopWhy} <input name="why" maxlength="200" value=${why} onInput=${(event) => setWhy(event.target.value)} /></label>
+      <button class="danger" onClick=${estop}>${t.estopNow}</button>
+      <button onClick=${() => setAsking(false)}>${t.cancel}</button>
+    </div>`}
+    <div class="stop-row">
+      <button id="stop" onPointerDown=${onStopDown} onClick=${onStopClick}>
+        <span aria-hidden="true">⬣</span> ${t.stop} <small>${t.stopKeys}</small>
+      </button>
+      <button id="estop" aria-expanded=${asking} onClick=${() => setAsking(!asking)}>${t.estop}</button>
+    </div>
+  </section>`;
+}
+
+// ---------------------------------------------------------------- the page
+
+const Banner = ({ words }) => html`<p class="banner" role="alert">${words}</p>`;
+
+class App extends Component {
+  componentDidMount() {
+    subscribe(() => this.setState({}));
+    window.addEventListener("hashchange", () => this.setState({}));
+  }
+  render() {
+    const { state } = store;
+    const here = location.hash in PAGES ? location.hash : "#/";
+    const [title, Page] = PAGES[here];
+    document.title = `${title} – ${t.title}`;
+    return html`
+      <a class="skip" href="#content" onClick=${(event) => {
+        event.preventDefault();
+        document.getElementById("content").focus();
+      }}>${t.skip}</a>
+      <header class="top">
+        <nav aria-label="Pages">
+          ${Object.entries(PAGES).map(
+            ([to, [name]]) => html`<a key=${to} href=${to} aria-current=${to === here ? "page" : undefined}>${name}</a>`,
+          )}
+        </nav>
+        <span class="fleet-name">${state?.fleet ?? ""}</span>
+      </header>
+      ${state !== null && (store.lost || !store.connected) && html`<${Banner} words=${t.consoleLost} />`}
+      ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
+      <main id="content" tabindex="-1">
+        ${state === null ? html`<h1>${t.title}</h1><p>${t.connecting}</p>` : html`<${Page} key=${here} cars=${state.cars} />`}
+      </main>
+      <${StopBar} report=${state?.stop ?? null} />
+    `;
+  }
+}
+
+setTexts(t);
+render(html`<${App} />`, document.getElementById("app"));

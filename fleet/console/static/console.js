@@ -1,0 +1,187 @@
+// The page's side of the one WebSocket: the newest state, presses, STOP, commands and their outcomes.
+
+const RECONNECT_MS = 500;
+const LOST_MS = 1500;
+const MAX_RESULTS = 6;
+
+const listeners = new Set();
+export const store = {
+  state: null,
+  hello: null,
+  connected: false,
+  lost: false,
+  press: null, // the motion that is held: {id, motion, cars, source}
+  results: [],
+  selected: new Set(),
+};
+
+let socket = null;
+let tick = 0;
+let pressNumber = 0;
+let requestNumber = 0;
+let lastMessageAt = performance.now();
+let drawing = false;
+const verbs = new Map();
+
+export function subscribe(listener) {
+  listeners.add(listener);
+  return () => listeners.delete(listener);
+}
+
+export function changed() {
+  if (drawing) return;
+  drawing = true;
+  requestAnimationFrame(() => {
+    drawing = false;
+    for (const listener of listeners) listener();
+  });
+}
+
+function send(message) {
+  if (socket !== null && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+}
+
+function note(words, bad) {
+  store.results = [{ key: ++requestNumber, words, bad }, ...store.results].slice(0, MAX_RESULTS);
+  changed();
+}
+
+// ---------------------------------------------------------------- STOP
+
+const newId = () => Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+
+// Twice at once: the socket may be half dead, and a fetch with keepalive outlives the page. The console acts once.
+export function stopAll() {
+  const id = newId();
+  send({ t: "stop", id });
+  fetch(`/stop?id=${id}`, { method: "POST", keepalive: true }).catch(() => {});
+  store.press = null;
+  changed();
+}
+
+export function estopAll(why) {
+  send({ t: "estop", id: newId(), why });
+  store.press = null;
+  changed();
+}
+
+// ---------------------------------------------------------------- hold to drive
+
+export function press(motion, cars, source) {
+  if (cars.length === 0 || document.visibilityState !== "visible") return;
+  store.press = { id: ++pressNumber, motion, cars, source };
+  send({ t: "press", press: pressNumber, cars, motion, n: tick });
+  changed();
+}
+
+// End the press of this source (left out: whatever its source).
+export function release(source) {
+  if (store.press === null || (source !== undefined && store.press.source !== source)) return;
+  send({ t: "release", press: store.press.id });
+  store.press = null;
+  changed();
+}
+
+for (const name of ["blur", "pagehide", "freeze"]) window.addEventListener(name, () => release());
+document.addEventListener("visibilitychange", () => {
+  if (document.visibilityState !== "visible") release();
+});
+
+// ---------------------------------------------------------------- commands
+
+export function command(verb, cars, fields = {}) {
+  if (cars.length === 0) return;
+  verbs.set(++requestNumber, verb);
+  send({ t: "do", id: requestNumber, verb, cars, ...fields });
+}
+
+export function lease(kind, cars) {
+  verbs.set(++requestNumber, kind === "take" ? "lease" : "release");
+  send({ t: kind, id: requestNumber, cars });
+}
+
+// ---------------------------------------------------------------- the socket
+
+export let describe = { done: () => "", refused: () => "" };
+export function setTexts(texts) {
+  describe = texts;
+}
+
+function onMessage(text) {
+  lastMessageAt = performance.now();
+  const message = JSON.parse(text);
+  switch (message.t) {
+    case "tick":
+      tick = message.n;
+      if (store.press !== null) send({ t: "echo", n: tick, press: store.press.id });
+      for (const listener of tickListeners) listener();
+      return;
+    case "state":
+      store.state = message;
+      break;
+    case "hello":
+      store.hello = message;
+      break;
+    case "over":
+      if (store.press !== null && store.press.id === message.press) {
+        store.press = null;
+        note(message.words, true);
+      }
+      break;
+    case "refused":
+      note(describe.refused(message.outcome), true);
+      break;
+    case "done": {
+      const verb = verbs.get(message.id);
+      verbs.delete(message.id);
+      for (const outcome of message.outcomes) {
+        note(outcome.ok ? describe.done(verb, outcome) : describe.refused(outcome), !outcome.ok);
+      }
+      break;
+    }
+    case "bad":
+      note(message.words, true);
+      break;
+  }
+  changed();
+}
+
+const tickListeners = new Set();
+export function onTick(listener) {
+  tickListeners.add(listener);
+  return () => tickListeners.delete(listener);
+}
+
+async function connect() {
+  // A console that was started again has another cookie.
+  try {
+    await fetch("/hello");
+  } catch {
+    setTimeout(connect, RECONNECT_MS);
+    return;
+  }
+  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
+  socket.onopen = () => {
+    store.connected = true;
+    pressNumber = 0;
+    changed();
+  };
+  socket.onmessage = (event) => onMessage(event.data);
+  socket.onclose = () => {
+    store.connected = false;
+    store.press = null;
+    changed();
+    setTimeout(connect, RECONNECT_MS);
+  };
+}
+
+setInterval(() => {
+  const lost = performance.now() - lastMessageAt > LOST_MS;
+  if (lost !== store.lost) {
+    store.lost = lost;
+    if (lost) store.press = null;
+    changed();
+  }
+}, 250);
+
+connect();

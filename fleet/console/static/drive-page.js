@@ -1,0 +1,265 @@
+// The drive page: hold to drive, modes, and everything else that the selected cars can do.
+
+import { command, lease, onTick, press, release, store, changed } from "./console.js";
+import { modes, motions, pad, t } from "./texts.js";
+import { html, useEffect, useState } from "./ui.js";
+
+const KEYS = {
+  ArrowUp: "forward", ArrowDown: "back", ArrowLeft: "spin_left", ArrowRight: "spin_right",
+  w: "forward", s: "back", a: "spin_left", d: "spin_right", q: "left", e: "right",
+};
+const TYPES_INTO = "input:not([type=checkbox]), select, textarea";
+const STICK_THRESHOLD = 0.5;
+
+const selected = () => {
+  const cars = store.state?.cars ?? [];
+  return cars.filter((car) => store.selected.has(car.name));
+};
+const names = () => selected().map((car) => car.name);
+
+// ---------------------------------------------------------------- keys and gamepads, on this page only
+
+function onKeyDown(event) {
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const motion = KEYS[key];
+  if (motion === undefined || event.ctrlKey || event.altKey || event.metaKey || event.target.closest(TYPES_INTO)) return;
+  event.preventDefault();
+  if (!event.repeat) press(motion, names(), `key ${key}`);
+}
+
+function onKeyUp(event) {
+  release(`key ${event.key.length === 1 ? event.key.toLowerCase() : event.key}`);
+}
+
+function stickMotion() {
+  for (const stick of navigator.getGamepads()) {
+    if (stick === null) continue;
+    const [x, y] = stick.axes;
+    if (y < -STICK_THRESHOLD) return "forward";
+    if (y > STICK_THRESHOLD) return "back";
+    if (x < -STICK_THRESHOLD) return "spin_left";
+    if (x > STICK_THRESHOLD) return "spin_right";
+  }
+  return null;
+}
+
+let stickBefore = null;
+function onStick() {
+  const motion = stickMotion();
+  if (motion === stickBefore) return;
+  stickBefore = motion;
+  if (motion === null) release("stick");
+  else press(motion, names(), "stick");
+}
+
+function useDriving() {
+  useEffect(() => {
+    window.addEventListener("keydown", onKeyDown);
+    window.addEventListener("keyup", onKeyUp);
+    const off = onTick(onStick);
+    return () => {
+      release();
+      window.removeEventListener("keydown", onKeyDown);
+      window.removeEventListener("keyup", onKeyUp);
+      off();
+    };
+  }, []);
+}
+
+// ---------------------------------------------------------------- the parts
+
+function PadButton({ motion, symbol, words, letter }) {
+  const source = `pad ${motion}`;
+  const down = (event) => {
+    if (event.button !== 0) return;
+    event.currentTarget.setPointerCapture(event.pointerId);
+    press(motion, names(), source);
+  };
+  const up = () => release(source);
+  // Space and Enter on the button are held, too. The browser's own click does nothing.
+  const isHoldKey = (event) => event.key === " " || event.key === "Enter";
+  const keyDown = (event) => {
+    if (!isHoldKey(event)) return;
+    event.preventDefault();
+    if (!event.repeat) press(motion, names(), source);
+  };
+  const keyUp = (event) => isHoldKey(event) && up();
+  const held = store.press?.motion === motion;
+  return html`<button class=${held ? "pad held" : "pad"} data-motion=${motion} aria-label=${`${words}, hold`}
+    aria-pressed=${held} onPointerDown=${down} onPointerUp=${up} onPointerCancel=${up} onLostPointerCapture=${up}
+    onKeyDown=${keyDown} onKeyUp=${keyUp} onBlur=${up} onContextMenu=${(event) => event.preventDefault()}>
+    <span class="arrow" aria-hidden="true">${symbol}</span><span class="pad-words">${words} <kbd>${letter}</kbd></span>
+  </button>`;
+}
+
+const Pad = () => html`<section aria-label=${t.padLabel}>
+  <h2>${t.padLabel}</h2>
+  <p class="hint" id="pad-hint">${t.padHint}</p>
+  <div class="pads">
+    ${pad.map(([motion, symbol, words, letter]) => html`<${PadButton} ...${{ motion, symbol, words, letter }} />`)}
+  </div>
+  <p class="driving" role="status">${store.press ? t.driving(motions[store.press.motion], store.press.cars) : ""}</p>
+</section>`;
+
+function Selection({ cars }) {
+  const toggle = (name) => {
+    if (!store.selected.delete(name)) store.selected.add(name);
+    release();
+    changed();
+  };
+  return html`<fieldset class="selection">
+    <legend>${t.select}</legend>
+    ${cars.map(
+      (car) => html`<label key=${car.name} style=${{ "--car": car.color }}>
+        <input type="checkbox" name=${`select-${car.name}`} checked=${store.selected.has(car.name)} onChange=${() => toggle(car.name)} />
+        ${car.name}
+      </label>`,
+    )}
+  </fieldset>`;
+}
+
+const Leases = ({ cars }) => html`<section>
+  <h2>${t.lease}</h2>
+  <ul class="plain">
+    ${cars.map(
+      (car) => html`<li key=${car.name}>
+        <strong>${car.name}</strong>: ${car.lease ? t.leaseOf(car.lease.holder, car.lease.kind) : t.nobody}
+        ${car.lease?.holder === "this console"
+          ? html`<button onClick=${() => lease("give_back", [car.name])} aria-label=${`${t.giveBack} ${car.name}`}>${t.giveBack}</button>`
+          : html`<button onClick=${() => lease("take", [car.name])} aria-label=${`${t.take} ${car.name}`}>${t.take}</button>`}
+      </li>`,
+    )}
+  </ul>
+</section>`;
+
+// A control that all cars have. Of the others, it says which car lacks it and why.
+function Offer({ title, needs, cars, children }) {
+  const lacking = cars.filter((car) => needs in car.cannot);
+  return html`<section data-control=${needs}>
+    <h2>${title}</h2>
+    ${lacking.length === 0
+      ? children
+      : lacking.map((car) => html`<p class="cannot" key=${car.name}>${t.cannot(car.name, car.cannot[needs])}</p>`)}
+  </section>`;
+}
+
+const common = (cars, field) => cars[0][field].filter((word) => cars.every((car) => car[field].includes(word)));
+
+const Modes = ({ cars }) => html`<ul class="modes">
+  ${common(cars, "modes").map((mode) => {
+    const [name, words] = modes[mode];
+    const asked = cars.every((car) => car.mode.asked === mode);
+    return html`<li key=${mode}>
+      <button data-mode=${mode} aria-pressed=${asked} aria-describedby=${`mode-${mode}`}
+        onClick=${() => command("mode", names(), { mode })}>${name}</button>
+      <span id=${`mode-${mode}`}>${words}</span>
+    </li>`;
+  })}
+</ul>`;
+
+function Led() {
+  const [color, setColor] = useState("#00ff00");
+  const rgb = [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16));
+  return html`<div class="controls">
+    <input type="color" aria-label=${t.led} value=${color} onInput=${(event) => setColor(event.target.value)} />
+    <button data-do="led" onClick=${() => command("led", names(), { rgb })}>${t.setLed}</button>
+  </div>`;
+}
+
+const Lights = ({ cars }) => html`<div class="controls">
+  ${common(cars, "lights").map(
+    (light) => html`<button key=${light} data-light=${light} onClick=${() => command("light", names(), { light })}>${light}</button>`,
+  )}
+</div>`;
+
+const Speed = ({ cars }) => html`<div class="controls">
+    <button data-do="slower" onClick=${() => command("speed", names(), { step: "down" })}>${t.slower}</button>
+    <button data-do="faster" onClick=${() => command("speed", names(), { step: "up" })}>${t.faster}</button>
+  </div>
+  ${cars.map(
+    (car) =>
+      car.motion.speed !== null &&
+      html`<p key=${car.name}>
+        <meter min="0" max="1" value=${car.motion.speed} aria-label=${`${t.speed} ${car.name}`}></meter>
+        ${car.name}: ${t.speedEstimate(car.motion.speed)}
+      </p>`,
+  )}`;
+
+function ServoAngle() {
+  const [deg, setDeg] = useState(90);
+  return html`<div class="controls">
+    <label>0° <input type="range" name="servo" min="0" max="180" value=${deg} aria-label=${t.servo}
+      onInput=${(event) => setDeg(event.target.valueAsNumber)}
+      onChange=${(event) => command("servo", names(), { deg: event.target.valueAsNumber })} /> 180°</label>
+    <output>${deg}°</output>
+    <p class="hint">${t.servoRange}</p>
+  </div>`;
+}
+
+const ServoSteps = ({ servo, actions }) => html`<div class="controls">
+  ${actions.map(
+    (action) => html`<button key=${action} onClick=${() => command("servo", names(), { servo, action })}
+      aria-label=${`${t.servoNames[servo]} ${t.servoStep[action]}`}>${t.servoStep[action]}</button>`,
+  )}
+</div>`;
+
+function Arm() {
+  const [joints, setJoints] = useState([90, 90, 90, 90, 90, 90]);
+  const set = (index, deg) => setJoints(joints.map((before, at) => (at === index ? deg : before)));
+  return html`<div class="joints">
+      ${joints.map(
+        (deg, index) => html`<label key=${index}>${t.joint(index + 1)}
+          <input type="range" min="0" max="180" value=${deg} onInput=${(event) => set(index, event.target.valueAsNumber)} />
+          <output>${deg}°</output></label>`,
+      )}
+    </div>
+    <button data-do="arm" onClick=${() => command("arm", names(), { joint_deg: joints })}>${t.moveArm}</button>`;
+}
+
+const Fan = ({ cars }) => html`<button data-do="fan" onClick=${() => command("fan", names())}>${t.toggleFan}</button>
+  ${cars.map((car) => html`<p key=${car.name} class="hint">${car.name}: ${t.fanState(car.motion.fan)}</p>`)}`;
+
+const Controls = ({ cars }) => html`
+  <${Leases} cars=${cars} />
+  <${Offer} title=${t.mode} needs="mode" cars=${cars}><${Modes} cars=${cars} /><//>
+  <${Offer} title=${t.speed} needs="speed" cars=${cars}><${Speed} cars=${cars} /><//>
+  <${Offer} title=${t.led} needs="led" cars=${cars}><${Led} /><//>
+  <${Offer} title=${t.light} needs="light" cars=${cars}><${Lights} cars=${cars} /><//>
+  <${Offer} title=${t.sounds} needs="whistle" cars=${cars}>
+    <div class="controls">
+      <button data-do="whistle" onClick=${() => command("whistle", names())}>${t.whistle}</button>
+      <button data-do="find" onClick=${() => command("find", names())}>${t.identify}</button>
+    </div>
+  <//>
+  <${Offer} title=${t.servo} needs="servo_deg" cars=${cars}><${ServoAngle} /><//>
+  <${Offer} title=${t.servoNames.vertical} needs="servo_vertical" cars=${cars}>
+    <${ServoSteps} servo="vertical" actions=${["up", "down", "reset"]} />
+  <//>
+  <${Offer} title=${t.servoNames.horizontal} needs="servo_horizontal" cars=${cars}>
+    <${ServoSteps} servo="horizontal" actions=${["left", "right", "reset"]} />
+  <//>
+  <${Offer} title=${t.arm} needs="arm" cars=${cars}><${Arm} /><//>
+  <${Offer} title=${t.fan} needs="fan" cars=${cars}><${Fan} cars=${cars} /><//>
+`;
+
+const Results = () => html`<section class="results" aria-live="polite" aria-label=${t.results}>
+  <ul class="plain">
+    ${store.results.map((result) => html`<li key=${result.key} class=${result.bad ? "bad" : ""}>${result.bad ? "⚠ " : "✓ "}${result.words}</li>`)}
+  </ul>
+</section>`;
+
+export function DrivePage({ cars }) {
+  useDriving();
+  const driven = selected();
+  return html`
+    <h1>${t.drive}</h1>
+    <div class="drive">
+      <div class="drive-pad">
+        <${Selection} cars=${cars} />
+        <${Pad} />
+        <${Results} />
+      </div>
+      <div class="drive-controls">${driven.length === 0 ? html`<p>${t.selectHint}</p>` : html`<${Controls} cars=${driven} />`}</div>
+    </div>
+  `;
+}

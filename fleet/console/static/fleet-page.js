@@ -1,0 +1,123 @@
+// The fleet page: a card for each car.
+
+import { command, store } from "./console.js";
+import { links, modes, motions, motors, t, trends, verdicts } from "./texts.js";
+import { html, Memo, useState, Verdict } from "./ui.js";
+
+export const motorName = (car) => {
+  const { state, basis } = car.motors;
+  return state === "off" && basis ? `off ${basis}` : state;
+};
+
+const Lamps = ({ values, words }) => html`<span class="lamps">
+  <span aria-hidden="true">${values.map((on) => html`<span class=${on ? "lamp on" : "lamp"}>${on ? "◉" : "○"}</span>`)}</span>
+  <span class="lamp-words">${words}</span>
+</span>`;
+
+const seen = (values, names) => names.filter((_, index) => values[index]);
+
+const Row = ({ name, children }) => html`<div class="row"><dt>${name}</dt><dd>${children}</dd></div>`;
+
+const Alarm = ({ words, todo }) => html`<div class="alarm"><p><strong>${words}</strong></p><p>${todo}</p></div>`;
+
+function Trouble({ car }) {
+  if (!car.gateway) return html`<${Alarm} words=${t.gone(car.name, t.ago(car.gone_s ?? 0))} todo=${t.goneDo} />`;
+  const ago = t.ago(car.link.since_s);
+  if (car.link.state === "lost") {
+    const words = (motors[motorName(car)] ?? motors.unknown)[1];
+    return html`<${Alarm} words=${t.lost(car.name, ago, words)} todo=${`${car.link.reason} ${t.lostDo}`} />`;
+  }
+  if (car.link.state === "stale") return html`<${Alarm} words=${t.stale(car.name, ago)} todo=${t.staleDo} />`;
+  return null;
+}
+
+function Estops({ car }) {
+  const [sure, setSure] = useState(false);
+  if (car.estops.length === 0) return null;
+  const end = () => {
+    setSure(false);
+    command("resume", [car.name], { ids: car.estops.map((estop) => estop.id) });
+  };
+  return html`<div class="alarm">
+    <p class="latched"><span aria-hidden="true">⛔</span> ${t.estopped}</p>
+    ${car.estops.map((estop) => html`<p key=${estop.id}>${t.estopLine(estop.by, estop.why, estop.scope)}</p>`)}
+    ${sure
+      ? html`<button class="danger" onClick=${end}>${t.endEstopSure}</button>
+          <button onClick=${() => setSure(false)}>${t.cancel}</button>`
+      : html`<button onClick=${() => setSure(true)}>${t.endEstop}</button>`}
+  </div>`;
+}
+
+const Hold = ({ car }) =>
+  car.hold === null || car.estops.length > 0
+    ? null
+    : html`<div class="note">
+        <p>${t.held(car.hold)}</p>
+        <button onClick=${() => command("resume", [car.name])} aria-label=${`${t.resume} ${car.name}`}>${t.resume}</button>
+      </div>`;
+
+function Card({ car }) {
+  const select = () => {
+    store.selected = new Set([car.name]);
+  };
+  const { battery, mode, event } = car;
+  return html`<article class="card" style=${{ "--car": car.color }} aria-labelledby=${`car-${car.name}`} data-car=${car.name}>
+    <header>
+      <h2 id=${`car-${car.name}`}>${car.name}</h2>
+      <span class="platform">${car.platform}</span>
+    </header>
+    <${Trouble} car=${car} />
+    <${Estops} car=${car} />
+    <${Hold} car=${car} />
+    <dl>
+      <${Row} name=${t.link}><${Verdict} table=${links} name=${car.gateway ? car.link.state : "unknown"} /><//>
+      <${Row} name=${t.mode}>
+        ${(modes[mode.asked] ?? modes.unknown)[0]}${" "}
+        <${Verdict} table=${verdicts} name=${mode.verdict}
+          detail=${mode.verdict === "contradicted" ? (modes[mode.inferred] ?? modes.unknown)[0] : ""} />
+      <//>
+      <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} /><//>
+      <${Row} name=${t.motion}>${motions[car.motion.motion]}${car.motion.owner ? ` (${car.motion.owner})` : ""}<//>
+      <${Row} name=${t.battery}>
+        ${battery
+          ? html`<span class=${`level-${battery.level}`}>
+              ${battery.v.toFixed(1)} V${battery.charge === null ? "" : ` · ${Math.round(battery.charge * 100)} %`}
+              ${battery.level === "ok" ? "" : ` · ⚠ ${battery.level}`} ${trends[battery.trend] ?? ""}</span
+            >`
+          : t.notMeasured}
+      <//>
+      <${Row} name=${t.distance}>
+        ${car.range_m === undefined ? t.notMeasured : car.range_m === null ? t.noEcho : `${car.range_m.toFixed(2)} m`}
+      <//>
+      <${Row} name=${t.line}>
+        ${car.line ? html`<${Lamps} values=${car.line} words=${t.seesLine(seen(car.line, t.lineNames))} />` : t.notMeasured}
+      <//>
+      <${Row} name=${t.obstacle}>
+        ${car.obstacle
+          ? html`<${Lamps} values=${car.obstacle} words=${t.seesObstacle(seen(car.obstacle, t.sideNames))} />`
+          : t.notMeasured}
+      <//>
+      <${Row} name=${t.control}>${car.lease ? t.leaseOf(car.lease.holder, car.lease.kind) : t.nobody}<//>
+      <${Row} name=${t.event}>
+        ${event
+          ? html`<time>${new Date(event.at_ms).toLocaleTimeString()}</time>${" "}
+              ${event.level === "info" ? "" : "⚠ "}${event.words}`
+          : "–"}
+      <//>
+    </dl>
+    <footer>
+      <a class="button" href="#/drive" onClick=${select} aria-label=${`${t.drive} ${car.name}`}>${t.drive}</a>
+      <button class="stop-one" onClick=${() => command("stop", [car.name])} aria-label=${`${t.stopCar} ${car.name}`}>
+        ${t.stopCar}
+      </button>
+    </footer>
+  </article>`;
+}
+
+export const FleetPage = ({ cars }) => html`
+  <h1>${t.fleet}</h1>
+  ${cars.length === 0 && html`<p>${t.noCars}</p>`}
+  <div class="cards">
+    ${cars.map((car) => html`<${Memo} key=${car.name} data=${JSON.stringify(car)} draw=${() => html`<${Card} car=${car} />`} />`)}
+  </div>
+`;

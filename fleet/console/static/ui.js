@@ -1,0 +1,26 @@
+// Preact with htm, and the small parts that all pages use.
+
+import { Component, h, render } from "./vendor/preact.js";
+import { useEffect, useRef, useState } from "./vendor/preact-hooks.js";
+import htm from "./vendor/htm.js";
+
+export const html = htm.bind(h);
+export { Component, render, useEffect, useRef, useState };
+
+// A symbol for the eye and a word for all: never color alone.
+export const Verdict = ({ table, name, detail = "" }) => {
+  const [symbol, words] = table[name] ?? ["?", name];
+  return html`<span class=${`verdict v-${name.replace(" ", "-")}`}
+    ><span class="symbol" aria-hidden="true">${symbol}</span> ${words}${detail && ` ${detail}`}</span
+  >`;
+};
+
+// Draws again only if its data has changed.
+export class Memo extends Component {
+  shouldComponentUpdate(next) {
+    return next.data !== this.props.data;
+  }
+  render({ draw }) {
+    return draw();
+  }
+}
