@@ -16,7 +16,7 @@ export FLEET_STATE_DIR := $(CURDIR)/.state
 # Tests start hundreds of Python processes. Each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test stress soak lint bench vectors proto pictures pages docs clean
+.PHONY: help demo test browser stress soak lint bench vectors proto pictures pages docs clean
 help: ## what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
@@ -38,16 +38,19 @@ demo: .venv/.ready ## three simulated cars do a job, recorded, checked, ready fo
 	@echo "Running the demo: three simulated cars do a job, about half a minute."
 	$(BIN)/fleet demo
 
-test: .venv/.ready ## the test suite (under seven minutes on two processors)
+test: .venv/.ready browser ## the test suite (under seven minutes on two processors)
 	@mkdir -p .tmp
 	@echo "Running the test suite: under seven minutes on two processors."
 	$(BIN)/python -m pytest $(TESTS) -m 'not soak' -n auto --dist loadgroup
+
+browser: .venv/.ready ## install Chromium for the console's tests, if there is none
+	@$(BIN)/python -m tests.tools.browser
 
 stress: .venv/.ready ## the suite twice at once while its processes are paused at random (TESTS=..., STRESS_SEED=...)
 	@mkdir -p .tmp
 	$(BIN)/python -m tests.tools.stress $(if $(STRESS_SEED),--seed $(STRESS_SEED)) $(TESTS)
 
-soak: .venv/.ready ## what takes longer than a test may
+soak: .venv/.ready browser ## what takes longer than a test may
 	@mkdir -p .tmp
 	$(BIN)/python -m pytest tests -m soak -s --timeout 3600
 

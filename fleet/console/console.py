@@ -5,7 +5,6 @@ import json
 import logging
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -16,7 +15,7 @@ from fleet.console.page_link import PageLink
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
 from fleet.console.requests import MAX_REASON_LENGTH, BadRequest, PageMessage
 from fleet.replay.colors import color
-from schemas import keys, messages
+from schemas import keys, messages, topics
 from schemas.bus import Handover, Latest, Sample
 from schemas.commands import STOPS
 
@@ -78,10 +77,11 @@ class Console:
 
     def _take_readings(self, now: float) -> None:
         for sample in self._readings.take().values():
-            with suppress(messages.BadPayload, KeyError):
-                key = keys.parse(sample.key)
-                if key is not None:
-                    self._view.car(key.car).on_message(key.topic, sample.message(), now)
+            if (found := _message_in(sample)) is not None:
+                key, message = found
+                self._view.car(key.car).on_message(key.topic, message, now)
+                if key.topic == "state/safety" and self.operator.report is not None:
+                    self.operator.report.on_safety(key.car, message, now)
         self._view.on_presence(self._fleet.sync.cars(), now)
 
     def _state(self, now: float) -> str:
@@ -97,14 +97,9 @@ class Console:
         return json.dumps(state, separators=(",", ":"))
 
     def _on_event(self, sample: Sample) -> None:
-        try:
-            event: Any = sample.message()
-        except (messages.BadPayload, KeyError):
+        if (found := _message_in(sample)) is None:
             return
-        key = keys.parse(sample.key)
-        if key is None:
-            return
-        now = time.monotonic()
+        (key, event), now = found, time.monotonic()
         self._view.car(key.car).on_message(key.topic, event, now)
         if key.topic == "event/command" and event.sender == self._fleet.sync.sender and self.operator.report:
             self.operator.report.on_event(key.car, event, now)
@@ -206,6 +201,18 @@ class Console:
         for press in self._presses.alive:
             self.operator.end_press(press)
         await self.operator.close()
+
+
+def _message_in(sample: Sample) -> tuple[keys.Key, Any] | None:
+    """Return the key and the message. None if it is not the message of its key: anyone on the bus may publish."""
+    topic, key = topics.of_key(sample.key), keys.parse(sample.key)
+    if topic is None or key is None:
+        return None
+    try:
+        return key, messages.parse(topic.message, sample.payload, sample.encoding)
+    except messages.BadPayload as error:
+        log.warning("%s: %s", sample.key, error)
+        return None
 
 
 def _hex_color(car: str, index: int) -> str:

@@ -63,10 +63,10 @@ class PageMessage:
     def cars(self) -> tuple[str, ...]:
         """Return names of cars, at least one. Raises BadRequest."""
         value = self.fields.get("cars")
-        if not isinstance(value, list) or not 0 < len(value) <= MAX_CARS:
+        if not isinstance(value, list) or not 0 < len(value) <= MAX_CARS or not all(isinstance(e, str) for e in value):
             raise BadRequest("cars is not a list of names")
         try:
-            return tuple(dict.fromkeys(keys.check_name(name) for name in value if isinstance(name, str)))
+            return tuple(dict.fromkeys(keys.check_name(name) for name in value))
         except keys.BadKey as error:
             raise BadRequest(str(error)) from None
 

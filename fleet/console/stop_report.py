@@ -36,6 +36,16 @@ class StopReport:
             case _:
                 self._cars[car] = _entry("stopping")
 
+    def on_safety(self, car: str, safety: Any, now: float) -> None:
+        """Handle a new state/safety: a car that was not reached may be stopped by its own gateway later."""
+        if (
+            car in self._cars
+            and self._cars[car]["state"] == "failed"
+            and safety.motors == "off"
+            and safety.motors_basis
+        ):
+            self._set(car, safety.motors_basis, now)
+
     def on_outcomes(self, outcomes: Iterable[Outcome], now: float) -> None:
         """Handle the final outcomes. A car without an outcome was not reached."""
         by_car = {outcome.car: outcome for outcome in outcomes}

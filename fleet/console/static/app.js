@@ -41,7 +41,7 @@ function Report({ report }) {
   if (reportSeen[0] !== report.number) reportSeen = [report.number, performance.now()];
   const failed = report.cars.some((car) => car.state === "failed");
   if (report.over && !failed && performance.now() - reportSeen[1] > SHOW_REPORT_MS) return null;
-  return html`<div class="report">
+  return html`<div class="report" data-report=${report.number}>
     <p role="status"><strong>${report.verb === "estop" ? t.estopped : "STOP"}</strong>: ${t.stopSummary(report.cars)}</p>
     <ul class="plain chips">
       ${report.cars.map(

@@ -1,0 +1,365 @@
+"""The console in a real browser, on real gateways. The simulated cars' true motors judge what each control does."""
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import psutil
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Page
+
+from tests.support.console import CARS, ConsoleProcess, Stage, browser_process, pids
+from tests.support.ports import free_endpoint
+from tests.support.processes import FleetProcesses, wait_for
+
+TTL_S = 0.5
+"""A drive of the console lasts for so long without another one."""
+BLOCK_S = 1.0
+"""The longest block of a car in mode 0: a ranging without echo."""
+STOPPED_WITHIN_S = TTL_S + BLOCK_S + 0.5
+
+
+@pytest.fixture(scope="module")
+def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+    stage = Stage(FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("console")))
+    yield stage
+    stage.close()
+
+
+@pytest.fixture
+def stage(stages: Stage) -> Iterator[Stage]:
+    yield stages
+    stages.rest()
+
+
+def drive_all(stage: Stage) -> None:
+    """Another person drives all cars."""
+    for car in CARS:
+        stage.person.car(car).drive("forward", 10.0, wait=False).check()
+    wait_for(lambda: all(stage.judges[car].driving for car in CARS), "all drive")
+
+
+@pytest.mark.parametrize("how", ["mouse", "escape", "space", "touch", "fetch alone"])
+def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: Stage, how: str) -> None:
+    page = stage.phone() if how == "touch" else stage.page()
+    page.locator("[data-car=red]").wait_for()
+    drive_all(stage)
+
+    def act() -> None:
+        match how:
+            case "mouse":  # pointerdown alone
+                page.locator("#stop").hover()
+                page.mouse.down()
+            case "touch":
+                page.locator("#stop").tap()
+            case "escape":  # also while a control has the focus
+                page.locator("#estop").click()
+                page.locator("input[name=why]").fill("x")
+                page.keyboard.press("Escape")
+            case "space":
+                page.keyboard.press(" ")
+            case _:  # the socket is dead, and nobody has noticed
+                page.evaluate("WebSocket.prototype.send = () => {}")
+                page.keyboard.press("Escape")
+
+    report = stage.report(page, act)
+    for car in CARS:
+        stage.stands(car)
+    for car, kind in CARS.items():
+        state = "sent" if kind == "raspberry_pi" else "shown"
+        report.locator(f"[data-stop={car}].stop-{state}").wait_for()
+        page.locator(f"[data-car={car}]").get_by_text("On hold: this console").wait_for()
+
+
+def test_a_car_is_shown_as_stopped_only_when_its_readings_show_it(stage: Stage) -> None:
+    page = stage.page()
+    drive_all(stage)
+    stage.gateways["red"].popen.send_signal(signal.SIGSTOP)
+    try:
+        report = stage.report(page, lambda: page.keyboard.press("Escape"))
+        report.locator("[data-stop=blue].stop-shown").wait_for()
+        assert report.locator("[data-stop=red].stop-shown").count() == 0
+        assert stage.judges["red"].driving, "its gateway is frozen"
+    finally:
+        stage.gateways["red"].popen.send_signal(signal.SIGCONT)
+    report.locator("[data-stop=red].stop-shown").wait_for()
+    assert not stage.judges["red"].driving
+
+
+def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: Stage) -> None:
+    page = stage.page()
+    page.locator("#estop").click()
+    page.locator("input[name=why]").fill("smoke")
+    page.get_by_role("button", name="E-stop all cars now").click()
+    card = page.locator("[data-car=red]")
+    card.get_by_text("E-stop of the whole fleet by this console: smoke").wait_for()
+    refused = stage.person.car("red").drive("forward")
+    assert refused.reason == "estopped"
+    card.get_by_role("button", name="End the e-stop…").click()
+    assert stage.fleet.state("safety").estops, "one press ends nothing"
+    card.get_by_role("button", name="Yes, end it").click()
+    for car in CARS:
+        wait_for(lambda car=car: not stage.fleet.state("safety", car).estops, "ended on all")
+    page.get_by_role("button", name="Resume red").click()
+    wait_for(lambda: not stage.fleet.state("safety").HasField("hold"), "its hold ends, too")
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_a_pad_drives_while_it_is_held(stage: Stage, size: str) -> None:
+    options = stage.playwright.devices["Pixel 7"] if size == "phone" else {}
+    page = stage.driving_page("red", **options)
+    with stage.held(page, "forward"):
+        time.sleep(1.2)  # longer than any drive of the stream
+        assert stage.judges["red"].driving
+    stage.stands()
+    assert not stage.judges["blue"].driving
+
+
+def test_a_finger_drives_until_it_is_lifted_or_leaves(stage: Stage) -> None:
+    page = stage.driving_page("red", **stage.playwright.devices["Pixel 7"])
+    box = page.locator("[data-motion=spin_left]").bounding_box()
+    assert box is not None
+    where = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    fingers = page.context.new_cdp_session(page)
+    for end in ("touchEnd", "touchCancel"):
+
+        def drives() -> bool:
+            fingers.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [where]})
+            try:
+                wait_for(lambda: stage.judges["red"].driving, "it drives", seconds=3.0)
+            except AssertionError:
+                fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+                time.sleep(0.7)
+                return False
+            return True
+
+        wait_for(drives, "it drives")
+        fingers.send("Input.dispatchTouchEvent", {"type": end, "touchPoints": []})
+        stage.stands()
+
+
+def test_several_cars_are_driven_together_by_keys(stage: Stage) -> None:
+    page = stage.driving_page("red", "green")
+
+    def both() -> bool:
+        page.keyboard.down("ArrowUp")
+        try:
+            wait_for(lambda: stage.judges["red"].driving and stage.judges["green"].driving, "both", seconds=3.0)
+        except AssertionError:
+            page.keyboard.up("ArrowUp")
+            time.sleep(0.7)
+            return False
+        return True
+
+    wait_for(both, "both drive")
+    assert not stage.judges["blue"].driving
+    page.keyboard.up("ArrowUp")
+    stage.stands("red")
+    stage.stands("green")
+
+
+def test_a_page_that_loses_the_focus_or_is_hidden_lets_go(stage: Stage) -> None:
+    page = stage.driving_page("red")
+    for lost in ("window.dispatchEvent(new Event('blur'))", "window.dispatchEvent(new Event('pagehide'))"):
+        with stage.held(page, "back"):
+            page.evaluate(lost)
+            stage.stands()
+    with stage.held(page, "back"):
+        page.context.close()
+        stage._pages.remove(page)
+        stage.stands()
+
+
+def test_a_browser_that_is_killed_stops_the_car(stage: Stage) -> None:
+    before = pids()
+    browser = stage.launch()
+    process = browser_process(before)
+    page = stage.driving_page("red", browser=browser)
+    with stage.held(page, "forward"):
+        killed_ns = time.time_ns()
+        for each in (process, *process.children(recursive=True)):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                each.kill()
+        assert stage.stands(since_ns=killed_ns) < STOPPED_WITHIN_S
+
+
+def test_a_browser_that_freezes_stops_the_car_and_does_not_start_it_again(stage: Stage) -> None:
+    page = stage.driving_page("red")
+    with stage.held(page, "forward"):
+        frozen = stage.renderers()
+        frozen_ns = time.time_ns()
+        for each in frozen:
+            each.suspend()
+        try:
+            assert stage.stands(since_ns=frozen_ns) < STOPPED_WITHIN_S
+            time.sleep(1.0)
+        finally:
+            for each in frozen:
+                each.resume()
+        # The finger is still down, for all that the page knows: nothing drives before it is lifted.
+        page.get_by_text("The page did not answer for 0.3 s.").wait_for()
+        thawed_ns = time.time_ns()
+        time.sleep(0.5)
+        assert stage.judges["red"].on_after(thawed_ns) == []
+
+
+def test_a_wire_that_is_cut_stops_the_car_and_its_burst_starts_nothing(stage: Stage) -> None:
+    page = stage.driving_page("red", wired=True)
+    with stage.held(page, "forward"):
+        cut_ns = stage.wire.cut()
+        try:
+            assert stage.stands(since_ns=cut_ns) < STOPPED_WITHIN_S
+        finally:
+            stage.wire.mend()
+        page.locator(".pad.held").wait_for(state="detached")
+        page.locator(".banner").wait_for(state="detached")
+        time.sleep(0.5)
+        assert stage.judges["red"].on_after(cut_ns) == []
+
+
+def test_a_console_that_is_killed_stops_the_car(stage: Stage) -> None:
+    page = stage.driving_page("red")
+    with stage.held(page, "forward"):
+        killed_ns = stage.console.process.kill()
+        stage.console.process.wait()
+        assert stage.stands(since_ns=killed_ns) < STOPPED_WITHIN_S
+    page.get_by_text("The console does not answer").wait_for()
+    stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)
+    page.get_by_text("The console does not answer").wait_for(state="hidden")
+    with stage.held(page, "forward"):  # with a new cookie
+        pass
+    stage.stands()
+
+
+def test_each_control_does_what_it_says_to_the_car(stage: Stage) -> None:
+    page = stage.driving_page("blue")
+    say = stage.sim.say
+
+    def truth(name: str) -> object:
+        return say({"car": "blue", "ask": "truth"})[name]
+
+    page.locator("input[type=color]").fill("#ff8000")
+    page.locator("[data-do=led]").click()
+    wait_for(lambda: truth("led") == "#ff8000", "its LED is orange")
+    page.locator("[data-light=red]").click()
+    page.locator("input[name=servo]").fill("30")
+    page.locator("[data-do=whistle]").click()
+    page.locator("[data-do=faster]").click()
+    frames = stage.judges["blue"].frames
+    for part in (b"PTZ30", b"CLR255,CLG128,CLB0"):
+        wait_for(lambda part=part: any(part in data for *_, data in frames), part.decode())
+    page.locator("[data-do=arm]").click()
+    wait_for(lambda: any(b"ServoJ190" in data for *_, data in frames), "the arm")
+    page.locator("[data-do=fan]").click()
+    wait_for(lambda: truth("fan") is True, "its fan runs")
+    page.locator("[data-do=fan]").click()
+    wait_for(lambda: truth("fan") is False, "its fan stands")
+    page.locator("[data-mode=tracking]").click()
+    wait_for(lambda: truth("mode") == "tracking", "it tracks")
+    page.locator("[data-mode=manual]").click()
+    wait_for(lambda: truth("mode") == "manual", "it stands")
+
+
+def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: Stage) -> None:
+    page = stage.driving_page("green")
+    modes = page.locator("[data-control=mode]")
+    modes.get_by_text("green: Mode tracking cannot be opened on raspberry_pi cars").wait_for()
+    assert modes.get_by_role("button").count() == 0
+    assert page.locator("[data-control=servo_vertical] button").count() == 3
+    page.locator("input[name=select-green]").uncheck()
+    page.locator("input[name=select-red]").check()
+    page.locator("[data-mode=tracking]").wait_for()
+    assert page.locator("[data-control=servo_vertical] button").count() == 0
+
+
+def test_a_car_that_another_person_drives_is_refused_until_it_is_taken(stage: Stage) -> None:
+    page = stage.driving_page("red")
+    stage.person.car("red").drive("forward", 10.0, wait=False).check()
+    page.get_by_text("mia (person)").wait_for()
+    page.locator("[data-motion=back]").hover()
+    page.mouse.down()
+    page.get_by_text("red is driven by mia").wait_for()
+    page.mouse.up()
+    assert stage.judges["red"].driving
+    page.get_by_role("button", name="Take over red").click()
+    page.get_by_role("button", name="Give back red").wait_for()
+    time.sleep(2.5)  # longer than a lease: it is renewed
+    refused = stage.person.car("red").drive("forward")
+    assert refused.reason == "leased"
+    page.get_by_role("button", name="Give back red").click()
+    page.get_by_role("button", name="Take over red").wait_for()
+    assert stage.person.car("red").drive("forward", 0.2).ok
+
+
+def test_a_lost_car_says_what_is_known_and_what_to_do(stage: Stage) -> None:
+    page = stage.page()
+    stage.gateways["red"].kill()
+    stage.gateways["red"].wait()
+    card = page.locator("[data-car=red]")
+    card.get_by_text("Whether red moves is not known").wait_for()
+    card.get_by_text("Look at the car.").wait_for()
+    stage.gateways["red"] = stage.fleet.gateway(stage.links["red"], car="red", platform=CARS["red"])
+    stage.fleet.ready("red")
+    card.get_by_text("online").wait_for()
+
+
+def serious(page: Page) -> list[str]:
+    """The serious violations that axe-core finds."""
+    found = Axe().run(page).response["violations"]
+    return [
+        f"{each['id']}: {[node['html'][:120] for node in each['nodes']]}"
+        for each in found
+        if each["impact"] in ("serious", "critical")
+    ]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_serious_violation(stage: Stage, scheme: str) -> None:
+    page = stage.driving_page("red", "green", viewport={"width": 1280, "height": 900}, color_scheme=scheme)
+    page.keyboard.press("Escape")
+    page.locator("[data-stop=red].stop-shown").wait_for()
+    assert serious(page) == []
+    page.locator("#estop").click()
+    page.locator("nav a").first.click()
+    page.locator("[data-car=red]").wait_for()
+    assert serious(page) == []
+
+
+def test_the_stop_is_in_view_and_nothing_is_in_the_way_on_a_phone(stage: Stage) -> None:
+    for path in ("", "#/drive"):
+        page = stage.phone(path)
+        size = page.viewport_size
+        box = page.locator("#stop").bounding_box()
+        assert size is not None
+        assert box is not None
+        assert box["width"] > size["width"] / 2
+        assert box["height"] >= 60
+        assert box["y"] + box["height"] <= size["height"]
+        page.locator("#stop").tap(trial=True)
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_the_page_breaks_no_rule_of_its_own_policy(stage: Stage) -> None:
+    page = stage.page()
+    said: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.reload()
+    page.locator("[data-car=red]").wait_for()
+    page.locator("nav a").nth(1).click()
+    page.locator("input[name=select-red]").check()
+    page.locator("[data-motion=forward]").wait_for()
+    assert said == []
+
+
+def test_ctrl_c_of_the_console_stops_the_car_that_a_page_drives(stage: Stage) -> None:
+    page = stage.driving_page("red")
+    with stage.held(page, "forward"):
+        ended_ns = time.time_ns()
+        os.kill(stage.console.process.pid, signal.SIGINT)
+        assert stage.stands(since_ns=ended_ns) < STOPPED_WITHIN_S
+        assert stage.console.process.wait() == 0, stage.console.process.stderr
+    stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)

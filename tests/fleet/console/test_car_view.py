@@ -1,0 +1,94 @@
+"""What a page shows of a car, from its messages."""
+
+from fleet.console.car_view import BatteryTrend, FleetView
+from gateway.protocol.platforms import parse_platform
+from schemas.gen import fleet_v1_pb2 as pb
+
+
+def view_of(platform: str = "arduino", capabilities: tuple[str, ...] | None = None) -> FleetView:
+    view = FleetView("us", lambda *_: "#ff0000")
+    known = sorted(parse_platform(platform).capabilities) if capabilities is None else capabilities
+    view.car("red").on_message("state/health", pb.Health(platform=platform, capabilities=known), 0.0)
+    return view
+
+
+def test_a_reading_that_is_stale_is_left_out() -> None:
+    view = view_of()
+    view.car("red").on_message("sensor/range", pb.Range(range_m=1.234), 10.0)
+    view.car("red").on_message("sensor/line", pb.Line(left_inner=True), 12.0)
+    (car,) = view.as_list(13.0)
+    assert car["range_m"] == 1.23
+    (car,) = view.as_list(13.1)
+    assert "range_m" not in car
+    assert car["line"] == [False, True, False, False]
+
+
+def test_no_echo_is_no_distance() -> None:
+    view = view_of()
+    view.car("red").on_message("sensor/range", pb.Range(no_echo=True), 10.0)
+    assert view.as_list(10.0)[0]["range_m"] is None
+
+
+def test_the_motors_rest_on_what_their_gateway_says() -> None:
+    view = view_of()
+    assert view.as_list(0.0)[0]["motors"] == {"state": "unknown", "basis": ""}
+    view.car("red").on_message("state/safety", pb.Safety(motors="off", motors_basis="sent"), 10.0)
+    assert view.as_list(10.0)[0]["motors"] == {"state": "off", "basis": "sent"}
+
+
+def test_the_console_calls_itself_this_console() -> None:
+    view = view_of()
+    safety = pb.Safety(hold=pb.Hold(by="us"), lease=pb.Lease(holder="mia", kind="person"))
+    safety.estops.add(id="e1", by="us", why="smoke", scope="fleet")
+    view.car("red").on_message("state/safety", safety, 10.0)
+    (car,) = view.as_list(10.0)
+    assert (car["hold"], car["lease"], car["estops"][0]["by"]) == (
+        "this console",
+        {"holder": "mia", "kind": "person"},
+        "this console",
+    )
+
+
+def test_a_gateway_that_has_gone_says_for_how_long() -> None:
+    view = view_of()
+    view.on_presence(["red"], 10.0)
+    assert view.as_list(11.0)[0]["gateway"] is True
+    view.on_presence([], 20.0)
+    view.on_presence([], 25.0)
+    (car,) = view.as_list(32.0)
+    assert (car["gateway"], car["gone_s"]) == (False, 12)
+
+
+def test_a_car_is_offered_what_its_platform_and_gateway_can() -> None:
+    (arduino,) = view_of().as_list(0.0)
+    assert "tracking" in arduino["modes"]
+    assert "Arduino cars" in arduino["cannot"]["arm"]
+    (pi,) = view_of("raspberry_pi").as_list(0.0)
+    assert pi["modes"] == ()
+    assert "raspberry_pi cars" in pi["cannot"]["mode"]
+    assert "servo_vertical" in pi["can"]
+    (listed,) = view_of(capabilities=("drive",)).as_list(0.0)
+    assert listed["cannot"]["led"] == "The fleet file leaves out led."
+    (unknown,) = view_of("hovercraft", ("drive",)).as_list(0.0)
+    assert unknown["can"] == ()
+
+
+def test_a_trend_needs_half_a_minute_and_ignores_noise() -> None:
+    falling, steady = BatteryTrend(), BatteryTrend()
+    for second in range(120):
+        assert falling.words == "" or second > 30
+        falling.add(8.0 - second * 0.002, float(second))
+        steady.add(7.5 + 0.01 * (second % 3), float(second))
+    assert (falling.words, steady.words) == ("falling", "steady")
+
+
+def test_the_last_event_and_the_ledger() -> None:
+    view = view_of()
+    car = view.car("red")
+    for number in range(100):
+        car.on_message(
+            "event/command", pb.CommandEvent(verb="drive", phase="rejected", sender="mia", words=f"no {number}"), 1.0
+        )
+    assert view.as_list(1.0)[0]["event"]["words"] == "drive rejected: no 99 (mia)"
+    assert view.as_list(1.0)[0]["event"]["level"] == "warning"
+    assert len(car.ledger) == 60

@@ -1,0 +1,124 @@
+"""The dead-man of the pages. Time is an argument, so each case is exact."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.console.presses import AFTER_STOP_S, MAX_ECHO_GAP_S, MAX_TICK_AGE_S, PressBook, PressRefused
+
+RED = ("red",)
+
+
+def book_with_press(*, at: float = 10.0, cars: tuple[str, ...] = RED) -> tuple[PressBook, int]:
+    book = PressBook()
+    tick = book.tick(at)
+    book.begin(1, 1, cars, "forward", tick, at)
+    return book, tick
+
+
+def test_a_press_lives_while_new_ticks_are_echoed() -> None:
+    book, _ = book_with_press()
+    for step in range(1, 50):
+        now = 10.0 + step * 0.1
+        tick = book.tick(now)
+        assert book.echo(1, 1, tick, now + 0.02) is not None
+        assert book.expire(now + 0.05) == []
+
+
+def test_a_press_without_an_echo_ends_after_the_gap_and_stays_over() -> None:
+    book, _ = book_with_press()
+    assert book.expire(9.99 + MAX_ECHO_GAP_S) == []
+    (over,) = book.expire(10.01 + MAX_ECHO_GAP_S)
+    assert over.cars == RED
+    tick = book.tick(10.4)
+    assert book.echo(1, 1, tick, 10.4) is None
+    with pytest.raises(PressRefused, match="over"):
+        book.begin(1, 1, RED, "forward", tick, 10.4)
+    assert book.begin(1, 2, RED, "forward", tick, 10.4).id == 2
+
+
+def test_an_echo_after_the_gap_does_not_count_even_if_nothing_has_expired_it() -> None:
+    """Our own loop was blocked: the echoes that waited are handled before `expire`."""
+    book, _ = book_with_press()
+    late = book.tick(10.0 + MAX_ECHO_GAP_S + 0.1)
+    assert book.echo(1, 1, late, 10.0 + MAX_ECHO_GAP_S + 0.1) is None
+    assert len(book.expire(10.0 + MAX_ECHO_GAP_S + 0.1)) == 1
+
+
+def test_the_echo_of_an_old_tick_does_not_count() -> None:
+    """A healed link delivers a burst. So does a thawed page."""
+    book, first = book_with_press()
+    book.tick(10.1)
+    assert book.echo(1, 1, first, 9.99 + MAX_TICK_AGE_S) is not None
+    assert book.echo(1, 1, first, 10.01 + MAX_TICK_AGE_S) is None
+    assert book.echo(1, 1, 99, 10.1) is None, "a tick that was never issued"
+
+
+def test_a_press_with_an_old_tick_never_begins() -> None:
+    book = PressBook()
+    tick = book.tick(10.0)
+    with pytest.raises(PressRefused, match="slow"):
+        book.begin(1, 1, RED, "forward", tick, 10.01 + MAX_TICK_AGE_S)
+    assert book.alive == []
+
+
+def test_a_release_that_overtakes_its_press_ends_it() -> None:
+    book = PressBook()
+    tick = book.tick(10.0)
+    assert book.release(1, 1) is None
+    with pytest.raises(PressRefused):
+        book.begin(1, 1, RED, "forward", tick, 10.0)
+
+
+def test_the_release_of_an_earlier_press_ends_no_later_one() -> None:
+    book, tick = book_with_press()
+    book.begin(1, 2, RED, "back", tick, 10.0)
+    assert book.release(1, 1) is None
+    assert [press.motion for press in book.alive] == ["back"]
+    assert book.release(1, 2) is not None
+
+
+def test_two_pages_never_drive_one_car() -> None:
+    book, tick = book_with_press(cars=("red", "blue"))
+    with pytest.raises(PressRefused, match="Another page drives blue"):
+        book.begin(2, 1, ("blue", "green"), "back", tick, 10.0)
+    assert book.begin(2, 2, ("green",), "back", tick, 10.0)
+    assert [press.client for press in book.drop_client(1)] == [1]
+    assert book.begin(2, 3, ("blue",), "back", tick, 10.0)
+
+
+def test_a_stop_ends_every_press_and_the_next_one_waits() -> None:
+    book, tick = book_with_press()
+    assert len(book.on_stop(10.1)) == 1
+    tick = book.tick(10.2)
+    with pytest.raises(PressRefused, match="just now"):
+        book.begin(1, 2, RED, "forward", tick, 10.2)
+    later = 10.11 + AFTER_STOP_S
+    assert book.begin(1, 3, RED, "forward", book.tick(later), later)
+
+
+@given(st.lists(st.tuples(st.sampled_from(["tick", "echo", "late echo", "release", "expire"]), st.floats(0.0, 0.5))))
+def test_nothing_revives_a_press(steps: list[tuple[str, float]]) -> None:
+    """Whatever comes in whatever order: no echo counts after a gap, and no press lives through one."""
+    book, newest = book_with_press()
+    now, last_echo, over = 10.0, 10.0, False
+    ticks = {newest: 10.0}
+    for what, pause in steps:
+        now += pause
+        if what == "tick":
+            newest = book.tick(now)
+            ticks[newest] = now
+        elif what in ("echo", "late echo"):
+            number = newest if what == "echo" else min(ticks)
+            counted = book.echo(1, 1, number, now) is not None
+            over = over or now - last_echo > MAX_ECHO_GAP_S
+            assert not (counted and (over or now - ticks[number] > MAX_TICK_AGE_S))
+            if counted:
+                last_echo = now
+        elif what == "release":
+            book.release(1, 1)
+            over = True
+        else:
+            book.expire(now)
+            over = over or now - last_echo > MAX_ECHO_GAP_S
+            assert not (over and book.alive)

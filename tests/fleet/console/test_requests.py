@@ -1,0 +1,78 @@
+"""Messages of pages: each value is checked, and what is wrong is refused."""
+
+import contextlib
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.console.requests import BadRequest, PageMessage
+
+
+def message(**fields: Any) -> PageMessage:
+    return PageMessage.of(json.dumps(fields))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "1", '"drive"', "[" * 100_000, '{"t": 1}', '{"t": "' + "x" * 20 + '"}']
+)
+def test_what_is_no_message_is_refused(text: str) -> None:
+    with pytest.raises(BadRequest):
+        _ = PageMessage.of(text).kind
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"verb": "drive", "motion": "forward"},  # only presses drive
+        {"verb": "lease"},
+        {"verb": "mode", "mode": "flying"},
+        {"verb": "mode"},
+        {"verb": "led", "rgb": [1, 2]},
+        {"verb": "led", "rgb": [1, 2, 256]},
+        {"verb": "led", "rgb": [1, 2, True]},
+        {"verb": "led", "rgb": [1, 2, 0.5]},
+        {"verb": "led", "rgb": [1, 2, -1]},
+        {"verb": "servo", "deg": 181},
+        {"verb": "servo", "servo": "front", "action": "sideways"},
+        {"verb": "arm", "joint_deg": [90] * 5},
+        {"verb": "arm", "joint_deg": [90] * 5 + [1e99]},
+        {"verb": "speed", "step": "warp"},
+        {"verb": "resume", "ids": "all"},
+        {"verb": "resume", "ids": [1]},
+        {"verb": "estop", "why": "x" * 201},
+    ],
+)
+def test_a_bad_command_is_refused(fields: dict[str, Any]) -> None:
+    with pytest.raises(BadRequest):
+        message(**fields).request()
+
+
+@pytest.mark.parametrize("names", [None, [], "red", ["red/../blue"], ["*"], ["@coordinator"], ["red"] * 129, [1, {}]])
+def test_bad_cars_are_refused(names: Any) -> None:
+    with pytest.raises(BadRequest):
+        message(cars=names).cars()
+
+
+def test_a_good_command_becomes_its_request() -> None:
+    assert message(verb="led", rgb=[1, 2, 3]).request().message.g == 2
+    assert message(verb="servo", deg=30).request().message.deg == 30
+    assert message(verb="mode", mode="tracking", take=True).request().take
+    assert list(message(verb="resume", ids=["e1"]).request().message.ids) == ["e1"]
+    assert message(cars=["red", "blue", "red"]).cars() == ("red", "blue")
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+)
+VERBS = ("mode", "led", "light", "servo", "arm", "resume", "speed", "estop", "fan")
+FIELDS = ("rgb", "deg", "mode", "light", "servo", "action", "joint_deg", "ids", "step", "why", "take")
+
+
+@given(st.sampled_from(VERBS), st.dictionaries(st.sampled_from(FIELDS), JSON))
+def test_any_values_are_a_request_or_refused(verb: str, fields: dict[str, Any]) -> None:
+    with contextlib.suppress(BadRequest):
+        message(verb=verb, **fields).request()

@@ -1,0 +1,60 @@
+"""The course of a STOP, from the events and outcomes of its cars."""
+
+from typing import Any
+
+from fleet.client.outcome import Outcome
+from fleet.console.stop_report import StopReport
+from schemas.gen import fleet_v1_pb2 as pb
+
+
+def states(report: StopReport) -> dict[str, Any]:
+    return {car["name"]: (car["state"], car["words"]) for car in report.as_dict()["cars"]}
+
+
+def event(phase: str, verb: str = "stop", **fields: Any) -> Any:
+    return pb.CommandEvent(verb=verb, phase=phase, **fields)
+
+
+def test_a_car_is_shown_only_by_a_complete_stop() -> None:
+    report = StopReport(1, "stop", ["red", "blue", "green"], 10.0, 0)
+    report.on_event("red", event("sent"), 10.1)
+    report.on_event("blue", event("sent", basis="sent"), 10.2)
+    assert states(report) == {"red": ("stopping", ""), "blue": ("sent", ""), "green": ("asked", "")}
+    assert not report.over
+    report.on_event("red", event("complete", basis="shown"), 11.4)
+    report.on_event("green", event("failed", words="the link broke"), 12.0)
+    assert states(report)["green"] == ("failed", "the link broke")
+    assert report.over
+    assert report.as_dict()["cars"][2]["took_s"] == 1.4
+
+
+def test_a_late_event_and_a_drive_change_nothing() -> None:
+    report = StopReport(1, "stop", ["red"], 10.0, 0)
+    report.on_event("red", event("complete", verb="drive"), 10.1)
+    assert states(report)["red"][0] == "asked"
+    report.on_event("red", event("complete", basis="shown"), 10.2)
+    report.on_event("red", event("asked"), 10.3)
+    assert states(report)["red"][0] == "shown"
+
+
+def test_a_car_without_an_outcome_was_not_reached() -> None:
+    report = StopReport(1, "stop", ["red", "blue"], 10.0, 0)
+    answer = Outcome("blue", ok=False, phase="no_answer", words="its gateway went away")
+    found = Outcome("green", ok=True, phase="complete", basis="shown")
+    report.on_outcomes([answer, found], 15.0)
+    assert states(report) == {
+        "red": ("failed", "its gateway is not on the bus: look at the car"),
+        "blue": ("failed", "its gateway went away"),
+        "green": ("shown", ""),
+    }
+
+
+def test_a_car_that_its_own_gateway_stops_later_is_shown() -> None:
+    report = StopReport(1, "stop", ["red"], 10.0, 0)
+    report.on_safety("red", pb.Safety(motors="off", motors_basis="shown"), 10.1)
+    assert states(report)["red"][0] == "asked", "the state may be older than the stop"
+    report.on_outcomes([], 12.0)
+    report.on_safety("red", pb.Safety(motors="on"), 13.0)
+    assert states(report)["red"][0] == "failed"
+    report.on_safety("red", pb.Safety(motors="off", motors_basis="shown"), 14.0)
+    assert states(report)["red"][0] == "shown"
