@@ -13,7 +13,7 @@ from fleet.console.car_view import FleetView
 from fleet.console.operator import ConsoleOperator
 from fleet.console.page_link import PageLink
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
-from fleet.console.requests import MAX_REASON_LENGTH, BadRequest, PageMessage
+from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessage
 from fleet.replay.colors import color
 from schemas import keys, messages, topics
 from schemas.bus import Handover, Latest, Sample
@@ -126,7 +126,7 @@ class Console:
         """Handle one message of a page. A bad one is answered, and changes nothing."""
         try:
             self._on_message(page, PageMessage.of(text))
-        except BadRequest as error:
+        except BadPageMessage as error:
             log.warning("page %d sent a bad message: %s", page.number, error)
             page.answer(t="bad", words=str(error))
 
@@ -163,7 +163,7 @@ class Console:
                     self._stop_presses(set(cars), "The car was stopped.")
                 self.operator.command(request, cars, self._answer_to(page, message))
             case kind:
-                raise BadRequest(f"unknown message {kind!r}")
+                raise BadPageMessage(f"unknown message {kind!r}")
 
     def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
         press_id, cars, motion = message.number("press"), message.cars(), message.motion()

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 SEND_TIMEOUT_S: Final = 5.0
 """Timeout of one message. A page that reads nothing for this long is disconnected."""
-_MAX_ANSWERS: Final = 256
+_MAX_PAGE_ANSWERS: Final = 256
 """Maximum number of queued answers. More are dropped, the oldest first."""
 
 
@@ -21,7 +21,7 @@ class PageLink:
     def __init__(self, number: int, send: Callable[[str], Awaitable[None]]) -> None:
         self.number = number
         self._send = send
-        self._answers: deque[str] = deque(maxlen=_MAX_ANSWERS)
+        self._answers: deque[str] = deque(maxlen=_MAX_PAGE_ANSWERS)
         self._newest: dict[str, str] = {}
         self._not_empty = asyncio.Event()
 

@@ -20,7 +20,7 @@ _MAX_NUMBER: Final = 2**53
 MOTIONS: Final = frozenset(str(motion) for motion in Motion if motion is not Motion.STOP)
 
 
-class BadRequest(ValueError):
+class BadPageMessage(ValueError):
     """A message of a page that is not allowed."""
 
 
@@ -32,13 +32,13 @@ class PageMessage:
 
     @classmethod
     def of(cls, text: str) -> Self:
-        """Parse a message. Raises BadRequest."""
+        """Parse a message. Raises BadPageMessage."""
         try:
             fields = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise BadRequest(f"not JSON: {error}") from None
+            raise BadPageMessage(f"not JSON: {error}") from None
         if not isinstance(fields, dict):
-            raise BadRequest("not a JSON object")
+            raise BadPageMessage("not a JSON object")
         return cls(fields)
 
     @property
@@ -47,55 +47,55 @@ class PageMessage:
         return self.text("t", 16)
 
     def text(self, name: str, longest: int = 64) -> str:
-        """Return a text. Raises BadRequest."""
+        """Return a text. Raises BadPageMessage."""
         value = self.fields.get(name, "")
         if not isinstance(value, str) or len(value) > longest:
-            raise BadRequest(f"{name} is not a text of at most {longest} characters")
+            raise BadPageMessage(f"{name} is not a text of at most {longest} characters")
         return value
 
     def number(self, name: str) -> int:
-        """Return a whole number from 0. Raises BadRequest."""
+        """Return a whole number from 0. Raises BadPageMessage."""
         value = self.fields.get(name)
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < _MAX_NUMBER:
-            raise BadRequest(f"{name} is not a whole number")
+            raise BadPageMessage(f"{name} is not a whole number")
         return value
 
     def cars(self) -> tuple[str, ...]:
-        """Return names of cars, at least one. Raises BadRequest."""
+        """Return names of cars, at least one. Raises BadPageMessage."""
         value = self.fields.get("cars")
         if not isinstance(value, list) or not 0 < len(value) <= MAX_CARS or not all(isinstance(e, str) for e in value):
-            raise BadRequest("cars is not a list of names")
+            raise BadPageMessage("cars is not a list of names")
         try:
             return tuple(dict.fromkeys(keys.check_name(name) for name in value))
         except keys.BadKey as error:
-            raise BadRequest(str(error)) from None
+            raise BadPageMessage(str(error)) from None
 
     def motion(self) -> str:
-        """Return a motion that moves the car. Raises BadRequest."""
+        """Return a motion that moves the car. Raises BadPageMessage."""
         return self._one_of("motion", MOTIONS)
 
     def _one_of(self, name: str, allowed: frozenset[str]) -> str:
         value = self.text(name)
         if value not in allowed:
-            raise BadRequest(f"{name} {value!r} is not allowed")
+            raise BadPageMessage(f"{name} {value!r} is not allowed")
         return value
 
     def _numbers(self, name: str, count: int) -> list[int]:
         value = self.fields.get(name)
         if not isinstance(value, list) or len(value) != count:
-            raise BadRequest(f"{name} is not a list of {count} numbers")
+            raise BadPageMessage(f"{name} is not a list of {count} numbers")
         return [PageMessage({name: each}).number(name) for each in value]
 
     def request(self) -> commands.CommandRequest:
-        """Return the command that the page wants. Raises BadRequest."""
+        """Return the command that the page wants. Raises BadPageMessage."""
         verb = self.text("verb", 16)
         build = _BUILDERS.get(verb)
         if build is None:
-            raise BadRequest(f"the console has no command {verb!r}")
+            raise BadPageMessage(f"the console has no command {verb!r}")
         try:
             request = build(self)
         except ValueError as error:
-            raise BadRequest(str(error)) from None
+            raise BadPageMessage(str(error)) from None
         return replace(request, take=self.fields.get("take") is True)
 
 
@@ -126,7 +126,7 @@ def _arm(message: PageMessage) -> commands.CommandRequest:
 def _resume(message: PageMessage) -> commands.CommandRequest:
     ids = message.fields.get("ids", [])
     if not isinstance(ids, list) or len(ids) > MAX_CARS or not all(isinstance(each, str) for each in ids):
-        raise BadRequest("ids is not a list of ids")
+        raise BadPageMessage("ids is not a list of ids")
     return commands.resume_request([each[:64] for each in ids])
 
 

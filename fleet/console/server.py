@@ -23,8 +23,8 @@ from fleet.console.guard import STOP_PATH, App, Guard
 from schemas.process import signals
 
 STATIC: Final = Path(__file__).parent / "static"
-DEFAULT_PORT: Final = 7448
-"""The port beside the bus's."""
+DEFAULT_PORT: Final = 7480
+"""A port near that of the bus (7447). Fleets of other names take those in between."""
 LOOPBACK: Final = "127.0.0.1"
 MAX_MESSAGE_BYTES: Final = 16_384
 """Maximum size of a page's message."""

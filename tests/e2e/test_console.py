@@ -11,7 +11,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page
 
-from tests.support.console import CARS, ConsoleProcess, Stage, browser_process, pids
+from tests.support.console import CARS, ConsoleProcess, ConsoleStage, browser_process, pids
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
@@ -23,19 +23,19 @@ STOPPED_WITHIN_S = TTL_S + BLOCK_S + 0.5
 
 
 @pytest.fixture(scope="module")
-def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
-    stage = Stage(FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("console")))
+def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ConsoleStage]:
+    stage = ConsoleStage(FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("console")))
     yield stage
     stage.close()
 
 
 @pytest.fixture
-def stage(stages: Stage) -> Iterator[Stage]:
+def stage(stages: ConsoleStage) -> Iterator[ConsoleStage]:
     yield stages
     stages.rest()
 
 
-def drive_all(stage: Stage) -> None:
+def drive_all(stage: ConsoleStage) -> None:
     """Another person drives all cars."""
     for car in CARS:
         stage.person.car(car).drive("forward", 10.0, wait=False).check()
@@ -43,7 +43,7 @@ def drive_all(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize("how", ["mouse", "escape", "space", "touch", "fetch alone"])
-def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: Stage, how: str) -> None:
+def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: ConsoleStage, how: str) -> None:
     page = stage.phone() if how == "touch" else stage.page()
     page.locator("[data-car=red]").wait_for()
     drive_all(stage)
@@ -74,7 +74,7 @@ def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: Stage, how: str)
         page.locator(f"[data-car={car}]").get_by_text("On hold: this console").wait_for()
 
 
-def test_a_car_is_shown_as_stopped_only_when_its_readings_show_it(stage: Stage) -> None:
+def test_a_car_is_shown_as_stopped_only_when_its_readings_show_it(stage: ConsoleStage) -> None:
     page = stage.page()
     drive_all(stage)
     stage.gateways["red"].popen.send_signal(signal.SIGSTOP)
@@ -89,7 +89,7 @@ def test_a_car_is_shown_as_stopped_only_when_its_readings_show_it(stage: Stage) 
     assert not stage.judges["red"].driving
 
 
-def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: Stage) -> None:
+def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: ConsoleStage) -> None:
     page = stage.page()
     page.locator("#estop").click()
     page.locator("input[name=why]").fill("smoke")
@@ -108,7 +108,7 @@ def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: Stag
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_a_pad_drives_while_it_is_held(stage: Stage, size: str) -> None:
+def test_a_pad_drives_while_it_is_held(stage: ConsoleStage, size: str) -> None:
     options = stage.playwright.devices["Pixel 7"] if size == "phone" else {}
     page = stage.driving_page("red", **options)
     with stage.held(page, "forward"):
@@ -118,7 +118,7 @@ def test_a_pad_drives_while_it_is_held(stage: Stage, size: str) -> None:
     assert not stage.judges["blue"].driving
 
 
-def test_a_finger_drives_until_it_is_lifted_or_leaves(stage: Stage) -> None:
+def test_a_finger_drives_until_it_is_lifted_or_leaves(stage: ConsoleStage) -> None:
     page = stage.driving_page("red", **stage.playwright.devices["Pixel 7"])
     box = page.locator("[data-motion=spin_left]").bounding_box()
     assert box is not None
@@ -141,7 +141,7 @@ def test_a_finger_drives_until_it_is_lifted_or_leaves(stage: Stage) -> None:
         stage.stands()
 
 
-def test_several_cars_are_driven_together_by_keys(stage: Stage) -> None:
+def test_several_cars_are_driven_together_by_keys(stage: ConsoleStage) -> None:
     page = stage.driving_page("red", "green")
 
     def both() -> bool:
@@ -161,7 +161,7 @@ def test_several_cars_are_driven_together_by_keys(stage: Stage) -> None:
     stage.stands("green")
 
 
-def test_a_page_that_loses_the_focus_or_is_hidden_lets_go(stage: Stage) -> None:
+def test_a_page_that_loses_the_focus_or_is_hidden_lets_go(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     for lost in ("window.dispatchEvent(new Event('blur'))", "window.dispatchEvent(new Event('pagehide'))"):
         with stage.held(page, "back"):
@@ -173,7 +173,7 @@ def test_a_page_that_loses_the_focus_or_is_hidden_lets_go(stage: Stage) -> None:
         stage.stands()
 
 
-def test_a_browser_that_is_killed_stops_the_car(stage: Stage) -> None:
+def test_a_browser_that_is_killed_stops_the_car(stage: ConsoleStage) -> None:
     before = pids()
     browser = stage.launch()
     process = browser_process(before)
@@ -186,7 +186,7 @@ def test_a_browser_that_is_killed_stops_the_car(stage: Stage) -> None:
         assert stage.stands(since_ns=killed_ns) < STOPPED_WITHIN_S
 
 
-def test_a_browser_that_freezes_stops_the_car_and_does_not_start_it_again(stage: Stage) -> None:
+def test_a_browser_that_freezes_stops_the_car_and_does_not_start_it_again(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     with stage.held(page, "forward"):
         frozen = stage.renderers()
@@ -206,7 +206,7 @@ def test_a_browser_that_freezes_stops_the_car_and_does_not_start_it_again(stage:
         assert stage.judges["red"].on_after(thawed_ns) == []
 
 
-def test_a_wire_that_is_cut_stops_the_car_and_its_burst_starts_nothing(stage: Stage) -> None:
+def test_a_wire_that_is_cut_stops_the_car_and_its_burst_starts_nothing(stage: ConsoleStage) -> None:
     page = stage.driving_page("red", wired=True)
     with stage.held(page, "forward"):
         cut_ns = stage.wire.cut()
@@ -220,7 +220,7 @@ def test_a_wire_that_is_cut_stops_the_car_and_its_burst_starts_nothing(stage: St
         assert stage.judges["red"].on_after(cut_ns) == []
 
 
-def test_a_console_that_is_killed_stops_the_car(stage: Stage) -> None:
+def test_a_console_that_is_killed_stops_the_car(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     with stage.held(page, "forward"):
         killed_ns = stage.console.process.kill()
@@ -234,7 +234,7 @@ def test_a_console_that_is_killed_stops_the_car(stage: Stage) -> None:
     stage.stands()
 
 
-def test_each_control_does_what_it_says_to_the_car(stage: Stage) -> None:
+def test_each_control_does_what_it_says_to_the_car(stage: ConsoleStage) -> None:
     page = stage.driving_page("blue")
     say = stage.sim.say
 
@@ -263,7 +263,7 @@ def test_each_control_does_what_it_says_to_the_car(stage: Stage) -> None:
     wait_for(lambda: truth("mode") == "manual", "it stands")
 
 
-def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: Stage) -> None:
+def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: ConsoleStage) -> None:
     page = stage.driving_page("green")
     modes = page.locator("[data-control=mode]")
     modes.get_by_text("green: Mode tracking cannot be opened on raspberry_pi cars").wait_for()
@@ -275,7 +275,7 @@ def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: Stage) -> None:
     assert page.locator("[data-control=servo_vertical] button").count() == 0
 
 
-def test_a_car_that_another_person_drives_is_refused_until_it_is_taken(stage: Stage) -> None:
+def test_a_car_that_another_person_drives_is_refused_until_it_is_taken(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     stage.person.car("red").drive("forward", 10.0, wait=False).check()
     page.get_by_text("mia (person)").wait_for()
@@ -294,7 +294,7 @@ def test_a_car_that_another_person_drives_is_refused_until_it_is_taken(stage: St
     assert stage.person.car("red").drive("forward", 0.2).ok
 
 
-def test_a_lost_car_says_what_is_known_and_what_to_do(stage: Stage) -> None:
+def test_a_lost_car_says_what_is_known_and_what_to_do(stage: ConsoleStage) -> None:
     page = stage.page()
     stage.gateways["red"].kill()
     stage.gateways["red"].wait()
@@ -317,7 +317,7 @@ def serious(page: Page) -> list[str]:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_serious_violation(stage: Stage, scheme: str) -> None:
+def test_axe_finds_no_serious_violation(stage: ConsoleStage, scheme: str) -> None:
     page = stage.driving_page("red", "green", viewport={"width": 1280, "height": 900}, color_scheme=scheme)
     page.keyboard.press("Escape")
     page.locator("[data-stop=red].stop-shown").wait_for()
@@ -328,7 +328,7 @@ def test_axe_finds_no_serious_violation(stage: Stage, scheme: str) -> None:
     assert serious(page) == []
 
 
-def test_the_stop_is_in_view_and_nothing_is_in_the_way_on_a_phone(stage: Stage) -> None:
+def test_the_stop_is_in_view_and_nothing_is_in_the_way_on_a_phone(stage: ConsoleStage) -> None:
     for path in ("", "#/drive"):
         page = stage.phone(path)
         size = page.viewport_size
@@ -342,7 +342,7 @@ def test_the_stop_is_in_view_and_nothing_is_in_the_way_on_a_phone(stage: Stage) 
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
 
 
-def test_the_page_breaks_no_rule_of_its_own_policy(stage: Stage) -> None:
+def test_the_page_breaks_no_rule_of_its_own_policy(stage: ConsoleStage) -> None:
     page = stage.page()
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))
@@ -355,7 +355,7 @@ def test_the_page_breaks_no_rule_of_its_own_policy(stage: Stage) -> None:
     assert said == []
 
 
-def test_ctrl_c_of_the_console_stops_the_car_that_a_page_drives(stage: Stage) -> None:
+def test_ctrl_c_of_the_console_stops_the_car_that_a_page_drives(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     with stage.held(page, "forward"):
         ended_ns = time.time_ns()

@@ -91,7 +91,7 @@ class ConsoleProcess:
         self.address = f"http://127.0.0.1:{self.port}"
 
 
-class Stage:
+class ConsoleStage:
     """Three simulated cars with their gateways, a console, a browser, and a client of another person."""
 
     def __init__(self, fleet: FleetProcesses) -> None:

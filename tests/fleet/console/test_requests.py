@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.console.requests import BadRequest, PageMessage
+from fleet.console.requests import BadPageMessage, PageMessage
 
 
 def message(**fields: Any) -> PageMessage:
@@ -19,7 +19,7 @@ def message(**fields: Any) -> PageMessage:
     "text", ["", "{", "[]", "1", '"drive"', "[" * 100_000, '{"t": 1}', '{"t": "' + "x" * 20 + '"}']
 )
 def test_what_is_no_message_is_refused(text: str) -> None:
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadPageMessage):
         _ = PageMessage.of(text).kind
 
 
@@ -46,13 +46,13 @@ def test_what_is_no_message_is_refused(text: str) -> None:
     ],
 )
 def test_a_bad_command_is_refused(fields: dict[str, Any]) -> None:
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadPageMessage):
         message(**fields).request()
 
 
 @pytest.mark.parametrize("names", [None, [], "red", ["red/../blue"], ["*"], ["@coordinator"], ["red"] * 129, [1, {}]])
 def test_bad_cars_are_refused(names: Any) -> None:
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadPageMessage):
         message(cars=names).cars()
 
 
@@ -74,5 +74,5 @@ FIELDS = ("rgb", "deg", "mode", "light", "servo", "action", "joint_deg", "ids", 
 
 @given(st.sampled_from(VERBS), st.dictionaries(st.sampled_from(FIELDS), JSON))
 def test_any_values_are_a_request_or_refused(verb: str, fields: dict[str, Any]) -> None:
-    with contextlib.suppress(BadRequest):
+    with contextlib.suppress(BadPageMessage):
         message(verb=verb, **fields).request()
