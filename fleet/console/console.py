@@ -5,6 +5,7 @@ import json
 import logging
 import time
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ from fleet.aio import Fleet
 from fleet.console.car_view import FleetView
 from fleet.console.operator import ConsoleOperator
 from fleet.console.page_link import PageLink
+from fleet.console.plan_view import PlanView, coordinator_topic
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
 from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessage
 from fleet.replay.colors import color
@@ -22,6 +24,8 @@ from schemas.commands import STOPS
 MAX_PAGES: Final = 32
 """Maximum number of connected pages."""
 _MAX_EVENTS: Final = 4096
+PLAN_VERBS: Final = frozenset({"restart", "next", "stop"})
+"""Requests to the coordinator without a text."""
 
 log = logging.getLogger("fleet")
 
@@ -40,7 +44,13 @@ class Console:
         self.operator = ConsoleOperator(fleet, self._on_stop)
         self._pages: dict[int, PageLink] = {}
         self._last_page = 0
+        self._coordinators: set[str] = set()
+        """Tokens of the coordinator."""
         self._readings: Latest[Sample] = Latest()
+        self._plan = PlanView()
+        self._plan_samples: Handover[Sample] = Handover(
+            asyncio.get_running_loop(), self._on_plan_sample, limit=_MAX_EVENTS, newest=True
+        )
         self._events: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_event, limit=_MAX_EVENTS, newest=True
         )
@@ -53,9 +63,24 @@ class Console:
         for family in ("sensor", "state"):
             bus.subscribe(f"{name}/*/{family}/*", lambda sample: self._readings(sample.key, sample))
         bus.subscribe(f"{name}/*/event/*", self._events)
+        bus.subscribe(f"{name}/{keys.COORDINATOR}/*", self._plan_samples)
+        loop = asyncio.get_running_loop()
+
+        def on_token(token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
+            change = self._coordinators.add if alive else self._coordinators.discard
+            with suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(change, token)
+
+        await self._fleet.call(bus.watch_tokens, f"{name}/{keys.COORDINATOR}", on_token)
+        self.operator.spawn(self._read_plan())
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tick())
             tasks.create_task(self.operator.renew_leases())
+
+    async def _read_plan(self) -> None:
+        """Read what the coordinator published before the console started."""
+        for reading in await self._fleet.get(f"{self._fleet.sync.name}/{keys.COORDINATOR}/*"):
+            self._plan.on_message(coordinator_topic(reading.key, self._fleet.sync.name), reading.value)
 
     async def _tick(self) -> None:
         loop = asyncio.get_running_loop()
@@ -69,11 +94,23 @@ class Console:
                 page.show("tick", tick)
             self._take_readings(now)
             if self._pages:
-                state = self._state(now)
-                for page in self._pages.values():
-                    page.show("state", state)
+                self._show("state", self._state(now))
+            if self._plan.changed:
+                self._plan.changed = False
+                self._show("plan", self._plan_text())
             next_at = max(next_at + TICK_INTERVAL_S, loop.time())
             await asyncio.sleep(next_at - loop.time())
+
+    def _show(self, kind: str, text: str) -> None:
+        for page in self._pages.values():
+            page.show(kind, text)
+
+    def _plan_text(self) -> str:
+        return json.dumps({"t": "plan", **self._plan.as_dict()}, separators=(",", ":"))
+
+    def _on_plan_sample(self, sample: Sample) -> None:
+        if (found := _message_in(sample)) is not None:
+            self._plan.on_message(coordinator_topic(sample.key, self._fleet.sync.name), found[1])
 
     def _take_readings(self, now: float) -> None:
         for sample in self._readings.take().values():
@@ -83,6 +120,8 @@ class Console:
                 if key.topic == "state/safety" and self.operator.report is not None:
                     self.operator.report.on_safety(key.car, message, now)
         self._view.on_presence(self._fleet.sync.cars(), now)
+        token = f"{self._fleet.sync.name}/{keys.COORDINATOR}"
+        self._plan.on_presence(running=token in self._coordinators)
 
     def _state(self, now: float) -> str:
         report = self.operator.report
@@ -113,6 +152,7 @@ class Console:
         self._last_page += 1
         page = self._pages[self._last_page] = PageLink(self._last_page, send)
         page.answer(t="hello", page=page.number, sender=self._fleet.sync.sender, fleet=self._fleet.sync.name)
+        page.show("plan", self._plan_text())
         return page
 
     def remove_page(self, page: PageLink) -> None:
@@ -157,6 +197,9 @@ class Console:
             case "give_back":
                 self._stop_presses(set(message.cars()), "The car was given back.")
                 self.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
+            case "plan":
+                verb = message.one_of("verb", PLAN_VERBS)
+                self.operator.spawn(self._ask_coordinator(page, message.number("id"), verb))
             case "do":
                 request, cars = message.request(), message.cars()
                 if request.verb in (*STOPS, "mode"):
@@ -164,6 +207,10 @@ class Console:
                 self.operator.command(request, cars, self._answer_to(page, message))
             case kind:
                 raise BadPageMessage(f"unknown message {kind!r}")
+
+    async def _ask_coordinator(self, page: PageLink, request_id: int, verb: str) -> None:
+        ok, words = await self.operator.ask_coordinator(verb)
+        page.answer(t="plan_done", id=request_id, ok=ok, words=words)
 
     def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
         press_id, cars, motion = message.number("press"), message.cars(), message.motion()

@@ -8,13 +8,15 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from fleet.aio import Fleet
+from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from fleet.client.commands import CommandRequest, drive_request, estop_request, lease_request, stop_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.client.outcome import Outcome
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
-from schemas import keys, messages
-from schemas.bus import BusError
+from fleet.policy.plan.parser import BadPlan, parse
+from schemas import keys, messages, topics
+from schemas.bus import BusError, Failure
 from schemas.commands import COMMANDS
 
 # The gateway is the watchdog outside our loop: if the loop blocks, the last drive expires.
@@ -168,6 +170,35 @@ class ConsoleOperator:
                 if not outcome.ok:
                     self._leases.pop(outcome.car, None)
 
+    async def ask_coordinator(self, verb: str, text: str = "") -> tuple[bool, str]:
+        """Send a request to the coordinator. Return whether it was carried out, and words. text: of a plan to set."""
+        client = self._fleet.sync
+        if verb == "plan":
+            command: Any = messages.message_class("fleet.v1.Plan")(text=text, set_by=client.sender)
+        else:
+            command = messages.message_class("fleet.v1.PlanCommand")(sender=client.sender, kind=client.kind)
+        key = keys.command_key(client.name, keys.COORDINATOR, verb)
+        encoding = messages.encoding_of(command.DESCRIPTOR.full_name)
+        return await self._fleet.call(self._ask_coordinator, key, command.SerializeToString(), encoding)
+
+    def _ask_coordinator(self, key: str, payload: bytes, encoding: str) -> tuple[bool, str]:
+        """Send a request to the coordinator. Runs on a thread."""
+        for answer in self._fleet.sync.bus.query(key, payload=payload, encoding=encoding, timeout_s=ANSWER_TIMEOUT_S):
+            if isinstance(answer, Failure):
+                return False, answer.words
+            result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)
+            return result.status == "sent", result.words
+        return False, "No plan is running. `fleet up --plan FILE` starts one."
+
+    async def check_plan(self, text: str) -> tuple[bool, str]:
+        """Check a plan's text. Return whether it is free of faults, and the faults, one per line."""
+        return await self._fleet.call(_check_plan, text)
+
+    async def set_plan(self, text: str) -> tuple[bool, str]:
+        """Put a plan in force. Return whether it is, and words, or the faults, one per line."""
+        ok, words = await self.check_plan(text)
+        return await self.ask_coordinator("plan", text) if ok else (ok, words)
+
     def spawn(self, work: Any) -> None:
         """Run a coroutine. Its errors go to the log, never to the socket that began it."""
         task = asyncio.ensure_future(work)
@@ -183,3 +214,11 @@ class ConsoleOperator:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             log.error("a command of the console failed: %s", error)
+
+
+def _check_plan(text: str) -> tuple[bool, str]:
+    try:
+        parse(text)
+    except BadPlan as error:
+        return False, str(error)
+    return True, ""

@@ -72,9 +72,10 @@ class PageMessage:
 
     def motion(self) -> str:
         """Return a motion that moves the car. Raises BadPageMessage."""
-        return self._one_of("motion", MOTIONS)
+        return self.one_of("motion", MOTIONS)
 
-    def _one_of(self, name: str, allowed: frozenset[str]) -> str:
+    def one_of(self, name: str, allowed: frozenset[str]) -> str:
+        """Return one of these texts. Raises BadPageMessage."""
         value = self.text(name)
         if value not in allowed:
             raise BadPageMessage(f"{name} {value!r} is not allowed")
@@ -100,7 +101,7 @@ class PageMessage:
 
 
 def _mode(message: PageMessage) -> commands.CommandRequest:
-    return commands.mode_request(message._one_of("mode", frozenset(map(str, Mode))))
+    return commands.mode_request(message.one_of("mode", frozenset(map(str, Mode))))
 
 
 def _led(message: PageMessage) -> commands.CommandRequest:
@@ -109,14 +110,14 @@ def _led(message: PageMessage) -> commands.CommandRequest:
 
 
 def _light(message: PageMessage) -> commands.CommandRequest:
-    return commands.light_request(message._one_of("light", frozenset(map(str, Light))))
+    return commands.light_request(message.one_of("light", frozenset(map(str, Light))))
 
 
 def _servo(message: PageMessage) -> commands.CommandRequest:
     if message.fields.get("deg") is not None:
         return commands.servo_request("front", deg=message.number("deg"))
-    servo = message._one_of("servo", frozenset({"front", "vertical", "horizontal"}))
-    return commands.servo_request(servo, message._one_of("action", frozenset({"left", "right", "up", "down", "reset"})))
+    servo = message.one_of("servo", frozenset({"front", "vertical", "horizontal"}))
+    return commands.servo_request(servo, message.one_of("action", frozenset({"left", "right", "up", "down", "reset"})))
 
 
 def _arm(message: PageMessage) -> commands.CommandRequest:
@@ -138,7 +139,7 @@ _BUILDERS: Final[Mapping[str, Callable[[PageMessage], commands.CommandRequest]]]
     "arm": _arm,
     "resume": _resume,
     "whistle": lambda _: commands.whistle_request(),
-    "speed": lambda message: commands.speed_request(message._one_of("step", frozenset({"up", "down"}))),
+    "speed": lambda message: commands.speed_request(message.one_of("step", frozenset({"up", "down"}))),
     "fan": lambda _: commands.fan_request(),
     "find": lambda _: commands.find_request(),
     "stop": lambda _: commands.stop_request(),

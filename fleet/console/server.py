@@ -4,7 +4,7 @@ import asyncio
 import logging
 import secrets
 import socket
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -12,7 +12,7 @@ from typing import Final
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -20,6 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from fleet.aio import Fleet
 from fleet.console.console import Console, TooManyPages
 from fleet.console.guard import STOP_PATH, App, Guard
+from schemas.bus import LARGEST_PAYLOAD
 from schemas.process import signals
 
 STATIC: Final = Path(__file__).parent / "static"
@@ -29,6 +30,8 @@ LOOPBACK: Final = "127.0.0.1"
 MAX_MESSAGE_BYTES: Final = 16_384
 """Maximum size of a page's message."""
 _MAX_STOP_ID_LENGTH: Final = 64
+_PLAN_MESSAGE_ROOM: Final = 1024
+"""Room for what a message contains beside the text of a plan, bytes."""
 _TRY_AGAIN_LATER: Final = 1013
 _CLOSE_TIMEOUT_S: Final = 2.0
 """Timeout for open connections when the console ends."""
@@ -112,6 +115,12 @@ def _app(console: Console) -> Starlette:
         console.stop_all(stop_id or secrets.token_hex(8))
         return Response(status_code=204)
 
+    async def check_plan(request: Request) -> Response:
+        return await _answer_plan(request, console.operator.check_plan)
+
+    async def set_plan(request: Request) -> Response:
+        return await _answer_plan(request, console.operator.set_plan)
+
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()
         try:
@@ -129,10 +138,31 @@ def _app(console: Console) -> Starlette:
             Route("/", page),
             Route("/hello", hello),
             Route(STOP_PATH, stop, methods=["POST"]),
+            Route("/plan/check", check_plan, methods=["POST"]),
+            Route("/plan/set", set_plan, methods=["POST"]),
             WebSocketRoute("/ws", connect),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
     )
+
+
+async def _answer_plan(request: Request, ask: Callable[[str], Awaitable[tuple[bool, str]]]) -> Response:
+    """Answer a request with the text of a plan."""
+    text = await _read_text(request)
+    if text is None:
+        return JSONResponse({"ok": False, "words": f"The plan has more than {LARGEST_PAYLOAD // 1024} KiB."}, 413)
+    ok, words = await ask(text)
+    return JSONResponse({"ok": ok, "words": words})
+
+
+async def _read_text(request: Request) -> str | None:
+    """Return the body of a request. None if it is too large for the bus: the rest is not read."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > LARGEST_PAYLOAD - _PLAN_MESSAGE_ROOM:
+            return None
+    return body.decode("utf-8", "replace")
 
 
 @asynccontextmanager

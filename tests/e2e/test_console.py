@@ -1,15 +1,24 @@
 """The console in a real browser, on real gateways. The simulated cars' true motors judge what each control does."""
 
 import contextlib
+import http.client
+import json
 import os
 import signal
+import socket
 import time
+import urllib.request
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from tests.support.console import CARS, ConsoleProcess, ConsoleStage, browser_process, pids
 from tests.support.ports import free_endpoint
@@ -200,7 +209,7 @@ def test_a_browser_that_freezes_stops_the_car_and_does_not_start_it_again(stage:
             for each in frozen:
                 each.resume()
         # The finger is still down, for all that the page knows: nothing drives before it is lifted.
-        page.get_by_text("The page did not answer for 0.3 s.").wait_for()
+        page.locator(".pad.held").wait_for(state="detached")
         thawed_ns = time.time_ns()
         time.sleep(0.5)
         assert stage.judges["red"].on_after(thawed_ns) == []
@@ -363,3 +372,112 @@ def test_ctrl_c_of_the_console_stops_the_car_that_a_page_drives(stage: ConsoleSt
         assert stage.stands(since_ns=ended_ns) < STOPPED_WITHIN_S
         assert stage.console.process.wait() == 0, stage.console.process.stderr
     stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)
+
+
+def socket_of(stage: ConsoleStage, **headers: str) -> Any:
+    """A WebSocket to the console as its own page opens it, but for these headers."""
+    hello = urllib.request.Request(f"{stage.console.address}/hello")
+    with urllib.request.urlopen(hello) as answer:
+        cookie = answer.headers["Set-Cookie"].partition(";")[0]
+    ours = {"Origin": stage.console.address, "Cookie": cookie}
+    chosen = {name: value for name, value in (ours | headers).items() if value}
+    origin = chosen.pop("Origin", None)
+    return connect(
+        f"ws://127.0.0.1:{stage.console.port}/ws",
+        origin=Origin(origin) if origin else None,
+        additional_headers=chosen,
+        max_size=None,
+    )
+
+
+def test_foreign_sockets_and_paths_out_of_the_folder_are_refused(stage: ConsoleStage) -> None:
+    for foreign in ({"Origin": "http://evil.example"}, {"Origin": ""}, {"Cookie": ""}, {"Cookie": "console=guess"}):
+        with pytest.raises(InvalidStatus):
+            socket_of(stage, **foreign)
+    for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/static//etc/passwd", "/etc/passwd"):
+        connection = http.client.HTTPConnection("127.0.0.1", stage.console.port)
+        connection.request("GET", path)
+        assert connection.getresponse().status == 404, path
+        connection.close()
+    connection = http.client.HTTPConnection("127.0.0.1", stage.console.port)
+    connection.request("POST", "/stop", headers={"Origin": "http://evil.example"})
+    assert connection.getresponse().status == 403
+    connection.close()
+
+
+def test_bad_messages_and_reconnects_move_no_car_and_harm_no_page(stage: ConsoleStage) -> None:
+    page = stage.driving_page("red")
+    begun_ns = time.time_ns()
+    with socket_of(stage) as socket_:
+        for bad in (
+            "{",
+            "[]",
+            '{"t":"press"}',
+            '{"t":"press","press":1,"cars":["*"],"motion":"forward","n":1}',
+            "x" * 9000,
+        ):
+            socket_.send(bad)
+        press = {"t": "press", "press": 1, "cars": ["blue"], "motion": "forward", "n": 1}  # a tick of long ago
+        socket_.send(json.dumps(press))
+        socket_.send("x" * 100_000)  # too large: the console closes this socket
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                socket_.recv(timeout=20.0)
+        assert socket_.close_code == 1009
+    for _ in range(100):
+        with socket_of(stage):
+            pass
+    with stage.held(page, "forward"):  # the page goes on
+        pass
+    stage.stands()
+    assert stage.judges["blue"].on_after(begun_ns) == []
+
+
+def test_a_page_that_reads_nothing_holds_up_no_other(stage: ConsoleStage) -> None:
+    page = stage.driving_page("red")
+    with socket_of(stage) as deaf:
+        deaf.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        with stage.held(page, "forward"):
+            pass
+        stage.stands()
+
+
+def test_two_pages_never_drive_one_car(stage: ConsoleStage) -> None:
+    first, second = stage.driving_page("red"), stage.driving_page("red")
+    with stage.held(first, "forward"):
+        second.locator("[data-motion=back]").hover()
+        second.mouse.down()
+        second.get_by_text("Another page drives red.").wait_for()
+        second.mouse.up()
+        assert stage.judges["red"].driving
+
+
+def test_a_plan_is_shown_explained_stopped_checked_and_set(stage: ConsoleStage, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("roles:\n  guide: {mode: tracking}\n")
+    coordinator = stage.fleet.start("-m", "fleet.cli", "plan", "run", str(plan))
+    page = stage.page("#/plan")
+    guide = page.locator("[data-role=guide] dd")
+    guide.filter(has_text="blue").or_(guide.filter(has_text="red")).wait_for()
+    car = guide.inner_text()
+    assert stage.sim.say({"car": car, "ask": "truth"})
+    wait_for(lambda: stage.sim.say({"car": car, "ask": "truth"})["mode"] == "tracking", "it tracks")
+    page.locator(f"[data-why={car}] summary").click()
+    page.locator(f"[data-why={car}]").get_by_text("Because:").wait_for()
+    page.locator("textarea").fill("roles:\n  guide: {mode: flying}\n")
+    page.locator("[data-plan=check]").click()
+    page.get_by_role("button", name="Line 2:").click()
+    assert page.evaluate("document.activeElement.selectionStart") == len("roles:\n")
+    page.locator("[data-plan=set]").click()
+    assert "flying" not in stage.fleet.get("fleet/@coordinator/plan")[0].text
+    page.locator("textarea").fill("roles:\n  lamp: {mode: color_led, count: 1}\n")
+    page.locator("[data-plan=set]").click()
+    page.locator("[data-role=lamp]").wait_for()
+    page.locator("textarea").fill("#" * 100_000)
+    page.locator("[data-plan=set]").click()
+    page.get_by_text("The plan has more than 64 KiB.").wait_for()
+    assert serious(page) == []
+    page.locator("[data-plan=stop]").click()
+    page.get_by_text("stopped by").first.wait_for()
+    coordinator.end()
+    page.get_by_text("Its coordinator has gone.").wait_for()

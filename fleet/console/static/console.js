@@ -7,6 +7,8 @@ const MAX_RESULTS = 6;
 const listeners = new Set();
 export const store = {
   state: null,
+  plan: null,
+  planAnswer: null, // of the last request about the plan: {ok, words}
   hello: null,
   connected: false,
   lost: false,
@@ -100,6 +102,21 @@ export function lease(kind, cars) {
   send({ t: kind, id: requestNumber, cars });
 }
 
+export function plan(verb) {
+  send({ t: "plan", id: ++requestNumber, verb });
+}
+
+// Check the text of a plan, or put it in force.
+export async function sendPlan(what, text) {
+  try {
+    const response = await fetch(`/plan/${what}`, { method: "POST", body: text });
+    store.planAnswer = { what, ...(await response.json()) };
+  } catch {
+    store.planAnswer = { what, ok: false, words: describe.unreachable };
+  }
+  changed();
+}
+
 // ---------------------------------------------------------------- the socket
 
 export let describe = { done: () => "", refused: () => "" };
@@ -118,6 +135,12 @@ function onMessage(text) {
       return;
     case "state":
       store.state = message;
+      break;
+    case "plan":
+      store.plan = message;
+      break;
+    case "plan_done":
+      store.planAnswer = message;
       break;
     case "hello":
       store.hello = message;
