@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
+from fleet.console.frame_log import describe_gateway
 from schemas import topics
 
 TREND_WINDOW_S: Final = 240.0
@@ -86,6 +87,10 @@ class CarView:
         """State of the motors and what it rests on."""
         safety = self._newest.get("state/safety")
         return ("unknown", "") if safety is None else (safety[0].motors, safety[0].motors_basis)
+
+    def describe_gateway(self) -> list[tuple[str, str]]:
+        """Return what the car's gateway knows, as names and texts."""
+        return describe_gateway(*(self._get(f"state/{name}") for name in ("link", "health", "safety", "mode")))
 
     def as_dict(self, now: float, sender: str) -> dict[str, Any]:
         """Return what a page shows of the car, as JSON values. Numbers are rounded, so that most are equal next time.

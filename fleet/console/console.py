@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from fleet.aio import Fleet
 from fleet.console.car_view import FleetView
+from fleet.console.inspections import Inspections
 from fleet.console.operator import ConsoleOperator
 from fleet.console.page_link import PageLink
 from fleet.console.plan_view import PlanView, coordinator_topic
@@ -47,6 +48,7 @@ class Console:
         self._coordinators: set[str] = set()
         """Tokens of the coordinator."""
         self._readings: Latest[Sample] = Latest()
+        self._inspections = Inspections(fleet, self._view.car)
         self._plan = PlanView()
         self._plan_samples: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_plan_sample, limit=_MAX_EVENTS, newest=True
@@ -95,6 +97,8 @@ class Console:
             self._take_readings(now)
             if self._pages:
                 self._show("state", self._state(now))
+            for number, text in self._inspections.texts().items():
+                self._pages[number].show("inspection", text)
             if self._plan.changed:
                 self._plan.changed = False
                 self._show("plan", self._plan_text())
@@ -158,6 +162,7 @@ class Console:
     def remove_page(self, page: PageLink) -> None:
         """Remove a page that has gone, and stop the cars that it drives."""
         self._pages.pop(page.number, None)
+        self._inspections.end(page.number)
         for press in self._presses.drop_client(page.number):
             self._end(press, "The page has gone.")
         self.operator.release_leases(page.number)
@@ -197,6 +202,10 @@ class Console:
             case "give_back":
                 self._stop_presses(set(message.cars()), "The car was given back.")
                 self.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
+            case "inspect":
+                self._inspections.begin(page.number, message.cars()[0])
+            case "inspect_end":
+                self._inspections.end(page.number)
             case "plan":
                 verb = message.one_of("verb", PLAN_VERBS)
                 self.operator.spawn(self._ask_coordinator(page, message.number("id"), verb))

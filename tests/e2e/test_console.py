@@ -481,3 +481,14 @@ def test_a_plan_is_shown_explained_stopped_checked_and_set(stage: ConsoleStage, 
     page.get_by_text("stopped by").first.wait_for()
     coordinator.end()
     page.get_by_text("Its coordinator has gone.").wait_for()
+
+
+def test_frames_stand_beside_what_they_became_with_the_ledger(stage: ConsoleStage) -> None:
+    page = stage.page("#/inspect")
+    page.locator("select").select_option("red")
+    page.locator("tbody tr").filter(has_text="$4WD,CSB").filter(has_text="range, battery").first.wait_for()
+    stage.person.car("red").whistle().check()
+    page.locator("tbody tr").filter(has_text="to the car").first.wait_for()
+    page.locator(".ledger").get_by_text("whistle sent (mia)").wait_for()
+    page.locator(".wide").get_by_text("rx_frames").wait_for()
+    assert serious(page) == []

@@ -8,6 +8,7 @@ const listeners = new Set();
 export const store = {
   state: null,
   plan: null,
+  inspection: null,
   planAnswer: null, // of the last request about the plan: {ok, words}
   hello: null,
   connected: false,
@@ -102,6 +103,12 @@ export function lease(kind, cars) {
   send({ t: kind, id: requestNumber, cars });
 }
 
+let inspected = null;
+export function inspect(car) {
+  inspected = car;
+  send(car === null ? { t: "inspect_end" } : { t: "inspect", cars: [car] });
+}
+
 export function plan(verb) {
   send({ t: "plan", id: ++requestNumber, verb });
 }
@@ -135,6 +142,9 @@ function onMessage(text) {
       return;
     case "state":
       store.state = message;
+      break;
+    case "inspection":
+      store.inspection = message;
       break;
     case "plan":
       store.plan = message;
@@ -187,6 +197,7 @@ async function connect() {
   socket.onopen = () => {
     store.connected = true;
     pressNumber = 0;
+    if (inspected !== null) inspect(inspected);
     changed();
   };
   socket.onmessage = (event) => onMessage(event.data);

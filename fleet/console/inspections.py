@@ -1,0 +1,71 @@
+"""The cars that pages inspect: their raw frames are subscribed to only as long as a page shows them."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any
+
+from fleet.aio import Fleet
+from fleet.console.car_view import CarView
+from fleet.console.frame_log import FrameLog
+from schemas import keys, messages, topics
+from schemas.bus import Handover, Sample
+
+_MAX_QUEUED_FRAMES = 1024
+
+
+class Inspections:
+    """Which page inspects which car."""
+
+    def __init__(self, fleet: Fleet, view_of: Callable[[str], CarView]) -> None:
+        self._fleet = fleet
+        self._view_of = view_of
+        self._cars: dict[int, str] = {}
+        self._logs: dict[str, FrameLog] = {}
+        self._subscriptions: dict[str, Any] = {}
+
+    def begin(self, page: int, car: str) -> None:
+        """Show a car to a page, instead of the car before."""
+        self._cars[page] = car
+        if car not in self._logs:
+            self._logs[car] = FrameLog()
+            frames = Handover[Sample](asyncio.get_running_loop(), self._on_frame, limit=_MAX_QUEUED_FRAMES, newest=True)
+            bus, name = self._fleet.sync.bus, self._fleet.sync.name
+            self._subscriptions[car] = bus.subscribe(keys.topic_key(name, car, "frame/*"), frames)
+        self._forget()
+
+    def end(self, page: int) -> None:
+        """Show a page no car."""
+        if self._cars.pop(page, None) is not None:
+            self._forget()
+
+    def texts(self) -> dict[int, str]:
+        """Return the message for each page."""
+        by_car = {car: self._text(car) for car in self._logs}
+        return {page: by_car[car] for page, car in self._cars.items()}
+
+    def _text(self, car: str) -> str:
+        view = self._view_of(car)
+        shown = {
+            "t": "inspection",
+            "car": car,
+            "frames": self._logs[car].as_list(),
+            "ledger": list(reversed(view.ledger)),
+            "gateway": view.describe_gateway(),
+        }
+        return json.dumps(shown, separators=(",", ":"))
+
+    def _forget(self) -> None:
+        for car in set(self._logs) - set(self._cars.values()):
+            self._subscriptions.pop(car).undeclare()
+            del self._logs[car]
+
+    def _on_frame(self, sample: Sample) -> None:
+        topic, key = topics.of_key(sample.key), keys.parse(sample.key)
+        if topic is None or key is None or key.car not in self._logs:
+            return
+        try:
+            frame = messages.parse(topic.message, sample.payload, sample.encoding)
+        except messages.BadPayload:
+            return
+        self._logs[key.car].on_frame(topic.name, frame)

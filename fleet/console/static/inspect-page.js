@@ -1,0 +1,60 @@
+// The inspect page: raw frames beside what they became, the ledger of commands, and what the gateway knows.
+
+import { inspect, store } from "./console.js";
+import { t } from "./texts.js";
+import { html, useEffect, useState } from "./ui.js";
+
+const time = (at_ms) => new Date(at_ms).toISOString().slice(11, 23);
+
+const Frames = ({ frames }) => html`<section>
+  <h2 id="frames">${t.frames}</h2>
+  <div class="scroll" tabindex="0" role="region" aria-labelledby="frames">
+    <table>
+      <thead><tr>${t.frameColumns.map((name) => html`<th key=${name} scope="col">${name}</th>`)}</tr></thead>
+      <tbody>
+        ${frames.map(
+          (frame, index) => html`<tr key=${index}>
+            <td>${time(frame.at_ms)}</td><td>${frame.from_car ? t.fromCar : t.toCar}</td>
+            <td><code>${frame.text}</code></td><td>${frame.verdict}</td><td>${frame.became}</td>
+          </tr>`,
+        )}
+      </tbody>
+    </table>
+  </div>
+</section>`;
+
+const Ledger = ({ ledger }) => html`<section>
+  <h2>${t.ledger}</h2>
+  <ul class="plain ledger">
+    ${ledger.map(
+      (entry, index) => html`<li key=${index}><time>${time(entry.at_ms)}</time> ${entry.level === "info" ? "" : "⚠ "}${entry.words}</li>`,
+    )}
+  </ul>
+</section>`;
+
+const Gateway = ({ rows }) => html`<section>
+  <h2>${t.gateway}</h2>
+  <dl class="wide">${rows.map(([name, words]) => html`<div class="row" key=${name}><dt>${name}</dt><dd>${words}</dd></div>`)}</dl>
+</section>`;
+
+export function InspectPage({ cars }) {
+  const [car, setCar] = useState([...store.selected][0] ?? cars[0]?.name ?? null);
+  const [frozen, setFrozen] = useState(null);
+  useEffect(() => {
+    if (car !== null) inspect(car);
+    return () => inspect(null);
+  }, [car]);
+  const shown = frozen ?? (store.inspection?.car === car ? store.inspection : null);
+  return html`
+    <h1>${t.inspect}</h1>
+    <div class="controls">
+      <label>${t.inspectCar} <select value=${car} onChange=${(event) => setCar(event.target.value)}>
+        ${cars.map((each) => html`<option key=${each.name} value=${each.name}>${each.name}</option>`)}
+      </select></label>
+      <button aria-pressed=${frozen !== null} onClick=${() => setFrozen(frozen === null ? shown : null)}>${t.freeze}</button>
+    </div>
+    ${shown !== null &&
+    html`<${Frames} frames=${shown.frames} />
+      <div class="columns"><${Ledger} ledger=${shown.ledger} /><${Gateway} rows=${shown.gateway} /></div>`}
+  `;
+}
