@@ -12,6 +12,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.replay.make_session import Made
 
 VIEW = (1, "pip install 'zenoh-car-fleet[view]'")
+CONSOLE = (1, "pip install 'zenoh-car-fleet[console]'")
 ANALYSIS = (1, "pip install 'zenoh-car-fleet[analysis]'")
 WORKS = (0, "")
 RUN = """
@@ -48,6 +49,7 @@ EXPECTED = {
     "replay SESSION": VIEW,
     "replay SESSION --save OUT/one.rrd": VIEW,
     "view": VIEW,
+    "console": CONSOLE,
     "view --save OUT/live.rrd": VIEW,
     "sessions export SESSION --parquet OUT/parquet": ANALYSIS,
     "sessions export SESSION --csv OUT/csv": WORKS,

@@ -5,7 +5,10 @@ import sys
 from collections.abc import Sequence
 from types import ModuleType
 
-HIDDEN = frozenset({"rerun", "rerun_cli", "rerun_sdk", "pyarrow", "numpy", "pandas", "PIL", "matplotlib", "bleak"})
+HIDDEN = frozenset(
+    {"rerun", "rerun_cli", "rerun_sdk", "pyarrow", "numpy", "pandas", "PIL", "matplotlib", "bleak"}
+    | {"starlette", "uvicorn", "websockets"}
+)
 
 
 class Hidden(importlib.abc.MetaPathFinder):
