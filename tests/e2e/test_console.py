@@ -125,6 +125,8 @@ def test_a_pad_drives_while_it_is_held(stage: ConsoleStage, size: str) -> None:
         assert stage.judges["red"].driving
     stage.stands()
     assert not stage.judges["blue"].driving
+    report = stage.report(page, lambda: page.keyboard.press(" "))  # the button has not kept the focus
+    report.locator("[data-stop=red].stop-shown").wait_for()
 
 
 def test_a_finger_drives_until_it_is_lifted_or_leaves(stage: ConsoleStage) -> None:

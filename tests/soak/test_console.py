@@ -85,6 +85,12 @@ class TwentyCars:
 
         wait_for(streams, "all report fast")
 
+        def confirmed() -> bool:
+            modes = {reading.car: reading.value for reading in self.person.get("*/state/mode")}
+            return all(modes[car].verdict == "confirmed" for car in tracking if car in modes)
+
+        wait_for(confirmed, "no car is blocked by the opening of its mode")
+
     def close(self) -> None:
         self.console.kill()
         self.console.wait()
@@ -106,7 +112,10 @@ def press_stop(twenty: TwentyCars, page: Page) -> list[float]:
     twenty.frames.clear()
     page.mouse.down()
     page.mouse.up()
-    wait_for(lambda: len({car for _, car in list(twenty.frames)}) == CARS, "all got it", seconds=30.0)
+    deadline = time.monotonic() + 30.0
+    while missing := set(twenty.cars) - {car for _, car in list(twenty.frames)}:
+        assert time.monotonic() < deadline, f"no stop for {sorted(missing)}: {page.locator('.stopbar').inner_text()}"
+        time.sleep(0.05)
     pressed_ms = page.evaluate("window.pressedAt")
     first: dict[str, int] = {}
     for at, car in list(twenty.frames):

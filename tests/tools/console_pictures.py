@@ -8,6 +8,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from PIL import Image
+
 from fleet.client.commands import mode_request
 from tests.support.console import ConsoleStage
 from tests.support.ports import free_endpoint
@@ -15,6 +17,7 @@ from tests.support.processes import FleetProcesses
 
 PLAN = "roles:\n  guide: {mode: tracking}\n  rest: {mode: manual, count: all, priority: -1}\n"
 PAGES = {"fleet": "", "drive": "#/drive", "plan": "#/plan", "inspect": "#/inspect"}
+COLORS = 64
 SETTLE_S = 4.0
 """Time for some readings of each car."""
 
@@ -30,14 +33,16 @@ def main(directory: Path) -> None:
             stage.fleet.start("-m", "fleet.cli", "plan", "run", str(plan))
             stage.person.ask(mode_request("light_seeking"), ["blue"])
             time.sleep(SETTLE_S)
-            phone = stage.playwright.devices["Pixel 7"] | {"color_scheme": "dark"}
+            phone = stage.playwright.devices["Pixel 7"] | {"color_scheme": "dark", "device_scale_factor": 1.5}
             for name, path in PAGES.items():
                 for suffix, options in (("", {}), ("-phone", phone)):
                     page = stage.page(path, **options)
                     if name == "drive":
                         page.locator("input[name=select-red]").check()
                     time.sleep(1.0)
-                    page.screenshot(path=directory / f"console-{name}{suffix}.png")
+                    file = directory / f"console-{name}{suffix}.png"
+                    page.screenshot(path=file)
+                    Image.open(file).quantize(COLORS).save(file, optimize=True)
         finally:
             stage.close()
 

@@ -71,7 +71,7 @@ export function estopAll(why) {
 // ---------------------------------------------------------------- hold to drive
 
 export function press(motion, cars, source) {
-  if (cars.length === 0 || document.visibilityState !== "visible") return;
+  if (cars.length === 0 || !store.connected || document.visibilityState !== "visible") return;
   store.press = { id: ++pressNumber, motion, cars, source };
   send({ t: "press", press: pressNumber, cars, motion, n: tick });
   changed();

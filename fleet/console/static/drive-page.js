@@ -68,6 +68,9 @@ function useDriving() {
 
 // ---------------------------------------------------------------- the parts
 
+// A button that was pressed with the mouse does not get the focus: Space shall stop after it, not drive.
+const prevent = (event) => event.preventDefault();
+
 function PadButton({ motion, symbol, words, letter }) {
   const source = `pad ${motion}`;
   const down = (event) => {
@@ -87,7 +90,7 @@ function PadButton({ motion, symbol, words, letter }) {
   const held = store.press?.motion === motion;
   return html`<button class=${held ? "pad held" : "pad"} data-motion=${motion} aria-label=${`${words}, hold`}
     aria-pressed=${held} onPointerDown=${down} onPointerUp=${up} onPointerCancel=${up} onLostPointerCapture=${up}
-    onKeyDown=${keyDown} onKeyUp=${keyUp} onBlur=${up} onContextMenu=${(event) => event.preventDefault()}>
+    onKeyDown=${keyDown} onKeyUp=${keyUp} onBlur=${up} onMouseDown=${prevent} onContextMenu=${prevent}>
     <span class="arrow" aria-hidden="true">${symbol}</span><span class="pad-words">${words} <kbd>${letter}</kbd></span>
   </button>`;
 }
