@@ -15,6 +15,8 @@ from fleet.console.inspections import Inspections
 from fleet.console.operator import ConsoleOperator
 from fleet.console.page_link import PageLink
 from fleet.console.plan_view import PlanView, coordinator_topic
+from fleet.console.plot_buffer import plottable
+from fleet.console.plot_feed import PlotFeed
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
 from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessage
 from fleet.replay.colors import color
@@ -25,6 +27,8 @@ from schemas.commands import STOPS
 MAX_PAGES: Final = 32
 """Maximum number of connected pages."""
 _MAX_EVENTS: Final = 4096
+MAX_PLOT_S: Final = 600
+"""Maximum time that a plot shows, s."""
 PLAN_VERBS: Final = frozenset({"restart", "next", "stop"})
 """Requests to the coordinator without a text."""
 
@@ -49,6 +53,7 @@ class Console:
         """Tokens of the coordinator."""
         self._readings: Latest[Sample] = Latest()
         self._inspections = Inspections(fleet, self._view.car)
+        self._plots = PlotFeed(fleet)
         self._plan = PlanView()
         self._plan_samples: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_plan_sample, limit=_MAX_EVENTS, newest=True
@@ -97,6 +102,8 @@ class Console:
             self._take_readings(now)
             if self._pages:
                 self._show("state", self._state(now))
+            for page in self._pages.values():
+                self._plots.send(page)
             for number, text in self._inspections.texts().items():
                 self._pages[number].show("inspection", text)
             if self._plan.changed:
@@ -155,7 +162,8 @@ class Console:
             raise TooManyPages
         self._last_page += 1
         page = self._pages[self._last_page] = PageLink(self._last_page, send)
-        page.answer(t="hello", page=page.number, sender=self._fleet.sync.sender, fleet=self._fleet.sync.name)
+        names = {"sender": self._fleet.sync.sender, "fleet": self._fleet.sync.name}
+        page.answer(t="hello", page=page.number, **names, plottable=plottable())
         page.show("plan", self._plan_text())
         return page
 
@@ -163,6 +171,7 @@ class Console:
         """Remove a page that has gone, and stop the cars that it drives."""
         self._pages.pop(page.number, None)
         self._inspections.end(page.number)
+        self._plots.end(page.number)
         for press in self._presses.drop_client(page.number):
             self._end(press, "The page has gone.")
         self.operator.release_leases(page.number)
@@ -206,6 +215,9 @@ class Console:
                 self._inspections.begin(page.number, message.cars()[0])
             case "inspect_end":
                 self._inspections.end(page.number)
+            case "plot":
+                since_s = float(min(message.number("since_s"), MAX_PLOT_S))
+                self.operator.spawn(self._plots.begin(page.number, message.series(), since_s))
             case "plan":
                 verb = message.one_of("verb", PLAN_VERBS)
                 self.operator.spawn(self._ask_coordinator(page, message.number("id"), verb))

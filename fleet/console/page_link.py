@@ -35,6 +35,10 @@ class PageLink:
         self._newest[kind] = text
         self._not_empty.set()
 
+    def has_unsent(self, kind: str) -> bool:
+        """Return True if the newest message of a kind still waits."""
+        return kind in self._newest
+
     async def run(self) -> None:
         """Send until the page has gone. Raises TimeoutError if it does not read."""
         while True:

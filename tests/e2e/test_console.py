@@ -4,6 +4,7 @@ import contextlib
 import http.client
 import json
 import os
+import re
 import signal
 import socket
 import time
@@ -494,3 +495,22 @@ def test_frames_stand_beside_what_they_became_with_the_ledger(stage: ConsoleStag
     page.locator(".ledger").get_by_text("whistle sent (mia)").wait_for()
     page.locator(".wide").get_by_text("rx_frames").wait_for()
     assert serious(page) == []
+
+
+def test_readings_of_several_cars_are_plotted_with_their_history(stage: ConsoleStage) -> None:
+    said: list[str] = []
+    page = stage.page()
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.goto(f"{stage.console.address}/#/plots")
+    distance = page.locator("[data-plot='0']")
+    distance.locator("canvas").wait_for()
+    values = distance.locator(".newest").filter(has_text=re.compile(r"blue [\d.]+, green [\d.]+, red [\d.]+"))
+    values.wait_for()
+    speed = page.locator("[data-plot='3']")
+    speed.locator("select").select_option("sensor/grayscale raw")
+    speed.locator(".newest").filter(has_text=re.compile(r"red \d+")).wait_for()
+    page.locator(".selection select").select_option("600")
+    values.wait_for()
+    assert serious(page) == []
+    assert said == []

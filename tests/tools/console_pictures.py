@@ -16,7 +16,7 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses
 
 PLAN = "roles:\n  guide: {mode: tracking}\n  rest: {mode: manual, count: all, priority: -1}\n"
-PAGES = {"fleet": "", "drive": "#/drive", "plan": "#/plan", "inspect": "#/inspect"}
+PAGES = {"fleet": "", "drive": "#/drive", "plan": "#/plan", "plots": "#/plots", "inspect": "#/inspect"}
 COLORS = 64
 SETTLE_S = 4.0
 """Time for some readings of each car."""

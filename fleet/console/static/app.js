@@ -5,13 +5,14 @@ import { DrivePage } from "./drive-page.js";
 import { FleetPage } from "./fleet-page.js";
 import { InspectPage } from "./inspect-page.js";
 import { PlanPage } from "./plan-page.js";
+import { PlotsPage } from "./plots-page.js";
 import { stopStates, t } from "./texts.js";
 import { Component, html, render, useState, Verdict } from "./ui.js";
 
 const SHOW_REPORT_MS = 30_000;
 const SAME_PRESS_MS = 1000;
 
-const PAGES = { "#/": [t.fleet, FleetPage], "#/drive": [t.drive, DrivePage], "#/plan": [t.plan, PlanPage], "#/inspect": [t.inspect, InspectPage] };
+const PAGES = { "#/": [t.fleet, FleetPage], "#/drive": [t.drive, DrivePage], "#/plan": [t.plan, PlanPage], "#/plots": [t.plots, PlotsPage], "#/inspect": [t.inspect, InspectPage] };
 
 // ---------------------------------------------------------------- STOP
 

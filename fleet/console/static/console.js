@@ -103,6 +103,18 @@ export function lease(kind, cars) {
   send({ t: kind, id: requestNumber, cars });
 }
 
+let plotted = { series: [], since_s: 60 };
+export function plot(series, since_s) {
+  plotted = { series, since_s };
+  send({ t: "plot", ...plotted });
+}
+
+const sampleListeners = new Set();
+export function onSamples(listener) {
+  sampleListeners.add(listener);
+  return () => sampleListeners.delete(listener);
+}
+
 let inspected = null;
 export function inspect(car) {
   inspected = car;
@@ -143,6 +155,9 @@ function onMessage(text) {
     case "state":
       store.state = message;
       break;
+    case "samples":
+      for (const listener of sampleListeners) listener(message.values);
+      return;
     case "inspection":
       store.inspection = message;
       break;
@@ -198,6 +213,7 @@ async function connect() {
     store.connected = true;
     pressNumber = 0;
     if (inspected !== null) inspect(inspected);
+    if (plotted.series.length > 0) plot(plotted.series, plotted.since_s);
     changed();
   };
   socket.onmessage = (event) => onMessage(event.data);

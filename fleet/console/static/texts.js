@@ -154,6 +154,13 @@ export const t = {
     return parts.join(", ");
   },
   took: (s) => (s === null ? "" : `after ${s.toFixed(1)} s`),
+  plots: "Plots",
+  plotCars: "Cars to plot",
+  plotSpan: "Time shown",
+  plotSpans: { 30: "30 s", 60: "1 min", 120: "2 min", 300: "5 min", 600: "10 min" },
+  plotReading: (number) => `Reading of plot ${number}`,
+  plotNothing: "nothing",
+  plotValues: (words) => `Newest values: ${words}`,
   inspect: "Inspect",
   inspectCar: "Car",
   frames: "Frames, the newest first",

@@ -1,0 +1,65 @@
+"""The values that one page plots, until they are sent. Pure."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+from fleet.conditions import fields_of, value_in
+from schemas import messages, topics
+
+MAX_SERIES: Final = 80
+"""Maximum number of series of a page: four plots of twenty cars."""
+MAX_BUFFERED_VALUES: Final = 200_000
+"""Maximum number of values that wait for one page. A page that reads nothing gets no more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One field of one topic of one car, over time."""
+
+    car: str
+    topic: str
+    field: str
+
+
+@cache
+def plottable() -> tuple[tuple[str, str, str], ...]:
+    """Return topic, field and unit of everything that is a number, or a lamp that is on or off."""
+    return tuple(
+        (topic.name, name, topic.units.get(name, ""))
+        for topic in topics.CAR_TOPICS
+        if topic.family in ("sensor", "state")
+        for name, kind in fields_of(messages.message_class(topic.message)).items()
+        if kind in (float, bool) and name != "seq"
+    )
+
+
+class PlotBuffer:
+    """The series of one page with the values that it does not have yet."""
+
+    def __init__(self, series: Sequence[Series]) -> None:
+        self._numbers: dict[tuple[str, str], list[tuple[int, str]]] = {}
+        for number, each in enumerate(series):
+            self._numbers.setdefault((each.car, each.topic), []).append((number, each.field))
+        self._values: dict[int, list[tuple[int, float]]] = {}
+        self._count = 0
+
+    @property
+    def keys(self) -> list[tuple[str, str]]:
+        """Car and topic of all series."""
+        return list(self._numbers)
+
+    def add(self, car: str, topic: str, message: Any) -> None:
+        """Add the values of a message. A field that was not measured has none."""
+        for number, field in self._numbers.get((car, topic), ()):
+            value = value_in(message)(field)
+            if isinstance(value, int | float) and self._count < MAX_BUFFERED_VALUES:
+                at_ms = message.stamp.seconds * 1000 + message.stamp.nanos // 1_000_000
+                self._values.setdefault(number, []).append((at_ms, round(float(value), 4)))
+                self._count += 1
+
+    def take(self) -> dict[int, list[tuple[int, float]]]:
+        """Return the values by the number of their series, and forget them."""
+        values, self._values, self._count = self._values, {}, 0
+        return values
