@@ -58,6 +58,7 @@ def listen(port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((LOOPBACK, port))
+        listener.listen()  # the address is printed before uvicorn accepts
     except OSError:
         listener.close()
         raise

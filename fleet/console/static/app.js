@@ -28,6 +28,12 @@ window.addEventListener(
   { capture: true },
 );
 
+// After a click with the mouse no button has the focus, so that Space stops. By keyboard the focus stays where it is.
+window.addEventListener("click", (event) => {
+  const focus = document.activeElement;
+  if (event.pointerType === "mouse" && focus?.matches("button, summary, a, input[type=checkbox]")) focus.blur();
+});
+
 let pointerAt = -Infinity;
 const onStopDown = () => {
   pointerAt = performance.now();

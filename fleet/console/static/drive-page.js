@@ -68,13 +68,14 @@ function useDriving() {
 
 // ---------------------------------------------------------------- the parts
 
-// A button that was pressed with the mouse does not get the focus: Space shall stop after it, not drive.
+// A button that was pressed with the mouse does not get the focus: Space shall stop afterwards, not drive.
 const prevent = (event) => event.preventDefault();
 
 function PadButton({ motion, symbol, words, letter }) {
   const source = `pad ${motion}`;
   const down = (event) => {
     if (event.button !== 0) return;
+    document.activeElement?.blur();
     event.currentTarget.setPointerCapture(event.pointerId);
     press(motion, names(), source);
   };
