@@ -278,7 +278,7 @@ def test_each_control_does_what_it_says_to_the_car(stage: ConsoleStage) -> None:
 def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: ConsoleStage) -> None:
     page = stage.driving_page("green")
     modes = page.locator("[data-control=mode]")
-    modes.get_by_text("green: Mode tracking cannot be opened on raspberry_pi cars").wait_for()
+    modes.get_by_text("green: Raspberry_pi cars do not know mode tracking").wait_for()
     assert modes.get_by_role("button").count() == 0
     assert page.locator("[data-control=servo_vertical] button").count() == 3
     page.locator("input[name=select-green]").uncheck()

@@ -65,7 +65,7 @@ def test_a_car_is_offered_what_its_platform_and_gateway_can() -> None:
     assert "Arduino cars" in arduino["cannot"]["arm"]
     (pi,) = view_of("raspberry_pi").as_list(0.0)
     assert pi["modes"] == ()
-    assert "raspberry_pi cars" in pi["cannot"]["mode"]
+    assert "do not know mode tracking" in pi["cannot"]["mode"]
     assert "servo_vertical" in pi["can"]
     (listed,) = view_of(capabilities=("drive",)).as_list(0.0)
     assert listed["cannot"]["led"] == "The fleet file leaves out led."
