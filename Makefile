@@ -38,7 +38,7 @@ demo: .venv/.ready ## three simulated cars do a job, recorded, checked, ready fo
 	@echo "Running the demo: three simulated cars do a job, about half a minute."
 	$(BIN)/fleet demo
 
-test: .venv/.ready browser ## the test suite (under seven minutes on two processors)
+test: .venv/.ready ## the test suite (under seven minutes on two processors)
 	@mkdir -p .tmp
 	@echo "Running the test suite: under seven minutes on two processors."
 	$(BIN)/python -m pytest $(TESTS) -m 'not soak' -n auto --dist loadgroup

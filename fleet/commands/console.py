@@ -9,6 +9,7 @@ import click
 
 from fleet.aio import Fleet
 from fleet.commands.options import bus_options
+from fleet.commands.params import Number
 from fleet.console.server import DEFAULT_PORT, LOOPBACK, listen, serve
 
 _LOOPBACK_NAMES: Final = ("localhost", "::1")
@@ -36,7 +37,7 @@ examples:
   fleet console --port 8080"""
 )
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=DEFAULT_PORT, show_default=True, help="Port, 0 for any free one."
+    "--port", type=Number(int, 0, 65535), default=DEFAULT_PORT, show_default=True, help="Port, 0 for any free one."
 )
 @click.option("--host", default=LOOPBACK, show_default=True, callback=_check_host, expose_value=False,
               help="Address: loopback only.")  # fmt: skip

@@ -25,6 +25,8 @@ from tests.support.console import CARS, ConsoleProcess, ConsoleStage, browser_pr
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
+pytestmark = pytest.mark.soak  # needs Chromium (`make browser`)
+
 TTL_S = 0.5
 """A drive of the console lasts for so long without another one."""
 BLOCK_S = 1.0
