@@ -39,8 +39,15 @@ examples:
 @click.option(
     "--port", type=Number(int, 0, 65535), default=DEFAULT_PORT, show_default=True, help="Port, 0 for any free one."
 )
-@click.option("--host", metavar="ADDRESS", default=LOOPBACK, show_default=True, callback=_check_host, expose_value=False,
-              help="Address: loopback only.")  # fmt: skip
+@click.option(
+    "--host",
+    metavar="ADDRESS",
+    default=LOOPBACK,
+    show_default=True,
+    callback=_check_host,
+    expose_value=False,
+    help="Address: loopback only.",
+)
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @bus_options
 def console(*, port: int, opens: bool, connect: str | None, fleet: str) -> None:
