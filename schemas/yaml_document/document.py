@@ -25,7 +25,7 @@ MAX_YAML_DEPTH: Final = 24
 MAX_YAML_VALUES: Final = 20_000
 """Maximum number of values with all aliases expanded: nine levels of nine aliases would make 387 million."""
 _MAX_INTEGER: Final = 2**53
-_TOO_LARGE: Final = f"has more than {MAX_YAML_BYTES // 1024} KiB: no file of a fleet needs so much"
+_TOO_LARGE: Final = f"the file has more than {MAX_YAML_BYTES // 1024} KiB, which is the limit"
 _COLLECTIONS: Final = {yaml.MappingNode: "tag:yaml.org,2002:map", yaml.SequenceNode: "tag:yaml.org,2002:seq"}
 _MAX_PROBLEMS_LISTED: Final = 50
 """Maximum faults in an error message."""
@@ -127,7 +127,7 @@ def read_text(path: Path, source: str | None = None) -> str:
             raise _bad_file(source, _TOO_LARGE) from None
         line = data.count(b"\n", 0, error.start) + 1
         column = error.start - (data.rfind(b"\n", 0, error.start) + 1) + 1
-        words = f"byte 0x{data[error.start]:02x} is no UTF-8: save the file as UTF-8"
+        words = f"byte 0x{data[error.start]:02x} is not UTF-8. Save the file as UTF-8."
         raise _bad_file(source, words, line, column) from None
 
 
@@ -157,9 +157,9 @@ class Document:
         except yaml.MarkedYAMLError as error:
             raise BadFile(source, [_syntax_problem(error)]) from None
         except ValueError:  # from PyYAML for a directive such as %YAML 999999…
-            raise _bad_file(source, "is no YAML: a directive with a number that is too long") from None
+            raise _bad_file(source, "this is not YAML: a directive has too long a number") from None
         if root is None or (isinstance(root, yaml.ScalarNode) and not root.value):
-            raise _bad_file(source, "is empty")
+            raise _bad_file(source, "the file is empty")
         self.tree = self._construct((), None, root)
 
     def report(self, where: Where, words: str, *, on_key: bool = False) -> None:
@@ -293,7 +293,7 @@ class Document:
             mark, place, words = key_node.start_mark, where, ""
             name: str = key_node.value
             if not isinstance(key_node, yaml.ScalarNode) or not key_node.tag.endswith(":str"):
-                words = f"key {quote_value(name)} is no word: write it in quotes, or with a letter first"
+                words = f"key {quote_value(name)} is not a word. Write it in quotes, or with a letter first."
             elif name in seen:
                 place, words = (*where, name), f"is given twice, first in line {seen[name]}"
             elif not _can_encode(name):
@@ -316,7 +316,7 @@ class Document:
             if isinstance(value, str) and not _can_encode(value):
                 self.report(where, f"{text} has half a character (a lone surrogate)")
             elif isinstance(value, float) and not math.isfinite(value):
-                self.report(where, f"{text} is no finite number")
+                self.report(where, f"{text} is not a finite number")
             elif isinstance(value, int) and abs(value) > _MAX_INTEGER:
                 self.report(where, f"{text} is too large a number")
             else:

@@ -205,7 +205,7 @@ class McapReader:
             return
         record = read(file, at, chunk.length)
         if record[: HEAD.size] != HEAD.pack(Opcode.CHUNK, length):
-            self.damage.append(Damage(at, "the head of the chunk there is damaged, its messages are shown if whole"))
+            self.damage.append(Damage(at, "the head of the chunk there is damaged; its intact messages are read"))
         yield ChunkPart(at, Opcode.CHUNK, record[HEAD.size :], _span(chunk))
 
     def _check_data(self, file: IO[bytes], footer: Footer) -> None:

@@ -95,7 +95,7 @@ class Session:
                 raise NoSession(f"{path} is not a session: no {session_dir.segment(Path(), 1)} in it")
             if not whole and not path.exists():
                 raise NoSession(
-                    f"there is no session at {path}: name the directory that `fleet record` printed, or an .mcap"
+                    f"There is no session at {path}. Name a directory (`fleet sessions` lists them) or an .mcap file."
                 )
         except OSError as error:
             raise NoSession(f"{path} cannot be read: {error.strerror}") from None
@@ -122,7 +122,7 @@ class Session:
                 raise NoSession(
                     f"{path} has format {given}, this version reads up to {session_dir.FORMAT_VERSION}: "
                     "update zenoh-car-fleet; "
-                    f"its files can be looked into one by one, as {there[0]}"
+                    f"its files can be read one by one, such as {there[0]}"
                 )
         self.description = session_dir.SessionInfo.read(path) if whole else None
 
@@ -170,7 +170,7 @@ class Session:
             for row in self.rows():
                 copy.add(row)
         if not copy.messages:
-            raise NoSession(f"{self.path} holds no message that is whole: {self.damage_words}")
+            raise NoSession(f"{self.path} has no intact message: {self.damage_words}")
         return self.part((out,))
 
     @overload

@@ -60,7 +60,7 @@ def recover(session: Session, out: Path, watched: Progress = iter) -> tuple[int,
         # Read the damage after reading: it names the lost times then. A check of all CRCs would add nothing.
         words = session.damage_words
         if not count:
-            raise NoSession(f"{session.path} holds no message that is whole: {words or 'it is empty'}")
+            raise NoSession(f"{session.path} has no intact message: {words or 'it is empty'}")
         if session.lacking(count) or (session.description is not None and not session.description.closed):
             words = "; ".join(filter(None, (words, session.lacking(count) or "its recorder did not close it")))
         _describe(session, new, count, {"by": "recover", "lost": words, "missing": _missing(session, count, words)})
@@ -181,7 +181,7 @@ def lost_words(session: Session) -> str:
     if not origin.get("lost") or origin.get("missing") == 0:
         return ""
     missing = origin.get("missing")
-    many = f"{missing} messages" if isinstance(missing, int) else "messages, it is not known how many,"
+    many = f"{missing} messages" if isinstance(missing, int) else "an unknown number of messages"
     return f"made of {origin.get('of')} by {origin.get('by')}: {many} are missing ({origin['lost']})"
 
 

@@ -90,7 +90,7 @@ class SessionVerdict:
         span = f", {time_spec.iso(self.first_ns)} to {time_spec.iso(self.last_ns)} ({length})" if self.messages else ""
         state = "whole" if self.whole else "NOT whole"
         if self.recording:
-            state = f"is being recorded, {'nothing is missing until now' if self.whole else state}"
+            state = f"is being recorded, {'nothing is missing so far' if self.whole else state}"
         yield f"{self.session}: {state}, {self.messages} messages{span}"
         for name, words in self.damage.items():
             yield f"  damage: {name} {words}"
@@ -180,7 +180,7 @@ class _Verifier:
         if message_class is not None:
             self._verdict.schemas[name] = compare_schema(message_class)
         elif name:
-            self._verdict.schemas[name] = "cannot be understood: its messages are kept as bytes"
+            self._verdict.schemas[name] = "is unreadable: its messages stay bytes"
         return message_class
 
     def _recorder_clock(self, log_ns: int) -> None:
@@ -241,9 +241,7 @@ def verify(
     verdict.damage = {path.name: words for path, words in sorted((session.damage | read).items())}
     description = session.description
     if session.path.is_dir() and description is None:
-        verdict.damage[session_dir.SESSION_FILE] = (
-            "is missing, or cannot be understood: who recorded what, and the marks"
-        )
+        verdict.damage[session_dir.SESSION_FILE] = "is missing or unreadable: it names recorder and marks"
     if words := session.lacking(verdict.messages):
         verdict.damage[session_dir.SESSION_FILE] = words
     verdict.lost = lost_words(session)
@@ -257,6 +255,6 @@ def verify(
             until = (
                 f"everything until {time_spec.iso(verdict.last_ns)} is here" if verdict.messages else "nothing is here"
             )
-            why = description.error or "it was killed, or is still recording"
-            verdict.ended = f"the recorder did not close it ({why}); {until}, what came after is not"
+            why = description.error or "it crashed, or is still recording"
+            verdict.ended = f"the recorder did not close it ({why}); {until}, later messages are lost"
     return verdict

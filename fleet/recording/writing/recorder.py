@@ -317,7 +317,7 @@ class Recorder:
     def _report_news(self, session: SessionWriter) -> None:
         """Notify of each removed session, failed copy and new state once."""
         for removed in session.removed:
-            self._notify(f"{removed} was removed for the quota: the oldest session without a mark")
+            self._notify(f"{removed} is removed, the oldest session without a mark: the quota is full")
         for words in session.uncopied:
             self._notify(words)
         session.removed.clear()
@@ -327,7 +327,7 @@ class Recorder:
         for text in sorted(now - self._reported):
             self._notify(text)
         if any(text.startswith("full") for text in self._reported) and not session.full and self._recording:
-            self._notify(f"there is room again: recording goes on to {session.path}")
+            self._notify(f"there is room again: recording continues to {session.path}")
         self._reported = now
 
     def _fail(self, words: str) -> None:
@@ -395,7 +395,7 @@ class Recorder:
                 if not self.ended.is_set():
                     self._last = self._status()
             case _:
-                raise _CommandRefused(f"{verb!r} is not known: allowed are {', '.join(VERBS)}")
+                raise _CommandRefused(f"There is no command {verb!r}. There are {', '.join(VERBS)}.")
 
     def _start_session(self) -> None:
         if self._recording:
@@ -405,13 +405,13 @@ class Recorder:
         try:
             self._begin_session()
         except OSError as error:
-            raise _CommandRefused(f"no session can be made in {self._root}: {error.strerror}") from None
+            raise _CommandRefused(f"No session can be made in {self._root}: {error.strerror}") from None
         self._recording = True
         self._publish()
 
     def _stop_session(self) -> None:
         if not self._recording:
-            raise _CommandRefused(f"nothing is being recorded; the last session is {self._session.path}")
+            raise _CommandRefused(f"Nothing is being recorded. The last session is {self._session.path}.")
         self._drain()
         self._end_session(self._session)
         self._recording = False
@@ -420,14 +420,14 @@ class Recorder:
 
     def _mark(self, query: zenoh.Query) -> None:
         if not self._recording:
-            raise _CommandRefused("nothing is being recorded: `fleet record start` begins a session")
+            raise _CommandRefused("Nothing is being recorded. `fleet record start` begins a session.")
         try:
             request = json.loads(query.payload.to_bytes()) if query.payload is not None else {}
             text, by = request["text"], request.get("by", "anonymous")
         except (ValueError, KeyError, TypeError, AttributeError):
-            raise _CommandRefused('a mark is JSON, as {"text": "the cat came", "by": "me"}') from None
+            raise _CommandRefused('A mark is JSON, such as {"text": "the cat came", "by": "me"}') from None
         if not (isinstance(text, str) and isinstance(by, str) and 0 < len(text) <= MAX_MARK_CHARACTERS >= len(by)):
-            raise _CommandRefused(f"text must have 1 to {MAX_MARK_CHARACTERS} characters, and by at most so many")
+            raise _CommandRefused(f"text needs 1 to {MAX_MARK_CHARACTERS} characters, by at most {MAX_MARK_CHARACTERS}")
         now = self._now()
         message: Any = messages.message_class("foxglove.Log")()
         message.timestamp.seconds, message.timestamp.nanos = divmod(now, 1_000_000_000)

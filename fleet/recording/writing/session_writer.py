@@ -302,9 +302,9 @@ class SessionWriter:
                 self._finish_segment()
         except OSError as error:
             self._on_write_error(error)
-            self.cost = "there was no room for the end of the last file, whose messages are all there"
+            self.cost = "The disk is full: the last file has no end, but all its messages"
         if dropped := dropped + self._drop_buffered():
-            self.cost = f"there was no room to the end: {dropped} messages that waited for it are dropped"
+            self.cost = f"The disk stayed full: {dropped} waiting messages are lost"
         if self.cost:
             self.description.error = self.cost = f"{self._root}: {self.cost}"
         if self._made:
@@ -313,7 +313,7 @@ class SessionWriter:
             except OSError as error:
                 if not session_dir.is_full(error):
                     raise
-                self.cost = f"{self.cost or self._root}; session.json there has no room to say so"
+                self.cost = f"{self.cost or self._root}; the disk is too full to note it in session.json"
             session_dir.release(self.path)
 
     def abandon(self, why: str, now_ns: int) -> str:
@@ -322,7 +322,7 @@ class SessionWriter:
             self._segment.cut()
         self._drop_buffered()
         dropped = sum(self.drops.values())
-        words = f"{why}. What was written until then is whole: {self._written} messages; {dropped} are dropped"
+        words = f"{why}. The {self._written} messages before are intact; {dropped} are lost"
         self.description.error = words
         with contextlib.suppress(OSError):  # the failed disk, which `words` already names
             self._write_info(now_ns, closed=False)
@@ -439,7 +439,7 @@ class SessionWriter:
         self._pause(f"{error.strerror or error}")
 
     def _pause(self, words: str) -> None:
-        self.full = f"{self._root}: {words}: nothing is written until there is room"
+        self.full = f"{self._root}: {words}. Recording pauses until there is room."
         self.description.error = self.full
         self._buffered_bytes = sum(len(row[2]) for row in self._unflushed)
         if self._made:
@@ -488,7 +488,7 @@ class SessionWriter:
             except OSError as error:
                 self._on_write_error(error)
                 return
-            self._pause(f"{free / MB:.1f} MB are left on the disk, {keep / MB:g} MB are to stay free")
+            self._pause(f"{free / MB:.1f} MB are left on the disk, {keep / MB:g} MB must stay free")
 
     def _resume(self, now_ns: int) -> None:
         keep = self._options.keep_free_bytes
@@ -501,7 +501,7 @@ class SessionWriter:
                 self._on_write_error(error)
             self._unflushed += rest
             if self._segment is None:
-                self._pause(f"{len(self._unflushed)} messages that wait need more than is free")
+                self._pause(f"{len(self._unflushed)} waiting messages need more space")
 
     def _write_buffered(self, keep_bytes: int) -> list[_BufferedRow]:
         """Write the buffer while this much stays free, and return the rest."""

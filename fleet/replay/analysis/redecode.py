@@ -136,12 +136,10 @@ class Redecoding:
                 found.append(parse_platform(name))
             except ValueError:
                 raise NoPlatform(
-                    f"{self.car} was treated as platform {name!r}, which this version does not know: give --platform"
+                    f"{self.car} was recorded as {name!r}, which this version does not know. Name it: --platform"
                 ) from None
         if not found:
-            raise NoPlatform(
-                f"the recording does not say what {self.car} was treated as (no state/health of it): give --platform"
-            )
+            raise NoPlatform(f"The recording has no platform of {self.car} (no state/health). Name it: --platform")
         return found
 
 

@@ -94,12 +94,14 @@ def read(path: Path) -> tuple[str, list[Item]]:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             objects.append((number, json.loads(line)))
     except ValueError as error:  # UnicodeDecodeError is one
-        raise BadVector(f"{path}, line {len(objects) + 1}: is no JSON in UTF-8: {error}") from None
+        raise BadVector(f"{path}, line {len(objects) + 1}: this is not JSON in UTF-8: {error}") from None
     head = objects[0][1] if objects else None
     if not isinstance(head, dict) or not isinstance(head.get("format"), int) or not isinstance(head.get("car"), str):
-        raise BadVector(f"{path} is no vector: its first line has no format and car; `fleet sessions vector` makes one")
+        raise BadVector(
+            f"{path} is not a vector: its first line lacks format and car. `fleet sessions vector` makes one."
+        )
     if head["format"] > FORMAT:
-        raise BadVector(f"{path} has format {head['format']}, this version reads up to {FORMAT}: update it")
+        raise BadVector(f"{path} has format {head['format']}. This version reads up to {FORMAT}: update it.")
     items = []
     for number, each in objects[1:]:
         try:

@@ -59,7 +59,7 @@ class Player:
 
     def begin(self, session: str, cars: Iterable[str]) -> None:
         """Declare the tokens of these cars, and answer queries; raises NameTaken."""
-        another = "give this one another name with --as"
+        another = "name this one otherwise with --as"
         if playing := self.bus.tokens(f"{self.name}/{keys.REPLAY}/*"):
             raise NameTaken(f"fleet {self.name} is a replay of {playing[0].rpartition('/')[2]} already: {another}")
         if taken := sorted(token.partition("/")[2] for token in self._alive()):
@@ -85,7 +85,7 @@ class Player:
     @staticmethod
     def _or_cars_only(taken: list[str]) -> str:
         tried = all(each.startswith((keys.COORDINATOR, keys.RECORDER)) for each in taken)
-        return ", or only what cars said with --cars-only" if tried else ""
+        return ", or play only the cars with --cars-only" if tried else ""
 
     def remember(self, recorded: Iterable[Recorded]) -> None:
         """Store messages from before the start as latest values for queries."""

@@ -101,7 +101,7 @@ def export(
             raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
         contents = drawing.contents()
         if not contents.cars and not contents.services:
-            raise NoSession(f"{session.path} holds no message of a fleet{part.words}")
+            raise NoSession(f"{session.path} has no message of a fleet{part.words}")
         recording.send_chunks(rrc.LazyChunkStream.from_iter(chain(drawing.ends(), drawing.static())))
         recording.send_blueprint(blueprint.layout(drawing, tab), make_active=False, make_default=True)
         recording.disconnect()
@@ -112,7 +112,7 @@ def export(
         except (RuntimeError, ValueError):
             free = shutil.disk_usage(out.parent).free
             raise ExportFailed(
-                f"{out} could not be written whole: {free} bytes are free there, {session.path} may need more"
+                f"{out} is incomplete: the disk is probably full ({free} bytes are free). Name another place."
             ) from None
         whole.replace(out)
     return drawing.counts

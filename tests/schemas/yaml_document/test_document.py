@@ -51,8 +51,8 @@ def test_yaml_is_that_of_1_2() -> None:
 @pytest.mark.parametrize(
     ("text", "place", "words"),
     [
-        ("", "1:1", "is empty"),
-        ("# nothing but words\n", "1:1", "is empty"),
+        ("", "1:1", "the file is empty"),
+        ("# nothing but words\n", "1:1", "the file is empty"),
         ("wheels:\n\ta: 1", "2:1", "a tab"),
         ("wheels: {a: {}\n", "2:1", "this is not YAML"),
         ("- 1", "1:1", "a list is not allowed. Write fields"),
@@ -61,10 +61,10 @@ def test_yaml_is_that_of_1_2() -> None:
         ("wheels: {a: {spokes: 2, spokes: 3}}", "1:25", "wheels.a.spokes: is given twice"),
         ("mode: fast", "1:1", "wheels: is missing. At least one wheel."),
         ("wheels:", "1:8", "wheels: has no value. Write fields"),
-        ("wheels: {1: {}}", "1:10", "key '1' is no word"),
-        ("wheels: {[a]: {}}", "1:10", "is no word"),
-        ("wheels: {a: {size_m: .nan}}", "1:22", "no finite number"),
-        ("wheels: {a: {size_m: 1e999}}", "1:22", "no finite number"),
+        ("wheels: {1: {}}", "1:10", "key '1' is not a word"),
+        ("wheels: {[a]: {}}", "1:10", "is not a word"),
+        ("wheels: {a: {size_m: .nan}}", "1:22", "not a finite number"),
+        ("wheels: {a: {size_m: 1e999}}", "1:22", "not a finite number"),
         ("wheels: {a: {size_m: true}}", "1:22", "true is not allowed. Write a number"),
         ("wheels: {a: {spokes: '8'}}", "1:22", "'8' is not allowed. Write a whole number"),
         ("wheels: {a: {spokes: " + "9" * 5000 + "}}", "1:22", "too long a number"),
@@ -114,7 +114,7 @@ def test_no_more_faults_are_told_than_somebody_reads() -> None:
 def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "f.yaml"
     path.write_bytes(b"wheels: {}\nmode: caf\xe9\n")
-    with pytest.raises(BadFile, match=r"f\.yaml:2:10: error: byte 0xe9 is no UTF-8"):
+    with pytest.raises(BadFile, match=r"f\.yaml:2:10: error: byte 0xe9 is not UTF-8"):
         read_text(path)
     with pytest.raises(BadFile, match="there is no such file"):
         read_text(tmp_path / "other.yaml")

@@ -53,7 +53,7 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "p:1:1: error: is empty"),
+        ("", "p:1:1: error: the file is empty"),
         ("{}", "p:1:1: error: a plan needs roles. Write: `roles: {"),
         ("fixed: {red: {role: fast}}", "p:1:21: error: fixed.red.role: there is no role fast. There is none."),
         ("fixed: {red: {mode: manual}, red: {mode: tracking}}", "p:1:30: error: fixed.red: is given twice"),

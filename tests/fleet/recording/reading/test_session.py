@@ -47,7 +47,7 @@ def test_a_file_that_is_none_hides_no_other(tmp_path: Path) -> None:
 
 def test_a_session_of_which_nothing_is_whole_is_refused_with_the_cause(tmp_path: Path) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1)[:40])
-    with pytest.raises(NoSession, match=r"holds no message that is whole: .*0001\.mcap is cut .*: byte 8: "):
+    with pytest.raises(NoSession, match=r"has no intact message: .*0001\.mcap is cut .*: byte 8: "):
         Session(tmp_path).rescue(tmp_path / "rescued.mcap")
 
 
@@ -76,7 +76,7 @@ def test_a_description_that_is_a_device_is_not_waited_for(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "there is no session at"), (b"", "is empty"), (b"not an mcap file", "is not an MCAP file")],
+    [(None, "There is no session at"), (b"", "is empty"), (b"not an mcap file", "is not an MCAP file")],
 )
 def test_what_is_no_session_says_why(content: bytes | None, words: str, tmp_path: Path) -> None:
     path = tmp_path / "0001.mcap"

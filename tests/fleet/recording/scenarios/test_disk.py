@@ -136,7 +136,7 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
         found = fleet(endpoint, "record", "status")
         assert found.returncode == 0
         assert found.stdout.startswith("full:")
-        assert "nothing is written until there is room" in found.stdout
+        assert "Recording pauses until there is room" in found.stdout
         for _ in range(100):
             publish()
         there.free()
@@ -149,7 +149,7 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
         # What came meanwhile was held, and is here, too.
         assert numbers == list(range(1, sent + 1))
         assert (process.returncode, end["drops"], end["missed"]) == (0, {}, {})
-        assert "nothing is written until there is room" in errors
+        assert "Recording pauses until there is room" in errors
         assert "there is room again" in errors
         verdict = verify(Session(session))
         assert (verdict.missing, verdict.twice, verdict.closed) == ([], [], True)
@@ -204,8 +204,8 @@ def test_ended_while_the_disk_is_full_it_writes_what_it_can_and_says_what_it_dro
             assert process.returncode == 1
             total = sum(end["drops"].values())
             assert total >= dropped > 100
-            assert f"no room to the end: {total} messages that waited for it are dropped" in errors.splitlines()[-1]
-            assert f"{total} messages that waited" in description.error
+            assert f"The disk stayed full: {total} waiting messages are lost" in errors.splitlines()[-1]
+            assert f"{total} waiting messages" in description.error
 
 
 @pytest.mark.parametrize("kind", DISKS)
@@ -234,8 +234,8 @@ def test_a_disk_that_is_full_at_the_start_is_waited_for_and_nothing_is_left_lyin
         assert verify(opened).whole
         assert opened.description is not None
         assert [mark["text"] for mark in opened.description.marks] == ["full"]
-        assert "nothing is written until there is room" in errors
-        assert f"there is room again: recording goes on to {session}" in errors
+        assert "Recording pauses until there is room" in errors
+        assert f"there is room again: recording continues to {session}" in errors
 
 
 @pytest.mark.parametrize("kind", DISKS)
@@ -254,7 +254,7 @@ def test_ended_on_a_disk_that_was_full_from_the_start_it_says_so_and_leaves_noth
             return
         assert process.returncode == 1
         dropped = sum(json.loads(text)["drops"].values())
-        assert f"no room to the end: {dropped} messages that waited for it are dropped" in errors.splitlines()[-1]
+        assert f"The disk stayed full: {dropped} waiting messages are lost" in errors.splitlines()[-1]
         assert list(there.root.glob("*")) == []
         with pytest.raises(NoSession):
             Session(session)
@@ -309,7 +309,7 @@ def test_a_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Pat
     text, errors = process.communicate(timeout=60)
     assert process.returncode == 0
     assert Path(json.loads(text)["session"]) != session
-    assert f"{session} was removed" in errors
+    assert f"{session} is removed" in errors
     assert errors.count("more than its quota") <= 2  # told when it begins, not with every figure
     assert all(verify(Session(path)).whole for path in tmp_path.iterdir())
 
@@ -342,13 +342,15 @@ def test_it_is_stopped_started_and_marked_over_the_bus(endpoint: str, bus: Bus, 
     first = ready(process)
     marked = fleet(endpoint, "mark", "the cat came", "--by", "me")
     assert (marked.returncode, marked.stdout) == (0, f"marked in {first}\n")
-    assert fleet(endpoint, "record", "start").stderr.startswith("fleet: the recorder says: fleet 'fleet' is being")
+    assert fleet(endpoint, "record", "start").stderr.startswith(
+        "fleet: the recorder says: The fleet is recorded already"
+    )
     stopped = fleet(endpoint, "record", "stop")
     assert stopped.stdout.startswith(f"stopped: {first}")
     assert verify(Session(first)).whole
     refused = fleet(endpoint, "mark", "nobody hears it")
     assert refused.returncode == 1
-    assert "nothing is being recorded" in refused.stderr
+    assert "Nothing is being recorded" in refused.stderr
     started = json.loads(fleet(endpoint, "record", "start", "--json").stdout)
     assert started["state"] == "recording"
     second = Path(started["session"])
@@ -373,7 +375,7 @@ def test_a_mark_that_cannot_be_is_refused(endpoint: str, bus: Bus, tmp_path: Pat
         assert isinstance(answer, Failure), payload
     (answer,) = bus.query("fleet/@recorder/@cmd/explode", timeout_s=10.0)
     assert isinstance(answer, Failure)
-    assert "allowed are start, stop, status, mark" in answer.words
+    assert "There are start, stop, status, mark" in answer.words
     process.send_signal(signal.SIGTERM)
     assert process.communicate(timeout=60)[1] == ""
     assert fleet(endpoint, "mark", " ").returncode == 2

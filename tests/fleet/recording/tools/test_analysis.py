@@ -171,7 +171,7 @@ def test_the_newest_session_needs_no_name(tmp_path: Path, monkeypatch: pytest.Mo
     assert [Session(name).name for name in ("latest", "latest~1", "s6", "sessions/s7")] == ["s7", "s8", "s6", "s7"]
     with pytest.raises(NoSession, match="latest~2: there are 2 recorded sessions"):
         Session("latest~2")
-    with pytest.raises(NoSession, match="there is no session at s5"):
+    with pytest.raises(NoSession, match="There is no session at s5"):
         Session("s5")
 
 

@@ -114,7 +114,7 @@ def test_what_is_being_recorded_is_not_called_damaged(tmp_path: Path) -> None:
         ended.set()
         recorder.join()
         segment.cut()
-    assert "is being recorded, nothing is missing until now" in result.output
+    assert "is being recorded, nothing is missing so far" in result.output
     assert "damage" not in result.output
     assert result.exit_code == 0
     assert not growing(Session(path))()

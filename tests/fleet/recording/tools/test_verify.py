@@ -173,5 +173,5 @@ def test_a_schema_that_makes_no_sense_is_said(written: Written) -> None:
     written.put(RANGE, 1, schema=b"\xff\xff")
     written.put(RANGE, 2)
     verdict = written.verdict()
-    assert verdict.schemas == {"fleet.v1.Range": "cannot be understood: its messages are kept as bytes"}
+    assert verdict.schemas == {"fleet.v1.Range": "is unreadable: its messages stay bytes"}
     assert verdict.messages == 2

@@ -164,7 +164,7 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     made.put("fleet/red/frame/rx", pb.RxFrame(data=TRACKING, verdict="sensors", published=["sensor/line"]), 1.0)
     made.close()
     assert (
-        "does not say what red was treated as (no state/health of it): give --platform"
+        "The recording has no platform of red (no state/health). Name it: --platform"
         in run("sessions", "redecode", unknown).output
     )
     result = run("sessions", "redecode", unknown, "--platform", "arduino")
@@ -182,9 +182,9 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     assert run("sessions", "redecode", unknown, "--platform", "tank").exit_code == 2
 
     for text, words in (
-        ("", "is no vector"),
-        ("{}\n", "is no vector"),
-        ("{\n", "line 1: is no JSON"),
+        ("", "is not a vector"),
+        ("{}\n", "is not a vector"),
+        ("{\n", "line 1: this is not JSON"),
         ('{"format": 9, "car": "red"}\n', "reads up to 1: update it"),
         ('{"format": 1, "car": "red"}\n{"at_us": 1, "mode": "asleep"}\n', "line 2: ValueError"),
         ('{"format": 1, "car": "red"}\n{"at_us": 1, "rx": "$"}\n', "line 2: KeyError"),

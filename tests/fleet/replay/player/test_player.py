@@ -129,7 +129,7 @@ def test_it_looks_like_a_fleet_and_takes_no_command(fleet: FleetProcesses, sessi
 
     second = play(fleet, session)
     assert second.wait() == 2
-    assert "fleet fleet-replay is a replay of made already: give this one another name with --as" in second.stderr
+    assert "fleet fleet-replay is a replay of made already: name this one otherwise with --as" in second.stderr
     assert player.end(signal.SIGINT) == 0
     wait_for(lambda: not fleet.bus.tokens("fleet-replay/*"), "it is gone")
 
@@ -186,16 +186,14 @@ def test_a_name_that_is_a_living_fleets_is_refused(fleet: FleetProcesses, sessio
     live(fleet, "again/red")
     player = play(fleet, session, "--as", "again")
     assert player.wait() == 2
-    assert "fleet again is alive (red): give this one another name with --as" in player.stderr
+    assert "fleet again is alive (red): name this one otherwise with --as" in player.stderr
     # Also one whose cars have not come yet; a policy that waits for the recorded cars is what --cars-only is for.
     live(fleet, "third/@supervisor")
     assert play(fleet, session, "--as", "third", "--cars-only").wait() == 2
     live(fleet, "tried/@coordinator")
     both = play(fleet, session, "--as", "tried")
     assert both.wait() == 2
-    assert (
-        "(@coordinator): give this one another name with --as, or only what cars said with --cars-only" in both.stderr
-    )
+    assert "(@coordinator): name this one otherwise with --as, or play only the cars with --cars-only" in both.stderr
     assert play(fleet, session, "--as", "tried", "--cars-only", "--rate", "100").wait() == 0
 
 

@@ -160,7 +160,7 @@ def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     foreign.write_bytes(b"something else")
     out = str(tmp_path / "out.rrd")
     for arguments, words in (
-        ([str(tmp_path / "none"), "--save", out], "there is no session at"),
+        ([str(tmp_path / "none"), "--save", out], "There is no session at"),
         ([str(tmp_path), "--save", out], "no 0001.mcap in it"),
         ([str(foreign), "--save", out], "is not an MCAP file"),
     ):
@@ -169,7 +169,7 @@ def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert words in result.stderr
     if sys.platform == "linux":
         missing = CliRunner().invoke(replay, [str(tmp_path / "none")])
-        assert "there is no session at" in missing.stderr, "what is missing comes before a missing display"
+        assert "There is no session at" in missing.stderr, "what is missing comes before a missing display"
 
 
 def test_without_a_display_a_file_is_proposed(made: tuple[Path, Counter[str]], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,7 +189,7 @@ def test_a_recording_that_was_cut_at_once_is_said(made: tuple[Path, Counter[str]
     assert result.exit_code == 1
     assert isinstance(result.exception, SystemExit)
     assert len(result.stderr.splitlines()) == 1
-    assert f"holds no message that is whole: {cut} is cut" in result.stderr
+    assert f"has no intact message: {cut} is cut" in result.stderr
     assert "byte " in result.stderr
 
 
@@ -240,7 +240,7 @@ def test_a_full_disk_is_said_in_our_words_only(
     said = done.stderr.splitlines()
     assert len(said) == 1 + damaged, done.stderr
     assert ("is cut" in said[0]) == damaged
-    assert f"{out} could not be written whole" in said[-1]
+    assert f"{out} is incomplete" in said[-1]
     assert "bytes are free" in said[-1]
     assert list(tmp_path.iterdir()) == [source], "nothing is left behind"
 
@@ -268,7 +268,7 @@ def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
         writer = Writer(file)
         writer.start()
         writer.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(NoSession, match="holds no message"):
+    with pytest.raises(NoSession, match="has no message"):
         export.export(Session(tmp_path), tmp_path / "out.rrd")
 
 
