@@ -38,6 +38,8 @@ class CommandRequest:
     @property
     def effect_verb(self) -> str:
         """The verb in `effects.EFFECTS`."""
+        if self.verb == "estop" and self.message.scope == "fleet":
+            return "estop_fleet"
         return "release" if self.verb == "drive" and self.until is Until.STOPPED else self.verb
 
     @property

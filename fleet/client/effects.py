@@ -3,7 +3,12 @@
 from typing import Final
 
 _ANY: Final = "*"
-_ESTOP_LASTS: Final = "until `fleet resume {car} --estops`"
+_ESTOP: Final[dict[str, str]] = {
+    "shown": "emergency-stopped ({took_s:.1f} s)",
+    "complete": "emergency-stopped ({took_s:.1f} s)",
+    "unconfirmed": "emergency stop sent, which {car} cannot confirm",
+    "sent": "emergency-stopped",
+}
 
 EFFECTS: Final[dict[str, dict[str, str]]] = {
     "drive": {
@@ -18,12 +23,8 @@ EFFECTS: Final[dict[str, dict[str, str]]] = {
         "unconfirmed": "stop sent, which {car} cannot confirm",
         "sent": "stopped",
     },
-    "estop": {
-        "shown": f"emergency-stopped ({{took_s:.1f}} s) {_ESTOP_LASTS}",
-        "complete": f"emergency-stopped ({{took_s:.1f}} s) {_ESTOP_LASTS}",
-        "unconfirmed": f"emergency stop sent, which {{car}} cannot confirm; in force {_ESTOP_LASTS}",
-        "sent": f"emergency-stopped {_ESTOP_LASTS}",
-    },
+    "estop": _ESTOP,
+    "estop_fleet": _ESTOP,
     "mode": {"sent": "switching to mode{detail}"},
     "led": {"sent": "LED set"},
     "light": {"sent": "light set to{detail}"},
@@ -33,7 +34,7 @@ EFFECTS: Final[dict[str, dict[str, str]]] = {
     "speed": {"sent": "speed one step{detail}"},
     "fan": {"sent": "fan{detail}"},
     "find": {"sent": "blinked and beeped"},
-    "resume": {"sent": "resumed"},
+    "resume": {"sent": "{words}", "estopped": "{words}"},
     "lease": {"sent": "done"},
     _ANY: {
         "complete": "done",
@@ -44,11 +45,16 @@ EFFECTS: Final[dict[str, dict[str, str]]] = {
         "failed": "failed: {words}",
     },
 }
-"""What a command did, by verb and result. `release` is a drive with motion stop."""
+"""What a command did, by verb and result. `release` is a drive with motion stop, `estop_fleet` an e-stop of all."""
+NEXT_STEPS: Final = {
+    "estop": "Release it with `fleet resume {car} --estops`",
+    "estop_fleet": "One release frees all cars: `fleet resume --estops`",
+}
+"""What the text of a command that was carried out says at its end, by verb."""
 
 _STOP_FAILURES: Final = {"not_shown": "stop sent, {words}", "rejected": "{words}", "failed": "{words}"}
 """The gateway's words of a stop that failed begin with the fact for the car."""
-STOP_VERBS: Final = frozenset({"stop", "estop", "release"})
+STOP_VERBS: Final = frozenset({"stop", "estop", "estop_fleet", "release"})
 
 
 def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, words: str, took_s: float) -> str:

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from enum import StrEnum
 from typing import Final, Self
 
-from fleet.client.effects import STOP_VERBS, describe, with_code
+from fleet.client.effects import NEXT_STEPS, STOP_VERBS, describe, with_code
 
 QUEUED: Final = "queued"
 SENT: Final = "sent"
@@ -62,6 +62,8 @@ class Outcome:
     """For a stop: `shown` if the car's readings show that it stands, `sent` if they cannot."""
     effect: str = ""
     """What the command did, in words: `LED set`, `stopped (1.2 s)`, `refused: ...`."""
+    next_step: str = ""
+    """How to end what the command began, such as the release of an e-stop. Empty if there is nothing to end."""
 
     @property
     def code(self) -> str:
@@ -80,6 +82,8 @@ class Outcome:
         text = self.effect or self.words or self.phase
         if self.ok and self.basis == "sent" and self.worst_case_s is not None:
             text += f"; motors off within {self.worst_case_s:.1f} s if the frames arrived"
+        if self.next_step:
+            text += f". {self.next_step}"
         return with_code(f"{self.car}: {text}", self.code)
 
 
@@ -243,7 +247,7 @@ class Progress:
         if phase in _FAILED_PHASES:
             self._end(phase, reason, words, at, ok=False)
         elif phase == COMPLETE or (phase == SENT and self._until is Until.SENT):
-            self._end(phase, reason, words, at, ok=True)
+            self._end(phase, reason, words, at, ok=reason != "estopped")  # resumed, and still e-stopped
 
     def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
         if self.outcome is None:
@@ -258,4 +262,5 @@ class Progress:
                 took_s=took_s,
             )
             worst_case_s = self._worst_case_s or None
-            self.outcome = Outcome(self.car, ok, phase, reason, words, worst_case_s, took_s, self._basis, effect)
+            after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if ok else ""
+            self.outcome = Outcome(self.car, ok, phase, reason, words, worst_case_s, took_s, self._basis, effect, after)

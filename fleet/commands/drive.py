@@ -141,17 +141,16 @@ def resume(client: Fleet, cars: tuple[str, ...], ids: tuple[str, ...], *, estops
     named = resolve_cars(client, cars or [ALL_CARS])
     if not estops and not ids:
         carry_out(client, resume_request(), named, as_json=as_json)
-    outcomes = []
-    for car in named:
+    connected, by_ids = client.cars(), dict[tuple[str, ...], list[str]]()
+    for car in named:  # look at all before the first release: the release of one car may free the others
         in_force = _in_force(client, car)
-        chosen = in_force if estops else [_complete_id(car, prefix, in_force) for prefix in ids]
-        if chosen:
-            outcomes += client.ask(resume_request(chosen), [car])
-        elif car not in client.cars():
-            outcomes += client.ask(resume_request(), [car])  # the outcome says that the car is missing
+        chosen = tuple(in_force if estops else [_complete_id(car, prefix, in_force) for prefix in ids])
+        if chosen or car not in connected:  # the outcome says that the car is missing
+            by_ids.setdefault(chosen, []).append(car)
         else:
             click.echo(f"{car}: no e-stop is in force", err=True)
-    end_with(outcomes, as_json=as_json)
+    outcomes = [outcome for chosen, cars in by_ids.items() for outcome in client.ask(resume_request(chosen), cars)]
+    end_with(sorted(outcomes, key=lambda each: each.car), as_json=as_json)
 
 
 def _in_force(client: Fleet, car: str) -> list[str]:

@@ -20,7 +20,7 @@ from fleet.recording.session_dir import is_session
 from schemas import keys
 from schemas.bus import Bus, canon
 from schemas.colors import COLORS, parse_color
-from schemas.duration import parse_duration
+from schemas.duration import duration_s, parse_duration
 
 N = TypeVar("N", bound=float)
 
@@ -84,6 +84,8 @@ class Choice(click.Choice[str]):
         near = self._hints.get(value) or did_you_mean(str(value), self.choices)
         if ctx is not None and set(ctx.params.get("cars", ())) & set(self.choices):
             near = f"Write the {self._what} last."
+        if self._what == "motion" and duration_s(str(value)) is not None:
+            near = f"How long: --for {value}"
         all_of_them = f"Choose from: {', '.join(self.choices)}."
         return f'"{value}" is not a {self._what}. {near or all_of_them}'
 

@@ -11,7 +11,7 @@ from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.processes import ManagedProcess, ProcessSet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, WRONG_USE, RunState, delay_s
 
-NOT_STOPPED: Final = "not stopped"
+NOT_STOPPED: Final = "NOT STOPPED"
 """First words of the result for a car that may be moving."""
 GATEWAY_START_TIMEOUT_S: Final = 20.0
 """Timeout for the first heartbeat of a gateway that has not yet reached its car."""

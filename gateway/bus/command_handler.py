@@ -89,6 +89,7 @@ class CommandHandler:
             encoding,
             time.time_ns(),
             longest_drive_s=self._longest_drive_s,
+            car=self._car,
             by_wildcard="*" in expression,
             unread=unread,
         )
@@ -112,6 +113,7 @@ class CommandHandler:
                 time.time_ns(),
                 sampled_ns=sample.time_ns,
                 longest_drive_s=self._longest_drive_s,
+                car=self._car,
                 by_wildcard="*" in sample.key,
                 unread=sample.unread,
             )

@@ -58,6 +58,7 @@ class ParsedRequest:
     sampled_ns: int | None = None
     """Zenoh timestamp of a publication; None for a query."""
     longest_drive_s: float = DEFAULT_MAX_DRIVE_S
+    car: str = "this car"
     by_wildcard: bool = False
     """True if one key expression addressed several cars."""
     unread: str = ""
@@ -147,7 +148,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
         kind: SenderKind = _word("kind", message.kind or SenderKind.SCRIPT, SenderKind)
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
-        what = _drive(message, request.longest_drive_s) if verb == "drive" else _WHAT[verb](message)
+        what = _drive(message, request.longest_drive_s, request.car) if verb == "drive" else _WHAT[verb](message)
     except (ValueError, EncodeError) as error:
         raise BadRequest(Reason.BAD_VALUE, f"{verb}: {error}", command) from None
     return replace(
@@ -201,9 +202,12 @@ def _seconds(field: str, value: float, top: float) -> float:
     return value
 
 
-def _drive(message: Any, longest_s: float) -> Action:
+def _drive(message: Any, longest_s: float, car: str) -> Action:
     duration_s = 0.5
     if message.HasField("duration_s"):
+        if longest_s < message.duration_s < math.inf:
+            limit = f"at most {longest_s:g} s (longest_drive_s in its fleet file)"
+            raise ValueError(f"{message.duration_s:g} s is longer than {car} may drive: {limit}")
         duration_s = _seconds("duration_s", message.duration_s, longest_s)
     return Drive(_word("motion", message.motion, Motion), duration_s)
 

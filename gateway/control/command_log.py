@@ -63,10 +63,10 @@ class CommandLog:
             )
         )
 
-    def record_sent(self, pending: Pending, now: float, words: str = "") -> None:
+    def record_sent(self, pending: Pending, now: float, words: str = "", reason: Reason | None = None) -> None:
         """Record once that the first frame was written."""
         if not pending.sent:
-            self.record(pending, Phase.SENT, now, words=words)
+            self.record(pending, Phase.SENT, now, reason=reason, words=words)
 
     def record_rejection(self, pending: Pending, reason: Reason, words: str, now: float) -> None:
         """Record a rejection. Of a stream record only the first of each reason."""

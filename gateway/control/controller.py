@@ -258,7 +258,8 @@ class Controller:
         sender, latched = command.sender, command.note
         if isinstance(command.what, EmergencyStop):
             estop = Estop(command.id, sender.name, command.what.why, command.asked_ns, command.what.fleet_wide)
-            until = f"e-stop {self.safety.latch(estop).id} lasts until `fleet resume {self.car} --estops`"
+            fleet_wide = self.safety.latch(estop).fleet_wide
+            until = f"the e-stop lasts until `fleet resume{'' if fleet_wide else f' {self.car}'} --estops`"
             why = f": {estop.why}" if estop.why else ""
             self._log.log(Level.ERROR, "estop", f"{self.car} is emergency-stopped by {sender.name}{why}; {until}", now)
             latched = f"{until}; {command.note}" if command.note else until
@@ -266,8 +267,9 @@ class Controller:
             self.safety.put_on_hold(sender.name, command.asked_ns)
         self._executor.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
         if not self.model.link_open or self.stops.shutting_down:
-            words = self._not_stopped()
-            return self._reject(pending, Reason.LINK_DOWN, f"{words} ({latched})" if latched else words, now)
+            words = self._not_stopped("stopped" if isinstance(command.what, Stop) else "emergency-stopped")
+            words = f"{words} ({command.note})" if command.note else words
+            return self._reject(pending, Reason.LINK_DOWN, words, now)
         if not self.model.is_heard:
             silent_s = self.model.mode.unheard_s(now)
             silent = f"{self.car} may not get this stop: it has been silent for {silent_s:.0f} s. Look at the car."
@@ -277,19 +279,14 @@ class Controller:
         self.stops.begin(self.stops.full(now), FrameOrigin.STOP, now, pending)
         return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
 
-    def _not_stopped(self) -> str:
-        """Return what a stop that cannot be sent means for the car, and who stops it now."""
+    def _not_stopped(self, later: str) -> str:
+        """Return what a stop that cannot be sent means for the car, and what happens to it later."""
         car, ending = self.car, self.stops.shutting_down
         if self.model.link_open:
             return f"NOT CONFIRMED: the gateway of {car} is shutting down and stops {car} itself. Look at the car."
-        then = (
-            "Its gateway is ending; a new one stops it (`fleet up`)"
-            if ending
-            else "It is stopped when its link is back"
-        )
+        when = "by its next gateway" if ending else "when its link is back"
         return (
-            f"NOT STOPPED: {car} is unreachable ({self.model.link_reason}). "
-            f"If it was driving, it still is: go to the car. {then}."
+            f"NOT STOPPED: {car} is unreachable. If it was driving, it still is: go to the car. It is {later} {when}."
         )
 
     def _may_drive(self, command: Command, drive: Drive, now: float) -> bool:
@@ -299,20 +296,33 @@ class Controller:
     def _resume(self, pending: Pending, ids: tuple[str, ...], now: float) -> Answer:
         sender = pending.command.sender.name
         if ids:
-            ended = " ".join(estop.id for estop in self.safety.end(ids))
-            words = f"e-stop {ended} was ended by {sender}" if ended else "the e-stop had ended before"
-            if ended:
-                self._log.log(Level.WARNING, "estop_ended", words, now)
-        elif self.safety.hold is not None:
-            words = f"the hold by {self.safety.hold.by} has ended"
-            self._end_hold(pending.command.sender, now)
-        else:
-            words = f"{self.car} was not on hold"
+            if ended := self.safety.end(ids):
+                which = " ".join(estop.id for estop in ended)
+                self._log.log(Level.WARNING, "estop_ended", f"e-stop {which} was ended by {sender}", now)
+            words = "e-stop released" if len(ids) == 1 else f"{len(ids)} e-stops released"
+            if self.safety.estops:
+                words += f"; {self._still_estopped()}"
+            elif self.safety.hold is not None:
+                words += f"; still on hold by {self.safety.hold.by}: `fleet resume {self.car}`"
+            return self._done(pending, words, now)
+        words = (
+            f"resumed: the hold by {self.safety.hold.by} has ended" if self.safety.hold else "resumed: was not on hold"
+        )
+        self._end_hold(pending.command.sender, now)
         if self.safety.estops:
-            words += f"; still in force: e-stop {' '.join(estop.id for estop in self.safety.estops)}"
-        elif self.safety.hold is not None:
-            words += f"; still on hold (by {self.safety.hold.by}) until `fleet resume {self.car}` or a drive"
+            return self._done(pending, self._still_estopped(), now, Reason.ESTOPPED)
         return self._done(pending, words, now)
+
+    def _still_estopped(self) -> str:
+        """Return which e-stops are in force, with their ids if there are several, and how to release them."""
+        estops = self.safety.estops
+        several = len(estops) > 1
+        each = [
+            f"by {estop.by}" + (f' ("{estop.why}")' if estop.why else "") + (f" [{estop.id}]" if several else "")
+            for estop in estops
+        ]
+        them = "them" if several else "it"
+        return f"still emergency-stopped {', '.join(each)}. Release {them} with `fleet resume {self.car} --estops`"
 
     def _grant_lease(self, command: Command, now: float) -> None:
         """Grant the lease for the duration of the command. Log if it was taken from another sender."""
@@ -427,10 +437,11 @@ class Controller:
 
     # ------------------------------------------------------------------ answers
 
-    def _done(self, pending: Pending, words: str, now: float) -> Answer:
+    def _done(self, pending: Pending, words: str, now: float, reason: Reason | None = None) -> Answer:
+        """Answer what needed no frame. reason: why the car is still not usable."""
         if not pending.command.streamed:
-            self._log.record_sent(pending, now, words)
-        return Answer(Phase.SENT, words=words)
+            self._log.record_sent(pending, now, words, reason)
+        return Answer(Phase.SENT, reason, words)
 
     def _queued(self, pending: Pending, now: float) -> Answer:
         self._log.record(pending, Phase.QUEUED, now)

@@ -19,7 +19,7 @@ def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gatew
         assert fleet.ask("drive", car, motion="forward", duration_s=10)["status"] in TAKEN
         wait_for(lambda car=car: driving(sim, car), f"{car} drives")
     answer = fleet.ask("estop", id="e1", sender="mia", why="smoke", scope="fleet")
-    assert "e-stop e1 lasts until" in answer["words"]
+    assert "lasts until `fleet resume --estops`" in answer["words"]
     wait_for(lambda: estops(fleet, "blue") == ["e1"], "blue has it from red")
     wait_for(lambda: not driving(sim) and not driving(sim, "blue"), "both stand")
 

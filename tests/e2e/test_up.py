@@ -324,7 +324,7 @@ def test_the_end_stops_cars_whose_gateways_hang_or_were_killed_and_says_which_it
         ended = [*started.heard, *map(json.loads, started.process.lines())]
         said = {each["name"]: each["words"] for each in ended if each["what"] == "end"}
         assert (said["red"], said["green"]) == ("stopped", "stopped")
-        assert said["blue"].startswith("not stopped: ")
+        assert said["blue"].startswith("NOT STOPPED: ")
         assert said["@supervisor"] == "NOT STOPPED: blue. They may be moving: go to them."
 
 
@@ -340,7 +340,7 @@ def test_a_car_that_cannot_be_reached_at_the_end_is_told_by_fresh_gateways_until
         started.process.popen.send_signal(signal.SIGINT)
         for _ in range(2):
             tried = started.until("end", "red", "A fresh gateway tries to stop the car")
-            assert tried["words"].startswith("not stopped: ")
+            assert tried["words"].startswith("NOT STOPPED: ")
         sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
         started.until("end", "red", "stopped")
         assert not driving(sim)
@@ -359,7 +359,7 @@ def test_fleet_down_names_the_car_that_was_not_stopped_and_fails(fleet: FleetPro
         second = started.fleet("down")
         first.join()
         assert second.returncode == 1
-        assert second.stderr.startswith("red: not stopped: ")
+        assert second.stderr.startswith("red: NOT STOPPED: ")
         assert started.process.wait() == 1
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 
 from fleet import cli
 from tests.fleet.conftest import Cars, running
@@ -71,6 +71,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("drive red up", '"up" is not a motion. Choose from: forward, back, '),
         ("drive red blue foward", '"foward" is not a motion. Did you mean forward? (see fleet drive --help)'),
         ("drive red forward blue", '"blue" is not a motion. Write the motion last.'),
+        ("drive red forward 2s", '"2s" is not a motion. How long: --for 2s'),
         ("drive red stop", '"stop" is not a motion. To stop cars, write: fleet stop red'),
         ("drive Red forward", 'fleet: No car "Red". Names are lower case: did you mean "red"?'),
         ("drive r!d forward", "car name 'r!d' is not allowed: use 1 to 32 of a-z"),
@@ -381,16 +382,40 @@ def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
 
 
 def test_ending_its_e_stops_does_not_end_a_cars_hold(cars: Cars) -> None:
-    assert run(cars.endpoint, "estop", "blue").returncode == 0
+    estopped = run(cars.endpoint, "estop", "blue", "--why", "wall")
+    assert estopped.stdout.endswith(". Release it with `fleet resume blue --estops`\n")
+    still = run(cars.endpoint, "resume", "blue")
+    assert (still.returncode, still.stdout) == (1, "")
+    assert re.fullmatch(
+        r'blue: still emergency-stopped by \S+ ."wall".. Release it with `fleet resume blue --estops` \[estopped\]\n',
+        still.stderr,
+    )
+    run(cars.endpoint, "stop", "blue")
     ended = run(cars.endpoint, "resume", "blue", "--estops")
     assert ended.returncode == 0
-    assert "still on hold (by " in ended.stdout
+    assert re.fullmatch(r"blue: e-stop released; still on hold by \S+: `fleet resume blue`\n", ended.stdout)
     again = run(cars.endpoint, "resume", "blue", "--estops")
     assert (again.returncode, again.stderr) == (0, "blue: no e-stop is in force\n")
     nobody = run(cars.endpoint, "resume", "pink", "--estops")
     assert nobody.returncode == 1
     assert 'No car named "pink"' in nobody.stderr
-    assert "the hold by " in run(cars.endpoint, "resume", "blue").stdout
+    assert "blue: resumed: the hold by " in run(cars.endpoint, "resume", "blue").stdout
+
+
+def test_one_release_of_a_fleet_wide_e_stop_has_one_line_per_car(cars: Cars) -> None:
+    def invoke(*arguments: str) -> Result:
+        return CliRunner().invoke(cli.cli, [*arguments, "--connect", cars.endpoint], catch_exceptions=False)
+
+    estopped = invoke("estop")
+    assert [line.split(". ")[-1] for line in estopped.output.splitlines()] == [
+        "One release frees all cars: `fleet resume --estops`"
+    ] * 3
+    released = invoke("resume", "--estops")
+    assert released.exit_code == 0
+    assert [line.split(";")[0] for line in released.output.splitlines()] == [
+        f"{car}: e-stop released" for car in ("blue", "green", "red")
+    ]
+    assert invoke("resume").exit_code == 0
 
 
 def completed(words: str, endpoint: str) -> "subprocess.CompletedProcess[str]":

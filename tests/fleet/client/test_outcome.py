@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.client.effects import EFFECTS
+from fleet.client.effects import EFFECTS, STOP_VERBS
 from fleet.client.outcome import STOP_EVIDENCE_S, Progress, Until
 from schemas.commands import COMMANDS
 
@@ -136,7 +136,19 @@ def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() ->
         ),
         ("stop", "", ("failed", "not_shown", "NOT CONFIRMED: x", ""), "stop sent, NOT CONFIRMED: x [not_shown]"),
         ("stop", "", ("rejected", "link_down", "NOT STOPPED: x", ""), "NOT STOPPED: x [link_down]"),
-        ("estop", "", ("complete", "", "", "shown"), "emergency-stopped (1.0 s) until `fleet resume red --estops`"),
+        (
+            "estop",
+            "",
+            ("complete", "", "", "shown"),
+            "emergency-stopped (1.0 s). Release it with `fleet resume red --estops`",
+        ),
+        (
+            "estop_fleet",
+            "",
+            ("complete", "", "", "shown"),
+            "emergency-stopped (1.0 s). One release frees all cars: `fleet resume --estops`",
+        ),
+        ("resume", "", ("sent", "estopped", "still e-stopped", ""), "still e-stopped [estopped]"),
         ("release", "", ("sent", "", "red is at rest", ""), "stopped (red is at rest)"),
         ("drive", "1.0 s", ("complete", "", "", ""), "drove 1.0 s, then stopped"),
         ("drive", "1.0 s", ("complete", "", "only 0.3 s", ""), "drove, then stopped (only 0.3 s)"),
@@ -153,12 +165,12 @@ def test_a_gateway_that_went_is_told_after_a_second_in_which_it_may_be_back() ->
         ("fan", "toggled", ("sent", "", "", ""), "fan toggled"),
         ("fan", "switched on", ("failed", "write_failed", "cable", ""), "failed: cable [write_failed]"),
         ("find", "", ("sent", "", "", ""), "blinked and beeped"),
-        ("resume", "", ("sent", "", "the hold by mia has ended", ""), "resumed (the hold by mia has ended)"),
+        ("resume", "", ("sent", "", "resumed: the hold has ended", ""), "resumed: the hold has ended"),
         ("lease", "", ("sent", "", "", ""), "done"),
     ],
 )
 def test_the_text_of_each_outcome(verb: str, detail: str, event: tuple[str, str, str, str], text: str) -> None:
-    until = {"drive": Until.OVER, "stop": Until.STOPPED, "estop": Until.STOPPED, "release": Until.STOPPED}
+    until = {"drive": Until.OVER, **dict.fromkeys(STOP_VERBS, Until.STOPPED)}
     progress = Progress("red", until.get(verb, Until.SENT), 100.0, 1.0, verb=verb, detail=detail)
     phase, reason, words, basis = event
     progress.on_event(phase, reason, words, 0.5, 101.0, basis)
@@ -169,7 +181,7 @@ def test_the_text_of_each_outcome(verb: str, detail: str, event: tuple[str, str,
 
 
 def test_each_verb_has_a_text() -> None:
-    assert set(EFFECTS) == {*COMMANDS, "release", "*"}
+    assert set(EFFECTS) == {*COMMANDS, "release", "estop_fleet", "*"}
 
 
 def test_a_command_without_a_result_has_a_code_of_its_own() -> None:

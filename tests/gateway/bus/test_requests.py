@@ -123,7 +123,12 @@ def test_every_verb_of_the_table_is_known_here() -> None:
         ("drive", {"motion": "Forward"}, Reason.BAD_VALUE, "motion 'Forward': allowed are "),
         ("drive", {"motion": "forward", "duration_s": 0}, Reason.BAD_VALUE, "duration_s 0: allowed are more than 0"),
         ("drive", {"motion": "forward", "duration_s": -1}, Reason.BAD_VALUE, "duration_s -1"),
-        ("drive", {"motion": "forward", "duration_s": 10.1}, Reason.BAD_VALUE, "at most 10 s"),
+        (
+            "drive",
+            {"motion": "forward", "duration_s": 10.1},
+            Reason.BAD_VALUE,
+            "10.1 s is longer than this car may drive: at most 10 s (longest_drive_s in its fleet file)",
+        ),
         ("drive", {"motion": "forward", "duration_s": "NaN"}, Reason.BAD_VALUE, "duration_s nan"),
         ("drive", {"motion": "forward", "duration_s": "Infinity"}, Reason.BAD_VALUE, "duration_s inf"),
         ("drive", {"motion": "forward", "ttl_s": 0}, Reason.BAD_VALUE, "ttl_s 0"),

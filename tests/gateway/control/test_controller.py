@@ -688,8 +688,8 @@ def test_a_stop_during_the_shutdown_says_who_stops_the_car(desk: Workbench) -> N
     )
     desk.control.link_down("unplugged", desk.now)
     assert desk.ask(Stop()).words == (
-        "NOT STOPPED: red is unreachable (unplugged). If it was driving, it still is: go to the car. "
-        "Its gateway is ending; a new one stops it (`fleet up`)."
+        "NOT STOPPED: red is unreachable. If it was driving, it still is: go to the car. "
+        "It is stopped by its next gateway."
     )
 
 

@@ -49,7 +49,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT)
     answer = desk.ask(EmergencyStop("smoke"), PERSON, identity="e1")
     assert answer.status is QUEUED
-    assert answer.words == "e-stop e1 lasts until `fleet resume red --estops`"
+    assert answer.words == "the e-stop lasts until `fleet resume red --estops`"
     assert answer.worst_case_s > 0
     desk.run(600.0)
     assert desk.frames == [RUN, *SHOWN_STOP]
@@ -60,7 +60,9 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
         assert 'red is emergency-stopped (mia: "smoke"). Release it with `fleet resume red --estops`.' in refused.words
     assert desk.ask(Stop(), SCRIPT).status is QUEUED
     assert desk.ask(Resume(("e2",)), PERSON).reason is Reason.BAD_VALUE
-    assert "still in force: e-stop e1" in desk.ask(Resume(), PERSON).words, "without ids it ends the hold"
+    still = desk.ask(Resume(), PERSON)
+    assert (still.status, still.reason) == (SENT, Reason.ESTOPPED), "without ids it ends the hold"
+    assert still.words == 'still emergency-stopped by mia ("smoke"). Release it with `fleet resume red --estops`'
     assert desk.control.safety.hold is None
     assert desk.ask(Resume(("e1",)), SCRIPT).status is SENT
     assert desk.logs[-1].code == "estop_ended"
@@ -71,9 +73,21 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
 def test_the_hold_outlives_the_e_stop(desk: Workbench) -> None:
     desk.ask(EmergencyStop("smoke"), COORDINATOR, identity="e1")
     desk.run(5.0)
-    assert "on hold (by plan)" in desk.ask(Resume(("e1",)), PERSON).words
+    assert desk.ask(Resume(("e1",)), PERSON).words == "e-stop released; still on hold by plan: `fleet resume red`"
     assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
     assert desk.ask(FORWARD, PERSON).status is QUEUED
+
+
+def test_several_e_stops_in_force_are_named_by_their_ids(desk: Workbench) -> None:
+    desk.ask(EmergencyStop("smoke"), PERSON, identity="e1")
+    desk.ask(EmergencyStop(), BOB, identity="e2")
+    desk.ask(EmergencyStop(fleet_wide=True), BOB, identity="e3")
+    released = desk.ask(Resume(("e2",)), PERSON).words
+    assert released == (
+        'e-stop released; still emergency-stopped by mia ("smoke") [e1], by bob [e3]. '
+        "Release them with `fleet resume red --estops`"
+    )
+    assert desk.ask(Resume(("e1", "e3")), PERSON).words.startswith("2 e-stops released; still on hold by mia")
 
 
 def test_an_e_stop_of_a_car_out_of_reach_is_latched_all_the_same(desk: Workbench) -> None:
@@ -81,8 +95,8 @@ def test_an_e_stop_of_a_car_out_of_reach_is_latched_all_the_same(desk: Workbench
     answer = desk.ask(EmergencyStop(), PERSON, identity="e1")
     assert (answer.status, answer.reason) == (REJECTED, Reason.LINK_DOWN)
     assert answer.words == (
-        "NOT STOPPED: red is unreachable (unplugged). If it was driving, it still is: go to the car. "
-        "It is stopped when its link is back. (e-stop e1 lasts until `fleet resume red --estops`)"
+        "NOT STOPPED: red is unreachable. If it was driving, it still is: go to the car. "
+        "It is emergency-stopped when its link is back."
     )
     desk.control.link_up(desk.now)
     desk.run(10.0)

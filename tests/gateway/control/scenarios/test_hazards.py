@@ -354,9 +354,7 @@ def pi_hang_up(pair: Pair) -> None:
     assert cut_off.control.model.motors == "unknown"
     answer = cut_off.ask(Stop(), verb="stop")
     assert answer.reason is Reason.LINK_DOWN
-    assert answer.words.startswith(
-        "NOT STOPPED: red is unreachable (connection refused). If it was driving, it still is"
-    )
+    assert answer.words.startswith("NOT STOPPED: red is unreachable. If it was driving, it still is")
 
 
 @ours("light 1 cycles; lights 5..8 are not known")
