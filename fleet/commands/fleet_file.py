@@ -9,7 +9,7 @@ from typing import Final
 import click
 
 from fleet.commands.options import cli_errors
-from fleet.commands.params import Duration, Number
+from fleet.commands.params import Choice, Duration, Number
 from fleet.fleetfile.fleet_file import FleetFile, default_color, parse_fleet, read_fleet
 from fleet.fleetfile.models import FileEntry, validate_car_name, validate_color, validate_link, validate_platform
 from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, format_new_plan, scan
@@ -60,7 +60,7 @@ def print_errors(error: BadFile, *, as_json: bool = False) -> None:
     "schema",
     epilog="\b\nexamples:\n  fleet schema fleet > fleet.schema.json\n  fleet schema plan\n  fleet schema world",
 )
-@click.argument("kind", type=click.Choice(SCHEMAS), default="fleet", metavar="fleet|plan|world")
+@click.argument("kind", type=Choice("kind of file", SCHEMAS), default="fleet", metavar="fleet|plan|world")
 def print_schema(kind: str) -> None:
     """Print the JSON Schema of fleet files, plans or worlds. Editors complete and check files with it."""
     click.echo(schema_text(kind), nl=False)
@@ -142,7 +142,7 @@ def init(
     where = "" if out == DEFAULT_FILE else f" {out}"
     click.echo(f"  fleet check{where}\n  fleet up{where}")
     if simulated:
-        click.echo(f"  fleet up{where} --plan {plan}")
+        click.echo(f"or, with the plan:\n  fleet up{where} --plan {plan}")
 
 
 def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:

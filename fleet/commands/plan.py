@@ -18,7 +18,6 @@ from fleet.commands.options import WrongFile, bus_options, json_option, with_cli
 from schemas import keys, messages, topics
 from schemas.bus import Failure
 
-NO_PLAN: Final = "No plan is running. `fleet up --plan FILE` starts one."
 _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.commands.plan_try:try_plan"}
 """Subcommands whose imports would slow down all others."""
 
@@ -38,7 +37,12 @@ def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}
     if not found and not client.bus.tokens(f"{client.name}/{keys.COORDINATOR}"):
-        raise click.ClickException(NO_PLAN)
+        stopped = {car: words for car in subjects if (words := _describe_stop(client, car))}
+        if not subjects or len(stopped) < len(subjects):
+            raise click.ClickException(_no_plan(client))
+        for car, words in stopped.items():
+            click.echo(json.dumps({"car": car, "words": words}) if as_json else f"{car}: {words}. No plan is running.")
+        return
     for subject in subjects or sorted(found):
         reading = found.get(subject) or found.get(f"role {subject}")
         if reading is None:
@@ -46,6 +50,25 @@ def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
             near = did_you_mean(subject, names) or f"There are decisions about: {', '.join(names) or 'nothing yet'}."
             raise click.ClickException(f"No decision about {subject}. {near}")
         click.echo(json.dumps(reading.as_dict()) if as_json else _describe(reading))
+
+
+def _no_plan(client: Fleet) -> str:
+    """Say that no plan is running, and what starts one. `fleet up` does only if the fleet is not up already."""
+    is_up = bool(client.bus.tokens(keys.car_token(client.name, keys.SUPERVISOR)))
+    other = "" if is_up else ", or a fleet with one: `fleet up --plan FILE`"
+    return f"No plan is running. Start one: `fleet plan run FILE`{other}."
+
+
+def _describe_stop(client: Fleet, car: str) -> str:
+    """Say who has stopped a car, and what ends that. Empty if nobody has."""
+    for reading in client.get(f"{car}/state/safety") if keys.is_name(car) else ():
+        safety = reading.value
+        if safety.estops:
+            by = ", ".join(f"{each.by}{f' ({each.why})' if each.why else ''}" for each in safety.estops)
+            return f"e-stopped by {by}; `fleet resume {car} --estops` releases it"
+        if safety.HasField("hold"):
+            return f"on hold by {safety.hold.by}; `fleet resume {car}` ends it"
+    return ""
 
 
 def _describe(reading: Reading) -> str:
@@ -119,7 +142,7 @@ def show(client: Fleet, *, as_json: bool) -> None:
     place = f"{client.name}/{keys.COORDINATOR}"
     found = {reading.key.rpartition("/")[2]: reading.value for reading in client.get(f"{place}/*")}
     if "plan" not in found:
-        raise click.ClickException(NO_PLAN)
+        raise click.ClickException(_no_plan(client))
     in_force, assignment = found["plan"], found.get("assignment")
     plan = parse(in_force.text, "the plan in force")
     cars = {role.name: list(role.cars) for role in assignment.roles} if assignment else {}
@@ -195,4 +218,4 @@ def _request(client: Fleet, verb: str, command: Any, *, as_json: bool, source: s
         else:
             raise (WrongFile if result.reason == "bad_value" else click.ClickException)(result.words)
         raise SystemExit(0 if ok else 2 if result.reason == "bad_value" else 1)
-    raise click.ClickException(NO_PLAN)
+    raise click.ClickException(_no_plan(client))

@@ -27,7 +27,7 @@ from fleet.policy.decision import LEFT_ALONE, Decision
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
-from fleet.policy.requests import PlanRequest, RequestRefused, on_request
+from fleet.policy.requests import EVENTS, PlanRequest, RequestRefused, on_request
 from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
 from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to_persisted
 from schemas import keys, messages, topics
@@ -61,12 +61,6 @@ _LEVEL_INFO, _LEVEL_ERROR = 2, 4  # foxglove.Log.Level
 PLAN_VERB: Final = "plan"
 """`<fleet>/@coordinator/@cmd/plan` takes another plan: a fleet.v1.Plan, or the plan's text as it is."""
 _ANONYMOUS: Final = "anonymous"
-_EVENTS: Final = {
-    PlanRequest.RESTART: ("plan_restarted", "restarted the plan"),
-    PlanRequest.NEXT: ("plan_next", "went on to the next phase"),
-    PlanRequest.STOP: ("plan_stopped", "stopped the plan"),
-}
-"""Code and words of the event for each request, whose sender stands before the words."""
 _PLAN_SET: Final = "plan_set"
 _UNSAVED: Final = "It cannot be saved: a restarted coordinator will not know it."
 
@@ -267,7 +261,7 @@ class Coordinator:
             self._drop_decisions()
         self._memory = memory
         saved = self._save(memory)
-        code, did = _EVENTS[request]
+        code, did = EVENTS[request]
         self._log(_LEVEL_INFO, code, f"{by} {did} ({words})")
         self._reply_result(query, pb.Result(status="sent", words=words if saved else f"{words}. {_UNSAVED}"))
 

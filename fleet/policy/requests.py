@@ -19,6 +19,14 @@ class PlanRequest(StrEnum):
     STOP = "stop"
 
 
+EVENTS: Final = {
+    PlanRequest.RESTART: ("plan_restarted", "restarted the plan"),
+    PlanRequest.NEXT: ("plan_next", "went on to the next phase"),
+    PlanRequest.STOP: ("plan_stopped", "stopped the plan"),
+}
+"""Code and words of the event for each request, whose sender stands before the words."""
+
+
 class RequestRefused(Exception):
     """The request cannot be carried out. The text gives the reason and, in brackets, its code."""
 

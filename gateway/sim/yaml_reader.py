@@ -10,6 +10,8 @@ from typing import Final
 import yaml
 from yamlcore import CoreLoader  # type: ignore[import-untyped]  # has no stubs
 
+from schemas.yaml_document.messages import suggest
+
 MAX_WORLD_BYTES: Final = 64 * 1024
 MAX_WORLD_DEPTH: Final = 8
 _MAX_FAULTS: Final = 50
@@ -79,7 +81,7 @@ class MarkedYaml:
             if key.value in known:
                 found[key.value] = value
             else:
-                self.complain(key, _below(field, key.value), f"is not known here: use {', '.join(known)}")
+                self.complain(key, _below(field, key.value), f"there is no such field. {suggest(key.value, known)}")
         if isinstance(node, yaml.MappingNode):
             for name, needed in known.items():
                 if needed and name not in found:

@@ -81,6 +81,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("drive red forward --for 1d", '--for: "1d" is not a duration: write it as 500ms, 2s, 1m30s or 1h.'),
         ("drive red forward --for nan", '"nan" is not a duration'),
         ("mode red fast", '"fast" is not a mode. Choose from: manual, remote_control, '),
+        ("schema plna", '"plna" is not a kind of file. Did you mean plan?'),
         ("mode red track", '"track" is not a mode. Did you mean tracking?'),
         ("led red blu", '"blu" is not a color. Did you mean blue?'),
         ("led red #ff00", '"#ff00" is not a color. Choose from: red, green, '),

@@ -6,7 +6,9 @@ against cars of any platform.
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from enum import StrEnum
+from typing import Final
 
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.policy.debounce import HYSTERESIS_S
@@ -17,6 +19,10 @@ from fleet.policy.snapshot import CarSnapshot, topic_of
 from gateway.protocol.enums import Mode
 from schemas.yaml_document.document import BadFile, Problem
 from schemas.yaml_document.messages import suggest
+
+_WORDS_FOR_CARS: Final = (THIS_CAR, OTHER_CARS, ALL_CARS)
+_NEAR_MISS: Final = 0.8
+"""Minimum likeness of a name to one of these words that is taken for a misspelling of it."""
 
 
 class Severity(StrEnum):
@@ -72,13 +78,16 @@ def find_faults(
     among `present` (on the bus; None: not known) is a warning, as it may still come.
     """
     findings = check(plan, cars)
+    reported = {each.part for each in findings}
     warnings = [each for each in findings if each.severity is Severity.WARNING]
     if cars is None and present is not None:
         listed = ", ".join(sorted(present)) or "no cars"
         warnings += [
             _placed(plan, PlanFault(Severity.WARNING, f"car {car}", f"it is not connected now. Connected: {listed}."))
             for car in sorted(_named(plan) - set(present))
+            if f"car {car}" not in reported
         ]
+        warnings.sort(key=_position)
     return Faults(tuple(each for each in findings if each.severity is Severity.ERROR), tuple(warnings))
 
 
@@ -87,8 +96,13 @@ def _named(plan: Plan) -> set[str]:
 
 
 def check(plan: Plan, fleet: Mapping[str, CarSnapshot] | None = None) -> tuple[PlanFault, ...]:
-    """Return the faults of a plan; `fleet`: the cars of the fleet file, None: there is none."""
-    return tuple(_placed(plan, fault) for fault in _Check(plan, fleet).findings())
+    """Return the faults of a plan by line; `fleet`: the cars of the fleet file, None: there is none."""
+    found = dict.fromkeys(_placed(plan, fault) for fault in _Check(plan, fleet).findings())
+    return tuple(sorted(found, key=_position))
+
+
+def _position(fault: PlanFault) -> tuple[int, int]:
+    return fault.line, fault.column
 
 
 def _placed(plan: Plan, fault: PlanFault) -> PlanFault:
@@ -101,6 +115,8 @@ class _Check:
         self._plan = plan
         self._named = _named(plan)
         self._known = fleet
+        self._unknown = set() if fleet is None else self._named - set(fleet)
+        """Cars of the plan that the fleet file does not have: reported once, not for each part that names them."""
         self._reach = ModeReachability(plan, fleet, self._named)
 
     def findings(self) -> Iterator[PlanFault]:
@@ -111,10 +127,15 @@ class _Check:
         yield from self._phases()
 
     def _unknown_cars(self) -> Iterator[PlanFault]:
+        targets = {effect.who for rule in self._plan.rules for effect in rule.effects}
         for car in sorted(self._named):
-            if self._known is not None and car not in self._known:
-                words = f"the fleet file has no such car. {suggest(car, sorted(self._known))}"
-                yield PlanFault(Severity.ERROR, f"car {car}", words)
+            if self._known is not None and car in self._unknown:
+                words = [*_WORDS_FOR_CARS, *sorted(self._known)] if car in targets else sorted(self._known)
+                yield PlanFault(Severity.ERROR, f"car {car}", f"the fleet file has no such car. {suggest(car, words)}")
+            elif self._known is None and car in targets:
+                for word in get_close_matches(car, _WORDS_FOR_CARS, 1, _NEAR_MISS):
+                    wrong = f"it seems to be misspelled. Did you mean {word}?"
+                    yield PlanFault(Severity.ERROR, f"car {car}", wrong)
 
     def _unknown_roles(self) -> Iterator[PlanFault]:
         for car, known in sorted((self._known or {}).items()):
@@ -132,12 +153,13 @@ class _Check:
                 yield PlanFault(Severity.ERROR, part, f"no car can fill it: {why}")
                 continue
             can_have = [car for car in self._reach.cars if self._reach.can_have(car, role)]
-            if not can_have:
+            unknown = self._unknown.intersection(role.cars or ())
+            if not can_have and not unknown:
                 whys = "; ".join(f"{car}: {self._reach.why_not(car, role)}" for car in list(self._reach.cars)[:4])
                 yield PlanFault(Severity.ERROR, part, f"no car can fill it{f': {whys}' if whys else ''}")
             elif (
                 role.count is not None
-                and len(can_have) < role.count
+                and len(can_have) + len(unknown) < role.count
                 and (self._known is not None or role.cars is not None)
             ):
                 words = f"it wants {role.count} cars, and only {', '.join(sorted(can_have))} can have it"
@@ -168,7 +190,8 @@ class _Check:
             out_of_phase = [*self._out_of_phase(rule)]
             yield from out_of_phase
             for condition, word in ((rule.when, "fires"), (rule.until, "ends by `until`")):
-                assess = Outlook() if condition is None or out_of_phase else self._reach.assess(condition, rule.during)
+                skip = condition is None or out_of_phase or condition.car in self._unknown
+                assess = Outlook() if skip or condition is None else self._reach.assess(condition, rule.during)
                 if assess.never:
                     yield PlanFault(Severity.ERROR, rule.name, f"it never {word}. {assess.never}")
                 elif assess.only:
@@ -292,6 +315,11 @@ class _Check:
     def _endless(self, phase: PlanPhase) -> Iterator[PlanFault]:
         """Report a phase that its condition does not end."""
         if phase.until is None:
+            if phase.next is not None and phase.timeout_s is None and not self._jumps_out(phase):
+                words = "only `fleet plan next` ends it: it has neither until nor timeout_s."
+                yield PlanFault(Severity.WARNING, f"phase {phase.name}", words)
+            return
+        if phase.until.car in self._unknown:
             return
         assess, jumps = self._reach.assess(phase.until, {phase.name}), self._jumps_out(phase)
         why = self._no_role(phase) or assess.never

@@ -99,7 +99,6 @@ class _PlanParser:
         self._check_stand_ins()
         rules = tuple(self._rule(index, each) for index, each in enumerate(entry.rules))
         phases = {name: self._phase(name, each) for name, each in entry.phases.items()}
-        self._check_circles()
         return Plan(
             MappingProxyType(roles),
             MappingProxyType(self._fixed),
@@ -208,8 +207,6 @@ class _PlanParser:
         for field in ("next", "on_timeout"):
             if (phase := getattr(entry, field)) is not None:
                 self._check_phase((*where, field), phase)
-        if entry.next is not None and entry.until is None and entry.timeout_s is None and not self._find_circle(name):
-            self._report((*where, "next"), f"nothing ends {name}: give it until, or timeout_s", unless=where)
         if entry.until is not None and entry.next is None:
             self._report((*where, "until"), "it needs next: the phase that begins then", unless=where)
         if entry.timeout_s is not None and entry.on_timeout is None and entry.next is None:
@@ -225,27 +222,6 @@ class _PlanParser:
             entry.next,
             entry.on_timeout if entry.on_timeout is not None else entry.next,
         )
-
-    def _find_circle(self, name: str) -> list[str]:
-        """Return the way from a phase back to it through phases without an end; empty if there is none."""
-        way = [name]
-        while (entry := self._entry.phases.get(way[-1])) is not None:
-            if entry.next is None or entry.until is not None or entry.timeout_s is not None:
-                return []
-            way.append(entry.next)
-            if entry.next in way[:-1]:
-                return way if entry.next == name else []
-        return []
-
-    def _check_circles(self) -> None:
-        reported: set[str] = set()
-        for name in self._entry.phases:
-            way = self._find_circle(name)
-            if way and name not in reported:
-                reported |= set(way)
-                circle = " -> ".join(way)
-                words = f"a cycle of phases without a condition or a time-out: {circle}; give one until or timeout_s"
-                self._report(("phases", name), words, unless=("phases", name))
 
     def _condition(self, where: Where, entry: Condition) -> PlanCondition:
         if isinstance(entry, str):

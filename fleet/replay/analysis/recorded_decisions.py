@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fleet.policy.decision import DecisionKind
+from fleet.policy.requests import EVENTS, PlanRequest
 from fleet.recording.reading.session import Recorded
 from schemas import keys, messages
 from schemas.topics import TOPICS
 
-DECISION_KEYS: Final = tuple(f"*/{keys.COORDINATOR}/{name}" for name in ("plan", "assignment", "decision"))
+DECISION_KEYS: Final = tuple(f"*/{keys.COORDINATOR}/{name}" for name in ("plan", "assignment", "decision", "log"))
 STATE_KEYS: Final = ("*/*/state/*",)
 MAX_STATE_PAUSE_NS: Final = 2_500_000_000
 """Minimum pause of states that means a gone gateway."""
@@ -38,8 +39,13 @@ class RecordedDecision:
         return self.kind, self.decided, "" if self.kind == DecisionKind.ALONE else self.role
 
     def __str__(self) -> str:
-        role = f" (role {self.role})" if self.role and self.kind != "role" else ""
-        return f"{self.kind} {self.decided}{role}"
+        match self.kind:
+            case DecisionKind.VACANT | DecisionKind.FILLED:
+                return f"cars: {self.decided.removesuffix(' of all')}"
+            case DecisionKind.OUT | DecisionKind.PHASE | DecisionKind.ALONE:
+                return self.decided
+            case _:
+                return f"{self.decided} ({f'role {self.role}' if self.role else 'no role'})"
 
 
 Timeline = dict[str, list[RecordedDecision]]
@@ -51,6 +57,18 @@ def add(timeline: Timeline, subject: str, decision: RecordedDecision) -> None:
     before = timeline.setdefault(subject, [])
     if not before or before[-1].what != decision.what:
         before.append(decision)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRequest:
+    """A request of a person that the coordinator carried out."""
+
+    at_ns: int
+    request: PlanRequest
+    by: str
+
+
+_REQUESTS: Final = {f"{keys.COORDINATOR} {code}": (request, words) for request, (code, words) in EVENTS.items()}
 
 
 @dataclass(slots=True)
@@ -68,6 +86,11 @@ class CoordinatorRun:
     roles: Mapping[str, str] = field(default_factory=dict)
     """First role of each car."""
     phase: str = ""
+    stopped_by: str = ""
+    """Sender who had stopped the plan before it started."""
+    requests: list[RecordedRequest] = field(default_factory=list)
+    assigned: bool = False
+    """True once it has published its roles."""
 
 
 def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
@@ -79,6 +102,12 @@ def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
         if key is None or value is None:
             continue
         at_ns = item.recorded_ns
+        if key.topic == "log":  # events do not name their coordinator: it is the last one that started
+            run = next((each for each in reversed(found.values()) if each.fleet == key.fleet), None)
+            if run is not None and value.name in _REQUESTS:
+                request, words = _REQUESTS[value.name]
+                run.requests.append(RecordedRequest(at_ns, request, value.message.partition(f" {words}")[0]))
+            continue
         run = found.get((key.fleet, value.boot_id))
         if run is None:
             # A coordinator publishes its plan first, and repeats everything every ten seconds.
@@ -90,6 +119,8 @@ def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
                 if not run.plans or run.plans[-1][1] != value.text:
                     run.plans.append((at_ns, value.text))
             case "assignment":
+                if not run.assigned:
+                    run.assigned, run.stopped_by = True, value.stopped_by
                 if not run.roles:
                     run.roles = {car: role.name for role in value.roles for car in role.cars}
                     run.phase = value.phase

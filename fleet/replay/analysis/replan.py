@@ -5,6 +5,7 @@ knows: its liveliness tokens (see recorded_decisions.py), the exact times of its
 ten times a second), and the order of messages that arrived almost at once.
 """
 
+import contextlib
 import heapq
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from fleet.coordinator.observer import FleetObserver
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
+from fleet.policy.requests import RequestRefused, on_request
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, Refusal, topic_of
 from fleet.policy.state import TAKEN_OVER, HeldRole, PersistedPolicy, PolicyState, carry_over, restore, to_persisted
 from fleet.recording.reading.session import Recorded
@@ -21,6 +23,7 @@ from fleet.replay.analysis.recorded_decisions import (
     CoordinatorRun,
     PresenceToken,
     RecordedDecision,
+    RecordedRequest,
     Timeline,
     add,
     decode_message,
@@ -80,7 +83,7 @@ class Replanning:
         """Process all messages of `keys_for`, in order, and return the state to persist for the next coordinator."""
         changes = [_NewPlan(at_ns, plan) for at_ns, plan in self.plans[1:]]
         new_ns: int | None = None
-        items: Iterable[Any] = heapq.merge(_ordered(recorded), tokens, changes, key=_time)
+        items: Iterable[Any] = heapq.merge(_ordered(recorded), tokens, changes, self.run.requests, key=_time)
         for item in items:
             at_ns = _time(item)
             if at_ns > self.run.end_ns:
@@ -97,12 +100,20 @@ class Replanning:
                     if self._state is not None:
                         self._state = carry_over(self._state, self._plan, item.plan)
                     self._plan = item.plan
+                case RecordedRequest():
+                    self._request(item)
                 case _:
                     self._take(item)
         self._advance(self.run.end_ns)
         self._step(self.run.end_ns)
         assert self._state is not None
         return to_persisted(self._plan, self._state, self.run.end_ns / 1e9, self.run.end_ns / 1e9)
+
+    def _request(self, item: RecordedRequest) -> None:
+        """Carry out what a person wanted of the recorded plan, if this plan can."""
+        if self._state is not None:
+            with contextlib.suppress(RequestRefused):
+                self._state, _ = on_request(item.request, self._plan, self._state, item.by, item.at_ns / 1e9)
 
     def _take(self, item: Recorded) -> None:
         if item.key.endswith("/event/command"):
@@ -145,9 +156,15 @@ class Replanning:
         if not self.run.whole or any(not snapshot.cars.get(car, UNKNOWN_CAR).mode for car in known):
             # The coordinator started, or knew its cars, before the recording: its first roles are from then.
             return restore(
-                self._plan, snapshot, PersistedPolicy(self._plan.version, known, self.run.phase, now), now, now
+                self._plan,
+                snapshot,
+                PersistedPolicy(self._plan.version, known, self.run.phase, now, stopped_by=self.run.stopped_by),
+                now,
+                now,
             )
-        state = restore(self._plan, snapshot, self.persisted, now, now)
+        # A coordinator that a person ends forgets that its plan was stopped; one that is killed does not.
+        persisted = replace(self.persisted, stopped_by=self.run.stopped_by)
+        state = restore(self._plan, snapshot, persisted, now, now)
         # Roles from before the session: its first decisions name them.
         initial = {
             car: HeldRole(known[car], TAKEN_OVER)
@@ -181,5 +198,5 @@ def _ordered(recorded: Iterable[Recorded]) -> Iterable[Recorded]:
             yield message
 
 
-def _time(item: Recorded | PresenceToken | _NewPlan) -> int:
+def _time(item: Recorded | PresenceToken | RecordedRequest | _NewPlan) -> int:
     return item.recorded_ns if isinstance(item, Recorded) else item.at_ns

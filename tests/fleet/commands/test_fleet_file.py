@@ -261,7 +261,12 @@ def test_simulated_cars_are_written_with_a_plan_that_uses_all(command: Command, 
     done = command("init", "--sim", str(count))
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Wrote fleet.yaml and plan.yaml with red")
-    assert done.stdout.splitlines()[1:] == ["  fleet check", "  fleet up", "  fleet up --plan plan.yaml"]
+    assert done.stdout.splitlines()[1:] == [
+        "  fleet check",
+        "  fleet up",
+        "or, with the plan:",
+        "  fleet up --plan plan.yaml",
+    ]
     fleet = read_fleet(tmp_path / "fleet.yaml")
     assert {car.link for car in fleet.cars.values()} == {"sim"}
     assert (len(fleet.cars), fleet.plan) == (count, None)

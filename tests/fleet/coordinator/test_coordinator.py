@@ -272,7 +272,7 @@ def test_a_person_goes_on_to_the_next_phase_stops_the_plan_and_restarts_it(cars:
     codes = [each.name.removeprefix("@coordinator ") for each in events]
     assert codes == ["plan_next", "plan_stopped", "plan_restarted", "plan_set"]
     assert {each.message.split()[0] for each in events} == {default_sender()}
-    assert plan("show").stderr == "fleet: No plan is running. `fleet up --plan FILE` starts one.\n"
+    assert plan("show").stderr.startswith("fleet: No plan is running. Start one: `fleet plan run FILE`, or")
 
 
 LISTED = """

@@ -135,7 +135,7 @@ FAULTS = [
     ("room: {width_m: 6, depth_m: 0}", ["1:29: error: room.depth_m: '0' is not allowed: a number from 0.02 to 100"]),
     ("room: {width_m: 6}", ["1:7: error: room.depth_m: is missing"]),
     ("room: 5", ["1:7: error: room: '5' is not allowed: write fields"]),
-    ("rooms: {}", ["1:1: error: rooms: is not known here: use room, walls"]),
+    ("rooms: {}", ["1:1: error: rooms: there is no such field. Did you mean room?"]),
     ("cars_meet: yes", ["1:12: error: cars_meet: 'yes' is not allowed: true or false"]),
     ("cars_meet: true\ncars_meet: false", ["2:1: error: cars_meet: is given twice, first in line 1"]),
     (
@@ -323,7 +323,11 @@ def test_a_good_file_with_something_changed_is_a_world_or_a_list_of_faults(chanc
         ("nothing.yaml", None, "No such file or directory: write room, open or the path of a file"),
         ("bytes.yaml", b"room: \xff", "is no UTF-8"),
         pytest.param("large.yaml", b"\xff" * 2 * MAX_WORLD_BYTES, "has more than 64 KiB", id="large.yaml"),
-        ("faulty.yaml", b"foo: 1\nbar: 2\n", "faulty.yaml:2:1: error: bar: is not known here"),
+        (
+            "faulty.yaml",
+            b"foo: 1\nbar: 2\n",
+            "faulty.yaml:2:1: error: bar: there is no such field. There are room, walls",
+        ),
         ("carried.yaml", b"lamps: {a: {carried_by: blue}}", "no car or thing 'blue' is simulated here: use red"),
     ],
 )

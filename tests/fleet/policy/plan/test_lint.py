@@ -35,7 +35,11 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
         ),
         ("roles: {x: {mode: tracking, given_by: rules}}", "role x", "no rule gives it to a car"),
         ("fixed: {purple: {mode: manual}}", "car purple", "the fleet file has no such car. There are green, pi, red."),
-        (SCOUT + "rules: [{when: {car: zed, is: light.left}, then: {who: red, mode: manual}}]", "rule 1", "no car zed"),
+        (
+            SCOUT + "rules: [{when: {car: zed, is: light.left}, then: {who: red, mode: manual}}]",
+            "car zed",
+            "the fleet file has no such car",
+        ),
         (
             SCOUT
             + "rules: [{when: {any_car: range.range_m < 1 and range.range_m > 2}, then: {who: red, mode: manual}}]",
@@ -157,6 +161,10 @@ def test_what_can_never_work_is_an_error(text: str, part: str, told: str) -> Non
         ),
         ("roles: {x: {mode: tracking}, y: {mode: manual}}\nphases: {p: {roles: [x]}}", "no phase has it"),
         (
+            SCOUT + "phases: {a: {next: b}, b: {}}",
+            "only `fleet plan next` ends it: it has neither until nor timeout_s.",
+        ),
+        (
             (
                 "roles: {patrol: {mode: obstacle_avoidance}, rest: {mode: manual}}\n"
                 "rules: [{when: battery_v < 7, then: {who: this_car, mode: manual}}]"
@@ -245,12 +253,10 @@ roles:
 def test_with_a_fleet_file_a_plan_that_can_never_work_is_refused_with_all_that_is_wrong() -> None:
     refusal = find_faults(BROKEN, FLEET).refusal("plan.yaml")
     assert [line.split(": ")[2] for line in refusal.splitlines()] == [
-        "car orange",
         "car purple",
-        "role patrol",
+        "car orange",
         "role ghost",
-        "role tracking",
-    ]
+    ], "by line, and a car that is missing once"
     assert all(line.startswith("plan.yaml:") for line in refusal.splitlines())
 
 
@@ -261,6 +267,20 @@ def test_without_one_a_named_car_that_is_not_there_is_a_warning() -> None:
     assert [str(each) for each in found.warnings] == ["car purple: it is not connected now. Connected: green, red."]
     assert found.refusal() == ""
     assert "role ghost: no car can fill it" in find_faults(BROKEN).refusal(), "what no car could do is refused anyway"
+
+
+def test_a_misspelled_word_for_cars_is_an_error_once() -> None:
+    plan = parse(SCOUT + "rules: [{when: line.left_outer, then: {who: this_cars, mode: manual}}]")
+    for cars in (None, FLEET):
+        (error,) = find_faults(plan, cars, {"red"}).errors
+        assert (error.part, error.line) == ("car this_cars", plan.places["car this_cars"][0])
+        assert error.words.endswith("Did you mean this_car?")
+    assert find_faults(plan, None, {"red"}).warnings == ()
+    named = parse(SCOUT + "rules: [{when: {car: rad, is: line.left_outer}, then: {who: rad, mode: manual}}]")
+    assert [str(each) for each in find_faults(named, FLEET).errors] == [
+        "car rad: the fleet file has no such car. Did you mean red?"
+    ]
+    assert find_faults(named).errors == ()
 
 
 def test_a_role_of_the_fleet_file_that_the_plan_does_not_have_is_told() -> None:

@@ -22,6 +22,8 @@ from fleet.replay.analysis.recorded_decisions import (
     differences,
     presence,
 )
+from schemas import messages
+from schemas.bus import Failure
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars
 from tests.fleet.replay.make_session import Made
@@ -36,12 +38,21 @@ rules:
   - name: spinning
     when: {car: green, is: motion.motion == 'spin_left'}
     then: {who: red, mode: light_seeking}
+phases: {first: {next: second}, second: {}}
 """
 OTHER = PLAN.replace("spin_left", "spin_right")
 
 
 def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(cli, [str(each) for each in arguments])
+
+
+def command(client: Fleet, verb: str) -> None:
+    payload = pb.PlanCommand(sender=client.sender, kind="person").SerializeToString()
+    encoding = messages.encoding_of("fleet.v1.PlanCommand")
+    key = f"fleet/@coordinator/@cmd/{verb}"
+    (answer,) = client.bus.query(key, payload=payload, encoding=encoding, timeout_s=10.0)
+    assert not isinstance(answer, Failure), answer
 
 
 def coordinator(cars: Cars, plan: Path) -> GatewayProcess:
@@ -65,6 +76,8 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
     first = coordinator(cars, plan)
     until(first, "red", "role")
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
+        command(client, "next")
+        until(first, "phase", "phase")
         drive = threading.Thread(target=lambda: client.car("green").drive("spin_left", 5.0))
         drive.start()  # for longer than what is no difference, also if the coordinator hears of it late
         until(first, "red", "rule")
@@ -83,6 +96,10 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
         first.wait()
         wait_for(lambda: not client.bus.tokens("fleet/@coordinator"), "its token is gone")
         second = coordinator(cars, plan)
+        until(second, "red", "role")
+        command(client, "stop")
+        until(second, "red", "alone")
+        command(client, "restart")
         until(second, "red", "role")
         assert client.car("red").stop().ok
         until(second, "red", "alone")
@@ -122,9 +139,21 @@ def test_another_plan_shows_where_and_why(recorded: Path, tmp_path: Path) -> Non
     assert "motion=spin_left" in first["then"]["readings"][0]
     assert (first["now"]["kind"], first["now"]["decided"]) == ("role", "tracking")
     told = run("plan", "try", recorded, plan).output
-    assert (
-        "  then: rule light_seeking (role track), because: rule spinning: green: motion.motion == 'spin_left'" in told
-    )
+    assert "  then: light_seeking (role track), because: rule spinning: green: motion.motion == 'spin_left'" in told
+
+
+@pytest.mark.parametrize(
+    ("kind", "decided", "words"),
+    [
+        ("alone", "left alone", "left alone"),
+        ("out", "not wanted", "not wanted"),
+        ("filled", "1 of all", "cars: 1"),
+        ("vacant", "0 of 1", "cars: 0 of 1"),
+        ("idle", "manual", "manual (no role)"),
+    ],
+)
+def test_a_state_is_shown_in_plain_words(kind: str, decided: str, words: str) -> None:
+    assert str(RecordedDecision(0, kind, decided, "")) == words
 
 
 def test_its_frames_are_decoded_as_they_were(recorded: Path) -> None:

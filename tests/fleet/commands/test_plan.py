@@ -1,0 +1,44 @@
+"""`fleet why` and `fleet plan` without a plan."""
+
+from pathlib import Path
+
+import zenoh
+from click.testing import CliRunner, Result
+
+from fleet.cli import cli
+from fleet.client.client import Fleet
+from schemas import keys
+from schemas.bus import reply_message, router_config
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.support.ports import free_endpoint
+
+
+def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
+    plan, endpoint = tmp_path / "plan.yaml", free_endpoint()
+    plan.write_text("roles: {line: {mode: tracking}}\n", encoding="utf-8")
+    safety = pb.Safety(car="red", hold=pb.Hold(by="ann"))
+
+    def run(*words: str) -> Result:
+        return CliRunner().invoke(cli, [*words, "--connect", endpoint])
+
+    with zenoh.open(router_config(endpoint)), Fleet(endpoint, kind="person") as client:
+
+        def answer(query: zenoh.Query) -> bool:
+            reply_message(query, "fleet/red/state/safety", safety, as_json=False)
+            return True
+
+        client.bus.queryable("fleet/red/state/safety", answer)
+        commands = (("plan", "set", str(plan)), ("plan", "show"), ("plan", "stop"), ("why",), ("why", "blue"))
+        for words in commands:
+            done = run(*words)
+            assert done.exit_code == 1
+            assert done.stderr == (
+                "Error: No plan is running. Start one: `fleet plan run FILE`, "
+                "or a fleet with one: `fleet up --plan FILE`.\n"
+            )
+        token = client.bus.token(keys.car_token("fleet", keys.SUPERVISOR))
+        for words in commands:
+            assert run(*words).stderr == "Error: No plan is running. Start one: `fleet plan run FILE`.\n", token
+        assert run("why", "red").stdout == "red: on hold by ann; `fleet resume red` ends it. No plan is running.\n"
+        safety.estops.add(id="1", by="bob", why="fire")
+        assert run("why", "red").stdout.startswith("red: e-stopped by bob (fire); `fleet resume red --estops` ")
