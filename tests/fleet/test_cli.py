@@ -343,6 +343,10 @@ def test_a_refusal_says_why(cars: Cars) -> None:
     done = run(cars.endpoint, "mode", "blue", "tracking")
     assert done.returncode == 1
     assert done.stderr.startswith("blue: refused: blue (raspberry_pi) has no mode tracking. It has: ")
+    arguments = ["drive", "red", "forward", "--for", "1h", "--connect", cars.endpoint]
+    too_long = CliRunner().invoke(cli.cli, arguments)
+    words = f"3600 s is longer than red may drive: at most {LONG_S:g} s (longest_drive_s in its fleet file)"
+    assert (too_long.exit_code, too_long.output) == (2, f"red: refused: drive: {words} [bad_value]\n")
 
 
 def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
