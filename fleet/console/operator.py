@@ -188,7 +188,7 @@ class ConsoleOperator:
                 return False, answer.words
             result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)
             return result.status == "sent", result.words
-        return False, "No plan is running. `fleet up --plan FILE` starts one."
+        return False, "No plan is running. Start one: `fleet plan run FILE`."
 
     async def check_plan(self, text: str) -> tuple[bool, str]:
         """Check a plan's text. Return whether it is free of faults, and the faults, one per line."""

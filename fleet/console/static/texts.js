@@ -171,7 +171,7 @@ export const t = {
   gateway: "What its gateway knows",
   freeze: "Freeze this view",
   plan: "Plan",
-  noPlan: "No plan is running. `fleet up --plan FILE` starts one.",
+  noPlan: "No plan is running. Start one: `fleet plan run FILE`.",
   coordinator: "Coordinator",
   planRuns: (version, by) => `Plan ${version}${by ? `, set by ${by}` : ""}: running.`,
   planStopped: (version, by) => `Plan ${version}: stopped by ${by}. It moves no car until you restart it.`,

@@ -293,7 +293,6 @@ def test_a_plan_that_can_never_work_is_put_in_force_neither_at_the_start_nor_ove
     told = (
         "1:9: error: car purple: the fleet file has no such car. There are blue, green, red.",
         "2:9: error: role ghost: no car can fill it",
-        "1:9: error: role tracking: no car can fill it",
     )
     refused = coordinator(cars, tmp_path / "never.yaml", NEVER, *listed)
     assert refused.wait() == 2
