@@ -522,11 +522,11 @@ def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(job: Up) -> None:
     (job.directory / "plan.yaml").write_text(bad)
     refused = job.fleet("reload")
     assert refused.returncode == 2
-    assert "plan.yaml:1:9: error: role follow: no car can fill it" in refused.stderr
+    assert "plan.yaml:1:41: error: car eve: the fleet file has no such car" in refused.stderr
     assert refused.stderr.endswith("\nNothing was changed.\n")
     second = fleet_command("up", str(job.directory / "fleet.yaml"), environment={})
     assert second.returncode == 2
-    assert "plan.yaml:1:9: error: role follow: no car can fill it" in second.stderr
+    assert "plan.yaml:1:41: error: car eve: the fleet file has no such car" in second.stderr
 
 
 @pytest.mark.parametrize(
