@@ -15,7 +15,7 @@ from typing import Any, Final, ParamSpec, Self, TypeVar
 from fleet.client import client
 from fleet.client import lease as leases
 from fleet.client.commands import CarCommands, CommandRequest
-from fleet.client.condition import KeyCondition
+from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.outcome import Outcome
 from fleet.client.reading import READING_QUEUE_LIMIT, Reading, ReadingFilter, reading_of
 from fleet.client.wait import ConditionWait
@@ -72,7 +72,7 @@ class Fleet:
 
     def car(self, name: str) -> "Car":
         """Return a car, whether or not it is on the bus."""
-        return Car(self, keys.check_name(name))
+        return Car(self, check_car(name))
 
     async def get(self, expression: str) -> list[Reading]:
         """Return the latest value of every matching key."""
@@ -88,7 +88,7 @@ class Fleet:
         Use it with `async with` if the fleet stays open longer. Otherwise it receives readings until the fleet is
         closed.
         """
-        written = self.sync.expression(expression)
+        written = check_key(self.sync.expression(expression))
         watch = Watch(None if when is None else KeyCondition.of(when, written).holds)
         watch.begin(self.sync.bus.subscribe(written, watch.hand_over).undeclare)
         self._watches.add(watch)

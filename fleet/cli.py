@@ -12,6 +12,7 @@ import click
 
 from fleet.commands.group import CommandGroup, connect_option, fleet_option
 from schemas.process import startup, stdio
+from schemas.suggestion import how_to_install
 
 COMMANDS: Final = {
     "Start here": {
@@ -101,10 +102,10 @@ COMMANDS: Final = {
 _FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (where, _) in section.items()}
 
 _EXTRAS: Final = {
-    **dict.fromkeys(("rerun", "rerun_cli", "numpy", "PIL"), "[view]"),
-    **dict.fromkeys(("pyarrow", "pandas", "matplotlib"), "[analysis]"),
-    **dict.fromkeys(("starlette", "uvicorn"), "[console]"),
-    "bleak": "[ble]",
+    **dict.fromkeys(("rerun", "rerun_cli", "numpy", "PIL"), "view"),
+    **dict.fromkeys(("pyarrow", "pandas", "matplotlib"), "analysis"),
+    **dict.fromkeys(("starlette", "uvicorn"), "console"),
+    "bleak": "ble",
 }
 """The extra that installs a module."""
 
@@ -185,8 +186,8 @@ def _missing(error: ModuleNotFoundError) -> str:
     module = (error.name or "").partition(".")[0]
     if module in ("", "fleet", "gateway", "schemas"):
         raise error
-    needed = f"zenoh-car-fleet{_EXTRAS.get(module, '')}"
-    return f"this command needs {module}, which is not installed. Type: pip install '{needed}'"
+    how = how_to_install(_EXTRAS[module]) if module in _EXTRAS else "pip install zenoh-car-fleet"
+    return f"this command needs {module}, which is not installed. Type: {how}"
 
 
 def _no_output(error: OSError) -> int:

@@ -26,6 +26,7 @@ from fleet.client.reading import Reading
 from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
+from schemas.suggestion import how_to_install
 
 DEFAULT_OUT: Final = Path("sessions")
 DEMO_CARS: Final = {"red": "arduino", "green": "arduino", "blue": "raspberry_pi"}
@@ -348,7 +349,7 @@ def _check_recording(run: Demo, session: Path) -> Counter[str]:
 def _replay(run: Demo, session: Path, recorded: Counter[str]) -> Path | None:
     """Export the recording to Rerun, and check that each key has the same number of messages."""
     if find_spec("rerun") is None:
-        run.say("no check of what Rerun shows: pip install 'zenoh-car-fleet[view]'")
+        run.say(f"no check of what Rerun shows: {how_to_install('view')}")
         return None
     from fleet.replay.rerun.export import rows
 

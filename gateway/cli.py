@@ -11,6 +11,7 @@ from typing import Final
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio
+from schemas.suggestion import did_you_mean
 
 COMMANDS: Final = {
     "sim": ("gateway.sim.cli", "simulated cars that behave like real ones, hazards included"),
@@ -41,6 +42,9 @@ def main() -> None:
     subparsers = {name: commands.add_parser(name, help=words) for name, (_, words) in COMMANDS.items()}
     called = sys.argv[1] if sys.argv[1:] else ""
     if called not in COMMANDS:
+        near = did_you_mean(called, ["run", *COMMANDS])
+        if called != "run" and near:
+            sys.exit(_failed(f'There is no command "{called}". {near}', 2))
         sys.exit(_run(_parse_arguments(parser)))
     command = importlib.import_module(COMMANDS[called][0])
     command.add_arguments(subparsers[called])
@@ -83,7 +87,7 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         "--link",
         required=True,
         help="/dev/ttyUSB0, serial://?vid=1a86&serial=ABC, tcp://host:8888, ble://ADDRESS or ble://name=BT04 "
-        "(`gateway scan` shows them)",
+        "(`fleet scan` shows them)",
     )
     run.add_argument(
         "--platform", default="auto", help="arduino, stm32, raspberry_pi, unknown; +arm, +imu (default auto: found out)"

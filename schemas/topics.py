@@ -7,6 +7,8 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Final
 
+from schemas.suggestion import nearest
+
 PROTOBUF: Final = "application/protobuf"
 HISTORY: Final = 1500  # docs/reference/keys.md#topics: one minute of the fastest readings
 # A hub or a recorder is back after two or three seconds.
@@ -284,3 +286,16 @@ def of_key(key: str) -> Topic | None:
     if rest.startswith("@"):
         return TOPICS.get(rest)
     return TOPICS.get(rest.partition("/")[2])
+
+
+def likely_name(name: str) -> str | None:
+    """Return the topic that was probably meant by a wrong name: `sensor/rang` is sensor/range."""
+    family, _, last = name.rpartition("/")
+    # The last part decides: with the family, any two topics of one family would be alike.
+    there = sorted(TOPICS, key=lambda each: (each.rpartition("/")[0] != family, each.startswith("@")))
+    parts = [each.rpartition("/")[2] for each in there]
+    if last == "*" or (not family and last not in parts):
+        near = nearest(family or last, [each.family for each in CAR_TOPICS])
+        return f"{near}/*" if near else None
+    near = nearest(last, parts)
+    return there[parts.index(near)] if near else None

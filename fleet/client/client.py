@@ -28,7 +28,7 @@ from fleet.client.command_tracker import (
     SupervisedCars,
 )
 from fleet.client.commands import CarCommands, CommandRequest, estop_request, resume_request, stop_request
-from fleet.client.condition import KeyCondition
+from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.lease import Lease
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome
 from fleet.client.reading import Reading, Watch, reading_of
@@ -120,14 +120,17 @@ class Fleet:
 
     def car(self, name: str) -> "Car":
         """Return a car, whether or not it is on the bus. Raises keys.BadKey for a bad name."""
-        return Car(self, keys.check_name(name))
+        return Car(self, check_car(name))
 
     def expression(self, expression: str) -> str:
         """Expand a short form (`red`, `*/sensor/battery`) to a key expression. Raises keys.BadKey."""
         return canon(keys.expand(expression, self.name))
 
     def get(self, expression: str) -> list[Reading]:
-        """Return the latest value of every matching key, sorted by key. Takes short forms as the command line does."""
+        """Return the latest value of every matching key, sorted by key. Takes short forms as the command line does.
+
+        Raises keys.BadKey for a key that no topic has. A car that is not on the bus has no readings.
+        """
         return self._read(self.expression(expression), ANSWER_TIMEOUT_S)
 
     def history(self, expression: str, *, last: int | None = None, since_s: float | None = None) -> list[Reading]:
@@ -148,6 +151,7 @@ class Fleet:
         written = selector.partition("?")[0]
         if "@cmd" in written.split("/"):
             raise keys.BadKey(f"{written} is a command, not a reading: a query of it would be carried out")
+        check_key(written)
         found = []
         for answer in self.bus.query(selector, timeout_s=timeout_s, qos=Qos.STATE):
             if isinstance(answer, Failure):
@@ -165,7 +169,7 @@ class Fleet:
         when: a condition on the fields of one message, such as `range_m < 0.3`. Raises conditions.BadExpression.
         Use it with `with` if the fleet stays open longer. Otherwise it receives readings until the fleet is closed.
         """
-        written = self.expression(expression)
+        written = check_key(self.expression(expression))
         accept = None if when is None else KeyCondition.of(when, written).holds
 
         def subscribe(on_sample: Callable[[Sample], None]) -> Callable[[], object]:

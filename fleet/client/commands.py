@@ -60,6 +60,8 @@ class CommandRequest:
 
 def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) -> CommandRequest:
     """Request a motion for `duration_s` (at most 10 s, or the gateway's limit). wait: wait for the end of the drive."""
+    if not hasattr(duration_s, "__float__"):  # text, of a caller without a type checker
+        raise TypeError(f"duration {duration_s!r} is not allowed: write a number of seconds, such as 1.5")
     if not (math.isfinite(duration_s) and 0 < duration_s <= MAX_DRIVE_S):
         raise ValueError(
             f"duration {duration_s:g} s is not allowed: more than 0 and at most {MAX_DRIVE_S:g} s; "

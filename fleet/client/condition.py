@@ -14,16 +14,48 @@ from fleet.conditions.fields import LAST
 from fleet.conditions.satisfiability import explain_impossible
 from schemas import keys, messages, topics
 from schemas.bus import intersects
+from schemas.suggestion import nearest
 
 _PATTERNS: Final = {
     topic.name: f"*/{topic.name}" if topic.name.startswith("@") else f"*/*/{topic.name}"
     for topic in topics.TOPICS.values()
 }
+_SERVICES: Final = {topic.family for topic in topics.SERVICE_TOPICS}
 
 
 def topics_under(written: str) -> list[topics.Topic]:
     """Return the topics that a key expression can match, in the table's order."""
     return [topic for topic in topics.TOPICS.values() if intersects(written, _PATTERNS[topic.name])]
+
+
+def known_topics_under(written: str) -> list[topics.Topic]:
+    """Return the topics that a key expression can match. Raises BadKey with the likely key if there are none."""
+    if under := topics_under(written):
+        return under
+    short = written.partition("/")[2]
+    car, _, name = short.partition("/")
+    begin = f"{car}/"
+    if car.startswith("@"):
+        if car not in _SERVICES and not nearest(car, _SERVICES):
+            raise keys.BadKey(f"{short}: a key names one car, or all (*), but no group. Such as '*/{name}'.")
+        begin, name = "", short
+    likely = topics.likely_name(name)
+    near = f"Did you mean {begin}{likely}?" if likely else "`fleet keys` lists what is published."
+    raise keys.BadKey(f"No key {short}. {near}")
+
+
+def check_key(written: str) -> str:
+    """Return the key expression if it can match a topic or a command. Raises BadKey with the likely key."""
+    if "@cmd" not in written.split("/"):
+        known_topics_under(written)
+    return written
+
+
+def check_car(name: str) -> str:
+    """Return the name of one car. Raises BadKey."""
+    if name.startswith("@"):
+        raise keys.BadKey(f"{name} is a group, and this takes one car. `fleet.cars()` are the names of all cars.")
+    return keys.check_name(name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +68,7 @@ class KeyCondition:
     @classmethod
     def of(cls, text: str, written: str) -> Self:
         """Parse a condition on the messages under `written`. Raises BadExpression, or BadKey if it matches no topic."""
-        under = topics_under(written)
-        if not under:
-            there = ", ".join(topics.TOPICS)
-            raise keys.BadKey(
-                f"nothing is ever published under {written}, so no condition can hold; topics are {there}"
-            )
+        under = known_topics_under(written)
         names = {topic.message: fields_of(messages.message_class(topic.message)) for topic in under}
         found: dict[str, Expression] = {}
         never: list[str] = []

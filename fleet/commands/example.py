@@ -8,10 +8,11 @@ from typing import Any, Final
 import click
 from click.shell_completion import CompletionItem
 
-from fleet.commands.group import CommandGroup, did_you_mean
+from fleet.commands.group import CommandGroup
 from fleet.commands.options import json_option
 from fleet.commands.output import show_table
 from fleet.examples import EXAMPLES
+from schemas.suggestion import did_you_mean
 
 _KINDS: Final = ("programs", "fleets", "plans", "worlds")
 _SUFFIXES: Final = (".py", ".ipynb", ".yaml")

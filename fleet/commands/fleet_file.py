@@ -1,6 +1,7 @@
 """`fleet init, check, schema`: writes, checks and describes fleet files. Nothing here moves a car."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +16,7 @@ from fleet.fleetfile.models import FileEntry, validate_car_name, validate_color,
 from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, format_new_plan, scan
 from fleet.links import LINK_SIM
 from fleet.supervisor.spec import MAX_SIMULATED_CARS
+from schemas import keys
 from schemas.atomic_file import write_atomically
 from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, Entry, schema_of
@@ -186,8 +188,8 @@ def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:
         name = prompt_name(f"  its name ({_SKIP} to leave it out)", offered, {car.name for car in cars})
         if name == _SKIP:
             continue
-        platform = click.prompt("  its platform", default=each.platform, value_proc=_checked(validate_platform))
-        color = click.prompt("  its color", default=default_color(name, len(cars)), value_proc=_checked(validate_color))
+        platform = prompt("  its platform", default=each.platform, value_proc=_checked(validate_platform))
+        color = prompt("  its color", default=default_color(name, len(cars)), value_proc=_checked(validate_color))
         cars.append(NewCar(name, each.url, platform, color, each.words))
     return cars
 
@@ -199,10 +201,27 @@ def prompt_name(words: str, offered: str | None, taken: set[str]) -> str:
         name = name.strip()
         if name in taken:
             raise click.UsageError(f"{name} is another car's name already")
+        likely = re.sub("[^a-z0-9_]+", "-", name.lower()).strip("-_")
+        if name != likely and name != _SKIP and keys.is_name(likely):
+            raise click.UsageError(f'"{name}" is not a car name: use {keys.NAME_RULE}. Such as {likely}.')
         return name if name == _SKIP else _checked(validate_car_name)(name)
 
-    name: str = click.prompt(words, default=offered, value_proc=check_name)
+    name: str = prompt(words, default=offered, value_proc=check_name)
     return name
+
+
+def prompt(words: str, *, default: str | None, value_proc: Callable[[str], str]) -> str:
+    """Prompt until the answer is valid. Raises click's error if the input ends."""
+    while True:
+        try:
+            return value_proc(click.prompt(words, default=default, type=str))
+        except click.UsageError as error:
+            click.echo(f"fleet: {error.message}")
+        except click.Abort as error:
+            if isinstance(error.__context__, KeyboardInterrupt):
+                raise
+            click.echo()
+            raise click.ClickException("Nothing was written.") from None
 
 
 def _checked(rule: Callable[[str], str]) -> Callable[[str], str]:

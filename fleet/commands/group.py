@@ -1,7 +1,6 @@
 """What the group of commands and the commands share. Imports neither a command nor the bus, so that help is fast."""
 
-import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +8,9 @@ import click
 from click.core import ParameterSource
 
 from schemas.keys import DEFAULT_FLEET
+from schemas.suggestion import did_you_mean
 
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
-
-
-def did_you_mean(wrong: str, names: Iterable[str]) -> str:
-    """Return a question with the likely name. Empty if no name is near."""
-    near = difflib.get_close_matches(wrong.lower(), list(names), n=1)
-    return f"Did you mean {near[0]}?" if near else ""
 
 
 class CommandGroup(click.Group):

@@ -4,6 +4,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import IO, Any, Final
@@ -14,13 +15,13 @@ from fleet.client.client import Fleet, default_sender
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
 from fleet.commands.observe import show_cars
 from fleet.commands.options import bus_options, json_option, not_running
-from fleet.commands.params import complete_cars
 from fleet.supervisor.child import parse_log_line, runs_directory
 from fleet.supervisor.service import ask_service
 from fleet.supervisor.shutdown import NOT_STOPPED
 from schemas import keys, messages
 from schemas.bus import Bus, BusError, resolve_endpoint
 from schemas.process import signals, startup
+from schemas.suggestion import did_you_mean
 
 FLEET_DOWN_TIMEOUT_S: Final = 120.0
 """Timeout for the shutdown: the longest stop of a car, and a recorder that writes its buffers."""
@@ -131,8 +132,21 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     raise SystemExit(2 if answer.status == "rejected" else 0)
 
 
+def _complete_logs(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """Return the cars and services that have a log, of the last run here, for the shell."""
+    fleet = ctx.params.get("fleet") or ctx.find_root().params.get("fleet") or keys.DEFAULT_FLEET
+    connect = ctx.params.get("connect") or ctx.find_root().params.get("connect")
+    with suppress(click.ClickException, ValueError, OSError):
+        return [name for name in _logged(_last_run(connect, fleet)) if name.startswith(incomplete)]
+    return []
+
+
+def _logged(directory: Path) -> list[str]:
+    return sorted({each.name.partition(".")[0].lstrip("@") for each in directory.glob("*.log*")})
+
+
 @click.command(epilog="\b\nexamples:\n  fleet logs red\n  fleet logs recorder --follow\n  fleet logs red --json")
-@click.argument("name", metavar="CAR|SERVICE", shell_complete=complete_cars)
+@click.argument("name", metavar="CAR|SERVICE", shell_complete=_complete_logs)
 @click.option("-f", "--follow", is_flag=True, help="Go on until Ctrl-C.")
 @json_option
 @bus_options
@@ -145,8 +159,9 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: b
     found = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]
     path = next((each for each in found if each.parent == directory and _either(each)), None)
     if path is None:
-        there = sorted({each.name.partition(".")[0].lstrip("@") for each in directory.glob("*.log*")})
-        raise click.UsageError(f"there is no log of {name!r} in {directory}: there are {', '.join(there) or 'none'}")
+        there = _logged(directory)
+        near = did_you_mean(name, there) or f"There are: {', '.join(there) or 'none'}."
+        raise click.UsageError(f'There is no log of "{name}" in {directory}. {near}')
     with signals.sigterm_interrupts():
         try:
             for line in _lines(path, follow=follow):
@@ -164,6 +179,11 @@ def _directory(connect: str | None, fleet: str) -> Path:
                     return Path(each.directory)
     except BusError:
         pass  # nothing is up: the logs are files
+    return _last_run(connect, fleet)
+
+
+def _last_run(connect: str | None, fleet: str) -> Path:
+    """Return the log directory of the last run here."""
     place = runs_directory(fleet, resolve_endpoint(connect))
     # A run that was refused has no logs.
     newest = sorted(each for each in place.iterdir() if any(each.glob("*.log"))) if place.is_dir() else []

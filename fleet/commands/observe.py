@@ -10,18 +10,20 @@ import click
 
 from fleet.client import history
 from fleet.client.client import Fleet
-from fleet.client.condition import KeyCondition, topics_under
+from fleet.client.condition import KeyCondition, check_key, topics_under
 from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
 from fleet.client.reading import Reading, Watch
 from fleet.client.wait import NotInTime
-from fleet.commands.group import did_you_mean
 from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.output import json_text, line, show_table
 from fleet.commands.params import (
     Duration,
     Number,
     any_cars_argument,
-    describe_available,
+    complete_car,
+    complete_cars,
+    describe_missing,
+    no_cars,
     resolve_cars,
     warn_if_missing,
     written_out,
@@ -30,6 +32,7 @@ from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
 from schemas.bus import Sample, intersects
+from schemas.suggestion import did_you_mean
 
 CAR_COLUMNS: Final = ("car", "platform", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
 OPTIONAL_CAR_COLUMNS: Final = ("platform", "verdict", "driver", "motion")
@@ -61,13 +64,13 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
         key = keys.parse(reading.key)
         if key is not None:
             latest.setdefault(key.car, {})[key.topic] = reading
+    if not latest:
+        raise no_cars(client)
     if missing := [car for car in only if car not in latest]:
-        there = f"Connected: {', '.join(sorted(latest))}." if latest else "No car is."
+        there = f"Connected: {', '.join(sorted(latest))}."
         raise click.ClickException(f"{', '.join(missing)}: not connected. {did_you_mean(missing[0], latest) or there}")
     if only:
         latest = {car: latest[car] for car in only}
-    if not latest:
-        raise click.ClickException("No car is connected.")
     rows = [row_of(car, values) for car, values in sorted(latest.items())]
     for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
         session = token.rpartition("/")[2]
@@ -146,7 +149,7 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
     epilog="\b\nexamples:\n  fleet get red\n  fleet get red/sensor/range\n  fleet get '*/sensor/battery' --json\n"
     "  fleet get red/sensor/range --last 100\n  fleet get '*/sensor/range' --since 30s --csv > range.csv"
 )
-@click.argument("keyexpr", metavar="KEY")
+@click.argument("keyexpr", metavar="KEY", shell_complete=complete_car)
 @click.option("-n", "--last", type=Number(int, 1), help="The last N values of each key, oldest first.")
 @click.option("--since", type=Duration(history.MAX_HISTORY_S), help="The values of this last time, such as 30s or 5m.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print one CSV table. KEY must mean one type of message.")
@@ -166,12 +169,12 @@ def get(
 
     `red` is every sensor of red. `*` stands for any one part of a key.
     """
-    written = written_out(keyexpr, fleet)
+    written = check_key(written_out(keyexpr, fleet))
     under = topics_under(written)
     if as_csv and as_json:
         raise click.UsageError("--csv and --json: give one of them")
     if as_csv and len(under) != 1:
-        meant = ", ".join(topic.name for topic in under) or "nothing that is ever published"
+        meant = ", ".join(topic.name for topic in under) or "no message"
         raise click.UsageError(f"--csv needs one message type, but {written} means {meant}.")
     past = last is not None or since is not None
     why_not = history.describe_missing_history(under) if past else ""
@@ -181,7 +184,7 @@ def get(
         readings = client.history(keyexpr, last=last, since_s=since) if past else client.get(keyexpr)
         if not readings:
             within = f" of the last {since:g} s" if since is not None else ""
-            raise click.ClickException(f"nothing under {written}{within}; {describe_available(client, written)}")
+            raise click.ClickException(describe_missing(client, written, f"nothing under {written}{within}"))
     _show(readings, csv_of=under[0] if as_csv else None, as_json=as_json, past=past)
     if past:
         _print_shortfalls(history.describe_shortfalls(readings, datetime.now(UTC), last=last, since_s=since))
@@ -208,7 +211,7 @@ def _print_shortfalls(lines: Sequence[str]) -> None:
     epilog="\b\nexamples:\n  fleet watch red\n  fleet watch '*/state/*' --json\n  fleet watch red/event/command\n"
     "  fleet watch '*/sensor/range' --when 'range_m < 0.3'\n  fleet watch red/sensor/light --when left --count 1"
 )
-@click.argument("keyexpr", metavar="KEY")
+@click.argument("keyexpr", metavar="KEY", shell_complete=complete_car)
 @click.option("--when", metavar="CONDITION", help="Only readings for which this is true, such as 'range_m < 0.3'.")
 @click.option("--count", type=Number(int, 1), help="End after N readings.")
 @json_option
@@ -219,7 +222,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     CONDITION compares fields of one message (range_m < 0.3), with and, or, not and parentheses. A yes/no field stands
     alone. A comparison with a value that was not measured is false.
     """
-    written = written_out(keyexpr, fleet)
+    written = check_key(written_out(keyexpr, fleet))
     if when is not None:
         KeyCondition.of(when, written)
     with Fleet(connect, fleet, kind="person") as client:
@@ -257,12 +260,12 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
     Rate "-": fewer than two messages while measuring. Age "-": nothing received.
     """
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
-    written = [written_out(each, fleet) for each in ([keyexpr] if keyexpr else everything)]
+    written = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
     with Fleet(connect, fleet, kind="person") as client:
         found = _alive(client, written, look_s)
         if not found:
             what = f"under {written[0]}" if keyexpr else f"of {keys.describe_fleet(fleet)}"
-            raise click.ClickException(f"no key {what} is alive; {describe_available(client, written[0])}")
+            raise click.ClickException(describe_missing(client, written[0], f"no key {what} is alive"))
     if as_json:
         for each in found:
             click.echo(json.dumps(_row(each)))
@@ -326,7 +329,7 @@ def _cells(alive: KeyInfo) -> dict[str, str]:
     "  fleet wait --ready && fleet drive all forward\n\n\b\n"
     "Exit codes: 0 it is true, 1 time-out or no fleet, 2 wrong use, 130 Ctrl-C."
 )
-@click.argument("words", nargs=-1, metavar="KEY CONDITION | --ready [CAR...]")
+@click.argument("words", nargs=-1, metavar="KEY CONDITION | --ready [CAR...]", shell_complete=complete_cars)
 @click.option("--ready", is_flag=True, help="Wait until these cars are ready, or all cars, recorder and plan.")
 @click.option(
     "--timeout",

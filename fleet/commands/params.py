@@ -15,12 +15,13 @@ from click.shell_completion import CompletionItem
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
 from fleet.client.supervision import ask_status
-from fleet.commands.group import did_you_mean
 from fleet.recording.session_dir import is_session
 from schemas import keys
 from schemas.bus import Bus, canon
 from schemas.colors import COLORS, parse_color
 from schemas.duration import duration_s, parse_duration
+from schemas.suggestion import did_you_mean
+from schemas.topics import likely_name
 
 N = TypeVar("N", bound=float)
 
@@ -105,8 +106,9 @@ class CarNames(click.ParamType[tuple[str, ...]]):
                 keys.check_name(name.removeprefix("@"))
             except keys.BadKey as error:
                 lower = name.lower()
-                if lower != name and keys.is_name(lower):
-                    self.fail(f'No car "{name}". Names are lower case: did you mean "{lower}"?', param, ctx)
+                if lower != name and keys.is_name(lower.removeprefix("@")):
+                    what = "group" if name.startswith("@") else "car"
+                    self.fail(f'No {what} "{name}". Names are lower case: did you mean "{lower}"?', param, ctx)
                 self.fail(str(error), param, ctx)
         return names
 
@@ -120,14 +122,21 @@ class CarNames(click.ParamType[tuple[str, ...]]):
 
 
 def complete_cars(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """Return connected cars for the shell, also after a comma. Never fails, prints, or takes long."""
+    """Return connected cars for the shell, also after a comma, and groups. Never fails, prints, or takes long."""
     earlier, comma, begin = incomplete.rpartition(",")
     named = earlier.split(",")
-    names = [*_connected_within(COMPLETION_TIMEOUT_S, ctx), ALL_CARS]
+    names = [*connected_within(COMPLETION_TIMEOUT_S, ctx), ALL_CARS]
+    if begin.startswith("@"):
+        names = [f"@{group}" for group in sorted(_groups_of_file())]
     return [f"{earlier}{comma}{name}" for name in names if name.startswith(begin) and name not in named]
 
 
-def _connected_within(timeout_s: float, ctx: click.Context) -> list[str]:
+def complete_car(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """Return connected cars for the shell, where neither `all` nor a group has a meaning."""
+    return [name for name in connected_within(COMPLETION_TIMEOUT_S, ctx) if name.startswith(incomplete)]
+
+
+def connected_within(timeout_s: float, ctx: click.Context) -> list[str]:
     """Return the connected cars. Empty if the bus does not answer in time."""
     values = {**ctx.find_root().params, **{name: value for name, value in ctx.params.items() if value}}
     fleet = values.get("fleet") or keys.DEFAULT_FLEET  # click sets no defaults while it completes
@@ -180,7 +189,8 @@ class SessionPath(click.ParamType[Path]):
             raise click.ClickException(f"No recordings here yet (in {place}). `fleet up` records everything.")
         back = int(match[1] or 0)
         if back >= len(found):
-            self.fail(f"{value}: there are only {len(found)} sessions in {place}.", param, ctx)
+            count = "is only 1 session" if len(found) == 1 else f"are only {len(found)} sessions"
+            self.fail(f"{value}: there {count} in {place}.", param, ctx)
         return found[back]
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's
@@ -262,7 +272,7 @@ def resolve_cars(client: Fleet, written: Sequence[str]) -> list[str]:
     for each in written:
         if each == ALL_CARS:
             if not (connected := client.cars()):
-                raise click.ClickException("No car is connected.")
+                raise no_cars(client)
             found += connected
         elif each.startswith("@"):
             found += _members(client, each.removeprefix("@"))
@@ -277,11 +287,8 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
     groups: Mapping[str, Sequence[str]] = {
         name: [car for car in cars.split(",") if car] for each in status for name, cars in each.groups.items()
     }
-    if not status and Path("fleet.yaml").is_file():
-        from fleet.fleetfile.fleet_file import read_fleet
-
-        with suppress(ValueError):  # a BadFile
-            groups = read_fleet(Path("fleet.yaml"), unbound=True).groups
+    if not status:
+        groups = _groups_of_file()
     if group not in groups:
         near = did_you_mean(group, groups).replace("mean ", "mean @")
         there = f"Groups: @{', @'.join(sorted(groups))}." if groups else ""
@@ -292,28 +299,56 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
     return groups[group]
 
 
+def _groups_of_file() -> Mapping[str, Sequence[str]]:
+    """Return the groups in the fleet file here. Empty if there is no such file, or it is wrong."""
+    from fleet.fleetfile.fleet_file import read_fleet
+
+    with suppress(ValueError):  # a BadFile
+        return read_fleet(Path("fleet.yaml"), unbound=True).groups
+    return {}
+
+
 def written_out(keyexpr: str, fleet: str) -> str:
     """Expand a key expression. Raises keys.BadKey."""
     return canon(keys.expand(keyexpr, keys.check_name(fleet, "fleet name")))
 
 
-def describe_available(client: Fleet, written: str) -> str:
-    """Describe the readings of the named car, or else the cars on the bus."""
+def no_cars(client: Fleet) -> click.ClickException:
+    """Return the error that no car is connected. It names other fleets if this one is not on the bus."""
+    there = {token.partition("/")[0] for token in client.bus.tokens("*/*")} - {client.name}
+    there |= {token.partition("/")[0] for token in client.bus.tokens(f"*/{keys.SUPERVISOR}")}
+    if not there or client.name in there:
+        return click.ClickException("No car is connected.")
+    return click.ClickException(f'No fleet "{client.name}" is on this bus. There is: {", ".join(sorted(there))}.')
+
+
+def describe_missing(client: Fleet, written: str, what: str) -> str:
+    """Describe what is there instead of what a key names: the likely car, its readings, or the connected cars."""
     under = topics_under(written)
     if under and all(topic.family == "sim" for topic in under):
-        return f"what is true of a simulated car is only published: fleet watch {written.partition('/')[2]}"
+        return f"{what}; what is true of a simulated car is only published: fleet watch {written.partition('/')[2]}"
     cars = client.cars()
+    if not cars:
+        return no_cars(client).message
     key = keys.parse(written)
     if key is not None and key.car in cars:
         begin = len(f"{client.name}/{key.car}/")
         found = [reading.key[begin:] for reading in client.get(f"{client.name}/{key.car}/*/*")]
-        return f"{key.car} has {', '.join(found)}" if found else f"{key.car} says nothing"
-    return f"connected: {', '.join(cars)}" if cars else "no car is connected"
+        return f"{what}; {key.car} has {', '.join(found)}" if found else f"{what}; {key.car} says nothing"
+    if key is not None and not set(key.car) & set("*$@"):
+        return f'No car "{key.car}". {_likely_car(key.car, cars)}'
+    return f"{what}; connected: {', '.join(cars)}"
+
+
+def _likely_car(name: str, cars: Sequence[str]) -> str:
+    """Return words about the likely car, the topic of that name, or the connected cars."""
+    topic = None if (near := did_you_mean(name, cars)) else likely_name(name)
+    return near or (f"Did you mean '*/{topic}'?" if topic else f"Connected: {', '.join(cars)}.")
 
 
 def warn_if_missing(written: str, cars: Sequence[str]) -> None:
     """Warn if the named car is not on the bus: the name may be misspelled."""
     key = keys.parse(written)
     if key is not None and not set(key.car) & set("*$@") and key.car not in cars:
-        there = f"connected: {', '.join(cars)}" if cars else "no car is"
-        click.echo(f'fleet: No car "{key.car}" is connected yet ({there}). Waiting.', err=True)
+        there = _likely_car(key.car, cars) if cars else "No car is."
+        click.echo(f'fleet: No car "{key.car}" is connected yet. {there} Waiting.', err=True)

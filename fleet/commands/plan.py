@@ -13,10 +13,12 @@ import click
 from fleet.client.client import Fleet
 from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from fleet.client.reading import Reading
-from fleet.commands.group import CommandGroup, did_you_mean
+from fleet.commands.group import CommandGroup
 from fleet.commands.options import WrongFile, bus_options, json_option, with_client
+from fleet.commands.params import complete_car
 from schemas import keys, messages, topics
 from schemas.bus import Failure
+from schemas.suggestion import did_you_mean
 
 _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.commands.plan_try:try_plan"}
 """Subcommands whose imports would slow down all others."""
@@ -29,7 +31,7 @@ examples:
   fleet why              every car, role and phase
   fleet why patrol --json"""
 )
-@click.argument("subjects", nargs=-1, metavar="[CAR|ROLE|phase]...")
+@click.argument("subjects", nargs=-1, metavar="[CAR|ROLE|phase]...", shell_complete=complete_car)
 @json_option
 @with_client
 def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:

@@ -20,6 +20,7 @@ from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link
 from gateway.protocol.platforms import Platform
 from schemas.links import BleUrl, SerialUrl, TcpUrl, UsbUrl
 from schemas.process import port_lock
+from schemas.suggestion import how_to_install
 
 if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo
@@ -147,5 +148,5 @@ def _check_tcp(link: TcpUrl, platform: str) -> tuple[bool, str]:
 
 def _check_ble() -> tuple[bool, str]:
     if find_spec("bleak") is None:
-        return False, "needs Bluetooth, which is not installed: pip install 'zenoh-car-fleet[ble]'"
-    return True, "Bluetooth is installed; whether the car is near, `gateway scan` shows"
+        return False, f"needs Bluetooth, which is not installed: {how_to_install('ble')}"
+    return True, "Bluetooth is installed; whether the car is near, `fleet scan` shows"

@@ -143,7 +143,7 @@ class CarEntry(CommonEntry):
     """One car."""
 
     type: str = Field(default_factory=str, description="one of the types above")
-    link: _Link = Field(default_factory=str, description="address of the car; `gateway scan` shows links")
+    link: _Link = Field(default_factory=str, description="address of the car; `fleet scan` shows links")
 
 
 class RecordEntry(Entry):

@@ -63,7 +63,7 @@ def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
     if done.returncode == 130:
         raise KeyboardInterrupt
     if done.returncode and not (links and done.returncode == 1):  # 1: one of the links could not be listened to
-        raise ScanFailed("`gateway scan` could not look, see above")
+        raise ScanFailed("`fleet scan` could not look, see above")
     found = [_found(json.loads(line)) for line in done.stdout.splitlines()]
     return [*(each for each in found if each.verdict in POSSIBLE_VERDICTS), *taken]
 

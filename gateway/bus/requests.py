@@ -32,6 +32,7 @@ from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from schemas import messages
 from schemas.commands import COMMANDS, STOPS
+from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
 
 DEFAULT_MAX_DRIVE_S: Final = 10.0
@@ -193,7 +194,8 @@ def _word(field: str, value: str, kind: Any) -> Any:
         return kind(value)
     except ValueError:
         problem = f"{field} {value!r}" if value else f"{field} is missing"
-        raise ValueError(f"{problem}: allowed are {', '.join(kind)}") from None
+        near = did_you_mean(value, kind)
+        raise ValueError(f"{problem}. {near}" if near else f"{problem}: allowed are {', '.join(kind)}") from None
 
 
 def _seconds(field: str, value: float, top: float) -> float:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from gateway.link.usb import list_ports
 from schemas.links import BleUrl, LinkUrl, SerialUrl, UsbUrl
+from schemas.suggestion import how_to_install
 
 if TYPE_CHECKING:
     from bleak.backends.scanner import AdvertisementData
@@ -94,13 +95,15 @@ async def ble_devices(seconds: float) -> list[BleDevice]:
 
         from gateway.link.ble import UART_SERVICES
     except ImportError:
-        raise NoBluetooth("Bluetooth was not searched. Type: pip install 'zenoh-car-fleet[ble]'") from None
+        raise NoBluetooth(f"Bluetooth was not searched. Type: {how_to_install('ble')}") from None
     try:
         async with asyncio.timeout(seconds + BLE_START_TIMEOUT_S):
             found = await BleakScanner.discover(timeout=seconds, return_adv=True)
     except TimeoutError:
         raise NoBluetooth("Bluetooth was not searched: its service does not answer. Is it running?") from None
     except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, `scan` still lists the ports
+        if isinstance(error, FileNotFoundError | ConnectionRefusedError):  # the socket of D-Bus
+            raise NoBluetooth("Bluetooth was not searched: no D-Bus or BlueZ is running here.") from None
         words = " ".join(str(error).split()) or type(error).__name__
         raise NoBluetooth(f"Bluetooth was not searched: {words}. Is there an adapter, and is it on?") from None
     devices = [_device(address, device.name, advert, UART_SERVICES) for address, (device, advert) in found.items()]

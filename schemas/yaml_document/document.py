@@ -8,6 +8,7 @@ import json
 import math
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -16,6 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 from yamlcore import CoreLoader  # type: ignore[import-untyped]  # has no stubs
 
+from schemas.suggestion import did_you_mean
 from schemas.yaml_document.messages import Where, describe_error, format_place, quote_value
 from schemas.yaml_document.partial import PartialTree
 
@@ -35,7 +37,7 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """One fault of a file. line, column: from 1. field: empty for the file as a whole."""
+    """One fault of a file. line, column: from 1; 0 if there is no such file. field: empty for the file as a whole."""
 
     line: int
     column: int
@@ -43,7 +45,12 @@ class Problem:
     words: str
 
     def __str__(self) -> str:
-        return f"{self.line}:{self.column}: error: " + (f"{self.field}: " if self.field else "") + self.words
+        return (
+            (f"{self.line}:{self.column}:" if self.line else "")
+            + " error: "
+            + (f"{self.field}: " if self.field else "")
+            + self.words
+        )
 
 
 class BadFile(ValueError):
@@ -105,6 +112,13 @@ def name_special_file(path: Path) -> str:
     return kinds.get(stat.S_IFMT(mode), "device")
 
 
+def _similar_file(path: Path) -> str:
+    """Return a question with the likely YAML file of the same directory. Empty if there is none."""
+    with suppress(OSError):
+        return did_you_mean(path.name, sorted(each.name for each in path.parent.iterdir() if each.suffix == ".yaml"))
+    return ""
+
+
 def read_text(path: Path, source: str | None = None) -> str:
     """Read the text of a file; raises BadFile if it cannot be read, is too large, or is not UTF-8."""
     source = str(path) if source is None else source
@@ -115,9 +129,10 @@ def read_text(path: Path, source: str | None = None) -> str:
             with path.open("rb") as file:
                 data = file.read(MAX_YAML_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        if isinstance(error, FileNotFoundError):
+            raise _bad_file(source, f"there is no such file. {_similar_file(path)}".rstrip(" ."), 0, 0) from None
         words = error.strerror if isinstance(error, OSError) else None
-        missing = isinstance(error, FileNotFoundError)
-        raise _bad_file(source, "there is no such file" if missing else f"cannot be read: {words or error}") from None
+        raise _bad_file(source, f"cannot be read: {words or error}") from None
     if kind:
         raise _bad_file(source, f"is a {kind}, not a file: save the text as a file, and give that")
     try:

@@ -535,7 +535,7 @@ def test_a_plan_that_can_never_work_is_not_begun_and_not_taken(job: Up) -> None:
         ((), "There is no fleet.yaml here. `fleet init` creates one"),
         (("--sim", "0"), "--sim: 0 is too small: at least 1"),
         (("none.yaml",), "none.yaml"),
-        (("--sim", "1", "--plan", "none.yaml"), "none.yaml:1:1: error: there is no such file"),
+        (("--sim", "1", "--plan", "none.yaml"), "none.yaml: error: there is no such file"),
         (("--sim", "1", "--fleet", "Über"), "fleet name"),
         (("--sim", "1", "--connect", "here"), "endpoint 'here' is not allowed"),
         (("--sim", "1", "--connect", f"tcp/0.0.0.0:{free_port()}"), "accept it with --insecure-lan"),

@@ -97,7 +97,7 @@ def test_the_first_minutes_from_the_wheel(tmp_path: Path) -> None:
         assert here.succeeds(f'python -c "{script}"') == "blue green red\n"
         refused = here.run("fleet replay latest --save x.rrd")
         assert (refused.returncode, refused.stdout) == (1, "")
-        assert refused.stderr.endswith("Type: pip install 'zenoh-car-fleet[view]'\n")
+        assert refused.stderr.endswith("(from a clone: pip install '.[view]')\n")
         assert refused.stderr.count("\n") == 1
     finally:
         down = here.run("fleet down")

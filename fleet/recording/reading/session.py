@@ -23,6 +23,7 @@ from fleet.recording.selection import EVERYTHING, Selection, key_expressions
 from fleet.recording.tools.analysis import arrow_table, data_frame, join_as_of
 from fleet.recording.writing.mcap_copy import Copy
 from schemas.keys import DEFAULT_FLEET
+from schemas.suggestion import did_you_mean
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,8 +56,16 @@ def find_session(session: str | PathLike[str], root: Path = ROOT) -> Path:
     ]
     back = int(nth[1] or 0)
     if back >= len(recorded):
-        raise NoSession(f"{session}: there are {len(recorded)} recorded sessions in {root.absolute()}. Name a session.")
+        count = "is 1 recorded session" if len(recorded) == 1 else f"are {len(recorded)} recorded sessions"
+        raise NoSession(f"{session}: there {count} in {root.absolute()}. Name a session.")
     return sorted(recorded)[-1 - back][1]
+
+
+def _near(path: Path) -> str:
+    """Return a question with the likely session and a blank. Empty if no name is near."""
+    there = sorted(each.name for each in ROOT.iterdir() if each.is_dir()) if ROOT.is_dir() else []
+    near = did_you_mean(path.name, [LATEST, *there])
+    return near and f"{near} "
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +103,7 @@ class Session:
                 next(path.iterdir(), None)
                 raise NoSession(f"{path} is not a session: no {session_dir.segment(Path(), 1)} in it")
             if not whole and not path.exists():
-                raise NoSession(
-                    f"There is no session at {path}. Name a directory (`fleet sessions` lists them) or an .mcap file."
-                )
+                raise NoSession(f"There is no session at {path}. {_near(path)}`fleet sessions` lists them.")
         except OSError as error:
             raise NoSession(f"{path} cannot be read: {error.strerror}") from None
         self.path = path

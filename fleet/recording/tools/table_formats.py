@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol
 
 from fleet.recording.tools.tables import Column, ColumnKind, Values
+from schemas.suggestion import how_to_install
 
 MAX_CACHED_SECONDS: Final = 4096
 """Maximum seconds cached as text."""
@@ -20,7 +21,7 @@ class FormatMissing(ImportError):
     """A package of the extra `analysis` is not installed. The message says how to install it."""
 
     def __init__(self, package: str) -> None:
-        super().__init__(f"{package} is not installed. Type: pip install 'zenoh-car-fleet[analysis]'")
+        super().__init__(f"{package} is not installed. Type: {how_to_install('analysis')}")
 
 
 class Sink(Protocol):

@@ -115,6 +115,8 @@ def test_a_drive_out_of_range_is_refused_here(client: Fleet, duration_s: float) 
 def test_other_values_that_no_message_can_carry(client: Fleet) -> None:
     with pytest.raises(ValueError, match="r 256 is not allowed"):
         client.car("red").led(256, 0, 0)
+    with pytest.raises(TypeError, match="write a number of seconds"):
+        client.car("red").drive("forward", "1s")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="six joints, 2 given"):
         client.car("red").arm([1, 2])
     with pytest.raises(ValueError, match="deg -1 is not allowed"):
@@ -131,7 +133,12 @@ def test_readings_have_key_time_and_value(client: Fleet) -> None:
     assert battery.as_dict()["voltage_v"] == battery.value.voltage_v > 0
     assert abs((datetime.now(UTC) - battery.time).total_seconds()) < 60
     assert {reading.key.split("/")[1] for reading in client.get("*/state/mode")} == {"blue", "green", "red"}
-    assert client.get("red/sensor/sonar") == []
+    with pytest.raises(keys.BadKey, match=r"No key red/sensor/rang\. Did you mean red/sensor/range\?"):
+        client.get("red/sensor/rang")
+    with pytest.raises(keys.BadKey, match=r"Did you mean red/sensor/battery\?"):
+        client.history("red/sensor/batery", last=1)
+    with pytest.raises(keys.BadKey, match="@a is a group"):
+        client.car("@a")
     with pytest.raises(keys.BadKey):
         client.get("red//x")
 

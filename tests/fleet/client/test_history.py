@@ -157,7 +157,7 @@ def test_any_zenoh_client_gets_the_same(remembered: Remembered) -> None:
     ("arguments", "code", "told"),
     [
         ("red --csv", 2, "--csv needs one message type, but fleet/red/sensor/* means sensor/range, sensor/battery"),
-        ("red/sensor/sonar --csv", 2, "means nothing that is ever published"),
+        ("red/sensor/rang --csv", 2, "No key red/sensor/rang. Did you mean red/sensor/range?"),
         ("red/sensor/range --csv --json", 2, "--csv and --json: give one of them"),
         ("red/sensor/range --last 0", 2, "--last: 0 is too small: at least 1"),
         ("red/sensor/range --last ten", 2, '--last: "ten" is not a whole number'),
@@ -165,7 +165,7 @@ def test_any_zenoh_client_gets_the_same(remembered: Remembered) -> None:
         ("red/sensor/range --since 8760h", 2, "--since: 8760h is too long: at most 168h"),
         ("red/event/command --last 3", 2, "Gateways keep no history of event/command, only of sensor/*"),
         ("red/sensor/arm --last 3", 1, "nothing under fleet/red/sensor/arm; red has sensor/battery"),
-        ("purple/sensor/range --since 1m", 1, "of the last 60 s; connected: red"),
+        ("purple/sensor/range --since 1m", 1, 'No car "purple". Connected: red.'),
     ],
 )
 def test_what_cannot_be_had_is_told_in_one_line(remembered: Remembered, arguments: str, code: int, told: str) -> None:

@@ -11,10 +11,13 @@ from click.testing import CliRunner, Result
 
 from fleet.cli import cli
 from fleet.client.client import Fleet
-from fleet.commands.params import resolve_cars
+from fleet.commands.fleet_file import prompt_name
+from fleet.commands.params import complete_cars, resolve_cars
+from fleet.recording.reading.session import NoSession, Session
 from schemas import keys
 from schemas.bus import reply_message, router_config
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.suggestion import nearest
 from tests.support.ports import free_endpoint
 
 FILE = "groups: {lab: [blue, green]}\ncars: {red: {link: COM1}, blue: {link: COM2}, green: {link: COM3}}\n"
@@ -69,3 +72,59 @@ def test_lists_and_waits_take_groups(client: Fleet) -> None:
     assert json.loads(waited.stdout)["cars"] == ["blue", "green"]
     assert 'There is no group "@lob". Did you mean @lab?' in run("wait", "--ready", "@lob").stderr
     assert len(tokens) == 3
+
+
+def test_a_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
+    tokens = [client.bus.token(keys.car_token("fleet", car)) for car in ("red", "blue")]
+
+    def error(*words: str) -> str:
+        done = CliRunner().invoke(cli, [*words, "--connect", client.bus.endpoint], standalone_mode=False)
+        assert isinstance(done.exception, click.ClickException)
+        return done.exception.message
+
+    assert error("get", "rde") == 'No car "rde". Did you mean red?'
+    assert error("get", "battery") == "No car \"battery\". Did you mean '*/sensor/battery'?"
+    assert error("get", "red/sensor/rang") == "No key red/sensor/rang. Did you mean red/sensor/range?"
+    assert error("watch", "*/sensor/rang") == "No key */sensor/rang. Did you mean */sensor/range?"
+    assert "names one car, or all (*), but no group" in error("get", "@a")
+    assert error("list", "@A") == 'No group "@A". Names are lower case: did you mean "@a"?'
+    assert error("list", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
+    assert len(tokens) == 2
+
+
+def test_the_shell_completes_groups_of_the_fleet_file(client: Fleet) -> None:
+    Path("fleet.yaml").write_text(FILE, encoding="utf-8")
+    context = click.Context(cli, info_name="fleet")
+    context.params["connect"] = client.bus.endpoint
+    assert complete_cars(context, click.Argument(["cars"]), "@") == ["@lab"]
+
+
+def test_a_wrong_name_of_a_session_or_file_names_the_likely_one(tmp_path: Path, client: Fleet) -> None:
+    assert client.bus.endpoint
+    Path("plan.yaml").touch()
+    Path("sessions/20260101T000000Z-demo").mkdir(parents=True)
+    with pytest.raises(NoSession, match=r"Did you mean latest\? `fleet sessions` lists them"):
+        Session("lates")
+    with pytest.raises(NoSession, match=r"Did you mean 20260101T000000Z-demo\?"):
+        Session("20260101T000000Z-dem")
+    done = CliRunner().invoke(cli, ["plan", "set", "plan.yml"])
+    assert done.output.endswith("plan.yml: error: there is no such file. Did you mean plan.yaml?\n")
+
+
+def test_the_prompt_of_a_name_proposes_a_valid_one() -> None:
+    @click.command()
+    def ask() -> None:
+        prompt_name("name", None, set())
+
+    done = CliRunner().invoke(ask, input="Red Car\n")
+    assert done.exit_code == 1
+    assert 'fleet: "Red Car" is not a car name' in done.output
+    assert "Such as red-car.\n" in done.output
+    assert done.output.endswith("\nError: Nothing was written.\n")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "near"), [("avoid", "obstacle_avoidance"), ("trakcing", "tracking"), ("xy", None), ("LIGHT", "light")]
+)
+def test_the_nearest_name_is_alike_or_contains_the_word(wrong: str, near: str | None) -> None:
+    assert nearest(wrong, ["manual", "tracking", "obstacle_avoidance", "light"]) == near

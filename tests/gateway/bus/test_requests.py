@@ -120,7 +120,7 @@ def test_every_verb_of_the_table_is_known_here() -> None:
         ("drive", None, Reason.BAD_VALUE, "drive without a payload: give fleet.v1.DriveCommand or its JSON"),
         ("resume", None, Reason.BAD_VALUE, "only stop and estop need none"),
         ("drive", {}, Reason.BAD_VALUE, "motion is missing: allowed are stop, forward, "),
-        ("drive", {"motion": "Forward"}, Reason.BAD_VALUE, "motion 'Forward': allowed are "),
+        ("drive", {"motion": "Forward"}, Reason.BAD_VALUE, "motion 'Forward'. Did you mean forward?"),
         ("drive", {"motion": "forward", "duration_s": 0}, Reason.BAD_VALUE, "duration_s 0: allowed are more than 0"),
         ("drive", {"motion": "forward", "duration_s": -1}, Reason.BAD_VALUE, "duration_s -1"),
         (
@@ -140,7 +140,7 @@ def test_every_verb_of_the_table_is_known_here() -> None:
         ("drive", {"motion": "forward", "sender": "a/b"}, Reason.BAD_VALUE, "sender 'a/b' is not allowed"),
         ("drive", {"motion": "forward", "sender": "a\nb"}, Reason.BAD_VALUE, "no control characters"),
         ("drive", {"motion": "forward", "id": "x" * 129}, Reason.BAD_VALUE, "id of 129 characters is too long"),
-        ("mode", {"mode": "parking"}, Reason.BAD_VALUE, "mode 'parking': allowed are manual, "),
+        ("mode", {"mode": "swim"}, Reason.BAD_VALUE, "mode 'swim': allowed are manual, "),
         ("led", {"r": 1, "b": 1}, Reason.BAD_VALUE, "g is missing: r, g and b are needed, 0..255 each"),
         ("led", {"r": 1, "g": 256, "b": 1}, Reason.BAD_VALUE, "g: 256, allowed are whole numbers 0..255"),
         ("light", {"light": "pink"}, Reason.BAD_VALUE, "light 'pink'"),

@@ -247,7 +247,7 @@ def test_bluetooth_that_is_not_installed_is_one_line_and_nothing_is_started() ->
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
         "gateway: link 'ble://AA:BB:CC:DD:EE:FF' needs Bluetooth, which is not installed: "
-        "pip install 'zenoh-car-fleet[ble]'\n"
+        "pip install 'zenoh-car-fleet[ble]' (from a clone: pip install '.[ble]')\n"
     )
 
 
