@@ -134,6 +134,8 @@ def test_a_second_one_refuses_and_names_the_first(up: Up) -> None:
 
 
 def test_status_and_logs_say_what_runs(up: Up) -> None:
+    ready = up.fleet("wait", "--ready", "--timeout", "60s")
+    assert ready.returncode == 0, ready.stderr
     first, header, *cars = up.fleet("status").stdout.splitlines()
     assert re.match(r"the fleet \(simulated cars\): running for \d:\d\d:\d\d, recording to ", first)
     assert header.startswith("CAR ")
