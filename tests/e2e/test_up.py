@@ -151,7 +151,7 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
     assert [each["time"] for each in lines] == sorted(each["time"] for each in lines if each["time"].endswith("Z"))
     wrong = up.fleet("logs", "gren")
     assert wrong.returncode == 2
-    assert "there are green, " in wrong.stderr
+    assert "Did you mean green?" in wrong.stderr
 
 
 def test_a_command_that_is_none_is_refused(up: Up) -> None:
