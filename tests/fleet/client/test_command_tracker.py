@@ -91,8 +91,8 @@ def test_a_table_on_a_terminal_and_plain_text_in_a_pipe(cars: Cars) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "told"),
     [
-        ("keys purple", 1, "no key under fleet/purple/sensor/* is alive; connected: blue, green, red"),
-        ("keys --fleet empty", 1, "no key of fleet empty is alive; no car is connected"),
+        ("keys purple", 1, 'No car "purple". Connected: blue, green, red.'),
+        ("keys --fleet empty", 1, 'No fleet "empty" is on this bus. There is: fleet.'),
         ("keys red/@cmd/*", 2, "fleet/red/@cmd/* is a command, not a reading"),
     ],
 )
@@ -195,8 +195,8 @@ def test_wait_is_ended_by_ctrl_c_without_a_word(cars: Cars) -> None:
         (["wait", "*/state/motion", "motion == 'forwards'"], "is never true: motion is one of stop, forward, back"),
         (["wait", "*/sensor/battery", "not voltage_v < 50"], "is never true: voltage_v is 0 .. 12"),
         (["watch", "*/state/mode", "--when", "verdict == 'wrong'"], "verdict is one of assumed, confirmed"),
-        (["wait", "red/sensor/sonar", "range_m < 1"], "nothing is ever published under fleet/red/sensor/sonar"),
-        (["wait", "red/@cmd/drive", "motion == 'stop'"], "nothing is ever published under fleet/red/@cmd/drive"),
+        (["wait", "red/sensor/sonar", "range_m < 1"], "No key red/sensor/sonar."),
+        (["wait", "red/@cmd/drive", "motion == 'stop'"], "No key red/@cmd/drive."),
         (["wait", "red", "range_m < 1 and voltage_v > 7"], "no message under fleet/red/sensor/* has all of its fields"),
         (["wait", "red", "left", "--timeout", "0"], "--timeout: 0 is too short: more than 0"),
         (["wait", "red", "left", "--timeout", "1s", "--for", "2s"], "--for 2 s cannot be over within --timeout 1 s"),

@@ -310,7 +310,7 @@ def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: An
     init.type("y")
     init.until("its name (- to leave it out) [red]: ")
     init.type("Rosa")
-    init.until("'Rosa' is not allowed: use 1 to 32 of a-z")
+    init.until('"Rosa" is not a car name: use 1 to 32 of a-z')
     init.until("[red]: ")
     init.type("rosa")
     init.until("its platform [arduino]: ")
