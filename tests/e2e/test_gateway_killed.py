@@ -51,5 +51,5 @@ def test_a_raspberry_pi_car_whose_gateway_was_killed_drives_on_and_it_is_said(fl
     assert fleet.state("motion").motion == "unknown"
     answer = fleet.ask("stop", sender="mia", kind="person")
     assert (answer["status"], answer["reason"]) == ("rejected", "link_down")
-    assert words in answer["words"]
+    assert answer["words"].startswith("NOT STOPPED: red is unreachable. If it was driving, it still is: go to the car.")
     assert judge.driving

@@ -107,7 +107,7 @@ def recorder_killed(
         verdict = verify(session)
         words = list(verdict.words())
         assert not verdict.whole
-        assert "it was killed" in verdict.ended, words
+        assert "it crashed" in verdict.ended, words
         assert (verdict.twice, verdict.missed, verdict.dropped) == ([], {}, {}), words
         # Everything from its beginning until then is here. Of what it had again from before it may lack some, if it
         # was killed meanwhile: that, verify says exactly.

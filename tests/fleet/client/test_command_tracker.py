@@ -169,7 +169,7 @@ def test_wait_says_what_was_instead_when_the_time_is_over(cars: Cars) -> None:
     done = run(cars.endpoint, "wait", "purple/sensor/range", "range_m < 1", "--timeout", "100ms")
     assert done.returncode == 1
     assert done.stderr.splitlines() == [
-        'fleet: No car "purple" is connected yet (connected: blue, green, red). Waiting.',
+        'fleet: No car "purple" is connected yet. Connected: blue, green, red. Waiting.',
         "fleet: range_m < 1 did not hold within 0.1 s: nothing came under fleet/purple/sensor/range",
     ]
 

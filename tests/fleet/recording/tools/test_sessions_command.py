@@ -148,7 +148,7 @@ def test_a_description_that_went_is_told(session: Path, text: str | None) -> Non
         (session / "session.json").write_text(text)
     broken = fleet("verify", session)
     assert broken.returncode == 1
-    assert "damage: session.json is missing, or cannot be understood" in broken.stdout
+    assert "damage: session.json is missing or unreadable" in broken.stdout
     assert fleet("recover", session).returncode == 0
     assert session_dir.SessionInfo.read(session.with_name(f"{session.name}-recovered")) is not None
 
