@@ -6,17 +6,18 @@ import re
 import time
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import click
 
 from fleet.client.client import Fleet
-from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from fleet.client.reading import Reading
+from fleet.client.services import NO_PLAN, ask_coordinator
 from fleet.commands.group import CommandGroup
 from fleet.commands.options import WrongFile, bus_options, json_option, with_client
 from fleet.commands.params import complete_car
-from schemas import keys, messages, topics
+from fleet.policy.requests import PlanRequest
+from schemas import keys
 from schemas.bus import Failure
 from schemas.suggestion import did_you_mean
 
@@ -58,7 +59,7 @@ def _no_plan(client: Fleet) -> str:
     """Say that no plan is running, and what starts one. `fleet up` does only if the fleet is not up already."""
     is_up = bool(client.bus.tokens(keys.car_token(client.name, keys.SUPERVISOR)))
     other = "" if is_up else ", or a fleet with one: `fleet up --plan FILE`"
-    return f"No plan is running. Start one: `fleet plan run FILE`{other}."
+    return f"{NO_PLAN}{other}."
 
 
 def _describe_stop(client: Fleet, car: str) -> str:
@@ -130,8 +131,7 @@ def set_plan(file: Path, *, as_json: bool, connect: str | None, fleet: str) -> N
     text = read_text(file)
     parse(text, str(file))  # before it is sent, for errors with the position in this file
     with Fleet(connect, fleet, kind="person") as client:
-        command = messages.message_class("fleet.v1.Plan")(text=text, set_by=client.sender)
-        _request(client, "plan", command, source=str(file), as_json=as_json)
+        _request(client, "plan", text, source=str(file), as_json=as_json)
 
 
 @plan.command(epilog="\b\nexample:\n  fleet plan show --json")
@@ -176,7 +176,7 @@ def show(client: Fleet, *, as_json: bool) -> None:
 @with_client
 def restart(client: Fleet, *, as_json: bool) -> None:
     """Begin the plan in force anew, with its first phase and without its memory. Also after `fleet plan stop`."""
-    _request(client, "restart", _command(client), as_json=as_json)
+    _request(client, PlanRequest.RESTART, as_json=as_json)
 
 
 @plan.command("next", epilog="\b\nexample:\n  fleet plan next")
@@ -184,7 +184,7 @@ def restart(client: Fleet, *, as_json: bool) -> None:
 @with_client
 def next_phase(client: Fleet, *, as_json: bool) -> None:
     """Go on to the next phase of the plan, now. Refused if the plan has no phases, or no further one."""
-    _request(client, "next", _command(client), as_json=as_json)
+    _request(client, PlanRequest.NEXT, as_json=as_json)
 
 
 @plan.command(epilog="\b\nexamples:\n  fleet plan stop\n  fleet plan restart")
@@ -196,28 +196,22 @@ def stop(client: Fleet, *, as_json: bool) -> None:
     The cars get no hold: anyone may drive them at once. Cars that a person has stopped or drives stay as they are.
     `fleet plan restart` or `fleet plan set` goes on. A coordinator that is restarted stays stopped.
     """
-    _request(client, "stop", _command(client), as_json=as_json)
+    _request(client, PlanRequest.STOP, as_json=as_json)
 
 
-def _command(client: Fleet) -> Any:
-    return messages.message_class("fleet.v1.PlanCommand")(sender=client.sender, kind="person")
-
-
-def _request(client: Fleet, verb: str, command: Any, *, as_json: bool, source: str = "plan") -> None:
+def _request(client: Fleet, verb: str, plan_text: str = "", *, as_json: bool, source: str = "plan") -> None:
     """Send a request to the coordinator, and print its answer. Exit with code 1 if it refuses, 2 for a wrong plan."""
-    key = keys.command_key(client.name, keys.COORDINATOR, verb)
-    payload, encoding = command.SerializeToString(), messages.encoding_of(command.DESCRIPTOR.full_name)
-    for answer in client.bus.query(key, payload=payload, encoding=encoding, timeout_s=ANSWER_TIMEOUT_S):
-        if isinstance(answer, Failure):
-            raise click.ClickException(answer.words)
-        result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)
-        ok = result.status == "sent"
-        result.words = re.sub("^plan:", f"{source}:", result.words, flags=re.MULTILINE)
-        if as_json:
-            click.echo(json.dumps({"status": result.status, "reason": result.reason, "words": result.words}))
-        elif ok:
-            click.echo(result.words)
-        else:
-            raise (WrongFile if result.reason == "bad_value" else click.ClickException)(result.words)
-        raise SystemExit(0 if ok else 2 if result.reason == "bad_value" else 1)
-    raise click.ClickException(_no_plan(client))
+    result = ask_coordinator(client, verb, plan_text)
+    if result is None:
+        raise click.ClickException(_no_plan(client))
+    if isinstance(result, Failure):
+        raise click.ClickException(result.words)
+    ok, wrong = result.status == "sent", result.reason == "bad_value"
+    words = re.sub("^plan:", f"{source}:", result.words, flags=re.MULTILINE)
+    if as_json:
+        click.echo(json.dumps({"status": result.status, "reason": result.reason, "words": words}))
+    elif ok:
+        click.echo(words)
+    else:
+        raise (WrongFile if wrong else click.ClickException)(words)
+    raise SystemExit(0 if ok else 2 if wrong else 1)

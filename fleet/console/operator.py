@@ -8,14 +8,14 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from fleet.aio import Fleet
-from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from fleet.client.commands import CommandRequest, drive_request, estop_request, lease_request, stop_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.client.outcome import Outcome
+from fleet.client.services import NO_PLAN, ask_coordinator
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
 from fleet.policy.plan.parser import BadPlan, parse
-from schemas import keys, messages, topics
+from schemas import keys, messages
 from schemas.bus import BusError, Failure
 from schemas.commands import COMMANDS
 
@@ -172,23 +172,10 @@ class ConsoleOperator:
 
     async def ask_coordinator(self, verb: str, text: str = "") -> tuple[bool, str]:
         """Send a request to the coordinator. Return whether it was carried out, and words. text: of a plan to set."""
-        client = self._fleet.sync
-        if verb == "plan":
-            command: Any = messages.message_class("fleet.v1.Plan")(text=text, set_by=client.sender)
-        else:
-            command = messages.message_class("fleet.v1.PlanCommand")(sender=client.sender, kind=client.kind)
-        key = keys.command_key(client.name, keys.COORDINATOR, verb)
-        encoding = messages.encoding_of(command.DESCRIPTOR.full_name)
-        return await self._fleet.call(self._ask_coordinator, key, command.SerializeToString(), encoding)
-
-    def _ask_coordinator(self, key: str, payload: bytes, encoding: str) -> tuple[bool, str]:
-        """Send a request to the coordinator. Runs on a thread."""
-        for answer in self._fleet.sync.bus.query(key, payload=payload, encoding=encoding, timeout_s=ANSWER_TIMEOUT_S):
-            if isinstance(answer, Failure):
-                return False, answer.words
-            result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)
-            return result.status == "sent", result.words
-        return False, "No plan is running. Start one: `fleet plan run FILE`."
+        answer = await self._fleet.call(ask_coordinator, self._fleet.sync, verb, text)
+        if answer is None:
+            return False, f"{NO_PLAN}."
+        return not isinstance(answer, Failure) and answer.status == "sent", answer.words
 
     async def check_plan(self, text: str) -> tuple[bool, str]:
         """Check a plan's text. Return whether it is free of faults, and the faults, one per line."""

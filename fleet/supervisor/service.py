@@ -9,8 +9,9 @@ from typing import Any, Final
 
 import zenoh
 
+from fleet.client.services import send_command
 from fleet.client.supervision import SUPERVISOR_STATUS
-from schemas import keys, messages, topics
+from schemas import keys, messages
 from schemas.bus import Bus, Failure, Handover, Sample, Singleton, is_json_wanted, reply_message, reply_value
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
@@ -118,16 +119,9 @@ class SupervisorService:
 
     def send_plan(self, text: str) -> bool:
         """Send the coordinator another plan. Return True if it accepted. Call it on a thread."""
-        key = f"{self.fleet}/{keys.COORDINATOR}/@cmd/plan"
-        payload, encoding = (
-            pb.Plan(text=text, set_by=keys.SUPERVISOR).SerializeToString(),
-            messages.encoding_of("fleet.v1.Plan"),
-        )
-        for answer in self.bus.query(key, payload=payload, encoding=encoding, timeout_s=SERVICE_QUERY_TIMEOUT_S):
-            if isinstance(answer, Sample):
-                result: Any = messages.parse(topics.RESULT, answer.payload, answer.encoding)
-                return bool(result.status == "sent")
-        return False
+        plan = pb.Plan(text=text, set_by=keys.SUPERVISOR)
+        answers = send_command(self.bus, self.fleet, keys.COORDINATOR, "plan", plan, SERVICE_QUERY_TIMEOUT_S)
+        return next((answer.status == "sent" for answer in answers if not isinstance(answer, Failure)), False)
 
     def stop_all(self) -> None:
         """Stop every car with one query. Call it on a thread."""
@@ -172,9 +166,5 @@ def ask_service(bus: Bus, fleet: str, verb: str, sender: str, timeout_s: float =
     """Send a command to the supervisor. Return its fleet.v1.Result, None if no supervisor answers."""
     command = messages.message_class(SUPERVISOR_COMMANDS[verb])()
     command.sender, command.kind, command.id = sender, "person", uuid.uuid4().hex  # type: ignore[attr-defined]  # ours
-    key = keys.topic_key(fleet, keys.SUPERVISOR, f"@cmd/{verb}")
-    payload, encoding = command.SerializeToString(), messages.encoding_of(SUPERVISOR_COMMANDS[verb])
-    for answer in bus.query(key, payload=payload, encoding=encoding, timeout_s=timeout_s):
-        if not isinstance(answer, Failure):
-            return messages.parse(topics.RESULT, answer.payload, answer.encoding)
-    return None
+    answers = send_command(bus, fleet, keys.SUPERVISOR, verb, command, timeout_s)
+    return next((answer for answer in answers if not isinstance(answer, Failure)), None)

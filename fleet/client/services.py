@@ -1,0 +1,31 @@
+"""Sends commands to the services of a fleet, such as the coordinator, and reads their results."""
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+from fleet.client.client import Fleet
+from fleet.client.command_tracker import ANSWER_TIMEOUT_S
+from schemas import keys, messages, topics
+from schemas.bus import Bus, Failure
+
+NO_PLAN: Final = "No plan is running. Start one: `fleet plan run FILE`"
+
+
+def send_command(bus: Bus, fleet: str, service: str, verb: str, command: Any, timeout_s: float) -> Iterator[Any]:
+    """Send a command to a service such as `@supervisor`. Yield each answer: a fleet.v1.Result, or a Failure."""
+    key = keys.command_key(fleet, service, verb)
+    payload, encoding = command.SerializeToString(), messages.encoding_of(command.DESCRIPTOR.full_name)
+    for answer in bus.query(key, payload=payload, encoding=encoding, timeout_s=timeout_s):
+        yield answer if isinstance(answer, Failure) else messages.parse(topics.RESULT, answer.payload, answer.encoding)
+
+
+def ask_coordinator(client: Fleet, verb: str, plan_text: str = "") -> Any:
+    """Send a request to the coordinator. Return the first answer as of `send_command`, None if there is none.
+
+    verb: `plan`, with the text of the plan to set, or a PlanRequest.
+    """
+    if verb == "plan":
+        command: Any = messages.message_class("fleet.v1.Plan")(text=plan_text, set_by=client.sender)
+    else:
+        command = messages.message_class("fleet.v1.PlanCommand")(sender=client.sender, kind=client.kind)
+    return next(send_command(client.bus, client.name, keys.COORDINATOR, verb, command, ANSWER_TIMEOUT_S), None)
