@@ -10,6 +10,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from fleet.aio import Fleet
+from fleet.console.bus_message import message_in
 from fleet.console.car_view import FleetView
 from fleet.console.inspections import Inspections
 from fleet.console.operator import ConsoleOperator
@@ -19,8 +20,9 @@ from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
 from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessage
+from fleet.policy.requests import PlanRequest
 from fleet.replay.colors import color
-from schemas import keys, messages, topics
+from schemas import keys
 from schemas.bus import Handover, Latest, Sample
 from schemas.commands import STOPS
 
@@ -29,8 +31,6 @@ MAX_PAGES: Final = 32
 _MAX_EVENTS: Final = 4096
 MAX_PLOT_S: Final = 600
 """Maximum time that a plot shows, s."""
-PLAN_VERBS: Final = frozenset({"restart", "next", "stop"})
-"""Requests to the coordinator without a text."""
 
 log = logging.getLogger("fleet")
 
@@ -120,12 +120,12 @@ class Console:
         return json.dumps({"t": "plan", **self._plan.as_dict()}, separators=(",", ":"))
 
     def _on_plan_sample(self, sample: Sample) -> None:
-        if (found := _message_in(sample)) is not None:
+        if (found := message_in(sample, logging.WARNING)) is not None:
             self._plan.on_message(coordinator_topic(sample.key, self._fleet.sync.name), found[1])
 
     def _take_readings(self, now: float) -> None:
         for sample in self._readings.take().values():
-            if (found := _message_in(sample)) is not None:
+            if (found := message_in(sample, logging.WARNING)) is not None:
                 key, message = found
                 self._view.car(key.car).on_message(key.topic, message, now)
                 if key.topic == "state/safety" and self.operator.report is not None:
@@ -147,7 +147,7 @@ class Console:
         return json.dumps(state, separators=(",", ":"))
 
     def _on_event(self, sample: Sample) -> None:
-        if (found := _message_in(sample)) is None:
+        if (found := message_in(sample, logging.WARNING)) is None:
             return
         (key, event), now = found, time.monotonic()
         self._view.car(key.car).on_message(key.topic, event, now)
@@ -219,7 +219,7 @@ class Console:
                 since_s = float(min(message.number("since_s"), MAX_PLOT_S))
                 self.operator.spawn(self._plots.begin(page.number, message.series(), since_s))
             case "plan":
-                verb = message.one_of("verb", PLAN_VERBS)
+                verb = message.one_of("verb", frozenset(PlanRequest))
                 self.operator.spawn(self._ask_coordinator(page, message.number("id"), verb))
             case "do":
                 request, cars = message.request(), message.cars()
@@ -269,18 +269,6 @@ class Console:
         for press in self._presses.alive:
             self.operator.end_press(press)
         await self.operator.close()
-
-
-def _message_in(sample: Sample) -> tuple[keys.Key, Any] | None:
-    """Return the key and the message. None if it is not the message of its key: anyone on the bus may publish."""
-    topic, key = topics.of_key(sample.key), keys.parse(sample.key)
-    if topic is None or key is None:
-        return None
-    try:
-        return key, messages.parse(topic.message, sample.payload, sample.encoding)
-    except messages.BadPayload as error:
-        log.warning("%s: %s", sample.key, error)
-        return None
 
 
 def _hex_color(car: str, index: int) -> str:

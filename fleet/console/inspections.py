@@ -6,9 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 from fleet.aio import Fleet
+from fleet.console.bus_message import message_in
 from fleet.console.car_view import CarView
 from fleet.console.frame_log import FrameLog
-from schemas import keys, messages, topics
+from schemas import keys
 from schemas.bus import Handover, Sample
 
 _MAX_QUEUED_FRAMES = 1024
@@ -61,11 +62,6 @@ class Inspections:
             del self._logs[car]
 
     def _on_frame(self, sample: Sample) -> None:
-        topic, key = topics.of_key(sample.key), keys.parse(sample.key)
-        if topic is None or key is None or key.car not in self._logs:
-            return
-        try:
-            frame = messages.parse(topic.message, sample.payload, sample.encoding)
-        except messages.BadPayload:
-            return
-        self._logs[key.car].on_frame(topic.name, frame)
+        if (found := message_in(sample)) is not None and found[0].car in self._logs:
+            key, frame = found
+            self._logs[key.car].on_frame(key.topic, frame)

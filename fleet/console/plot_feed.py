@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from fleet.aio import Fleet
+from fleet.console.bus_message import message_in
 from fleet.console.page_link import PageLink
 from fleet.console.plot_buffer import PlotBuffer, Series
-from schemas import keys, messages, topics
+from schemas import keys, topics
 from schemas.bus import BusError, Handover, Sample
 
 _MAX_PLOT_SAMPLES: Final = 16_384
@@ -63,12 +64,7 @@ class PlotFeed:
             self._subscriptions.pop(key).undeclare()
 
     def _on_sample(self, sample: Sample) -> None:
-        topic, key = topics.of_key(sample.key), keys.parse(sample.key)
-        if topic is None or key is None:
-            return
-        try:
-            message = messages.parse(topic.message, sample.payload, sample.encoding)
-        except messages.BadPayload:
-            return
-        for buffer in self._buffers.values():
-            buffer.add(key.car, topic.name, message)
+        if (found := message_in(sample)) is not None:
+            key, message = found
+            for buffer in self._buffers.values():
+                buffer.add(key.car, key.topic, message)
