@@ -2,6 +2,6 @@
 
 Read `server` first: it serves the page and one WebSocket per page, and `console` wires the rest. `operator` sends the
 commands, `page_link` the messages to a page. Pure: `presses` (how long a car drives: the dead-man), `guard` (which
-requests are answered), `requests`, `car_view`, `plan_view`, `frame_log`,
-`plot_buffer`, `abilities` and `stop_report`.
+requests are answered), `pairing` (who may open a page from the network), `requests`, `car_view`, `plan_view`,
+`frame_log`, `plot_buffer`, `abilities` and `stop_report`.
 """

@@ -15,6 +15,7 @@ from fleet.console.car_view import FleetView
 from fleet.console.inspections import Inspections
 from fleet.console.operator import ConsoleOperator
 from fleet.console.page_link import PageLink
+from fleet.console.pairing import PagePerson
 from fleet.console.plan_view import PlanView, coordinator_topic
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
@@ -156,14 +157,19 @@ class Console:
 
     # ------------------------------------------------------------------ the pages
 
-    def add_page(self, send: Callable[[str], Awaitable[None]]) -> PageLink:
-        """Add a page. Raises TooManyPages."""
+    @property
+    def person(self) -> PagePerson:
+        """The person of the pages on this computer."""
+        return PagePerson(self._fleet.sync.sender.partition("@")[0])
+
+    def add_page(self, send: Callable[[str], Awaitable[None]], person: PagePerson | None = None) -> PageLink:
+        """Add a page of a person (None: of this computer). Raises TooManyPages."""
         if len(self._pages) >= MAX_PAGES:
             raise TooManyPages
         self._last_page += 1
-        page = self._pages[self._last_page] = PageLink(self._last_page, send)
+        page = self._pages[self._last_page] = PageLink(self._last_page, send, person or self.person)
         names = {"sender": self._fleet.sync.sender, "fleet": self._fleet.sync.name}
-        page.answer(t="hello", page=page.number, **names, plottable=plottable())
+        page.answer(t="hello", page=page.number, **names, person=asdict(page.person), plottable=plottable())
         page.show("plan", self._plan_text())
         return page
 

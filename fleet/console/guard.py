@@ -31,6 +31,9 @@ COOKIE_PATHS: Final = ("/", "/hello")
 STOP_PATH: Final = "/stop"
 """The only POST without a cookie: a stop must not fail because a cookie is old. Host and Origin are checked."""
 
+PERSON: Final = "fleet.person"
+"""Where the scope of a request from the network has its `PagePerson`."""
+
 
 class Guard:
     """Passes requests of our own pages to the app, and refuses all others.

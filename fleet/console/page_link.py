@@ -9,6 +9,8 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
+from fleet.console.pairing import PagePerson
+
 SEND_TIMEOUT_S: Final = 5.0
 """Timeout of one message. A page that reads nothing for this long is disconnected."""
 _MAX_PAGE_ANSWERS: Final = 256
@@ -18,8 +20,9 @@ _MAX_PAGE_ANSWERS: Final = 256
 class PageLink:
     """One connected page."""
 
-    def __init__(self, number: int, send: Callable[[str], Awaitable[None]]) -> None:
+    def __init__(self, number: int, send: Callable[[str], Awaitable[None]], person: PagePerson) -> None:
         self.number = number
+        self.person = person
         self._send = send
         self._answers: deque[str] = deque(maxlen=_MAX_PAGE_ANSWERS)
         self._newest: dict[str, str] = {}

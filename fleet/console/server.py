@@ -19,7 +19,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fleet.aio import Fleet
 from fleet.console.console import Console, TooManyPages
-from fleet.console.guard import STOP_PATH, App, Guard
+from fleet.console.guard import PERSON, STOP_PATH, App, Guard
 from schemas.bus import LARGEST_PAYLOAD
 from schemas.process import signals
 
@@ -169,7 +169,7 @@ async def _read_text(request: Request) -> str | None:
 @asynccontextmanager
 async def _joined(console: Console, socket_: WebSocket) -> AsyncIterator[Callable[[str], None]]:
     """Join a page to the console. Yield the function that takes its messages."""
-    page = console.add_page(socket_.send_text)
+    page = console.add_page(socket_.send_text, socket_.scope.get(PERSON))
     sending = asyncio.ensure_future(page.run())
 
     def on_sent(task: "asyncio.Task[None]") -> None:
