@@ -11,7 +11,10 @@ from gateway.control.commands import Sender, SenderKind
 
 LEASE_S: Final = 2.0
 """Duration of a lease after the drive (docs/explanation/who-may-drive.md#lease)."""
-MAX_ENDED_ESTOPS: Final = 64
+# Each e-stop in force is in each `state/safety` and in the state file. 200 a second hung a gateway after four seconds.
+MAX_ESTOPS: Final = 32
+"""Maximum e-stops in force of one car, and as many of the whole fleet. A further one only stops the car."""
+MAX_ENDED_ESTOPS: Final = 2 * MAX_ESTOPS
 """Maximum ended e-stops that are remembered and published in `state/safety`: the newest."""
 _SENDER_RANK: Final = {SenderKind.PERSON: 2, SenderKind.SCRIPT: 1, SenderKind.COORDINATOR: 0}
 
@@ -101,11 +104,16 @@ class Safety:
             self.lease = None
 
     def latch(self, estop: Estop) -> Estop:
-        """Latch an e-stop and put the car on hold. An e-stop whose id has already ended gets a new id."""
+        """Latch an e-stop and put the car on hold. An e-stop whose id has already ended gets a new id.
+
+        If too many are in force, it is not latched: the car stays stopped until all of them are released.
+        """
         if estop.id in self._ended:
             estop = Estop(f"{estop.id}.{estop.at_ns:x}", estop.by, estop.why, estop.at_ns, estop.fleet_wide)
         self.put_on_hold(estop.by, estop.at_ns)
         first = self._estops.get(estop.id)
+        if sum(each.fleet_wide is estop.fleet_wide for each in self.estops) >= MAX_ESTOPS:
+            return first or estop
         if first is None or (estop.fleet_wide and not first.fleet_wide):  # widened from this car to the fleet
             self._estops[estop.id] = estop
         return self._estops[estop.id]
@@ -121,7 +129,7 @@ class Safety:
         removed = self.end(each for each in ended if each in self._estops and self._estops[each].fleet_wide)
         known = {*self._estops, *self._ended}
         latched = [self.latch(each) for each in estops if each.fleet_wide and each.id not in known]
-        return latched, removed
+        return [each for each in latched if each.id in self._estops], removed
 
     def _remember(self, ids: Iterable[str]) -> None:
         self._ended.update(dict.fromkeys(ids))

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.commands import Sender, SenderKind
-from gateway.control.safety import MAX_ENDED_ESTOPS, Estop, Hold, LeaseState, PersistedSafety, Safety
+from gateway.control.safety import MAX_ENDED_ESTOPS, MAX_ESTOPS, Estop, Hold, LeaseState, PersistedSafety, Safety
 
 ANN, BOB = Sender("ann", SenderKind.PERSON), Sender("bob", SenderKind.PERSON)
 SCRIPT, PLAN = Sender("ann", SenderKind.SCRIPT), Sender("plan", SenderKind.COORDINATOR)
@@ -59,6 +59,18 @@ def test_ended_ids_are_bounded() -> None:
         safety.latch(estop(str(number)))
         safety.end([str(number)])
     assert safety.ended == tuple(str(number) for number in range(9, MAX_ENDED_ESTOPS + 9))
+
+
+def test_e_stops_in_force_are_bounded_and_one_of_the_fleet_always_finds_room() -> None:
+    safety = Safety()
+    for number in range(1000):
+        safety.latch(estop(str(number), fleet_wide=False))
+    assert [each.id for each in safety.estops] == [str(number) for number in range(MAX_ESTOPS)]
+    begun, _ = safety.merge([estop(f"fleet {number}") for number in range(1000)], ())
+    assert len(begun) == MAX_ESTOPS
+    assert safety.merge([estop("one more")], ()) == ([], []), "nothing new: the car is not stopped once more"
+    assert len(safety.end([each.id for each in safety.estops])) == len(safety.ended) == 2 * MAX_ESTOPS
+    assert safety.latch(estop("later")) in safety.estops
 
 
 def test_only_fleet_wide_ids_are_united_and_ended_wins() -> None:
