@@ -18,6 +18,8 @@ from fleet.fleetfile.models import (
     BatteryAction,
     FileEntry,
     LimitsEntry,
+    PersonEntry,
+    PersonRank,
     RecordEntry,
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
@@ -67,11 +69,24 @@ class FleetCar:
 
 
 @dataclass(frozen=True, slots=True)
+class FleetPerson:
+    """One person with their rank and the cars that they may drive; None: all."""
+
+    rank: PersonRank = PersonRank.PERSON
+    drives: tuple[str, ...] | None = None
+
+    def may_drive(self, car: str) -> bool:
+        """Return True if this person may drive the car."""
+        return self.drives is None or car in self.drives
+
+
+@dataclass(frozen=True, slots=True)
 class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
     endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: none.
-    groups: the cars of each. colors: of cars that have one in the file. unlinked: cars without a link, if allowed.
+    groups: the cars of each. people: who may drive; None: everyone. colors: of cars that have one in the file.
+    unlinked: cars without a link, if allowed.
     """
 
     name: str
@@ -85,6 +100,7 @@ class FleetFile:
     text: str
     path: Path
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    people: Mapping[str, FleetPerson] | None = None
     colors: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
     unlinked: Mapping[str, FleetCar] = field(default_factory=dict)
 
@@ -132,6 +148,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
         recordings=_resolve_path(path, record.to or None if record else None),
         quota=record.quota if record else "",
         groups=MappingProxyType({name: tuple(cars) for name, cars in file.groups.items()}),
+        people=_resolve_people(file) if "people" in tree else None,
         colors=MappingProxyType({name: parse_color(car["color"]) for name, car in merged.items() if "color" in car}),
         text=text,
         path=path.absolute(),
@@ -161,6 +178,18 @@ def _resolve_car(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
         limits=Limits(**dict(limits)),
         roles=tuple(car["roles"]) if "roles" in car else None,
     )
+
+
+def _resolve_people(file: FileEntry) -> Mapping[str, FleetPerson]:
+    """Resolve groups of cars to their members."""
+
+    def cars(person: PersonEntry) -> tuple[str, ...] | None:
+        if "drives" not in person.model_fields_set:
+            return None
+        named = (file.groups[each[1:]] if each.startswith("@") else [each] for each in person.drives)
+        return tuple(dict.fromkeys(car for members in named for car in members))
+
+    return MappingProxyType({name: FleetPerson(person.rank, cars(person)) for name, person in file.people.items()})
 
 
 def _is_listed(word: str, car: Mapping[str, Any]) -> bool:
@@ -217,12 +246,28 @@ def _find_contradictions(
         for index, car in enumerate(members if isinstance(members, list) else ()):
             if isinstance(car, str) and car not in cars:
                 yield ("groups", group, index), f"there is no car {quote_value(car)}. {suggest(car, cars)}"
+    yield from _find_people_contradictions(tree, cars)
     for entry in () if moved else ("plan", "world"):
         given = tree.get(entry)
         if isinstance(given, str) and given and given.isprintable():
             there = _resolve_path(path, given)
             if there is not None and not there.is_file():
                 yield (entry,), f"there is no file {quote_value(given)} beside this one"
+
+
+def _find_people_contradictions(tree: Mapping[str, Any], cars: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:
+    groups = _as_mapping(tree.get("groups"))
+    for name, entry in _as_mapping(tree.get("people")).items():
+        person = _as_mapping(entry)
+        drives = person.get("drives")
+        if person.get("rank") == PersonRank.LEAD and "drives" in person:
+            yield ("people", name, "drives"), "a lead drives every car. Leave it out."
+        for index, each in enumerate(drives if isinstance(drives, list) else ()):
+            if not isinstance(each, str) or each in cars or (each.removeprefix("@") in groups and each[:1] == "@"):
+                continue
+            what, there = ("group", {f"@{group}": None for group in groups}) if each[:1] == "@" else ("car", cars)
+            near = f'Did you mean "@{each}"?' if each in groups else suggest(each, there)
+            yield ("people", name, "drives", index), f"there is no {what} {quote_value(each)}. {near}"
 
 
 def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:

@@ -23,6 +23,13 @@ LOW_V, CRITICAL_V = 7.0, 6.6
 EMPTY_V, FULL_V = 6.4, 8.4  # docs/reference/protocol.md#readings: two Li-ion cells
 
 
+class PersonRank(StrEnum):
+    """The rank of a person."""
+
+    LEAD = "lead"
+    PERSON = "person"
+
+
 class BatteryAction(StrEnum):
     """The reaction to a battery's level, a value of `gateway run --on-battery-low`."""
 
@@ -41,6 +48,11 @@ def validate_car_name(name: str) -> str:
     if name == "all":
         raise ValueError("no car can be called all: `fleet stop all` stops every car")
     return validate_name(name)
+
+
+def validate_driven(name: str) -> str:
+    """Return a car or @group if it is valid; raises ValueError."""
+    return f"@{validate_name(name[1:])}" if name.startswith("@") else validate_car_name(name)
 
 
 def validate_link(text: str) -> str:
@@ -99,6 +111,9 @@ _Name = Annotated[
 _CarName = Annotated[
     str, AfterValidator(validate_car_name), Field(json_schema_extra={"pattern": "^(?!all$)[a-z0-9][a-z0-9_-]{0,31}$"})
 ]
+_Driven = Annotated[
+    str, AfterValidator(validate_driven), Field(json_schema_extra={"pattern": "^(?!all$)@?[a-z0-9][a-z0-9_-]{0,31}$"})
+]
 _Link = Annotated[str, AfterValidator(validate_link), Field(examples=["/dev/ttyUSB0", "tcp://192.168.1.7:8888"])]
 _Platform = Annotated[str, AfterValidator(validate_platform), Field(json_schema_extra={"pattern": _PLATFORMS})]
 _Color = Annotated[str, AfterValidator(validate_color), Field(json_schema_extra={"pattern": COLOR_PATTERN})]
@@ -146,6 +161,17 @@ class CarEntry(CommonEntry):
     link: _Link = Field(default_factory=str, description="address of the car; `fleet scan` shows links")
 
 
+class PersonEntry(Entry):
+    """What a person may do. Everyone may watch, stop and emergency-stop every car."""
+
+    rank: PersonRank = Field(
+        default=PersonRank.PERSON, description="lead: drives every car, outranks all others, pauses and lends"
+    )
+    drives: list[_Driven] = Field(
+        default_factory=list, description='cars and groups that they may drive, `[red, "@a"]`; left out: all cars'
+    )
+
+
 class RecordEntry(Entry):
     """Where `fleet up` records, and how much it keeps."""
 
@@ -173,5 +199,9 @@ class FileEntry(Entry):
     )
     groups: dict[_Name, list[_Name]] = Field(
         default_factory=dict, description="groups of cars, `a: [red, blue]`, for commands: `fleet stop @a`"
+    )
+    people: dict[_Name, PersonEntry] = Field(
+        default_factory=dict,
+        description="who may drive, `group_a: {drives: [red]}`; left out: everyone. Others watch and stop.",
     )
     cars: dict[_CarName, CarEntry] = Field(description="at least one car, as `red: {link: /dev/ttyUSB0}`", min_length=1)

@@ -114,6 +114,8 @@ def format_new_file(cars: Sequence[NewCar]) -> str:
         "    longest_drive_s: 5      # no command drives longer than this",
         "    on_battery_low: warn    # below 7.0 V: warn, refuse or stop",
         "",
+        "# groups: {a: [red, blue]}  # for commands: `fleet stop @a`",
+        '# people: {group_a: {drives: ["@a"]}, teacher: {rank: lead}}   # who may drive; left out: everyone',
         "# plan: plan.yaml           # what the cars do together",
         "# record: {to: sessions, quota: 20GB}   # where `fleet up` records, and how much it keeps; false: it does not",
     ]

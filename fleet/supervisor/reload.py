@@ -43,7 +43,7 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         before = old.cars.get(name)
         if car == before:
             cars[name] = car
-        elif SIMULATED in (car.link, before.link if before else ""):
+        elif SIMULATED in (car.link, before.link if before else "") and not _is_same_simulated(before, car):
             words.append(
                 f"{name}, a simulated car, cannot change while the fleet runs. Restart it: `fleet down`, `fleet up`."
             )
@@ -74,6 +74,11 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         warnings=new.warnings,
     )
     return SpecChange(spec, removed, tuple(restarted), tuple(words))
+
+
+def _is_same_simulated(before: CarProcessSpec | None, now: CarProcessSpec) -> bool:
+    """Return True if only options of the gateway differ, so that the simulator can go on."""
+    return before is not None and replace(before, arguments=now.arguments) == now
 
 
 def _describe_difference(before: CoordinatorCar | None, now: CoordinatorCar | None) -> str:

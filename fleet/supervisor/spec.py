@@ -7,12 +7,13 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from fleet.fleetfile.fleet_file import FleetCar, FleetFile, profile_capabilities
+from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, profile_capabilities
+from fleet.fleetfile.models import PersonRank
 from fleet.supervisor.restart_policy import Patience
 from schemas.keys import DEFAULT_FLEET
 
@@ -133,6 +134,9 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         # A simulated car needs a platform. The platform of a real car can be detected.
         platform = "arduino" if car.platform in ("auto", "unknown") else car.platform
         cars[name] = CarProcessSpec(name, SIMULATED, platform, car.arguments)
+    people = file.people if file else None
+    if people is not None:
+        cars = {name: replace(car, arguments=(*car.arguments, *_people(name, people))) for name, car in cars.items()}
     return FleetSpec(
         fleet=options.fleet or (file.name if file else DEFAULT_FLEET),
         endpoint=options.connect or (file.endpoint if file else None),
@@ -185,6 +189,13 @@ def _car(spec: FleetCar) -> CarProcessSpec:
             ),
         ),
     )
+
+
+def _people(car: str, people: Mapping[str, FleetPerson]) -> tuple[str, ...]:
+    """Return the options of a gateway that name the people who may drive its car."""
+    drivers = {name: person for name, person in people.items() if person.may_drive(car)}
+    named = [f"{name}:lead" if person.rank is PersonRank.LEAD else name for name, person in drivers.items()]
+    return ("--people-only", *(word for name in named for word in ("--person", name)))
 
 
 def _listed(spec: FleetCar | None, platform: str) -> CoordinatorCar:

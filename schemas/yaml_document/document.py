@@ -363,6 +363,8 @@ def _syntax_problem(error: yaml.MarkedYAMLError) -> Problem:
     problem = " ".join((error.problem or error.context or "it cannot be read").split())
     if "'\\t'" in problem:
         problem = "a tab. YAML needs spaces"
+    elif "'@'" in problem or "'`'" in problem:
+        problem = f"a text that begins with {'@' if '@' in problem else '`'}. Write it in quotes"
     elif "single document" in (error.context or ""):
         problem = "a second document (`---`). A file has one"
     return Problem(line, column, "", f"this is not YAML: {problem}")

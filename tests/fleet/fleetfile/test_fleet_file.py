@@ -67,6 +67,40 @@ def test_a_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> Non
     assert blue.capabilities == profile_capabilities("raspberry_pi+arm") - servos
 
 
+TWO = "cars: {red: {link: COM1}, blue: {link: COM2}}\ngroups: {a: [red]}\n"
+
+
+def test_people_have_a_rank_and_cars() -> None:
+    text = 'people: {lee: {drives: ["@a", blue]}, ana: {drives: []}, kim: {}, teacher: {rank: lead}}\n'
+    people = _fleet(TWO + text).people
+    assert people is not None
+    assert {name: (str(person.rank), person.drives) for name, person in people.items()} == {
+        "lee": ("person", ("red", "blue")),
+        "ana": ("person", ()),
+        "kim": ("person", None),
+        "teacher": ("lead", None),
+    }
+    assert [people[name].may_drive("blue") for name in people] == [True, False, True, True]
+    assert _fleet(TWO).people is None, "everyone may drive"
+
+
+@pytest.mark.parametrize(
+    ("people", "fault"),
+    [
+        ('{lee: {drives: ["@b"]}}', "3:25: error: people.lee, drive 1: there is no group '@b'. There is only @a."),
+        ("{lee: {drives: [rad]}}", "3:25: error: people.lee, drive 1: there is no car 'rad'. Did you mean red?"),
+        ("{lee: {drives: [a]}}", "3:25: error: people.lee, drive 1: there is no car 'a'. Did you mean \"@a\"?"),
+        ("{lee: {drives: [@a]}}", "3:25: error: this is not YAML: a text that begins with @. Write it in quotes"),
+        ("{lee: {rank: led}}", "3:22: error: people.lee.rank: 'led' is not allowed. Did you mean lead?"),
+        ("{lee: {rank: lead, drives: [red]}}", "error: people.lee.drives: a lead drives every car. Leave it out."),
+        ("{lee: {drive: [red]}}", "3:16: error: people.lee.drive: there is no such field. Did you mean drives?"),
+    ],
+)
+def test_what_is_wrong_about_a_person(people: str, fault: str) -> None:
+    (found,) = _faults(f"{TWO}people: {people}\n")
+    assert found.endswith(fault)
+
+
 def test_what_is_not_said() -> None:
     fleet = _fleet("cars: {red: {link: sim, platform: stm32}, b2: {link: COM3}}")
     assert (fleet.name, fleet.endpoint, fleet.plan, fleet.recordings, fleet.record) == ("fleet", None, None, None, True)

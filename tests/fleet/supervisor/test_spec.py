@@ -54,6 +54,29 @@ def test_the_recorder_takes_any_quota_and_place_of_a_file(quota: str, size: floa
     assert given["fleet_file"] == tmp_path / "fleet.yaml"
 
 
+PEOPLE = """
+people: {lee: {drives: ["@a"]}, ana: {drives: [bob]}, kim: {}, teacher: {rank: lead}}
+groups: {a: [ann]}
+"""
+
+
+def test_each_gateway_gets_the_people_who_may_drive_its_car(tmp_path: Path) -> None:
+    spec = build_spec(parse_fleet(FILE + PEOPLE, tmp_path / "fleet.yaml"), UpOptions(simulated=3))
+    assert {name: _people(car.arguments) for name, car in spec.cars.items()} == {
+        "ann": ["--people-only", "--person", "lee", "--person", "kim", "--person", "teacher:lead"],
+        "bob": ["--people-only", "--person", "ana", "--person", "kim", "--person", "teacher:lead"],
+        "red": ["--people-only", "--person", "kim", "--person", "teacher:lead"],  # a simulated car beside the file's
+    }
+    nobody = build_spec(parse_fleet(FILE + "people: {}\n", tmp_path / "fleet.yaml"), UpOptions())
+    assert _people(nobody.cars["ann"].arguments) == ["--people-only"]
+    everyone = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions())
+    assert _people(everyone.cars["ann"].arguments) == []
+
+
+def _people(arguments: tuple[str, ...]) -> list[str]:
+    return list(arguments[arguments.index("--people-only") :]) if "--people-only" in arguments else []
+
+
 def test_the_command_line_wins(tmp_path: Path) -> None:
     asked = UpOptions(plan=Path("p.yaml"), record=True, out=Path("o"), connect="tcp/127.0.0.1:7000", fleet="x")
     spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), asked)
@@ -119,6 +142,12 @@ def test_cars_come_go_and_change() -> None:
     assert found.restarted == ("bob", "eve")
     assert found.spec.cars == cars
     assert found.words == ("bob is restarted", "eve is added", "ann is removed")
+
+
+def test_a_gateway_of_a_simulated_car_restarts_with_other_people() -> None:
+    car = replace(OLD.cars["sim"], arguments=("--people-only", "--person", "lee"))
+    found = compare(OLD, replace(OLD, cars={**OLD.cars, "sim": car}))
+    assert (found.restarted, found.words, found.spec.cars["sim"]) == (("sim",), ("sim is restarted",), car)
 
 
 @pytest.mark.parametrize(
