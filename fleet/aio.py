@@ -14,7 +14,7 @@ from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from fleet.client import client
 from fleet.client import lease as leases
-from fleet.client.commands import CarCommands, CommandRequest
+from fleet.client.commands import CarCommands, CommandRequest, estop_request, resume_request, stop_request
 from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.outcome import Outcome
 from fleet.client.reading import READING_QUEUE_LIMIT, Reading, ReadingFilter, reading_of
@@ -23,7 +23,7 @@ from schemas import keys, messages
 from schemas.bus import Handover, Sample
 
 _THREADS: Final = 256
-"""Maximum number of concurrent calls. A drive blocks its thread until its end, and a stop must find a free one."""
+"""Maximum number of concurrent calls. A drive blocks its thread until its end."""
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -112,19 +112,19 @@ class Fleet:
 
     async def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Stop these cars, or every car."""
-        return await self.call(self.sync.stop, cars)
+        return await self.ask(stop_request(), cars)
 
     async def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
         """E-stop these cars, or the fleet."""
-        return await self.call(self.sync.estop, cars, why)
+        return await self.ask(estop_request(why, "fleet" if cars is None else "car"), cars)
 
     async def resume(self, cars: Iterable[str], ids: Sequence[str] = ()) -> list[Outcome]:
         """End the e-stops of these ids. Without ids, end the hold."""
-        return await self.call(self.sync.resume, cars, ids)
+        return await self.ask(resume_request(ids), cars)
 
     async def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
-        """Send a command to the cars and return their outcomes."""
-        return await self.call(self.sync.ask, request, cars)
+        """Send a command to the cars and return their outcomes. It is sent at once, whatever the threads wait for."""
+        return await self.call(self.sync.outcomes, self.sync.send(request, cars))
 
 
 class Car(CarCommands[Coroutine[Any, Any, Outcome]]):
@@ -148,7 +148,9 @@ class Car(CarCommands[Coroutine[Any, Any, Outcome]]):
 
     async def do(self, request: CommandRequest) -> Outcome:
         """Send one command and return its outcome."""
-        return await self._fleet.call((self._leased or self._fleet.sync.car(self.name)).do, request)
+        if self._leased is not None:
+            return await self._fleet.call(self._leased.do, request)
+        return (await self._fleet.ask(request, [self.name]))[0]
 
 
 class Lease:

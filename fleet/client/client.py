@@ -30,7 +30,7 @@ from fleet.client.command_tracker import (
 from fleet.client.commands import CarCommands, CommandRequest, estop_request, resume_request, stop_request
 from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.lease import Lease
-from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome
+from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome, Until
 from fleet.client.reading import Reading, Watch, reading_of
 from fleet.client.supervision import ask_status
 from fleet.client.wait import ConditionWait
@@ -42,6 +42,8 @@ from schemas.topics import Qos
 _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0
 """Poll interval of a wait without a timeout."""
+_MAX_STOP_THREADS: Final = 1024
+"""Maximum number of queries of stops that wait for answers, two for each stop."""
 _MIN_QUERY_TIMEOUT_S: Final = 0.1
 """Minimum timeout for the query of the current values, however short a wait is."""
 
@@ -86,6 +88,8 @@ class Fleet:
         self._pending: dict[str, PendingCommand] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
+        # The query of a gateway that hangs occupies its thread for 10 s. A stop never waits for such a thread.
+        self._stop_pool = ThreadPoolExecutor(max_workers=_MAX_STOP_THREADS, thread_name_prefix="fleet-stop")
         self.dropped = 0
         """Number of dropped command events: the queue of their command was full."""
         try:
@@ -108,9 +112,11 @@ class Fleet:
             watch.close()
         for command in list(self._pending.values()):
             command.inbox.put((time.monotonic(), CLOSED))
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        for pool in (self._pool, self._stop_pool):
+            pool.shutdown(wait=False, cancel_futures=True)
         self.bus.close()  # ends every pending query
-        self._pool.shutdown()
+        for pool in (self._pool, self._stop_pool):
+            pool.shutdown()
 
     # ------------------------------------------------------------------ reading
 
@@ -221,25 +227,39 @@ class Fleet:
 
         A missing or silent car has its own outcome and does not delay the others.
         """
+        return self.outcomes(self.send(request, cars))
+
+    def send(self, request: CommandRequest, cars: Iterable[str] | None = None) -> PendingCommand:
+        """Send a command and return at once. Pass the result to `outcomes`."""
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._filled(request)
         payload = message.SerializeToString()
+        pool = self._stop_pool if request.until is Until.STOPPED else self._pool
 
         def send_again(car: str) -> None:
-            self._pool.submit(self._query, car, command, payload)
+            pool.submit(self._query, car, command, payload)
 
-        command = PendingCommand(request, self.cars(), named, lambda: self.bus.hubs, send_again)
+        command = PendingCommand(command_id, request, self.cars(), named, lambda: self.bus.hubs, send_again)
         self._pending[command_id] = command
         try:
-            futures = [self._pool.submit(self._query, target, command, payload) for target in command.targets]
+            command.queries = [pool.submit(self._query, target, command, payload) for target in command.targets]
             if command.is_stop:
-                self._pool.submit(self._query_supervisor, command)
-            command.wait()
-            for future in futures:
-                if future.done():
-                    future.result()
-        finally:
+                with suppress(RuntimeError):  # the fleet is closed meanwhile, which ends the command
+                    pool.submit(self._query_supervisor, command)
+        except BaseException:
             del self._pending[command_id]
+            raise
+        return command
+
+    def outcomes(self, command: PendingCommand) -> list[Outcome]:
+        """Wait and return the outcomes of a command that was sent."""
+        try:
+            command.wait()
+            for query in command.queries:
+                if query.done() and not query.cancelled():
+                    query.result()
+        finally:
+            self._pending.pop(command.id, None)
         return command.outcomes()
 
     def _filled(self, request: CommandRequest) -> tuple[Any, str]:

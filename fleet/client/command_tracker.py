@@ -4,6 +4,7 @@ import logging
 import queue
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any, Final
 
 from fleet.client.commands import CommandRequest
@@ -58,13 +59,16 @@ class PendingCommand:
 
     def __init__(
         self,
+        command_id: str,
         request: CommandRequest,
         present: list[str],
         named: list[str] | None,
         hubs: Callable[[], tuple[str, ...]],
         send_again: Callable[[str], None],
     ) -> None:
+        self.id = command_id
         self.request = request
+        self.queries: list[Future[None]] = []
         self.is_stop = request.verb in STOPS
         self._send_again = send_again
         self._present = set(present)

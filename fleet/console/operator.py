@@ -16,7 +16,7 @@ from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
 from fleet.policy.plan.parser import BadPlan, parse
 from schemas import keys, messages
-from schemas.bus import BusError, Failure
+from schemas.bus import Failure
 from schemas.commands import COMMANDS
 
 # The gateway is the watchdog outside our loop: if the loop blocks, the last drive expires.
@@ -44,6 +44,8 @@ class ConsoleOperator:
         """Time of the last drive and number of drives, by press."""
         self._leases: dict[str, int] = {}
         """The cars that a page has taken, and the page."""
+        self._renewals: set[str] = set()
+        """Cars whose lease is being renewed."""
         self._numbers = 0
         self.report: StopReport | None = None
         """The course of the last STOP."""
@@ -159,16 +161,18 @@ class ConsoleOperator:
         """Renew the leases of the pages until the task is cancelled. A lease that another sender has taken is lost."""
         while True:
             await asyncio.sleep(LEASE_RENEWAL_INTERVAL_S)
-            if not self._leases:
-                continue
-            try:
-                outcomes = await self._fleet.ask(lease_request(), list(self._leases))
-            except BusError as error:
-                log.warning("leases not renewed: %s", error)
-                continue
-            for outcome in outcomes:
-                if not outcome.ok:
-                    self._leases.pop(outcome.car, None)
+            for car in self._leases.keys() - self._renewals:
+                self._renewals.add(car)
+                self.spawn(self._renew_lease(car))
+
+    async def _renew_lease(self, car: str) -> None:
+        """Renew one lease. A gateway that hangs must not cost a page its other leases."""
+        try:
+            (outcome,) = await self._fleet.ask(lease_request(), [car])
+            if not outcome.ok:
+                self._leases.pop(car, None)
+        finally:
+            self._renewals.discard(car)
 
     async def ask_coordinator(self, verb: str, text: str = "") -> tuple[bool, str]:
         """Send a request to the coordinator. Return whether it was carried out, and words. text: of a plan to set."""

@@ -231,6 +231,33 @@ def test_a_gateway_that_hangs_is_told_from_one_that_answers_late(
     assert caplog.messages == ["fine, hung: no answer yet, still waiting. Computer or gateway may be overloaded."]
 
 
+async def test_a_stop_waits_for_no_command_that_nobody_answers(
+    cars: Cars, gateway: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fleet.client.client.OVERLOAD_ANSWER_TIMEOUT_S", 600.0)
+    stopped: list[str] = []
+    held: list[zenoh.Query] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            stopped.append(_asked(query))
+            result = pb.Result(id=stopped[-1], car="fine", status="sent").SerializeToString()
+            reply(query, "odd/fine/@cmd/stop", result, messages.encoding_of(topics.RESULT))
+
+    gateway.queryable("odd/fine/@cmd/*", answer)
+    gateway.queryable("odd/hung/@cmd/*", held.append)
+    for car in ("fine", "hung"):
+        gateway.token(keys.car_token("odd", car))
+    async with AsyncFleet(cars.endpoint, "odd", sender="ann") as client:
+        await asyncio.to_thread(wait_for, lambda: client.sync.cars() == ["fine", "hung"], "both are there")
+        commands = [client.ask(led_request(0, 0, 0), ["hung"]) for _ in range(40)]
+        stops = [client.stop() for _ in range(40)]
+        unanswered = asyncio.gather(*commands, *stops)
+        await asyncio.to_thread(wait_for, lambda: len(set(stopped)) == len(stops), "each stop is there")
+        assert not unanswered.done()
+    assert len(await unanswered) == 80
+
+
 def test_a_command_of_which_nothing_more_is_heard_ends_with_what_was_heard_last(cars: Cars, gateway: Bus) -> None:
     def answer(query: zenoh.Query) -> None:
         with query:
