@@ -36,6 +36,7 @@ COMMANDS: Final = {
         ),
         "console": ("fleet.commands.console:console", "The fleet as a web page: watch, drive, STOP."),
         "status": ("fleet.commands.lifecycle:status", "Processes, session and hub at a glance."),
+        "doctor": ("fleet.commands.doctor:doctor", "Why a car or a session is odd, and what to type."),
         "reload": ("fleet.commands.lifecycle:reload", "Apply changes in fleet.yaml without a restart."),
         "logs": ("fleet.commands.lifecycle:logs", "What a car's gateway or a service has logged."),
         "sim": ("fleet.commands.gateway_tools:sim", "Simulated cars alone, with faults: test your own programs."),

@@ -12,6 +12,7 @@ import click
 import pytest
 
 from fleet.cli import cli
+from fleet.client.diagnosis import CHECKS
 from gateway.control.commands import Reason
 from gateway.protocol.enums import Mode
 from schemas import world
@@ -159,6 +160,10 @@ def rows(page: str, heading: str) -> set[str]:
 
 def test_each_reason_of_a_refusal_is_documented() -> None:
     assert rows("docs/reference/commands.md", "Results") == set(Reason)
+
+
+def test_each_finding_of_the_doctor_is_documented() -> None:
+    assert rows("docs/how-to/troubleshooting.md", "Ask the doctor") == {check.code for check in CHECKS}
 
 
 def test_each_verb_and_each_mode_is_documented() -> None:

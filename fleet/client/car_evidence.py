@@ -1,0 +1,59 @@
+"""Collects from the bus what `diagnosis` judges: states, recent commands, processes, recorder and plan."""
+
+import time
+from contextlib import suppress
+from typing import Any
+
+from fleet.client.client import Fleet
+from fleet.client.diagnosis import RECENT_COMMAND_S, CarEvidence
+from fleet.client.supervision import ask_status
+from schemas import keys, messages, topics
+
+_EVENT = topics.TOPICS["event/command"]
+
+
+def collect(client: Fleet) -> dict[str, CarEvidence]:
+    """Return the evidence of every car that is on the bus or that a supervisor starts a gateway for, by name."""
+    present = client.cars()
+    processes = {
+        each.name: each
+        for status in ask_status(client.bus, client.name)
+        for each in status.processes
+        if each.kind == "gateway" and each.state != "ended"
+    }
+    states: dict[str, dict[str, Any]] = {}
+    for expression in ("*/state/*", "*/sensor/battery"):
+        for reading in client.get(expression):
+            if (key := keys.parse(reading.key)) is not None:
+                states.setdefault(key.car, {})[key.topic] = reading.value
+    commands = _commands(client)
+    recording = next((each.value for each in client.get(f"{client.name}/{keys.RECORDER}/status")), None)
+    assignment = next((each.value for each in client.get(f"{client.name}/{keys.COORDINATOR}/assignment")), None)
+    coordinated = bool(client.bus.tokens(keys.car_token(client.name, keys.COORDINATOR)))
+    return {
+        car: CarEvidence(
+            car,
+            present=car in present,
+            states=states.get(car, {}),
+            commands=commands.get(car, []),
+            process=processes.get(car),
+            recording=recording,
+            assignment=assignment,
+            coordinated=coordinated,
+        )
+        for car in sorted({*present, *processes})
+    }
+
+
+def _commands(client: Fleet) -> dict[str, list[tuple[float, Any]]]:
+    """Return age and event of the recent commands, by car, the newest last. Gateways cache their last hundred."""
+    found: dict[str, list[tuple[float, Any]]] = {}
+    now = time.time()
+    for sample in client.bus.recall(keys.topic_key(client.name, "*", _EVENT.name), RECENT_COMMAND_S):
+        with suppress(messages.BadPayload):
+            event: Any = messages.parse(_EVENT.message, bytes(sample.payload), str(sample.encoding))
+            age_s = max(0.0, now - event.stamp.seconds - event.stamp.nanos / 1e9)
+            found.setdefault(event.car, []).append((age_s, event))
+    for events in found.values():
+        events.sort(key=lambda each: -each[0])
+    return found

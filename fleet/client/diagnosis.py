@@ -1,0 +1,356 @@
+"""What an engineer needs to know of a car that behaves oddly, and the likely causes. Pure.
+
+`CHECKS` is the table of findings: condition, cause, and what to type. The likeliest cause comes first.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
+
+RECENT_COMMAND_S: Final = 600.0
+"""Maximum age of a command that `fleet doctor` looks at."""
+MAX_ODD_LOOP_LAG_S: Final = 0.25
+"""Maximum lag of a gateway's loop on a computer that is not overloaded."""
+MAX_REJECTED_SHARE: Final = 0.05
+"""Maximum share of rejected frames on a link that works."""
+_MIN_REJECTED: Final = 10
+MAX_AIRTIME: Final = 0.8
+MIN_ODD_RECONNECTS: Final = 2
+_NOT_OBEYED: Final = "not_obeyed"
+_FAILED_PHASES: Final = ("rejected", "failed", "expired")
+_NO_TROUBLE: Final = ("superseded", "duplicate")
+"""Reasons of commands that ended early as somebody intended."""
+
+
+@dataclass(frozen=True, slots=True)
+class CarEvidence:
+    """Everything that the bus knows of one car. A message that nobody sent is missing."""
+
+    car: str
+    present: bool
+    """True if its gateway is on the bus."""
+    states: Mapping[str, Any] = field(default_factory=dict)
+    """The newest message by topic, such as `state/link`."""
+    commands: Sequence[tuple[float, Any]] = ()
+    """Age (s) and CommandEvent, the newest last."""
+    process: Any = None
+    """The gateway's process, as the supervisor reports it (fleet.v1.Supervised)."""
+    recording: Any = None
+    """The recorder's status (fleet.v1.Recording)."""
+    assignment: Any = None
+    """The roles of the plan (fleet.v1.Assignment)."""
+    coordinated: bool = False
+    """True if a coordinator is on the bus."""
+
+    def of(self, name: str) -> Any:
+        """Return the newest message of a topic. None if there is none."""
+        return self.states.get(name)
+
+    @property
+    def failed(self) -> list[tuple[float, Any]]:
+        """The refused and failed commands, the newest last."""
+        return [
+            (age, event)
+            for age, event in self.commands
+            if event.phase in _FAILED_PHASES and event.reason not in _NO_TROUBLE
+        ]
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """The rejected frames by cause."""
+        link = self.of("state/link")
+        return {} if link is None else {cause: count for cause, count in link.rejects.items() if cause != _NOT_OBEYED}
+
+
+@dataclass(frozen=True, slots=True)
+class DoctorFinding:
+    """One thing that is odd."""
+
+    code: str
+    cause: str
+    todo: str
+    """What to type."""
+
+    def __str__(self) -> str:
+        return f"{self.cause} Type: {self.todo}"
+
+
+@dataclass(frozen=True, slots=True)
+class DoctorCheck:
+    """One row of the table. cause: returns words about the cause, empty if the condition is not met."""
+
+    code: str
+    cause: Callable[[CarEvidence], str]
+    todo: str
+    """`{car}` stands for the car."""
+
+
+def _ended(e: CarEvidence) -> str:
+    if e.present or e.process is None:
+        return ""
+    why = f" ({e.process.words})" if e.process.words else ""
+    return f"Its gateway is {e.process.state}{why}. Nothing stops the car, and whether it moves is not known."
+
+
+def _absent(e: CarEvidence) -> str:
+    if e.present or e.process is not None:
+        return ""
+    return "No gateway serves the car. Nothing stops it, and whether it moves is not known."
+
+
+def _hung(e: CarEvidence) -> str:
+    answers = any(topic.startswith("state/") for topic in e.states)
+    return "" if answers or not e.present else "Its gateway is on the bus and does not answer. It may hang."
+
+
+def _lost(e: CarEvidence) -> str:
+    link = e.of("state/link")
+    if link is None or link.state != "lost":
+        return ""
+    return f"The link has been lost for {link.since_s:.0f} s: {link.reason or 'no reason is known'}."
+
+
+def _contradicted(e: CarEvidence) -> str:
+    health = e.of("state/health")
+    if health is None or not health.platform_contradictions:
+        return ""
+    return f"It may be no {health.platform} car: {'; '.join(health.platform_contradictions)}."
+
+
+def _unproven(e: CarEvidence) -> str:
+    safety, link = e.of("state/safety"), e.of("state/link")
+    lost = 0 if link is None else link.rejects.get(_NOT_OBEYED, 0)
+    if safety is None or (safety.trust != "unproven" and not (lost and safety.trust != "stopped")):
+        return ""
+    return "Readings arrive, and the car has not reacted to a stop. The wire to its RX pin may be loose."
+
+
+def _silent(e: CarEvidence) -> bool:
+    link, safety = e.of("state/link"), e.of("state/safety")
+    stale = link is not None and link.state in ("stale", "quiet")
+    return stale and (link.state == "stale" or (safety is not None and safety.trust == "unheard"))
+
+
+def _fan_runs(e: CarEvidence) -> bool:
+    motion = e.of("state/motion")
+    return motion is not None and motion.fan
+
+
+def _silent_fan(e: CarEvidence) -> str:
+    return "It is silent, and its fan runs: some cars send nothing then." if _silent(e) and _fan_runs(e) else ""
+
+
+def _silent_car(e: CarEvidence) -> str:
+    if not _silent(e) or _fan_runs(e):
+        return ""
+    link = e.of("state/link")
+    since = f"for {link.last_rx_s:.0f} s" if link.HasField("last_rx_s") else "since its link opened"
+    return f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
+
+
+def _damaged(e: CarEvidence) -> str:
+    link, count = e.of("state/link"), sum(e.rejected.values())
+    if count < _MIN_REJECTED or count < MAX_REJECTED_SHARE * (link.rx_frames + count):
+        return ""
+    worst = max(e.rejected, key=lambda cause: e.rejected[cause])
+    return f"{count} of {link.rx_frames + count} frames were no reading, most of them {worst}: a bad wire or radio."
+
+
+def _estopped(e: CarEvidence) -> str:
+    safety = e.of("state/safety")
+    if safety is None or not safety.estops:
+        return ""
+    estop = safety.estops[0]
+    return f"E-stopped by {estop.by}{f': {estop.why}' if estop.why else ''}. It accepts only stops."
+
+
+def _other_mode(e: CarEvidence) -> str:
+    mode = e.of("state/mode")
+    if mode is None or mode.verdict != "contradicted":
+        return ""
+    return f"It should be in mode {mode.asked} and is probably in {mode.inferred}: {mode.evidence}."
+
+
+def _weak(e: CarEvidence) -> str:
+    battery = e.of("sensor/battery")
+    if battery is None or battery.level not in ("low", "critical"):
+        return ""
+    return f"The battery is {battery.level} ({battery.voltage_v:.2f} V). Motors may not start, and the car may reset."
+
+
+def _held(e: CarEvidence) -> str:
+    safety = e.of("state/safety")
+    if safety is None or not safety.HasField("hold"):
+        return ""
+    return f"On hold: {safety.hold.by} stopped it. No plan moves it until someone resumes it."
+
+
+def _leased(e: CarEvidence) -> str:
+    safety = e.of("state/safety")
+    refused = any(event.reason == "leased" for _, event in e.failed)
+    if safety is None or not safety.HasField("lease") or not refused:
+        return ""
+    return f"{safety.lease.holder} ({safety.lease.kind}) drives it, so others are refused."
+
+
+def _breaks(e: CarEvidence) -> str:
+    link = e.of("state/link")
+    if link is None or link.reconnects < MIN_ODD_RECONNECTS:
+        return ""
+    return f"The link broke {link.reconnects} times: cable, range or battery."
+
+
+def _restarted(e: CarEvidence) -> str:
+    if e.process is None or not e.process.restarts or not e.present:
+        return ""
+    return f"Its gateway was started again {_times(e.process.restarts)}: {e.process.words or 'see its log'}."
+
+
+def _lags(e: CarEvidence) -> str:
+    health = e.of("state/health")
+    if health is None or health.loop_lag_s <= MAX_ODD_LOOP_LAG_S:
+        return ""
+    return f"Its gateway stood still for {health.loop_lag_s:.2f} s: the computer is overloaded."
+
+
+def _flooded(e: CarEvidence) -> str:
+    link = e.of("state/link")
+    if link is None or link.tx_airtime <= MAX_AIRTIME:
+        return ""
+    return f"Our frames fill {link.tx_airtime:.0%} of the link: a program sends too many commands."
+
+
+def _refused(e: CarEvidence) -> str:
+    if not e.failed:
+        return ""
+    age, event = e.failed[-1]
+    return f"{event.sender}'s {event.verb} was not carried out {age:.0f} s ago: {_why(event)}."
+
+
+def _unrecorded(e: CarEvidence) -> str:
+    if e.recording is None or e.recording.state not in ("full", "failed"):
+        return ""
+    return f"The recorder is {e.recording.state}: {e.recording.error or e.recording.warning or 'see its log'}."
+
+
+def _drops(e: CarEvidence) -> str:
+    count = 0 if e.recording is None else sum(e.recording.drops.values())
+    return f"The recorder dropped {count} messages: its disk is too slow." if count else ""
+
+
+def _stopped_plan(e: CarEvidence) -> str:
+    if not e.coordinated or e.assignment is None or not e.assignment.stopped_by:
+        return ""
+    return f"{e.assignment.stopped_by} stopped the plan: it moves no car."
+
+
+CHECKS: Final = (
+    DoctorCheck("gateway_ended", _ended, "fleet logs {car}"),
+    DoctorCheck("no_gateway", _absent, "fleet up"),
+    DoctorCheck("gateway_hung", _hung, "fleet logs {car}"),
+    DoctorCheck("link_down", _lost, "fleet scan"),
+    DoctorCheck("platform_contradicted", _contradicted, "fleet bind"),
+    DoctorCheck("not_shown", _unproven, "fleet stop {car}"),
+    DoctorCheck("fan_silence", _silent_fan, "fleet fan {car}"),
+    DoctorCheck("silent", _silent_car, "fleet watch '{car}/sensor/*'"),
+    DoctorCheck("damaged_frames", _damaged, "fleet watch {car}/frame/rx"),
+    DoctorCheck("estopped", _estopped, "fleet resume {car} --estops"),
+    DoctorCheck("mode_contradicted", _other_mode, "fleet stop {car}"),
+    DoctorCheck("battery_low", _weak, "fleet get {car}/sensor/battery"),
+    DoctorCheck("leased", _leased, "fleet drive {car} forward --take"),
+    DoctorCheck("link_breaks", _breaks, "fleet logs {car}"),
+    DoctorCheck("gateway_restarted", _restarted, "fleet logs {car}"),
+    DoctorCheck("overloaded", _lags, "fleet status --processes"),
+    DoctorCheck("flooded", _flooded, "fleet watch {car}/event/command"),
+    DoctorCheck("held", _held, "fleet resume {car}"),
+    DoctorCheck("plan_stopped", _stopped_plan, "fleet plan restart"),
+    DoctorCheck("refused", _refused, "fleet why {car}"),
+    DoctorCheck("not_recorded", _unrecorded, "fleet record status"),
+    DoctorCheck("recorder_drops", _drops, "fleet record status"),
+)
+"""The table of findings, the likeliest cause first."""
+
+
+def diagnose(evidence: CarEvidence) -> list[DoctorFinding]:
+    """Return what is odd, the likeliest cause first. Empty if nothing is."""
+    found = [
+        DoctorFinding(check.code, cause, check.todo.format(car=evidence.car))
+        for check in CHECKS
+        if (cause := check.cause(evidence))
+    ]
+    last = evidence.failed[-1][1].reason if evidence.failed else ""
+    # The reason of the last refusal is the cause: it need not be listed twice.
+    known = any(each.code == last for each in found)
+    return [each for each in found if not (known and each.code == "refused")]
+
+
+def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
+    """Yield what is known of the car, as names and texts."""
+    link, health = evidence.of("state/link"), evidence.of("state/health")
+    if link is not None:
+        rejected = ", ".join(f"{count} {cause}" for cause, count in sorted(link.rejects.items()))
+        counts = f"{link.rx_frames} frames in, {link.tx_frames} out, {link.reconnects} reconnects"
+        yield "link", f"{link.state} for {link.since_s:.0f} s, {counts}{f'; rejected: {rejected}' if rejected else ''}"
+    if (mode := evidence.of("state/mode")) is not None:
+        inferred = "" if mode.inferred == mode.asked else f", probably {mode.inferred}"
+        yield "mode", f"{mode.asked}, {mode.verdict}{inferred}{f': {mode.evidence}' if mode.evidence else ''}"
+    if (safety := evidence.of("state/safety")) is not None:
+        basis = f", {safety.motors_basis}" if safety.motors_basis else ""
+        why = f": {safety.trust_evidence}" if safety.trust_evidence else ""
+        yield "motors", f"{safety.motors}{basis}; {safety.trust}{why}"
+        yield "control", _control(safety)
+    if health is not None:
+        seen = "; ".join(health.platform_evidence) or "nothing was seen yet"
+        yield "platform", f"{health.platform}: {seen}"
+    if (battery := evidence.of("sensor/battery")) is not None:
+        yield "battery", f"{battery.voltage_v:.2f} V, {battery.level}"
+    yield "refused", _describe_refused(evidence)
+    yield "services", ", ".join(_services(evidence, health))
+
+
+def as_dict(evidence: CarEvidence) -> dict[str, Any]:
+    """Return the findings and what is known, for JSON."""
+    found = [asdict(finding) for finding in diagnose(evidence)]
+    return {"car": evidence.car, "findings": found, "facts": dict(describe(evidence))}
+
+
+def _control(safety: Any) -> str:
+    lease = f"{safety.lease.holder} ({safety.lease.kind}) drives" if safety.HasField("lease") else "nobody drives"
+    hold = f"on hold by {safety.hold.by}" if safety.HasField("hold") else "no hold"
+    return f"{lease}, {hold}, {len(safety.estops) or 'no'} e-stop{'s' * (len(safety.estops) > 1)}"
+
+
+def _describe_refused(evidence: CarEvidence) -> str:
+    failed = evidence.failed
+    if not failed:
+        return "no command was refused lately"
+    age, event = failed[-1]
+    more = f" ({len(failed) - 1} more before)" if len(failed) > 1 else ""
+    return f"{event.verb} of {event.sender} {age:.0f} s ago: {_why(event)}{more}"
+
+
+def _services(evidence: CarEvidence, health: Any) -> Iterator[str]:
+    if health is not None:
+        yield f"gateway up for {health.uptime_s:.0f} s, lag {health.loop_lag_s * 1e3:.0f} ms"
+    restarts = 0 if evidence.process is None else evidence.process.restarts
+    if restarts:
+        yield f"started again {_times(restarts)}"
+    recording = evidence.recording
+    yield "no recorder" if recording is None else f"recorder {recording.state}"
+    if not evidence.coordinated:
+        yield "no plan"
+    elif evidence.assignment is None or not evidence.assignment.stopped_by:
+        roles = () if evidence.assignment is None else evidence.assignment.roles
+        role = next((role.name for role in roles if evidence.car in role.cars), "none")
+        yield f"plan runs, role {role}"
+    else:
+        yield "plan stopped"
+
+
+def _why(event: Any) -> str:
+    words = event.words.rstrip(".") or event.phase
+    return f"{words} [{event.reason}]" if event.reason else words
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

@@ -1,0 +1,99 @@
+"""`fleet doctor`: what an engineer needs to know of a car or a session that is odd, and the likely cause."""
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+import click
+
+from fleet.client.car_evidence import collect
+from fleet.client.client import Fleet
+from fleet.client.diagnosis import CarEvidence, DoctorFinding, as_dict, describe, diagnose
+from fleet.commands.options import bus_options, json_option
+from fleet.commands.params import SessionPath, complete_car, no_cars
+from fleet.commands.sessions import watched
+from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.session_dir import is_session
+from fleet.recording.tools.checkup import SessionCheckup
+from fleet.recording.tools.summary import growing, total
+from fleet.recording.tools.verify import verify
+from schemas.suggestion import did_you_mean
+
+MAX_FURTHER_FINDINGS: Final = 3
+"""Number of findings that stand on the line after the likely cause."""
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet doctor
+  fleet doctor red
+  fleet doctor latest
+
+The first line is the likely cause with what to type. Exit code 1: something is odd."""
+)
+@click.argument("name", required=False, metavar="[CAR | SESSION]", shell_complete=complete_car)
+@json_option
+@bus_options
+def doctor(name: str | None, connect: str | None, fleet: str, *, as_json: bool) -> None:
+    """Say in ten lines why a car behaves oddly, or what is wrong with a session. Without a name, look at all cars."""
+    if name is not None and (session := _session_of(name)) is not None:
+        _show_session(session, as_json=as_json)
+    with Fleet(connect, fleet, kind="person") as client:
+        found = collect(client)
+        if not found:
+            raise no_cars(client)
+        if name is not None and name not in found:
+            near = did_you_mean(name, found) or f"Cars: {', '.join(found)}."
+            raise click.ClickException(f'No car or session "{name}". {near}')
+    cars = list(found.values()) if name is None else [found[name]]
+    odd = [diagnose(evidence) for evidence in cars]
+    for evidence, findings in zip(cars, odd, strict=True):
+        if as_json:
+            click.echo(json.dumps(as_dict(evidence)))
+        elif name is None:
+            click.echo(_first_line(evidence.car, findings))
+        else:
+            _show_car(evidence, findings)
+    raise SystemExit(1 if any(odd) else 0)
+
+
+def _session_of(name: str) -> Path | None:
+    """Return the path of a session of this name. None if it is none."""
+    path = SessionPath().convert(name, None, click.get_current_context())
+    return path if is_session(path) else None
+
+
+def _show_car(evidence: CarEvidence, findings: Sequence[DoctorFinding]) -> None:
+    click.echo(_first_line(evidence.car, findings))
+    _show(findings, describe(evidence))
+
+
+def _show_session(path: Path, *, as_json: bool) -> None:
+    """Print what is known of a session, and exit."""
+    try:
+        session = Session(path)
+    except NoSession as error:
+        raise click.ClickException(str(error)) from None
+    checkup, progress = SessionCheckup(), watched("doctor", total(session))
+    verdict = verify(session, lambda rows: checkup.watch(progress(rows)), growing(session))
+    findings = list(checkup.findings(verdict, session.name))
+    if as_json:
+        click.echo(json.dumps(checkup.as_dict(verdict, session.name)))
+    else:
+        click.echo(_first_line(session.name, findings))
+        _show(findings, checkup.facts(verdict))
+    raise SystemExit(1 if findings else 0)
+
+
+def _first_line(name: str, findings: Sequence[DoctorFinding]) -> str:
+    return f"{name}: {findings[0] if findings else 'Nothing odd was found.'}"
+
+
+def _show(findings: Sequence[DoctorFinding], facts: Iterable[tuple[str, str]]) -> None:
+    """Print the further findings on one line, then one line for each fact."""
+    if further := findings[1 : 1 + MAX_FURTHER_FINDINGS]:
+        click.echo(f"  also: {' '.join(map(str, further))}")
+    for name, words in facts:
+        click.echo(f"  {name:11} {words}")

@@ -1,0 +1,112 @@
+"""Each row of the doctor's table, and what it says of a car that is well."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from fleet.client.diagnosis import CHECKS, CarEvidence, as_dict, describe, diagnose
+from schemas.gen import fleet_v1_pb2 as pb
+
+WELL: dict[str, Any] = {
+    "state/link": pb.Link(state="online", rx_frames=500, tx_frames=20, last_rx_s=0.2),
+    "state/mode": pb.Mode(asked="manual", inferred="manual", verdict="confirmed", evidence="reports come"),
+    "state/motion": pb.Motion(motion="stop"),
+    "state/safety": pb.Safety(motors="off", motors_basis="shown", trust="stopped"),
+    "state/health": pb.Health(platform="arduino", platform_evidence=["a sonar with fractions"], uptime_s=90),
+    "sensor/battery": pb.Battery(voltage_v=7.9, level="ok"),
+}
+
+
+def evidence(*, present: bool = True, **more: Any) -> CarEvidence:
+    return CarEvidence("red", present, **{"states": WELL, "recording": pb.Recording(state="recording"), **more})
+
+
+def with_states(**messages: Any) -> CarEvidence:
+    changed = {("sensor/battery" if name == "battery" else f"state/{name}"): each for name, each in messages.items()}
+    return evidence(states=WELL | changed)
+
+
+def refused(reason: str, *, phase: str = "rejected", words: str = "no", age_s: float = 3.0) -> Any:
+    return age_s, pb.CommandEvent(verb="drive", sender="mia", phase=phase, reason=reason, words=words)
+
+
+def process(**fields: Any) -> pb.Supervised:
+    return pb.Supervised(name="red", kind="gateway", **{"state": "running", **fields})
+
+
+STALE = pb.Link(state="stale", last_rx_s=12, url="tcp://x:1")
+ODD: dict[str, CarEvidence] = {
+    "gateway_ended": evidence(present=False, states={}, process=process(state="waiting", words="exit code 1")),
+    "no_gateway": evidence(present=False, states={}),
+    "gateway_hung": evidence(states={}),
+    "link_down": with_states(link=pb.Link(state="lost", reason="no such port", since_s=12)),
+    "platform_contradicted": with_states(health=pb.Health(platform="stm32", platform_contradictions=["7.91 V"])),
+    "not_shown": with_states(safety=pb.Safety(motors="unknown", trust="unproven")),
+    "fan_silence": with_states(link=STALE, motion=pb.Motion(fan=True)),
+    "silent": with_states(link=STALE),
+    "damaged_frames": with_states(link=pb.Link(state="online", rx_frames=90, rejects={"truncated": 8, "noise": 3})),
+    "estopped": with_states(safety=pb.Safety(motors="off", trust="stopped", estops=[pb.Estop(by="ann", why="smoke")])),
+    "mode_contradicted": with_states(mode=pb.Mode(asked="tracking", inferred="manual", verdict="contradicted")),
+    "battery_low": with_states(battery=pb.Battery(voltage_v=6.6, level="critical")),
+    "leased": replace(
+        with_states(safety=pb.Safety(motors="on", trust="driving", lease=pb.Lease(holder="jo", kind="person"))),
+        commands=[refused("leased")],
+    ),
+    "link_breaks": with_states(link=pb.Link(state="online", rx_frames=90, reconnects=3)),
+    "gateway_restarted": evidence(process=process(restarts=2, words="killed by signal 9")),
+    "overloaded": with_states(health=pb.Health(platform="arduino", loop_lag_s=0.8)),
+    "flooded": with_states(link=pb.Link(state="online", rx_frames=90, tx_airtime=0.95)),
+    "held": with_states(safety=pb.Safety(motors="off", trust="stopped", hold=pb.Hold(by="mia"))),
+    "plan_stopped": evidence(coordinated=True, assignment=pb.Assignment(stopped_by="mia")),
+    "refused": evidence(commands=[refused("wrong_mode", words="red ignores drive commands.")]),
+    "not_recorded": evidence(recording=pb.Recording(state="full", error="50 MB are free")),
+    "recorder_drops": evidence(recording=pb.Recording(state="recording", drops={"fleet/red/sensor/line": 7})),
+}
+
+
+def test_a_car_that_is_well_has_no_finding() -> None:
+    assert diagnose(evidence(process=process(), coordinated=True)) == []
+
+
+def test_each_check_is_tried() -> None:
+    assert set(ODD) == {check.code for check in CHECKS}
+
+
+@pytest.mark.parametrize("code", ODD)
+def test_each_condition_has_its_cause_and_what_to_type(code: str) -> None:
+    found = diagnose(ODD[code])
+    assert [each.code for each in found] == [code]
+    assert found[0].cause.endswith((".", "?"))
+    assert found[0].todo.startswith("fleet ")
+    assert "{" not in found[0].todo
+
+
+def test_the_likely_cause_comes_first_and_a_known_refusal_is_not_said_twice() -> None:
+    lost = with_states(link=pb.Link(state="lost", reason="unplugged"), safety=ODD["held"].of("state/safety"))
+    found = diagnose(replace(lost, commands=[refused("link_down")]))
+    assert [each.code for each in found] == ["link_down", "held"]
+    other = diagnose(replace(lost, commands=[refused("wrong_mode")]))
+    assert [each.code for each in other] == ["link_down", "held", "refused"]
+
+
+def test_a_command_that_somebody_replaced_is_no_refusal() -> None:
+    assert diagnose(evidence(commands=[refused("superseded", phase="failed")])) == []
+
+
+@pytest.mark.parametrize("code", ODD)
+def test_all_that_is_known_fits_ten_lines(code: str) -> None:
+    facts = dict(describe(ODD[code]))
+    assert len(facts) <= 8
+    assert as_dict(ODD[code])["facts"] == facts
+
+
+def test_the_facts_name_counts_evidence_and_the_last_refusal() -> None:
+    last = refused("held", words="red is on hold.")
+    facts = dict(describe(replace(ODD["damaged_frames"], commands=[refused("leased", age_s=60), last])))
+    assert "90 frames in" in facts["link"]
+    assert "rejected: 3 noise, 8 truncated" in facts["link"]
+    assert facts["mode"] == "manual, confirmed: reports come"
+    assert facts["motors"] == "off, shown; stopped"
+    assert facts["platform"] == "arduino: a sonar with fractions"
+    assert facts["refused"] == "drive of mia 3 s ago: red is on hold [held] (1 more before)"
