@@ -250,7 +250,7 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
             wait_for(lambda: b"Ctrl-C: the fleet is ending already, and waits for" in shown, "it has heard it")
             os.kill(waited_for, signal.SIGCONT)
             wait_for(lambda: not truths["red"].message().motor_left, "red stands")  # type: ignore[attr-defined]
-            assert process.wait(PATIENCE_S) == 0
+            assert process.wait(PATIENCE_S) == 0, shown[-4000:].decode(errors="replace")
             reader.join()
         said = shown.decode()
         assert "red: stopped" in said
