@@ -1,4 +1,4 @@
-"""What all processes of the fleet share: keys, topics, messages and the bus.
+"""Parts that all processes of the fleet share: keys, topics, messages and the bus.
 
 Read `keys`, `topics` and `commands` first, then `messages` (classes of `proto/`, generated into `gen/`) and `bus`.
 `process` contains the common parts of the start and the end of a process. `gateway run` imports no other package of

@@ -55,6 +55,16 @@ def to_json(message: Message) -> str:
     return json.dumps(to_dict(message), separators=(",", ":"))
 
 
+def stamp_ns(stamp: Any) -> int:
+    """Return a Timestamp as ns since the epoch."""
+    return int(stamp.seconds * 1_000_000_000 + stamp.nanos)
+
+
+def stamp_ms(stamp: Any) -> int:
+    """Return a Timestamp as ms since the epoch. Nanoseconds out of range raise nothing, unlike in ToMilliseconds."""
+    return stamp_ns(stamp) // 1_000_000
+
+
 def parse(name: str, payload: bytes, encoding: str) -> Message:
     """Parse a payload as message `name`, protobuf or JSON by its encoding. Raises BadPayload."""
     kind, _, schema = encoding.partition(";")

@@ -45,12 +45,12 @@ EFFECTS: Final[dict[str, dict[str, str]]] = {
         "failed": "failed: {words}",
     },
 }
-"""What a command did, by verb and result. `release` is a drive with motion stop, `estop_fleet` an e-stop of all."""
+"""Effect of a command, by verb and result. `release` is a drive with motion stop, `estop_fleet` an e-stop of all."""
 NEXT_STEPS: Final = {
     "estop": "Release it with `fleet resume {car} --estops`",
     "estop_fleet": "One release frees all cars: `fleet resume --estops`",
 }
-"""What the text of a command that was carried out says at its end, by verb."""
+"""End of the text of a command that was carried out, by verb."""
 
 _STOP_FAILURES: Final = {"not_shown": "stop sent, {words}", "rejected": "{words}", "failed": "{words}"}
 """The gateway's words of a stop that failed begin with the fact for the car."""

@@ -61,7 +61,7 @@ class Outcome:
     basis: str = ""
     """For a stop: `shown` if the car's readings show that it stands, `sent` if they cannot."""
     effect: str = ""
-    """What the command did, in words: `LED set`, `stopped (1.2 s)`, `refused: ...`."""
+    """The effect of the command in words: `LED set`, `stopped (1.2 s)`, `refused: ...`."""
     next_step: str = ""
     """How to end what the command began, such as the release of an e-stop. Empty if there is nothing to end."""
 

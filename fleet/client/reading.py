@@ -42,7 +42,7 @@ class Reading:
         """Return the reading of a message. time_ns: its time if it has no stamp, ns since the epoch."""
         stamp = getattr(value, "stamp", None) or getattr(value, "timestamp", None)
         if stamp is not None and stamp.seconds:
-            time_ns = stamp.seconds * 1_000_000_000 + stamp.nanos
+            time_ns = messages.stamp_ns(stamp)
         return cls(key, _EPOCH + timedelta(microseconds=time_ns // 1000), value)
 
     @property

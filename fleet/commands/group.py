@@ -1,4 +1,4 @@
-"""What the group of commands and the commands share. Imports neither a command nor the bus, so that help is fast."""
+"""Parts that the group of commands and the commands share. Imports no command and no bus, so that help is fast."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Sequence
 from difflib import get_close_matches
-from typing import Any, Final
+from typing import Final
 
 import click
 
@@ -75,6 +75,6 @@ def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
     return sorted(rows), {car: why for car, row in sorted(rows.items()) if (why := describe_missing(row))}
 
 
-def _unknown(car: str, known: Sequence[str]) -> Any:
+def _unknown(car: str, known: Sequence[str]) -> str:
     near = get_close_matches(car, known, 1)
     return f"no such car{f', did you mean {near[0]}?' if near else ''}"

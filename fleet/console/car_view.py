@@ -1,4 +1,4 @@
-"""What the pages show of each car, from the messages of the bus. Pure: time is an argument (s, monotonic)."""
+"""The state of each car as the pages show it, from messages of the bus. Pure: time is an argument (s, monotonic)."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.frame_log import describe_gateway
-from schemas import topics
+from schemas import messages, topics
 
 TREND_WINDOW_S: Final = 240.0
 """Time over which the trend of a battery is measured."""
@@ -212,8 +212,7 @@ class CarView:
         self._note(event.stamp, f"{words} ({event.sender})", level)
 
     def _note(self, stamp: Any, words: str, level: str) -> None:
-        at_ms = stamp.seconds * 1000 + stamp.nanos // 1_000_000
-        self.ledger.append({"at_ms": at_ms, "words": words, "level": level})
+        self.ledger.append({"at_ms": messages.stamp_ms(stamp), "words": words, "level": level})
 
 
 def _name(sender: str, ours: str) -> str:

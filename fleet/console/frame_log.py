@@ -3,6 +3,8 @@
 from collections import deque
 from typing import Any, Final
 
+from schemas import messages
+
 MAX_FRAMES: Final = 60
 """Number of frames that a page shows."""
 MAX_FRAME_BYTES: Final = 80
@@ -22,7 +24,7 @@ class FrameLog:
         text = (
             frame.data[:MAX_FRAME_BYTES].decode("ascii", "backslashreplace").replace("\r", "\\r").replace("\n", "\\n")
         )
-        at_ms = frame.stamp.seconds * 1000 + frame.stamp.nanos // 1_000_000
+        at_ms = messages.stamp_ms(frame.stamp)
         if topic == "frame/rx":
             became = ", ".join(key.partition("/")[2] for key in frame.published)
             shown = {"from_car": True, "verdict": frame.verdict, "became": became}

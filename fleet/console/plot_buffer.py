@@ -55,7 +55,7 @@ class PlotBuffer:
         for number, field in self._numbers.get((car, topic), ()):
             value = value_in(message)(field)
             if isinstance(value, int | float) and self._count < MAX_BUFFERED_VALUES:
-                at_ms = message.stamp.seconds * 1000 + message.stamp.nanos // 1_000_000
+                at_ms = messages.stamp_ms(message.stamp)
                 self._values.setdefault(number, []).append((at_ms, round(float(value), 4)))
                 self._count += 1
 

@@ -251,8 +251,7 @@ class Coordinator:
             by = _sender(query, "fleet.v1.PlanCommand")
             memory, words = on_request(request, self.plan, self._memory, by, time.monotonic())
         except RequestRefused as refused:
-            reason = str(refused).rpartition("[")[2].rstrip("]")
-            self._reply_result(query, pb.Result(status="rejected", reason=reason, words=str(refused)))
+            self._reply_result(query, pb.Result(status="rejected", reason=refused.reason, words=str(refused)))
             return
         except messages.BadPayload as error:
             self._reply_result(query, pb.Result(status="rejected", reason="bad_value", words=f"{error} [bad_value]"))

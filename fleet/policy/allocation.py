@@ -28,7 +28,7 @@ _LINK_DOUBT_COST: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Barrier:
-    """Why a car may not do something, and what would change that."""
+    """Reason why a car may not do something, and what would change that."""
 
     why: str
     change: str
@@ -126,7 +126,7 @@ def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
 
 @dataclass(frozen=True, slots=True)
 class RoleAllocation:
-    """Which car has which role, and how many places each role has."""
+    """Roles of the cars, and number of places of each role."""
 
     roles: Mapping[str, str]
     places: Mapping[str, int]

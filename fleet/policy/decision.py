@@ -10,7 +10,7 @@ LEFT_ALONE: Final = "left alone"
 
 
 class DecisionKind(StrEnum):
-    """What a decision is about."""
+    """Subject of a decision."""
 
     ROLE = "role"
     RULE = "rule"

@@ -28,7 +28,11 @@ EVENTS: Final = {
 
 
 class RequestRefused(Exception):
-    """The request cannot be carried out. The text gives the reason and, in brackets, its code."""
+    """The request cannot be carried out. The text says why and, in brackets, gives the reason's code."""
+
+    def __init__(self, words: str, reason: str = "unsupported") -> None:
+        super().__init__(f"{words} [{reason}]")
+        self.reason: Final = reason
 
 
 def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, now: float) -> tuple[PolicyState, str]:
@@ -47,17 +51,17 @@ def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, n
 
 def _next_phase(plan: Plan, memory: PolicyState) -> str:
     if memory.stopped_by:
-        raise RequestRefused(f"The plan is stopped (by {memory.stopped_by}): {GOES_ON}. [unsupported]")
+        raise RequestRefused(f"The plan is stopped (by {memory.stopped_by}): {GOES_ON}.")
     if not plan.phases:
-        raise RequestRefused("The plan has no phases. [unsupported]")
+        raise RequestRefused("The plan has no phases.")
     phase = plan.phases.get(memory.phase.name)
     if phase is None:
-        raise RequestRefused("No phase has begun yet. Try again. [unsupported]")
+        raise RequestRefused("No phase has begun yet. Try again.")
     name = phase.next or phase.on_timeout
     if name is None:
         raise RequestRefused(
             f"Phase {phase.name} is the last one: `next` names none after it. "
-            f"`fleet plan restart` begins with {plan.first}. [unsupported]"
+            f"`fleet plan restart` begins with {plan.first}."
         )
     return name
 

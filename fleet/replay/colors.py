@@ -3,9 +3,8 @@
 from collections.abc import Iterable, Mapping
 from typing import Final
 
+from schemas.colors import Rgb
 from schemas.commands import COMMANDS
-
-Rgb = tuple[int, int, int]
 
 OFF: Final[Rgb] = (70, 74, 82)
 """Color of a lamp or LED that is off."""

@@ -136,5 +136,4 @@ class EstopSync:
 
 
 def _estop(message: pb.Estop) -> Estop:
-    at_ns = message.stamp.seconds * 1_000_000_000 + message.stamp.nanos
-    return Estop(message.id, message.by, message.why, at_ns, message.scope == "fleet")
+    return Estop(message.id, message.by, message.why, messages.stamp_ns(message.stamp), message.scope == "fleet")

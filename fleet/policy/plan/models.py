@@ -24,14 +24,14 @@ _Color = Annotated[str, AfterValidator(_check_color), Field(json_schema_extra={"
 
 
 class GivenBy(StrEnum):
-    """Who gives a role to cars."""
+    """Source of roles: the plan or the operator."""
 
     PLAN = "plan"
     RULES = "rules"
 
 
 class WithoutRole(StrEnum):
-    """What a car without a role does."""
+    """Behavior of a car without a role."""
 
     MANUAL = "manual"
     LEAVE_ALONE = "leave_alone"

@@ -18,7 +18,7 @@ from google.protobuf.json_format import Parse, ParseError
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
-from schemas import keys
+from schemas import keys, messages
 from schemas.topics import PROTOBUF, TOPICS
 
 TIMESTAMP: Final = "google.protobuf.Timestamp"
@@ -249,12 +249,8 @@ def _converter(field: FieldDescriptor) -> Callable[[Any], Any]:
         names = {number: value.name for number, value in field.enum_type.values_by_number.items()}
         return lambda number: names.get(number, str(number))
     if kind_of(field) is ColumnKind.TIME:
-        return _nanoseconds
+        return messages.stamp_ns
     return lambda value: value
-
-
-def _nanoseconds(stamp: Any) -> int:
-    return int(stamp.seconds) * 1_000_000_000 + int(stamp.nanos)
 
 
 def plain(message: Any) -> dict[str, Any]:

@@ -15,7 +15,7 @@ RESUME_WINDOW_S: Final = 3 * CACHE_S
 
 @dataclass(frozen=True, slots=True)
 class ResumePoint:
-    """Where a new session continues, and the messages that it need not write again."""
+    """End of an interrupted session, from which a new one continues, and the messages that it already holds."""
 
     name: str
     """Name of the interrupted session; empty if there is none."""

@@ -14,7 +14,6 @@ from gateway.protocol.enums import Mode
 from schemas import keys, messages
 from schemas.topics import TOPICS
 
-SENSOR_TOPICS: Final = tuple(name for name, topic in TOPICS.items() if topic.family == "sensor")
 FRAME_KEYS: Final = ("*/*/frame/*", "*/*/sensor/*", "*/*/state/mode", "*/*/state/health")
 MAX_MESSAGE_DELAY_NS: Final = 10_000_000_000
 """Maximum delay of a message on the recorder's clock: after an outage of the bus, cached messages come at once."""
@@ -125,7 +124,7 @@ def _sort_by_stamp(recorded: Iterable[Recorded], skipped: SkippedMessages) -> It
         except messages.BadPayload:
             skipped.broken[message.key] = skipped.broken.get(message.key, 0) + 1
             continue
-        at_ns = value.stamp.seconds * 1_000_000_000 + value.stamp.nanos
+        at_ns = messages.stamp_ns(value.stamp)
         heapq.heappush(heap, (at_ns, topic.family != "sensor", number, key, value))
         while heap and heap[0][0] < message.recorded_ns - MAX_MESSAGE_DELAY_NS:
             at_ns, _, _, key, value = heapq.heappop(heap)

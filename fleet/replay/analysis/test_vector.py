@@ -23,7 +23,7 @@ from gateway.protocol.enums import Mode
 ENDING: Final = ".jsonl"
 FORMAT: Final = 1
 BEFORE_NS: Final = 3_000_000_000
-"""How far before the stretch is looked for what was known at its beginning: states come once a second."""
+"""Time before the stretch in which to look for the states at its beginning. Gateways publish them once a second."""
 _ESTIMATED: Final = frozenset({"charge", "charge_error", "level"})
 """Fields that the gateway adds to what was decoded."""
 

@@ -9,12 +9,12 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from fleet.replay import colors, panels
-from fleet.replay.colors import Rgb
 from fleet.replay.panels import Curve, Panel, StateTrack
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.lenses import component
 from fleet.replay.rerun.staleness import PUBLISH_TIMELINE
 from schemas import keys
+from schemas.colors import Rgb
 from schemas.topics import TOPICS
 
 _THRESHOLDS: Final[Mapping[panels.Derivation, Rgb]] = {

@@ -16,10 +16,11 @@ import rerun as rr
 import rerun.chunk as rrc
 
 from fleet.replay import panels
-from fleet.replay.colors import OFF, Rgb, color, rgb
+from fleet.replay.colors import OFF, color, rgb
 from fleet.replay.rerun.lenses import component, numbers, triples
 from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
 from schemas import keys, messages
+from schemas.colors import Rgb
 from schemas.commands import COMMANDS
 
 TIMELINES: Final = (LOG_TIMELINE, PUBLISH_TIMELINE)
