@@ -2,8 +2,9 @@
 
 from typing import Annotated, Final
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from schemas.keys import check_name
 from schemas.yaml_document.document import Entry
 
 _MAX_ITEMS: Final = 200
@@ -13,7 +14,11 @@ _Size = Annotated[float, Field(ge=0.02, le=100)]
 _Degrees = Annotated[float, Field(ge=-360, le=360)]
 _Point = tuple[_Place, _Place]
 _Wall = tuple[_Place, _Place, _Place, _Place]
-_Name = Annotated[str, Field(pattern="^[a-z0-9][a-z0-9_-]{0,31}$")]
+_Name = Annotated[
+    str,
+    AfterValidator(lambda name: check_name(name, "name")),
+    Field(json_schema_extra={"pattern": "^[a-z0-9][a-z0-9_-]{0,31}$"}),
+]
 
 
 class RoomEntry(Entry):
@@ -51,7 +56,8 @@ class StartEntry(Entry):
 class ThingEntry(Entry):
     """A disc or a box that stands, moves along a path, or is carried by a car."""
 
-    # Defaults without a value are for editors only. gateway/sim/world_file.py finds out what is missing or too much.
+    # Default factories keep defaults that mean nothing out of the schema for editors. gateway/sim/world_file.py
+    # finds out what is missing or too much.
     x_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, ahead of the car's middle")
     y_m: _Place = Field(default=0.0, description="where it stands, meters; if carried, to the left of the car's middle")
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
@@ -99,7 +105,9 @@ class WorldEntry(Entry):
     )
     cars_meet: bool = Field(default=True, description="cars see each other and are in each other's way")
     cars: dict[_Name, StartEntry] = Field(
-        default_factory=dict, description="where each car begins; a car that is not named begins on the line"
+        default_factory=dict,
+        max_length=_MAX_ITEMS,
+        description="where each car begins; a car that is not named begins on the line",
     )
     lamps: dict[_Name, LampEntry] = Field(
         default_factory=dict, max_length=_MAX_ITEMS, description="lamps that light sensors see"

@@ -173,23 +173,13 @@ def _world(words: str, cars: list[str] | None) -> World:
         return WORLDS[words]()
     # Imported only for a world file: the simulator starts faster without YAML.
     from gateway.sim.world_file import read_world
-    from gateway.sim.yaml_reader import MAX_WORLD_BYTES, BadWorld
+    from schemas.yaml_document.document import BadFile, read_text
 
     try:
-        if Path(words).exists() and not Path(words).is_file():  # opening a FIFO would block
-            raise BadSpec(f"world {words}: is a directory, FIFO or device, not a file: save the text as a file")
-        with Path(words).open("rb") as file:
-            data = file.read(MAX_WORLD_BYTES + 1)
-        text = data.decode("utf-8-sig", errors="strict" if len(data) <= MAX_WORLD_BYTES else "replace")
-        return read_world(text, words, cars).world()
-    except OSError as error:
-        raise BadSpec(f"world {words}: {error.strerror}: write {', '.join(WORLDS)} or the path of a file") from None
-    except UnicodeDecodeError as error:
-        raise BadSpec(f"{words}: byte {error.start} is no UTF-8: save the file as UTF-8") from None
-    except BadWorld as error:
-        raise BadSpec(str(error)) from None
-    except ValueError as error:  # a NUL in the path
-        raise BadSpec(f"world {words!r} is no path: {error}") from None
+        return read_world(read_text(Path(words), words), words, cars).world()
+    except BadFile as error:
+        hint = "" if error.problems[0].line else f" (worlds without a file: {', '.join(WORLDS)})"
+        raise BadSpec(f"{error}{hint}") from None
 
 
 def _print_error(words: str) -> None:

@@ -88,6 +88,10 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
     if kind == "missing":
         return "is missing", next((_sentence(each["description"]) for each in here if "description" in each), "")
     value = error["input"]
+    if kind in ("too_short", "too_long"):
+        limits = error["ctx"]
+        most = f"at most {limits['max_length']}" if kind == "too_long" else f"at least {limits['min_length']}"
+        return f"has {len(value)} items", f"Write {most}."
     if kind in ("value_error", "assertion_error"):
         return str(error["ctx"]["error"]), ""
     head = "has no value" if value is None else f"{quote_value(value)} is not allowed"

@@ -475,7 +475,7 @@ BAD = [
     (["--car", "red:arduino:pty", "--fleet", "No"], 2, "fleet name"),
     (["--car", "red:arduino:pty", "--connect", "nonsense"], 2, "endpoint 'nonsense'"),
     (["--car", "red:arduino:pty", "--world", "moon"], 2, "room"),
-    (["--car", "red:arduino:pty", "--world", os.devnull], 2, "is a directory, FIFO or device, not a file"),
+    (["--car", "red:arduino:pty", "--world", os.devnull], 2, "/dev/null:1:1: error: is a device, not a file"),
     (["--car", "red:arduino:pty:/nowhere/at/all", "--no-truth"], 1, "car red: no symlink can be made"),
     (["--car", "red:arduino:tcp://127.0.0.1:PORT", "--no-truth"], 1, "car red: cannot listen on 127.0.0.1:"),
 ]
