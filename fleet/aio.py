@@ -14,7 +14,17 @@ from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from fleet.client import client
 from fleet.client import lease as leases
-from fleet.client.commands import CarCommands, CommandRequest, estop_request, resume_request, stop_request
+from fleet.client.commands import (
+    CarCommands,
+    CommandRequest,
+    end_loan_request,
+    estop_request,
+    lend_request,
+    pause_request,
+    resume_request,
+    stop_request,
+    unpause_request,
+)
 from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.outcome import Outcome
 from fleet.client.reading import READING_QUEUE_LIMIT, Reading, ReadingFilter, reading_of
@@ -36,11 +46,12 @@ class Fleet:
         endpoint: str | None = None,
         name: str = keys.DEFAULT_FLEET,
         *,
+        person: str | None = None,
         sender: str | None = None,
         kind: str = "script",
         start_hub: bool = False,
     ) -> None:
-        self._open = lambda: client.Fleet(endpoint, name, sender=sender, kind=kind, start_hub=start_hub)
+        self._open = lambda: client.Fleet(endpoint, name, person=person, sender=sender, kind=kind, start_hub=start_hub)
         self._client: client.Fleet | None = None
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="fleet-aio")
@@ -118,9 +129,27 @@ class Fleet:
         """E-stop these cars, or the fleet."""
         return await self.ask(estop_request(why, "fleet" if cars is None else "car"), cars)
 
-    async def resume(self, cars: Iterable[str], ids: Sequence[str] = ()) -> list[Outcome]:
-        """End the e-stops of these ids. Without ids, end the hold."""
-        return await self.ask(resume_request(ids), cars)
+    async def resume(
+        self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False
+    ) -> list[Outcome]:
+        """End the e-stops of these ids. Without ids, end the hold. None: of every car."""
+        return await self.ask(resume_request(ids, everything=everything), cars)
+
+    async def pause(self, why: str = "") -> list[Outcome]:
+        """Stop every car, and let only leads move cars until `unpause`."""
+        return await self.ask(pause_request(why))
+
+    async def unpause(self) -> list[Outcome]:
+        """End the pause of the fleet. No car moves."""
+        return await self.ask(unpause_request())
+
+    async def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
+        """Lend these cars to a person: until then only that person and leads drive them."""
+        return await self.ask(lend_request(to, duration_s), cars)
+
+    async def end_loan(self, cars: Iterable[str]) -> list[Outcome]:
+        """End the loan of these cars, and stop those that the borrower drives."""
+        return await self.ask(end_loan_request(), cars)
 
     async def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Send a command to the cars and return their outcomes. It is sent at once, whatever the threads wait for."""

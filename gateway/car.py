@@ -11,7 +11,7 @@ import logging
 import os
 import random
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -28,7 +28,8 @@ from gateway.control.controller import Controller
 from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.link_health import LinkHealth
 from gateway.control.events import Level
-from gateway.control.safety import Estop
+from gateway.control.people import People
+from gateway.control.safety import PersistedSafety
 from gateway.control.stop_executor import SHUTDOWN_S
 from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.protocol.decoder import Decoder
@@ -80,6 +81,7 @@ class Settings:
     """True to retry if the first attempt to open the link fails."""
     battery: BatteryPolicy = field(default_factory=BatteryPolicy)
     speed_max: float = 1.0
+    people: People = field(default_factory=People)
     longest_drive_s: float = requests.DEFAULT_MAX_DRIVE_S
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""
@@ -99,9 +101,12 @@ class CarGateway:
             settings.car,
             settings.profile,
             auto=settings.auto,
-            persisted=state_file.load(time.time_ns()),
+            persisted=state_file.load(now_ns := time.time_ns()),
             battery_policy=settings.battery,
             speed_max=settings.speed_max,
+            people=settings.people,
+            now=now,
+            now_ns=now_ns,
         )
         self._estop_sync = EstopSync(opened, settings.fleet, settings.car)
         self._health = LinkHealth(since=now)
@@ -153,7 +158,7 @@ class CarGateway:
             self._tick(),
             self._keep_hub(),
             self._check_rival(),
-            self._estop_sync.keep_synced(self._merge_estops),
+            self._estop_sync.keep_synced(self._merge),
             self._answer(self._service.values),
             self._answer(self._service.histories),
         )
@@ -381,8 +386,10 @@ class CarGateway:
             self._control.on_sender_token(name, alive=alive, now=now)
         self._wake.set()
 
-    def _merge_estops(self, estops: Sequence[Estop], ended: Sequence[str], source: str) -> None:
-        self._control.merge_estops(estops, ended, source, self._loop.time())
+    def _merge(self, other: PersistedSafety, source: str) -> None:
+        now = self._loop.time()
+        self._control.merge_estops(other.estops, other.ended, source, now)
+        self._control.merge_pauses(other.pauses, other.ended_pauses, source, now)
         self._wake.set()
 
     # ------------------------------------------------------------------ time, and the hub

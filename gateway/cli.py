@@ -102,6 +102,14 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         help="where e-stops and holds of each bus are kept (default: FLEET_STATE_DIR, or the user's)",
     )
     run.add_argument(
+        "--person",
+        metavar="NAME",
+        action="append",
+        help="who may drive this car, once for each: NAME, NAME:lead, or NAME:other for one who drives other cars; "
+        "all others only watch and stop (default: everybody drives, nobody is a lead)",
+    )
+    run.add_argument("--people-only", action="store_true", help="without --person: nobody drives this car")
+    run.add_argument(
         "--longest-drive",
         metavar="DURATION",
         default="10s",
@@ -143,6 +151,13 @@ def _run(arguments: argparse.Namespace) -> int:
     speed_max = arguments.speed_max
     low_v, critical_v = arguments.battery_low_v, arguments.battery_critical_v
     try:
+        from gateway.control.people import NO_PEOPLE, People
+
+        listed = arguments.people_only or arguments.person
+        people = People.parse(arguments.person or ()) if listed else NO_PEOPLE
+    except ValueError as error:
+        return _failed(f"--person: {error}", 2)
+    try:
         longest_s = parse_duration(arguments.longest_drive, max_s=3600)
     except ValueError as error:
         return _failed(f"--longest-drive: {error}", 2)
@@ -182,6 +197,7 @@ def _run(arguments: argparse.Namespace) -> int:
                     critical_v,
                 ),
                 speed_max=speed_max,
+                people=people,
                 longest_drive_s=longest_s,
                 parent=parent,
             )

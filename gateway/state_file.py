@@ -1,10 +1,13 @@
-"""Persists the safety state of one car (its hold, its e-stops, the ended ones) in a small JSON file."""
+"""Persists the safety state of one car (its hold, e-stops, pauses and loan) in a small JSON file."""
 
 import json
+from dataclasses import asdict
+from math import inf
 from pathlib import Path
 from typing import Any
 
-from gateway.control.safety import Estop, Hold, PersistedSafety
+from gateway.control.commands import SenderKind
+from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
 from schemas.atomic_file import write_atomically
 
 
@@ -30,31 +33,41 @@ class SafetyStateFile:
     def save(self, state: PersistedSafety) -> None:
         """Replace the file atomically; raise OSError."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        hold = state.hold
-        content = {
-            "hold": None if hold is None else {"by": hold.by, "since_ns": hold.since_ns},
-            "estops": [
-                {"id": each.id, "by": each.by, "why": each.why, "at_ns": each.at_ns, "fleet_wide": each.fleet_wide}
-                for each in state.estops
-            ],
-            "ended": list(state.ended),
-        }
-        write_atomically(self.path, json.dumps(content).encode(), sync=True)
+        write_atomically(self.path, json.dumps(asdict(state)).encode(), sync=True)
 
 
 def _parse(content: Any, now_ns: int) -> PersistedSafety:
     """Return the state in a file; raise ValueError, TypeError or KeyError. Older versions only have the hold."""
-    hold = content["hold"]
+    hold, loan = content["hold"], content.get("loan")
     return PersistedSafety(
-        None if hold is None else Hold(_text(hold["by"]), _past(hold["since_ns"], now_ns)),
-        tuple(_estop(each, now_ns) for each in content.get("estops", ())),
+        None if hold is None else Hold(_text(hold["by"]), _past(hold["since_ns"], now_ns), _rank(hold)),
+        tuple(
+            Estop(*_who_and_why(each), _past(each["at_ns"], now_ns), each["fleet_wide"] is True, _rank(each))
+            for each in content.get("estops", ())
+        ),
         tuple(_text(each) for each in content.get("ended", ())),
+        tuple(
+            FleetPause(*_who_and_why(each), _past(each["at_ns"], now_ns), _rank(each))
+            for each in content.get("pauses", ())
+        ),
+        tuple(_text(each) for each in content.get("ended_pauses", ())),
+        None if loan is None else _loan(loan, now_ns),
     )
 
 
-def _estop(content: Any, now_ns: int) -> Estop:
-    identity, by, why = (_text(content[name]) for name in ("id", "by", "why"))
-    return Estop(identity, by, why, _past(content["at_ns"], now_ns), content["fleet_wide"] is True)
+def _who_and_why(content: Any) -> tuple[str, str, str]:
+    return _text(content["id"]), _text(content["by"]), _text(content["why"])
+
+
+def _loan(content: Any, now_ns: int) -> Loan | None:
+    """Return the loan; None if it is over."""
+    to, by, since_ns = _text(content["to"]), _text(content["by"]), _past(content["since_ns"], now_ns)
+    loan = Loan(to, by, _rank(content), since_ns, float(content["duration_s"]))
+    return loan if 0 < loan.left_s(now_ns) < inf else None
+
+
+def _rank(content: Any) -> SenderKind:
+    return SenderKind(content.get("rank", SenderKind.PERSON))
 
 
 def _text(value: Any) -> str:

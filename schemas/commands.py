@@ -46,7 +46,10 @@ _ROWS: Final = (
         wildcard=True,
         stops=True,
     ),
-    CommandType("resume", "end the e-stops of these ids; without ids, the hold", wildcard=True),
+    CommandType("resume", "end the e-stops of these ids; without ids, the hold; `all` ends both", wildcard=True),
+    CommandType("pause", "stop, and let only leads move the cars of the fleet until `unpause`", wildcard=True),
+    CommandType("unpause", "end the pause of the fleet; move nothing", wildcard=True),
+    CommandType("lend", "let only one person drive the car for `duration_s`, or `end` that"),
     CommandType("lease", "reserve the car for a moment, or release it"),
     CommandType("find", "blink and beep, without moving"),
 )

@@ -27,7 +27,17 @@ from fleet.client.command_tracker import (
     QueryEnded,
     SupervisedCars,
 )
-from fleet.client.commands import CarCommands, CommandRequest, estop_request, resume_request, stop_request
+from fleet.client.commands import (
+    CarCommands,
+    CommandRequest,
+    end_loan_request,
+    estop_request,
+    lend_request,
+    pause_request,
+    resume_request,
+    stop_request,
+    unpause_request,
+)
 from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.lease import Lease
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome, Until
@@ -50,10 +60,14 @@ _MIN_QUERY_TIMEOUT_S: Final = 0.1
 log = logging.getLogger("fleet")
 
 
-def default_sender() -> str:
-    """Return the default sender, one key chunk: user@host-pid."""
+def default_sender(person: str | None = None) -> str:
+    """Return the default sender, one key chunk: person@host-pid. The person is FLEET_AS, else the user's login.
+
+    Raises keys.BadKey for a bad name of a person.
+    """
+    person = person or os.environ.get("FLEET_AS")
     try:
-        user = getpass.getuser()
+        user = keys.check_name(person, "person") if person else getpass.getuser()
     except (KeyError, OSError, ImportError):  # no entry for this user id, as in some containers; no pwd (Windows)
         user = "user"
     return re.sub(r"[^A-Za-z0-9_.@-]", "-", f"{user}@{socket.gethostname()}-{os.getpid()}").lstrip("@")
@@ -63,7 +77,8 @@ class Fleet:
     """One operator on the bus. Use it with `with`. Its methods may be called from several threads.
 
     endpoint: `tcp/HOST:PORT` of the bus. The default is FLEET_ENDPOINT, else loopback port 7447.
-    name: the fleet's name. sender: the name shown to others, user@host-pid by default.
+    name: the fleet's name. person: who drives, such as `group_a` (default: FLEET_AS, else the user's login).
+    sender: the name shown to others, person@host-pid by default.
     kind: `script`, `person` (outranks scripts) or `coordinator`.
 
     While it is open, it has the token `<fleet>/@operator/<sender>`. If the token is lost, gateways stop the cars that
@@ -76,12 +91,13 @@ class Fleet:
         endpoint: str | None = None,
         name: str = keys.DEFAULT_FLEET,
         *,
+        person: str | None = None,
         sender: str | None = None,
         kind: str = "script",
         start_hub: bool = False,
     ) -> None:
         self.name = keys.check_name(name, "fleet name")
-        self.sender = sender or default_sender()
+        self.sender = sender or default_sender(person)
         self.kind = kind
         token = keys.operator_token(self.name, self.sender)
         self.bus = Bus.open(endpoint, start_hub=start_hub)
@@ -218,9 +234,28 @@ class Fleet:
         """E-stop these cars. Without an argument, e-stop the whole fleet."""
         return self.ask(estop_request(why, "fleet" if cars is None else "car"), cars)
 
-    def resume(self, cars: Iterable[str], ids: Sequence[str] = ()) -> list[Outcome]:
-        """End the e-stops of these ids. Without ids, end the hold."""
-        return self.ask(resume_request(ids), cars)
+    def resume(self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False) -> list[Outcome]:
+        """End the e-stops of these ids. Without ids, end the hold. None: of every car.
+
+        everything: end the hold and every e-stop that this sender may end. The outcome is not ok if something stays.
+        """
+        return self.ask(resume_request(ids, everything=everything), cars)
+
+    def pause(self, why: str = "") -> list[Outcome]:
+        """Stop every car, and let only leads move cars until `unpause`. Without leads nobody moves a car."""
+        return self.ask(pause_request(why))
+
+    def unpause(self) -> list[Outcome]:
+        """End the pause of the fleet. No car moves."""
+        return self.ask(unpause_request())
+
+    def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
+        """Lend these cars to a person: until then only that person and leads drive them."""
+        return self.ask(lend_request(to, duration_s), cars)
+
+    def end_loan(self, cars: Iterable[str]) -> list[Outcome]:
+        """End the loan of these cars, and stop those that the borrower drives."""
+        return self.ask(end_loan_request(), cars)
 
     def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Send a command to the cars (None: to all, with one wildcard query). Wait and return their outcomes.

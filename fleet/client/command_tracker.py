@@ -69,7 +69,7 @@ class PendingCommand:
         self.id = command_id
         self.request = request
         self.queries: list[Future[None]] = []
-        self.is_stop = request.verb in STOPS
+        self.is_stop = request.verb in STOPS or request.verb == "pause"
         self._send_again = send_again
         self._present = set(present)
         self._named = named

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
 from fleet.client.outcome import Until
+from schemas import keys
 from schemas.gen import fleet_v1_pb2 as pb
 
 R = TypeVar("R")
@@ -144,9 +145,29 @@ def estop_request(why: str, scope: str) -> CommandRequest:
     return CommandRequest("estop", pb.EstopCommand(why=why, scope=scope), Until.STOPPED)
 
 
-def resume_request(ids: Sequence[str] = ()) -> CommandRequest:
-    """Request the end of the e-stops of these ids. Without ids, request the end of the hold."""
-    return CommandRequest("resume", pb.ResumeCommand(ids=ids))
+def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> CommandRequest:
+    """Request the end of the e-stops of these ids. Without ids, request the end of the hold. everything: of both."""
+    return CommandRequest("resume", pb.ResumeCommand(ids=ids, all=everything))
+
+
+def pause_request(why: str = "") -> CommandRequest:
+    """Request a stop, and a pause of the whole fleet."""
+    return CommandRequest("pause", pb.PauseCommand(why=why), Until.STOPPED)
+
+
+def unpause_request() -> CommandRequest:
+    """Request the end of the pause of the fleet."""
+    return CommandRequest("unpause", pb.UnpauseCommand())
+
+
+def lend_request(to: str, duration_s: float) -> CommandRequest:
+    """Request that of all persons and scripts only this person and leads drive the car, for `duration_s`."""
+    return CommandRequest("lend", pb.LendCommand(to=keys.check_name(to, "person"), duration_s=duration_s))
+
+
+def end_loan_request() -> CommandRequest:
+    """Request the end of a loan."""
+    return CommandRequest("lend", pb.LendCommand(end=True))
 
 
 def _check_range(name: str, value: int, top: int) -> None:
@@ -220,9 +241,17 @@ class CarCommands(ABC, Generic[R]):
         """E-stop this car."""
         return self.do(estop_request(why, "car"))
 
-    def resume(self, ids: Sequence[str] = ()) -> R:
-        """End the e-stops of these ids. Without ids, end the hold."""
-        return self.do(resume_request(ids))
+    def resume(self, ids: Sequence[str] = (), *, everything: bool = False) -> R:
+        """End the e-stops of these ids. Without ids, end the hold. everything: end all that this sender may end."""
+        return self.do(resume_request(ids, everything=everything))
+
+    def lend(self, to: str, duration_s: float) -> R:
+        """Lend the car to a person: until then only that person and leads drive it."""
+        return self.do(lend_request(to, duration_s))
+
+    def end_loan(self) -> R:
+        """End the loan of the car, and stop it if the borrower drives it."""
+        return self.do(end_loan_request())
 
     def find(self) -> R:
         """Blink and beep, without moving."""

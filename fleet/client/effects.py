@@ -9,6 +9,12 @@ _ESTOP: Final[dict[str, str]] = {
     "unconfirmed": "emergency stop sent, which {car} cannot confirm",
     "sent": "emergency-stopped",
 }
+_STOP: Final[dict[str, str]] = {
+    "shown": "stopped ({took_s:.1f} s)",
+    "complete": "stopped ({took_s:.1f} s)",
+    "unconfirmed": "stop sent, which {car} cannot confirm",
+    "sent": "stopped",
+}
 
 EFFECTS: Final[dict[str, dict[str, str]]] = {
     "drive": {
@@ -17,12 +23,7 @@ EFFECTS: Final[dict[str, dict[str, str]]] = {
         "sent": "driving{detail}",
     },
     "release": {"shown": "stopped", "unconfirmed": "stop sent", "sent": "stopped"},
-    "stop": {
-        "shown": "stopped ({took_s:.1f} s)",
-        "complete": "stopped ({took_s:.1f} s)",
-        "unconfirmed": "stop sent, which {car} cannot confirm",
-        "sent": "stopped",
-    },
+    "stop": _STOP,
     "estop": _ESTOP,
     "estop_fleet": _ESTOP,
     "mode": {"sent": "switching to mode{detail}"},
@@ -34,7 +35,10 @@ EFFECTS: Final[dict[str, dict[str, str]]] = {
     "speed": {"sent": "speed one step{detail}"},
     "fan": {"sent": "fan{detail}"},
     "find": {"sent": "blinked and beeped"},
-    "resume": {"sent": "{words}", "estopped": "{words}"},
+    "resume": {"sent": "{words}", "estopped": "{words}", "held": "{words}"},
+    "pause": _STOP,
+    "unpause": {"sent": "{words}"},
+    "lend": {"sent": "{words}"},
     "lease": {"sent": "done"},
     _ANY: {
         "complete": "done",
@@ -49,12 +53,13 @@ EFFECTS: Final[dict[str, dict[str, str]]] = {
 NEXT_STEPS: Final = {
     "estop": "Release it with `fleet resume {car} --estops`",
     "estop_fleet": "One release frees all cars: `fleet resume --estops`",
+    "pause": "Paused until `fleet unpause`",
 }
 """End of the text of a command that was carried out, by verb."""
 
 _STOP_FAILURES: Final = {"not_shown": "stop sent, {words}", "rejected": "{words}", "failed": "{words}"}
 """The gateway's words of a stop that failed begin with the fact for the car."""
-STOP_VERBS: Final = frozenset({"stop", "estop", "estop_fleet", "release"})
+STOP_VERBS: Final = frozenset({"stop", "estop", "estop_fleet", "pause", "release"})
 
 
 def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, words: str, took_s: float) -> str:

@@ -14,6 +14,8 @@ COMPLETE: Final = "complete"
 NO_ANSWER: Final = "no_answer"
 NO_RESULT: Final = "no_result"
 """The code of a command whose last event is missing."""
+_STAYS: Final = ("estopped", "held")
+"""Reasons of a resume after which the car is still stopped."""
 _FAILED_PHASES: Final = frozenset({"superseded", "expired", "failed", "rejected"})
 
 OUTCOME_MARGIN_S: Final = 5.0
@@ -247,7 +249,7 @@ class Progress:
         if phase in _FAILED_PHASES:
             self._end(phase, reason, words, at, ok=False)
         elif phase == COMPLETE or (phase == SENT and self._until is Until.SENT):
-            self._end(phase, reason, words, at, ok=reason != "estopped")  # resumed, and still e-stopped
+            self._end(phase, reason, words, at, ok=reason not in _STAYS)
 
     def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
         if self.outcome is None:

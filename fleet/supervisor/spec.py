@@ -192,9 +192,11 @@ def _car(spec: FleetCar) -> CarProcessSpec:
 
 
 def _people(car: str, people: Mapping[str, FleetPerson]) -> tuple[str, ...]:
-    """Return the options of a gateway that name the people who may drive its car."""
-    drivers = {name: person for name, person in people.items() if person.may_drive(car)}
-    named = [f"{name}:lead" if person.rank is PersonRank.LEAD else name for name, person in drivers.items()]
+    """Return the options of a gateway that name the people who may drive its car, and those who drive others."""
+    named = [
+        f"{name}:lead" if person.rank is PersonRank.LEAD else name if person.may_drive(car) else f"{name}:other"
+        for name, person in people.items()
+    ]
     return ("--people-only", *(word for name in named for word in ("--person", name)))
 
 

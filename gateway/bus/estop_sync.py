@@ -1,7 +1,7 @@
-"""Syncs fleet-wide e-stops between the gateways of a fleet.
+"""Syncs fleet-wide e-stops and pauses between the gateways of a fleet.
 
-Each gateway serves its own car. Only a fleet-wide e-stop, and its end, concerns the others. A gateway queries the
-others and does not subscribe to them: with fifty cars that would be 2,500 states a second.
+Each gateway serves its own car. Only a fleet-wide e-stop or a pause, and its end, concerns the others. A gateway
+queries the others and does not subscribe to them: with fifty cars that would be 2,500 states a second.
 """
 
 import asyncio
@@ -10,8 +10,8 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from gateway.control.commands import Command, EmergencyStop, Resume
-from gateway.control.safety import Estop, PersistedSafety
+from gateway.control.commands import Command, EmergencyStop, Pause, Resume, SenderKind, Unpause
+from gateway.control.safety import Estop, FleetPause, PersistedSafety
 from schemas import bus, keys, messages
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
@@ -36,8 +36,8 @@ ANSWERS_PER_S: Final = 400.0
 
 log = logging.getLogger("gateway")
 
-MergeEstops = Callable[[Sequence[Estop], Sequence[str], str], object]
-"""Takes the e-stops in force, the ids of ended ones, and the car whose gateway has sent them."""
+MergeSafety = Callable[[PersistedSafety, str], object]
+"""Takes the e-stops and pauses, in force and ended, and the car whose gateway has sent them."""
 
 
 class EstopSync:
@@ -72,14 +72,18 @@ class EstopSync:
         self._changed.set()
 
     def forward(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
-        """Send a fleet-wide e-stop, or its end, to all gateways under the same id, if it came to this car only."""
+        """Send a fleet-wide e-stop or a pause, or its end, to all gateways, if it came to this car only."""
         fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
-        payload: pb.EstopCommand | pb.ResumeCommand
+        payload: pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand
         match command.what:
             case EmergencyStop(why, True):
                 payload = pb.EstopCommand(why=why, scope="fleet")
-            case Resume(ids) if ended_ids := sorted(fleet_wide & set(ids) & set(now.ended)):
+            case Resume() if ended_ids := sorted(fleet_wide & set(now.ended)):
                 payload = pb.ResumeCommand(ids=ended_ids)
+            case Pause(why) if now.pauses != before.pauses:
+                payload = pb.PauseCommand(why=why)
+            case Unpause() if now.pauses != before.pauses:
+                payload = pb.UnpauseCommand()
             case _:
                 return
         payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
@@ -94,8 +98,8 @@ class EstopSync:
         for _ in self._bus.query(key, payload=payload, encoding=encoding):
             pass
 
-    async def keep_synced(self, merge: MergeEstops) -> None:
-        """Merge the fleet-wide e-stops of each gateway that starts, until cancelled."""
+    async def keep_synced(self, merge: MergeSafety) -> None:
+        """Merge the fleet-wide e-stops and the pauses of each gateway that starts, until cancelled."""
         retry_s, retry = FIRST_RETRY_S, None
         batch_delay_s, first = BATCH_DELAY_S, True
         while True:
@@ -117,7 +121,7 @@ class EstopSync:
                 except (messages.BadPayload, KeyError) as error:
                     log.warning("%s: no state of a gateway of this fleet: %s", answer.key, error)
                     continue
-                merge([_estop(each) for each in state.estops], state.ended, state.car)
+                merge(_shared(state), state.car)
                 self._due.discard(state.car)
             if retry is not None:
                 retry.cancel()
@@ -135,5 +139,17 @@ class EstopSync:
         ]
 
 
-def _estop(message: pb.Estop) -> Estop:
-    return Estop(message.id, message.by, message.why, messages.stamp_ns(message.stamp), message.scope == "fleet")
+def _shared(state: pb.Safety) -> PersistedSafety:
+    """Return the part of a gateway's state that concerns the others."""
+    estops = (
+        Estop(each.id, each.by, each.why, messages.stamp_ns(each.stamp), each.scope == "fleet", _rank(each.rank))
+        for each in state.estops
+    )
+    pauses = (
+        FleetPause(each.id, each.by, each.why, messages.stamp_ns(each.stamp), _rank(each.rank)) for each in state.pauses
+    )
+    return PersistedSafety(None, tuple(estops), tuple(state.ended), tuple(pauses), tuple(state.ended_pauses))
+
+
+def _rank(text: str) -> SenderKind:
+    return SenderKind(text) if text in tuple(SenderKind) else SenderKind.PERSON

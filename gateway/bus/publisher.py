@@ -322,12 +322,21 @@ def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
     safety = control.safety
     for estop in safety.estops:
         scope = "fleet" if estop.fleet_wide else "car"
-        shown = message.estops.add(id=estop.id, by=estop.by, why=estop.why, scope=scope)
-        shown.stamp.seconds, shown.stamp.nanos = divmod(estop.at_ns, 1_000_000_000)
+        shown = message.estops.add(id=estop.id, by=estop.by, why=estop.why, scope=scope, rank=estop.rank)
+        _set_stamp(shown.stamp, estop.at_ns)
     message.ended.extend(safety.ended)
     if safety.hold is not None:
-        message.hold.by = safety.hold.by
-        message.hold.since.seconds, message.hold.since.nanos = divmod(safety.hold.since_ns, 1_000_000_000)
+        message.hold.by, message.hold.rank = safety.hold.by, safety.hold.rank
+        _set_stamp(message.hold.since, safety.hold.since_ns)
+    for pause in safety.pauses:
+        added = message.pauses.add(id=pause.id, by=pause.by, why=pause.why, rank=pause.rank)
+        _set_stamp(added.stamp, pause.at_ns)
+    message.ended_pauses.extend(safety.ended_pauses)
+    loan = safety.loan_at(now)
+    if loan is not None:
+        message.loan.to, message.loan.by, message.loan.rank = loan.to, loan.by, loan.rank
+        _set_stamp(message.loan.since, loan.since_ns)
+        message.loan.expires_in_s = safety.loan_until - now
     lease = safety.lease_at(now)
     if lease is not None:
         message.lease.holder, message.lease.kind = lease.holder.name, lease.holder.kind
@@ -340,3 +349,7 @@ def _fill_safety(message: pb.Safety, control: Controller, now: float) -> None:
     if trust.shown_at is not None:
         message.shown_age_s = max(0.0, now - trust.shown_at)
     message.worst_stop_s = control.stops.worst_s(now)
+
+
+def _set_stamp(stamp: Any, at_ns: int) -> None:
+    stamp.seconds, stamp.nanos = divmod(at_ns, 1_000_000_000)

@@ -17,9 +17,12 @@ from gateway.control.commands import (
     Command,
     Drive,
     EmergencyStop,
+    EndLoan,
     Fan,
     Find,
+    Lend,
     OneShot,
+    Pause,
     Reason,
     Resume,
     Sender,
@@ -27,6 +30,7 @@ from gateway.control.commands import (
     SetMode,
     Stop,
     TakeLease,
+    Unpause,
 )
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
@@ -39,11 +43,15 @@ DEFAULT_MAX_DRIVE_S: Final = 10.0
 """Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
+MAX_LOAN_S: Final = 86_400.0
+"""Maximum duration of a loan."""
 MAX_REASON_LENGTH: Final = 200
 """Maximum characters of an e-stop's reason. The rest is cut off, so that no e-stop fails for its reason."""
 _SAME_QUERY_NS: Final = 2_000_000_000
 """Maximum time in which one query reaches every gateway."""
 # One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
+_WIRE_KINDS: Final = tuple(kind for kind in SenderKind if kind is not SenderKind.LEAD)
+"""The kinds that a command may claim."""
 WILDCARD_VERBS: Final = tuple(verb for verb, row in COMMANDS.items() if row.wildcard)
 
 
@@ -146,7 +154,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
     try:
         command = replace(command, id=_text("id", message.id) or blank.id)
         command = replace(command, sender=Sender(_text("sender", message.sender, "/*$#?") or "anonymous"))
-        kind: SenderKind = _word("kind", message.kind or SenderKind.SCRIPT, SenderKind)
+        kind: SenderKind = _word("kind", message.kind or SenderKind.SCRIPT, _WIRE_KINDS)
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
         what = _drive(message, request.longest_drive_s, request.car) if verb == "drive" else _WHAT[verb](message)
@@ -191,11 +199,28 @@ def _text(field: str, value: str, forbidden: str = "") -> str:
 
 def _word(field: str, value: str, kind: Any) -> Any:
     try:
-        return kind(value)
+        return kind[kind.index(value)] if isinstance(kind, tuple) else kind(value)
     except ValueError:
         problem = f"{field} {value!r}" if value else f"{field} is missing"
         near = did_you_mean(value, kind)
         raise ValueError(f"{problem}. {near}" if near else f"{problem}: allowed are {', '.join(kind)}") from None
+
+
+def _lend(message: Any) -> Action:
+    if message.end:
+        if message.to or message.HasField("duration_s"):
+            raise ValueError("end: give neither to nor duration_s")
+        return EndLoan()
+    to = _text("to", message.to, "/*$#?@")
+    if not to:
+        raise ValueError("to is missing: the person who gets the car")
+    return Lend(to, _seconds("duration_s", message.duration_s, MAX_LOAN_S))
+
+
+def _resume(message: Any) -> Action:
+    if message.all and message.ids:
+        raise ValueError("all: give no ids")
+    return Resume(tuple(message.ids), message.all)
 
 
 def _seconds(field: str, value: float, top: float) -> float:
@@ -288,7 +313,10 @@ _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
     "fan": _fan,
     "stop": lambda _: Stop(),
     "estop": _estop,
-    "resume": lambda message: Resume(tuple(message.ids)),
+    "resume": _resume,
+    "pause": lambda message: Pause(_why(message.why)),
+    "unpause": lambda _: Unpause(),
+    "lend": _lend,
     "lease": lambda message: TakeLease(message.release),
     "find": lambda _: Find(),
 }

@@ -3,7 +3,7 @@
 Pure: takes the context of the car, returns a refusal or None. A stop or e-stop passes in every state.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from gateway.control.commands import (
@@ -12,17 +12,23 @@ from gateway.control.commands import (
     Command,
     Drive,
     EmergencyStop,
+    EndLoan,
     Fan,
     Find,
+    Lend,
     OneShot,
+    Pause,
     Reason,
     Resume,
+    Sender,
     SenderKind,
     SetMode,
     Stop,
     TakeLease,
+    Unpause,
 )
-from gateway.control.safety import Estop, LeaseState
+from gateway.control.people import NO_PEOPLE, People, PersonRole
+from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ArmSet, General, Ptz
 from gateway.protocol.platforms import Profile
@@ -47,7 +53,7 @@ class CommandContext:
     """The commanded mode, also one that still waits."""
     contradicted: bool
     """True if readings or silence contradict the commanded mode."""
-    held_by: str | None
+    hold: Hold | None
     estops: tuple[Estop, ...]
     ended: tuple[str, ...]
     """Ids of ended e-stops."""
@@ -60,15 +66,20 @@ class CommandContext:
     """Estimated speed, in the unit of the profile's speed model."""
     speed_max: float = 1.0
     """Maximum share of full speed, 0..1, after a speed step."""
+    people: People = NO_PEOPLE
+    pauses: tuple[FleetPause, ...] = ()
+    loan: Loan | None = None
+    loan_until: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Needs:
     """The conditions for a command."""
 
-    not_estopped: bool = True
+    allowed: bool = True
+    """The sender may drive the car, nobody else has borrowed it, and neither an e-stop nor a pause is in force."""
     not_held: bool = True
-    """For a coordinator: the car must not be on hold."""
+    """The car must not be on hold. This holds for a coordinator; after the stop of a lead for all but leads."""
     lease: bool = False
     """No sender of the same or a higher rank may hold the lease."""
     battery: bool = False
@@ -78,7 +89,7 @@ class Needs:
     queue: bool = False
 
 
-_ANYTIME: Final = Needs(not_estopped=False, not_held=False, link=False)
+_ANYTIME: Final = Needs(allowed=False, not_held=False, link=False)
 _MOVES: Final = Needs(lease=True, battery=True, manual=True)
 _ACTS: Final = Needs(manual=True, queue=True)
 _ADJUSTS: Final = Needs(lease=True, manual=True, queue=True)
@@ -91,6 +102,10 @@ TABLE: Final[dict[type[Action], Needs]] = {
     Stop: _ANYTIME,
     EmergencyStop: _ANYTIME,
     Resume: _ANYTIME,
+    Pause: _ANYTIME,
+    Unpause: _ANYTIME,
+    Lend: _ANYTIME,
+    EndLoan: _ANYTIME,
     TakeLease: Needs(lease=True, link=False),
     Drive: _MOVES,
     SetMode: Needs(lease=True, battery=True),
@@ -122,9 +137,11 @@ def needs(what: Action) -> Needs:
 
 def refuse(command: Command, context: CommandContext) -> Refusal | None:
     """Return why the command is refused; None if it is accepted. The words name the car, the state, and what to do."""
-    what = command.what
+    what, sender = command.what, command.sender
     if isinstance(what, Stop | EmergencyStop):
         return None
+    if isinstance(what, Pause):  # late is better than never, as of a stop
+        return _may_direct(sender, "pause the fleet", context)
     if command.age_s is not None and command.age_s > command.ttl_s:
         return (
             Reason.STALE,
@@ -133,9 +150,17 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
     unknown = _unknown(what, context)
     if unknown is not None:
         return Reason.UNSUPPORTED, unknown
-    if isinstance(what, Resume):
-        return _resume(what, command.sender.kind, context)
-    return _unmet(command, needs(what), context)
+    match what:
+        case Resume():
+            return _resume(what, sender, context)
+        case Unpause():
+            return _may_direct(sender, "end the pause", context)
+        case Lend():
+            return _may_direct(sender, f"lend {context.car}", context) or _may_drive(sender, context)
+        case EndLoan() if context.loan is not None and context.loan.to != sender.person:
+            return _may_direct(sender, f"end the loan of {context.car}", context)
+        case _:
+            return _unmet(command, needs(what), context)
 
 
 def _unknown(what: Action, context: CommandContext) -> str | None:
@@ -170,35 +195,135 @@ def _unknown(what: Action, context: CommandContext) -> str | None:
             return None
 
 
-def _resume(resume: Resume, kind: SenderKind, context: CommandContext) -> Refusal | None:
-    if kind is SenderKind.COORDINATOR:
-        return (
-            Reason.HELD,
-            f"{context.car} stays on hold: only a person or a script may resume it, not the coordinator.",
-        )
-    in_force = [estop.id for estop in context.estops]
+def _may_direct(sender: Sender, deed: str, context: CommandContext) -> Refusal | None:
+    """Return why this sender may not pause or lend: where there are leads, only they may; elsewhere every person."""
+    leads, person = context.people.leads, sender.person
+    if sender.kind is SenderKind.LEAD:
+        return None
+    if leads:
+        return Reason.NOT_ALLOWED, f"{person} may not {deed}: only a lead may ({', '.join(leads)})."
+    if sender.kind is not SenderKind.PERSON:
+        return Reason.NOT_ALLOWED, f'a {sender.kind} may not {deed}: only a person may. Send kind "person".'
+    return _unlisted(sender, context) if context.people.role(person) is None else None
+
+
+def _may_drive(sender: Sender, context: CommandContext) -> Refusal | None:
+    """Return why the people of the fleet or a loan keep this sender from the car."""
+    car, person, people, loan = context.car, sender.person, context.people, context.loan
+    if sender.kind is SenderKind.LEAD:
+        return None
+    if loan is not None and person != loan.to and person not in people.leads:
+        left = f"{context.loan_until - context.now:.0f} s"
+        words = f"{car} is lent to {loan.to} for another {left}. {loan.by} ends that with `fleet lend {car} --end`."
+        return Reason.LENT, words
+    borrowed = loan is not None and person == loan.to
+    if sender.kind is SenderKind.COORDINATOR or borrowed or people.may_drive(person):
+        return None
+    if people.role(person) is None:
+        return _unlisted(sender, context)
+    words = f"{person} may not drive {car}: `people:` in the fleet file gives {person} other cars."
+    who = f"{', '.join(people.leads)} can lend it" if people.leads else "Somebody who drives it can lend it"
+    return Reason.NOT_ALLOWED, f"{words} {who}: `fleet lend {car} --to {person} --for 10m`."
+
+
+def _unlisted(sender: Sender, context: CommandContext) -> Refusal:
+    return Reason.NOT_ALLOWED, (
+        f"{sender.person} may watch and stop {context.car}, nothing else: `people:` in the fleet file does not list "
+        f"{sender.person}. Say who you are with `--as NAME` or FLEET_AS."
+    )
+
+
+def may_end_estop(estop: Estop, sender: Sender, people: People) -> bool:
+    """Return True if the sender may end this e-stop.
+
+    A lead's e-stop ends only a lead. An e-stop of this car ends who may drive the car, a fleet-wide one every person of
+    the fleet, so that all gateways decide alike. Everybody ends their own.
+    """
+    if sender.kind is SenderKind.COORDINATOR or not people.may_end(sender, estop.rank):
+        return False
+    person, role = sender.person, people.role(sender.person)
+    own = person == Sender(estop.by).person
+    return own or people.may_drive(person) or (estop.fleet_wide and role is PersonRole.OTHER)
+
+
+def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal | None:
+    car, people = context.car, context.people
+    if sender.kind is SenderKind.COORDINATOR:
+        return Reason.HELD, f"{car} stays on hold: only a person or a script may resume it, not the coordinator."
+    in_force = {estop.id: estop for estop in context.estops}
     if resume.ids and not set(resume.ids) & {*in_force, *context.ended}:
         there = f"In force: {', '.join(in_force)}." if in_force else "None is in force."
-        return Reason.BAD_VALUE, f"{context.car} has no e-stop {', '.join(resume.ids)}. {there}"
-    return None
+        return Reason.BAD_VALUE, f"{car} has no e-stop {', '.join(resume.ids)}. {there}"
+    named = [estop for estop in context.estops if resume.all or estop.id in resume.ids]
+    stays = [estop for estop in named if not may_end_estop(estop, sender, people)]
+    if len(stays) < len(named) or (resume.ids and not named):
+        return None
+    hold = refuse_end_of_hold(sender, context)
+    if stays and (hold is not None or context.hold is None or not resume.all):
+        return _estop_stays(stays[0], sender, context)
+    return hold
+
+
+def refuse_end_of_hold(sender: Sender, context: CommandContext) -> Refusal | None:
+    """Return why the sender may not end a hold, or None. A loan to another person does not matter here."""
+    return _hold_stays(sender, context) or _may_drive_at_all(sender, context)
+
+
+def _may_drive_at_all(sender: Sender, context: CommandContext) -> Refusal | None:
+    loan = context.loan if context.loan is not None and context.loan.to == sender.person else None
+    return _may_drive(sender, replace(context, loan=loan))
+
+
+def _estop_stays(estop: Estop, sender: Sender, context: CommandContext) -> Refusal:
+    if context.people.may_end(sender, estop.rank):
+        return _may_drive_at_all(sender, context) or _unlisted(sender, context)
+    why = f': "{estop.why}"' if estop.why else ""
+    words = f"{context.car} stays emergency-stopped: {estop.by} did it{why}, and only a lead ends what a lead began"
+    return Reason.ESTOPPED, f"{words} ({', '.join(context.people.leads)})."
+
+
+def _hold_stays(sender: Sender, context: CommandContext) -> Refusal | None:
+    hold = context.hold
+    if hold is None or context.people.may_end(sender, hold.rank):
+        return None
+    words = f"{context.car} is on hold: {hold.by} stopped it, and only a lead ends what a lead began"
+    return Reason.HELD, f"{words} ({', '.join(context.people.leads)})."
+
+
+def _not_allowed(sender: Sender, context: CommandContext) -> Refusal | None:
+    """Return why an e-stop, a pause, a loan or the people of the fleet keep the sender from the car."""
+    car = context.car
+    if context.estops:
+        first = context.estops[0]
+        why = f': "{first.why}"' if first.why else ""
+        words = f"{car} is emergency-stopped ({first.by}{why}). Release it with `fleet resume {car} --estops`."
+        return Reason.ESTOPPED, words
+    refusal = _may_drive(sender, context)
+    if refusal is not None or not context.pauses or sender.kind is SenderKind.LEAD:
+        return refusal
+    last = context.pauses[-1]
+    why = f': "{last.why}"' if last.why else ""
+    who = "A lead" if context.people.leads else "A person"
+    return Reason.PAUSED, f"{car} is paused with the whole fleet ({last.by}{why}). {who} ends it with `fleet unpause`."
 
 
 def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal | None:
     """Return the first need that is not met; None if all are."""
     car, sender = context.car, command.sender
-    if needed.not_estopped and context.estops:
-        first = context.estops[0]
-        why = f': "{first.why}"' if first.why else ""
-        return (
-            Reason.ESTOPPED,
-            f"{car} is emergency-stopped ({first.by}{why}). Release it with `fleet resume {car} --estops`.",
-        )
-    if needed.not_held and sender.kind is SenderKind.COORDINATOR and context.held_by is not None:
-        return Reason.HELD, f"{car} is on hold ({context.held_by} stopped it). End the hold with `fleet resume {car}`."
+    refusal = _not_allowed(sender, context) if needed.allowed else None
+    if refusal is not None:
+        return refusal
+    if needed.not_held and context.hold is not None:
+        if sender.kind is SenderKind.COORDINATOR:
+            words = f"{car} is on hold ({context.hold.by} stopped it). End the hold with `fleet resume {car}`."
+            return Reason.HELD, words
+        refusal = _hold_stays(sender, context)
+        if refusal is not None:
+            return refusal
     lease, now = context.lease, context.now
     if needed.lease and lease is not None and lease.refuses(sender, now, take=command.take):
         words = f"{car} is driven by {lease.holder.name} ({lease.holder.kind}) for another {lease.until - now:.1f} s."
-        if sender.kind is lease.holder.kind is SenderKind.PERSON:
+        if sender.kind is lease.holder.kind and sender.kind in (SenderKind.PERSON, SenderKind.LEAD):
             return Reason.LEASED, f"{words} Wait, or take the car over (--take)."
         return Reason.LEASED, f"{words} Wait until the car is free."
     if needed.battery and context.battery:

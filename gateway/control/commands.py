@@ -8,8 +8,10 @@ from gateway.protocol.frames import Frame
 
 
 class SenderKind(StrEnum):
-    """The kind of a sender. A person outranks a script, a script outranks the coordinator."""
+    """The kind of a sender, which is its rank. Each outranks those below it."""
 
+    LEAD = "lead"
+    """A person whom the people table of the gateway names as a lead. No command may claim it."""
     PERSON = "person"
     SCRIPT = "script"
     COORDINATOR = "coordinator"
@@ -22,6 +24,11 @@ class Reason(StrEnum):
     UNSUPPORTED = "unsupported"
     WRONG_MODE = "wrong_mode"
     LEASED = "leased"
+    LENT = "lent"
+    """The car is lent to another person."""
+    NOT_ALLOWED = "not_allowed"
+    """The people table does not allow it to this sender."""
+    PAUSED = "paused"
     HELD = "held"
     ESTOPPED = "estopped"
     BATTERY_LOW = "battery_low"
@@ -56,6 +63,11 @@ class Sender:
 
     name: str = "anonymous"
     kind: SenderKind = SenderKind.SCRIPT
+
+    @property
+    def person(self) -> str:
+        """Return the person: `group_a` of `group_a@host-4711`."""
+        return self.name.partition("@")[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +121,35 @@ class EmergencyStop:
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """End the e-stops of these ids. Without ids, end the hold."""
+    """End the e-stops of these ids. Without ids, end the hold. `all`: end both, as far as the sender may."""
 
     ids: tuple[str, ...] = ()
+    all: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Stop the car, and let only leads move the cars of the fleet until an `Unpause`."""
+
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Unpause:
+    """End the pause of the fleet. Move nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lend:
+    """Let only this person, of all persons and scripts, drive the car for `duration_s` seconds."""
+
+    to: str
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class EndLoan:
+    """End the loan of the car."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +164,22 @@ class Find:
     """Make the car blink and beep, without moving it."""
 
 
-Action = Drive | SetMode | OneShot | ChangeSpeed | Fan | Stop | EmergencyStop | Resume | TakeLease | Find
+Action = (
+    Drive
+    | SetMode
+    | OneShot
+    | ChangeSpeed
+    | Fan
+    | Stop
+    | EmergencyStop
+    | Resume
+    | TakeLease
+    | Find
+    | Pause
+    | Unpause
+    | Lend
+    | EndLoan
+)
 
 
 @dataclass(frozen=True, slots=True)

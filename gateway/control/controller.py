@@ -6,6 +6,7 @@ than one frame in flight.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from gateway.control import arbiter
 from gateway.control.car_model import CarModel
@@ -19,9 +20,12 @@ from gateway.control.commands import (
     Command,
     Drive,
     EmergencyStop,
+    EndLoan,
     Fan,
     Find,
+    Lend,
     OneShot,
+    Pause,
     Phase,
     Reason,
     Resume,
@@ -30,12 +34,14 @@ from gateway.control.commands import (
     SetMode,
     Stop,
     TakeLease,
+    Unpause,
 )
 from gateway.control.estimate.battery import BatteryPolicy
 from gateway.control.estimate.mode import Verdict
 from gateway.control.events import FrameOrigin, Level, OutgoingFrame, Record
 from gateway.control.executor import Executor
-from gateway.control.safety import LEASE_S, Estop, PersistedSafety, Safety
+from gateway.control.people import NO_PEOPLE, People
+from gateway.control.safety import LEASE_S, Estop, FleetPause, Loan, PersistedSafety, Safety
 from gateway.control.senders import STREAM_PAUSE_S
 from gateway.control.stops import sequences
 from gateway.protocol.enums import Mode, Motion
@@ -60,9 +66,14 @@ class Controller:
         persisted: PersistedSafety | None = None,
         battery_policy: BatteryPolicy | None = None,
         speed_max: float = 1.0,
+        people: People = NO_PEOPLE,
+        now: float = 0.0,
+        now_ns: int = 0,
     ) -> None:
+        """Take over the state from before a restart. `now_ns`: the wall clock at `now`."""
         self.car = car
-        self.safety = Safety.restore(persisted or PersistedSafety())
+        self.people = people
+        self.safety = Safety.restore(persisted or PersistedSafety(), now, now_ns)
         self._log = CommandLog()
         self.model = CarModel(car, profile, auto, self._log, battery_policy or BatteryPolicy())
         self._executor = Executor(self.model, self._log, self.safety)
@@ -71,6 +82,8 @@ class Controller:
         self._senders = self._executor.senders
         self._queue = self._executor.queue
         self._speed_max = speed_max
+        self._mover = ""
+        """The person who moved the car last, by a drive or a mode."""
         self.was_open = False
         """True if the link was open at least once, so the car may have been driven."""
 
@@ -141,6 +154,8 @@ class Controller:
 
     def tick(self, now: float) -> None:
         """Check for silence. Call it a few times a second."""
+        if self.safety.loan is not None and self.safety.loan_at(now) is None:
+            self._end_loan(f"the loan of {self.car} to {self.safety.loan.to} is over", now)
         self._monitor.tick(now)
 
     def on_stall(self, gap_s: float, now: float) -> None:
@@ -155,6 +170,7 @@ class Controller:
 
     def command(self, command: Command, now: float) -> Answer:
         """Refuse a command with a reason, or begin to carry it out. Record each of its transitions."""
+        command = replace(command, sender=self.people.ranked(command.sender))
         pending, what = Pending(command, now), command.what
         if self._log.has_accepted(command) and not isinstance(what, Stop | EmergencyStop):
             words = f"a command with id {command.id} was accepted before. Use a new id."
@@ -177,12 +193,16 @@ class Controller:
         busy = self._too_busy(what, now)
         if busy:  # before the lease and the hold: a refused command changes neither
             return self._reject(pending, Reason.EXPIRED, busy, now)
+        if isinstance(what, Pause):
+            return self._stop(pending, now)
         self._log.accept(command)
         if arbiter.needs(what).lease:
             self._grant_lease(command, now)
         moves = isinstance(what, SetMode) or (isinstance(what, Drive) and what.motion is not Motion.STOP)
         if moves and command.sender.kind is not SenderKind.COORDINATOR:  # a release ends no hold
             self._end_hold(command.sender, now)
+        if moves:
+            self._mover = command.sender.person
         match what:
             case Drive(Motion.STOP):
                 return self._release(pending, now)
@@ -192,8 +212,14 @@ class Controller:
                 return self._close_mode(pending, now)
             case SetMode(mode):
                 return self._set_mode(pending, mode, now)
-            case Resume(ids):
-                return self._resume(pending, ids, now)
+            case Resume():
+                return self._resume(pending, what, now)
+            case Unpause():
+                return self._unpause(pending, now)
+            case Lend():
+                return self._lend(pending, what, now)
+            case EndLoan():
+                return self._take_back(pending, now)
             case TakeLease(release):
                 return self._take_lease(pending, now, release=release)
             case Fan(bool() as on) if on == self.model.believed.fan:
@@ -251,23 +277,41 @@ class Controller:
         self._executor.halt(words, now)
         self.stops.begin_full(now)
 
+    def merge_pauses(self, pauses: Iterable[FleetPause], ended: Iterable[str], source: str, now: float) -> None:
+        """Merge the pauses, in force and ended, of another gateway of the fleet."""
+        joined, removed = self.safety.merge_pauses(pauses, ended)
+        if removed:
+            self._log.log(
+                Level.INFO, "unpaused", f"the pause of {self.car} was ended elsewhere (seen from {source})", now
+            )
+        if joined:
+            why = f": {joined[0].why}" if joined[0].why else ""
+            words = f"{self.car} is paused with the whole fleet by {joined[0].by}{why} (seen from {source})"
+            self._log.log(Level.WARNING, "paused", words, now)
+            self._executor.halt(words, now)
+            self.stops.begin_full(now)
+
     # ------------------------------------------------------------------ each command
 
     def _stop(self, pending: Pending, now: float) -> Answer:
+        """Stop the car, for a stop, an e-stop or a pause."""
         command = pending.command
         sender, latched = command.sender, command.note
-        if isinstance(command.what, EmergencyStop):
-            estop = Estop(command.id, sender.name, command.what.why, command.asked_ns, command.what.fleet_wide)
+        if isinstance(command.what, Pause):
+            latched = self._latch_pause(command, command.what.why, now)
+        elif isinstance(command.what, EmergencyStop):
+            why, fleet_wide = command.what.why, command.what.fleet_wide
+            estop = Estop(command.id, sender.name, why, command.asked_ns, fleet_wide, sender.kind)
             fleet_wide = self.safety.latch(estop).fleet_wide
             until = f"the e-stop lasts until `fleet resume{'' if fleet_wide else f' {self.car}'} --estops`"
             why = f": {estop.why}" if estop.why else ""
             self._log.log(Level.ERROR, "estop", f"{self.car} is emergency-stopped by {sender.name}{why}; {until}", now)
             latched = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not SenderKind.COORDINATOR:
-            self.safety.put_on_hold(sender.name, command.asked_ns)
+            self.safety.put_on_hold(sender.name, command.asked_ns, sender.kind)
         self._executor.halt(f"{command.verb} by {sender.name}", now, by=sender.name)
         if not self.model.link_open or self.stops.shutting_down:
-            words = self._not_stopped("stopped" if isinstance(command.what, Stop) else "emergency-stopped")
+            words = self._not_stopped("emergency-stopped" if isinstance(command.what, EmergencyStop) else "stopped")
             words = f"{words} ({command.note})" if command.note else words
             return self._reject(pending, Reason.LINK_DOWN, words, now)
         if not self.model.is_heard:
@@ -293,36 +337,99 @@ class Controller:
         release = drive.motion is Motion.STOP
         return self._senders.may_drive(command.sender.name, now, streamed=command.streamed, release=release)
 
-    def _resume(self, pending: Pending, ids: tuple[str, ...], now: float) -> Answer:
-        sender = pending.command.sender.name
-        if ids:
-            if ended := self.safety.end(ids):
-                which = " ".join(estop.id for estop in ended)
-                self._log.log(Level.WARNING, "estop_ended", f"e-stop {which} was ended by {sender}", now)
-            words = "e-stop released" if len(ids) == 1 else f"{len(ids)} e-stops released"
-            if self.safety.estops:
-                words += f"; {self._still_estopped()}"
-            elif self.safety.hold is not None:
-                words += f"; still on hold by {self.safety.hold.by}: `fleet resume {self.car}`"
-            return self._done(pending, words, now)
-        words = (
-            f"resumed: the hold by {self.safety.hold.by} has ended" if self.safety.hold else "resumed: was not on hold"
-        )
-        self._end_hold(pending.command.sender, now)
-        if self.safety.estops:
-            return self._done(pending, self._still_estopped(), now, Reason.ESTOPPED)
+    def _resume(self, pending: Pending, resume: Resume, now: float) -> Answer:
+        """End e-stops, the hold, or both, as far as the sender may. Tell what stays."""
+        sender, safety = pending.command.sender, self.safety
+        named = tuple(each.id for each in safety.estops) if resume.all else resume.ids
+        mine = [each for each in safety.estops if arbiter.may_end_estop(each, sender, self.people)]
+        if ended := safety.end(each.id for each in mine if each.id in named):
+            which = " ".join(estop.id for estop in ended)
+            self._log.log(Level.WARNING, "estop_ended", f"e-stop {which} was ended by {sender.name}", now)
+        parts = []
+        if resume.ids or ended:
+            count = len(ended) if resume.all else len(named)
+            parts.append("e-stop released" if count == 1 else f"{count} e-stops released")
+        hold = safety.hold
+        if not resume.ids and arbiter.refuse_end_of_hold(sender, self._context(now)) is None:
+            parts.append(f"resumed: the hold by {hold.by} has ended" if hold else "resumed: was not on hold")
+            self._end_hold(sender, now)
+        if safety.estops:
+            parts = (
+                [self._still_estopped(sender)]
+                if not resume.ids and not ended
+                else [*parts, self._still_estopped(sender)]
+            )
+        elif safety.hold is not None:
+            fix = f": `fleet resume {self.car}`" if self.people.may_end(sender, safety.hold.rank) else " (a lead)"
+            parts.append(f"still on hold by {safety.hold.by}{fix}")
+        if safety.pauses and not resume.ids:
+            parts.append(f"still paused by {safety.pauses[-1].by}: `fleet unpause`")
+        stays = Reason.ESTOPPED if safety.estops else Reason.HELD if safety.hold else None
+        return self._done(pending, "; ".join(parts), now, None if resume.ids else stays)
+
+    # ------------------------------------------------------------------ pauses and loans
+
+    def _latch_pause(self, command: Command, why: str, now: float) -> str:
+        pause = FleetPause(command.id, command.sender.name, why, command.asked_ns, command.sender.kind)
+        if self.safety.pause(pause):
+            words = f"{self.car} is paused with the whole fleet by {pause.by}{f': {why}' if why else ''}"
+            self._log.log(Level.WARNING, "paused", words, now)
+        if pause.id in self.safety.ended_pauses:
+            return "this pause has ended already, and the car only stops"
+        return "the pause lasts until `fleet unpause`"
+
+    def _unpause(self, pending: Pending, now: float) -> Answer:
+        by = pending.command.sender.name
+        if not self.safety.end_pauses(each.id for each in self.safety.pauses):
+            return self._done(pending, "was not paused", now)
+        self._log.log(Level.INFO, "unpaused", f"the pause of {self.car} was ended by {by}", now)
+        return self._done(pending, "the pause has ended", now)
+
+    def _lend(self, pending: Pending, lend: Lend, now: float) -> Answer:
+        sender = pending.command.sender
+        words = f"lent to {lend.to} for {lend.duration_s:g} s"
+        if self._mover != lend.to:
+            self._clear_for(words, now)
+        loan = Loan(lend.to, sender.name, sender.kind, pending.command.asked_ns, lend.duration_s)
+        self.safety.lend(loan, now)
+        self._log.log(Level.INFO, "lent", f"{self.car} was {words} by {sender.name}", now)
         return self._done(pending, words, now)
 
-    def _still_estopped(self) -> str:
-        """Return which e-stops are in force, with their ids if there are several, and how to release them."""
+    def _take_back(self, pending: Pending, now: float) -> Answer:
+        loan = self.safety.loan_at(now)
+        if loan is None:
+            return self._done(pending, "was not lent", now)
+        words = f"the loan to {loan.to} was ended by {pending.command.sender.name}"
+        self._end_loan(words, now)
+        return self._done(pending, f"the loan to {loan.to} has ended", now)
+
+    def _end_loan(self, words: str, now: float) -> None:
+        """End the loan, and stop a car that the borrower drives."""
+        loan, self.safety.loan = self.safety.loan, None
+        self._log.log(Level.INFO, "loan_ended", f"{self.car}: {words}", now)
+        if loan is not None and self._mover == loan.to:
+            self._clear_for(words, now)
+
+    def _clear_for(self, words: str, now: float) -> None:
+        """End the lease of the driver, and stop the car unless it is at rest: somebody else drives it from now on."""
+        self.safety.lease = None
+        waiting = self._queue.held is not None or self._queue.mode_change is not None or self._queue.one_shots
+        if waiting or not self.model.at_rest:
+            self._executor.halt(words, now)
+            self.stops.begin_full(now)
+
+    def _still_estopped(self, sender: Sender) -> str:
+        """Return which e-stops are in force, with their ids if there are several, and who can release them."""
         estops = self.safety.estops
         several = len(estops) > 1
         each = [
             f"by {estop.by}" + (f' ("{estop.why}")' if estop.why else "") + (f" [{estop.id}]" if several else "")
             for estop in estops
         ]
-        them = "them" if several else "it"
-        return f"still emergency-stopped {', '.join(each)}. Release {them} with `fleet resume {self.car} --estops`"
+        words, them = f"still emergency-stopped {', '.join(each)}", "them" if several else "it"
+        if not any(arbiter.may_end_estop(estop, sender, self.people) for estop in estops):
+            return f"{words}. {sender.person} cannot release {them}"
+        return f"{words}. Release {them} with `fleet resume {self.car} --estops`"
 
     def _grant_lease(self, command: Command, now: float) -> None:
         """Grant the lease for the duration of the command. Log if it was taken from another sender."""
@@ -468,7 +575,7 @@ class Controller:
             closing=self.stops.shutting_down,
             asked=self.asked,
             contradicted=self.model.mode.verdict is Verdict.CONTRADICTED,
-            held_by=self.safety.hold.by if self.safety.hold else None,
+            hold=self.safety.hold,
             estops=self.safety.estops,
             ended=self.safety.ended,
             lease=self.safety.lease_at(now),
@@ -477,4 +584,8 @@ class Controller:
             queued=len(self._queue.one_shots),
             speed=self.model.believed.speed,
             speed_max=self._speed_max,
+            people=self.people,
+            pauses=self.safety.pauses,
+            loan=self.safety.loan_at(now),
+            loan_until=self.safety.loan_until,
         )

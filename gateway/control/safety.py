@@ -1,6 +1,6 @@
-"""Holds the hold, the e-stops and the lease of one car, which decide who may move it.
+"""Holds the hold, e-stops, pauses, loan and lease of one car, which decide who may move it.
 
-`gateway.state_file` writes `PersistedSafety` to disk, so that hold and e-stops survive a restart.
+`gateway.state_file` writes `PersistedSafety` to disk, so that all but the lease survive a restart.
 """
 
 from collections.abc import Iterable
@@ -16,15 +16,23 @@ MAX_ESTOPS: Final = 32
 """Maximum e-stops in force of one car, and as many of the whole fleet. A further one only stops the car."""
 MAX_ENDED_ESTOPS: Final = 2 * MAX_ESTOPS
 """Maximum ended e-stops that are remembered and published in `state/safety`: the newest."""
-_SENDER_RANK: Final = {SenderKind.PERSON: 2, SenderKind.SCRIPT: 1, SenderKind.COORDINATOR: 0}
+MAX_PAUSES: Final = 32
+"""Maximum pauses in force. A further one only stops the cars."""
+MAX_ENDED_PAUSES: Final = 2 * MAX_PAUSES
+"""Maximum ended pauses that are remembered."""
+_SENDER_RANK: Final = {kind: -number for number, kind in enumerate(SenderKind)}
 
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Keeps the coordinator from moving a stopped car. `since_ns`: ns since the epoch."""
+    """Keeps the coordinator from moving a stopped car; after the stop of a lead also persons and scripts.
+
+    `since_ns`: ns since the epoch.
+    """
 
     by: str
     since_ns: int
+    rank: SenderKind = SenderKind.PERSON
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +44,33 @@ class Estop:
     why: str
     at_ns: int
     fleet_wide: bool
+    rank: SenderKind = SenderKind.PERSON
+
+
+@dataclass(frozen=True, slots=True)
+class FleetPause:
+    """One pause of the whole fleet. `at_ns`: wall clock, ns since the epoch."""
+
+    id: str
+    by: str
+    why: str
+    at_ns: int
+    rank: SenderKind = SenderKind.PERSON
+
+
+@dataclass(frozen=True, slots=True)
+class Loan:
+    """The car is lent to the person `to`. `since_ns`: wall clock, ns since the epoch."""
+
+    to: str
+    by: str
+    rank: SenderKind
+    since_ns: int
+    duration_s: float
+
+    def left_s(self, now_ns: int) -> float:
+        """Return the remaining time by the wall clock. A clock that was set back prolongs no loan."""
+        return self.duration_s - max(0.0, (now_ns - self.since_ns) / 1e9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +80,9 @@ class PersistedSafety:
     hold: Hold | None = None
     estops: tuple[Estop, ...] = ()
     ended: tuple[str, ...] = ()
+    pauses: tuple[FleetPause, ...] = ()
+    ended_pauses: tuple[str, ...] = ()
+    loan: Loan | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,28 +99,43 @@ class LeaseState:
         if now >= self.until or sender == self.holder:
             return False
         mine, theirs = _SENDER_RANK[sender.kind], _SENDER_RANK[self.holder.kind]
-        return mine < theirs or (mine == theirs and not self.gone and not (take and sender.kind is SenderKind.PERSON))
+        takes = take and sender.kind in (SenderKind.PERSON, SenderKind.LEAD)
+        return mine < theirs or (mine == theirs and not self.gone and not takes)
 
 
 @dataclass(slots=True)
 class Safety:
-    """Hold, e-stops and lease of one car."""
+    """Hold, e-stops, pauses, loan and lease of one car."""
 
     hold: Hold | None = None
     lease: LeaseState | None = None
+    loan: Loan | None = None
+    loan_until: float = 0.0
+    """When the loan ends, s, monotonic."""
     _estops: dict[str, Estop] = field(default_factory=dict)
     _ended: dict[str, None] = field(default_factory=dict)
+    _pauses: dict[str, FleetPause] = field(default_factory=dict)
+    _ended_pauses: dict[str, None] = field(default_factory=dict)
 
     @classmethod
-    def restore(cls, persisted: PersistedSafety) -> "Safety":
-        """Return the state from before a restart."""
-        estops = {estop.id: estop for estop in persisted.estops}
-        return cls(persisted.hold, None, estops, dict.fromkeys(persisted.ended))
+    def restore(cls, persisted: PersistedSafety, now: float = 0.0, now_ns: int = 0) -> "Safety":
+        """Return the state from before a restart. `now_ns`: the wall clock at `now`."""
+        loan = persisted.loan
+        return cls(
+            persisted.hold,
+            None,
+            loan,
+            0.0 if loan is None else now + loan.left_s(now_ns),
+            {estop.id: estop for estop in persisted.estops},
+            dict.fromkeys(persisted.ended),
+            {pause.id: pause for pause in persisted.pauses},
+            dict.fromkeys(persisted.ended_pauses),
+        )
 
     @property
     def persisted(self) -> PersistedSafety:
         """Return the part of the state that must survive a restart."""
-        return PersistedSafety(self.hold, self.estops, self.ended)
+        return PersistedSafety(self.hold, self.estops, self.ended, self.pauses, self.ended_pauses, self.loan)
 
     @property
     def estops(self) -> tuple[Estop, ...]:
@@ -94,12 +147,22 @@ class Safety:
         """Return the ids of ended e-stops, oldest first."""
         return tuple(self._ended)
 
+    @property
+    def pauses(self) -> tuple[FleetPause, ...]:
+        """Return the pauses in force, oldest first."""
+        return tuple(sorted(self._pauses.values(), key=lambda pause: (pause.at_ns, pause.id)))
+
+    @property
+    def ended_pauses(self) -> tuple[str, ...]:
+        """Return the ids of ended pauses."""
+        return tuple(self._ended_pauses)
+
     # ------------------------------------------------------------------ hold and e-stops
 
-    def put_on_hold(self, name: str, at_ns: int) -> None:
-        """Put the car on hold, and end a lease of the coordinator. An earlier hold stays in force."""
-        if self.hold is None:
-            self.hold = Hold(name, at_ns)
+    def put_on_hold(self, name: str, at_ns: int, rank: SenderKind = SenderKind.PERSON) -> None:
+        """Put the car on hold, and end a lease of the coordinator. The hold of a lead replaces another."""
+        if self.hold is None or (rank is SenderKind.LEAD and self.hold.rank is not SenderKind.LEAD):
+            self.hold = Hold(name, at_ns, rank)
         if self.lease is not None and self.lease.holder.kind is SenderKind.COORDINATOR:
             self.lease = None
 
@@ -109,13 +172,17 @@ class Safety:
         If too many are in force, it is not latched: the car stays stopped until all of them are released.
         """
         if estop.id in self._ended:
-            estop = Estop(f"{estop.id}.{estop.at_ns:x}", estop.by, estop.why, estop.at_ns, estop.fleet_wide)
-        self.put_on_hold(estop.by, estop.at_ns)
+            estop = replace(estop, id=f"{estop.id}.{estop.at_ns:x}")
+        self.put_on_hold(estop.by, estop.at_ns, estop.rank)
         first = self._estops.get(estop.id)
-        if sum(each.fleet_wide is estop.fleet_wide for each in self.estops) >= MAX_ESTOPS:
+        is_new = first is None or (estop.fleet_wide and not first.fleet_wide)  # or widened from this car to the fleet
+        if is_new and sum(each.fleet_wide is estop.fleet_wide for each in self.estops) >= MAX_ESTOPS:
             return first or estop
-        if first is None or (estop.fleet_wide and not first.fleet_wide):  # widened from this car to the fleet
+        if first is None:
             self._estops[estop.id] = estop
+        else:  # nobody lowers the rank of another's e-stop
+            stronger = max(first, estop, key=lambda each: _SENDER_RANK[each.rank])
+            self._estops[estop.id] = replace(stronger, fleet_wide=first.fleet_wide or estop.fleet_wide)
         return self._estops[estop.id]
 
     def end(self, ids: Iterable[str]) -> list[Estop]:
@@ -135,6 +202,41 @@ class Safety:
         self._ended.update(dict.fromkeys(ids))
         while len(self._ended) > MAX_ENDED_ESTOPS:
             del self._ended[next(iter(self._ended))]
+
+    # ------------------------------------------------------------------ pauses
+
+    def pause(self, pause: FleetPause) -> bool:
+        """Pause the fleet. Return False if this pause has ended already, or is in force."""
+        if pause.id in self._ended_pauses or (pause.id not in self._pauses and len(self._pauses) >= MAX_PAUSES):
+            return False
+        first = self._pauses.get(pause.id)
+        self._pauses[pause.id] = pause if first is None else max(first, pause, key=_strength)
+        return first is None
+
+    def end_pauses(self, ids: Iterable[str]) -> list[FleetPause]:
+        """End pauses, also such as are not known yet: they may arrive later. Return those that were in force."""
+        named = list(ids)
+        self._ended_pauses.update(dict.fromkeys(named))
+        while len(self._ended_pauses) > MAX_ENDED_PAUSES:
+            del self._ended_pauses[next(iter(self._ended_pauses))]
+        return [self._pauses.pop(each) for each in named if each in self._pauses]
+
+    def merge_pauses(
+        self, pauses: Iterable[FleetPause], ended: Iterable[str]
+    ) -> tuple[list[FleetPause], list[FleetPause]]:
+        """Merge the pauses of another gateway. Return (joined, removed). An ended pause stays ended."""
+        removed = self.end_pauses(each for each in ended if each not in self._ended_pauses)
+        return [pause for pause in pauses if self.pause(pause)], removed
+
+    # ------------------------------------------------------------------ loan
+
+    def loan_at(self, now: float) -> Loan | None:
+        """Return the loan; None if it is over."""
+        return self.loan if now < self.loan_until else None
+
+    def lend(self, loan: Loan, now: float) -> None:
+        """Lend the car, in place of an earlier loan."""
+        self.loan, self.loan_until = loan, now + loan.duration_s
 
     # ------------------------------------------------------------------ lease
 
@@ -162,3 +264,8 @@ class Safety:
             return False
         self.lease = None
         return True
+
+
+def _strength(pause: FleetPause) -> tuple[int, int, str, str]:
+    """Order two reports of one pause, so that gateways agree on the same in whatever order they arrive."""
+    return _SENDER_RANK[pause.rank], -pause.at_ns, pause.by, pause.why

@@ -243,26 +243,58 @@ class Motion(_message.Message):
     def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., motion: _Optional[str] = ..., source: _Optional[str] = ..., speed: _Optional[float] = ..., owner: _Optional[str] = ..., expires_in_s: _Optional[float] = ..., fan: _Optional[bool] = ..., servo_deg: _Optional[float] = ...) -> None: ...
 
 class Estop(_message.Message):
-    __slots__ = ("id", "by", "why", "stamp", "scope")
+    __slots__ = ("id", "by", "why", "stamp", "scope", "rank")
     ID_FIELD_NUMBER: _ClassVar[int]
     BY_FIELD_NUMBER: _ClassVar[int]
     WHY_FIELD_NUMBER: _ClassVar[int]
     STAMP_FIELD_NUMBER: _ClassVar[int]
     SCOPE_FIELD_NUMBER: _ClassVar[int]
+    RANK_FIELD_NUMBER: _ClassVar[int]
     id: str
     by: str
     why: str
     stamp: _timestamp_pb2.Timestamp
     scope: str
-    def __init__(self, id: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., scope: _Optional[str] = ...) -> None: ...
+    rank: str
+    def __init__(self, id: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., scope: _Optional[str] = ..., rank: _Optional[str] = ...) -> None: ...
 
 class Hold(_message.Message):
-    __slots__ = ("by", "since")
+    __slots__ = ("by", "since", "rank")
     BY_FIELD_NUMBER: _ClassVar[int]
     SINCE_FIELD_NUMBER: _ClassVar[int]
+    RANK_FIELD_NUMBER: _ClassVar[int]
     by: str
     since: _timestamp_pb2.Timestamp
-    def __init__(self, by: _Optional[str] = ..., since: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
+    rank: str
+    def __init__(self, by: _Optional[str] = ..., since: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., rank: _Optional[str] = ...) -> None: ...
+
+class Pause(_message.Message):
+    __slots__ = ("id", "by", "why", "stamp", "rank")
+    ID_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    RANK_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    by: str
+    why: str
+    stamp: _timestamp_pb2.Timestamp
+    rank: str
+    def __init__(self, id: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., rank: _Optional[str] = ...) -> None: ...
+
+class Loan(_message.Message):
+    __slots__ = ("to", "by", "rank", "since", "expires_in_s")
+    TO_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
+    RANK_FIELD_NUMBER: _ClassVar[int]
+    SINCE_FIELD_NUMBER: _ClassVar[int]
+    EXPIRES_IN_S_FIELD_NUMBER: _ClassVar[int]
+    to: str
+    by: str
+    rank: str
+    since: _timestamp_pb2.Timestamp
+    expires_in_s: float
+    def __init__(self, to: _Optional[str] = ..., by: _Optional[str] = ..., rank: _Optional[str] = ..., since: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., expires_in_s: _Optional[float] = ...) -> None: ...
 
 class Lease(_message.Message):
     __slots__ = ("holder", "kind", "expires_in_s")
@@ -275,7 +307,7 @@ class Lease(_message.Message):
     def __init__(self, holder: _Optional[str] = ..., kind: _Optional[str] = ..., expires_in_s: _Optional[float] = ...) -> None: ...
 
 class Safety(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s", "pauses", "ended_pauses", "loan")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -290,6 +322,9 @@ class Safety(_message.Message):
     TRUST_FIELD_NUMBER: _ClassVar[int]
     TRUST_EVIDENCE_FIELD_NUMBER: _ClassVar[int]
     SHOWN_AGE_S_FIELD_NUMBER: _ClassVar[int]
+    PAUSES_FIELD_NUMBER: _ClassVar[int]
+    ENDED_PAUSES_FIELD_NUMBER: _ClassVar[int]
+    LOAN_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -304,7 +339,10 @@ class Safety(_message.Message):
     trust: str
     trust_evidence: str
     shown_age_s: float
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ...) -> None: ...
+    pauses: _containers.RepeatedCompositeFieldContainer[Pause]
+    ended_pauses: _containers.RepeatedScalarFieldContainer[str]
+    loan: Loan
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ..., pauses: _Optional[_Iterable[_Union[Pause, _Mapping]]] = ..., ended_pauses: _Optional[_Iterable[str]] = ..., loan: _Optional[_Union[Loan, _Mapping]] = ...) -> None: ...
 
 class Health(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops", "platform_contradictions")
@@ -971,7 +1009,7 @@ class EstopCommand(_message.Message):
     def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., why: _Optional[str] = ..., scope: _Optional[str] = ...) -> None: ...
 
 class ResumeCommand(_message.Message):
-    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "ids")
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "ids", "all")
     SENDER_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
@@ -979,6 +1017,7 @@ class ResumeCommand(_message.Message):
     TAKE_FIELD_NUMBER: _ClassVar[int]
     TTL_S_FIELD_NUMBER: _ClassVar[int]
     IDS_FIELD_NUMBER: _ClassVar[int]
+    ALL_FIELD_NUMBER: _ClassVar[int]
     sender: str
     kind: str
     id: str
@@ -986,7 +1025,8 @@ class ResumeCommand(_message.Message):
     take: bool
     ttl_s: float
     ids: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., ids: _Optional[_Iterable[str]] = ...) -> None: ...
+    all: bool
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., ids: _Optional[_Iterable[str]] = ..., all: _Optional[bool] = ...) -> None: ...
 
 class LeaseCommand(_message.Message):
     __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "release")
@@ -1021,6 +1061,62 @@ class FindCommand(_message.Message):
     take: bool
     ttl_s: float
     def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ...) -> None: ...
+
+class PauseCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "why")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    why: str
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., why: _Optional[str] = ...) -> None: ...
+
+class UnpauseCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ...) -> None: ...
+
+class LendCommand(_message.Message):
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "to", "duration_s", "end")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    TAKE_FIELD_NUMBER: _ClassVar[int]
+    TTL_S_FIELD_NUMBER: _ClassVar[int]
+    TO_FIELD_NUMBER: _ClassVar[int]
+    DURATION_S_FIELD_NUMBER: _ClassVar[int]
+    END_FIELD_NUMBER: _ClassVar[int]
+    sender: str
+    kind: str
+    id: str
+    asked: _timestamp_pb2.Timestamp
+    take: bool
+    ttl_s: float
+    to: str
+    duration_s: float
+    end: bool
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., to: _Optional[str] = ..., duration_s: _Optional[float] = ..., end: _Optional[bool] = ...) -> None: ...
 
 class Result(_message.Message):
     __slots__ = ("id", "status", "reason", "words", "worst_case_s", "car")

@@ -63,14 +63,18 @@ groups: {a: [ann]}
 def test_each_gateway_gets_the_people_who_may_drive_its_car(tmp_path: Path) -> None:
     spec = build_spec(parse_fleet(FILE + PEOPLE, tmp_path / "fleet.yaml"), UpOptions(simulated=3))
     assert {name: _people(car.arguments) for name, car in spec.cars.items()} == {
-        "ann": ["--people-only", "--person", "lee", "--person", "kim", "--person", "teacher:lead"],
-        "bob": ["--people-only", "--person", "ana", "--person", "kim", "--person", "teacher:lead"],
-        "red": ["--people-only", "--person", "kim", "--person", "teacher:lead"],  # a simulated car beside the file's
+        "ann": listed("lee", "ana:other", "kim", "teacher:lead"),
+        "bob": listed("lee:other", "ana", "kim", "teacher:lead"),
+        "red": listed("lee:other", "ana:other", "kim", "teacher:lead"),  # a simulated car beside the file's
     }
     nobody = build_spec(parse_fleet(FILE + "people: {}\n", tmp_path / "fleet.yaml"), UpOptions())
     assert _people(nobody.cars["ann"].arguments) == ["--people-only"]
     everyone = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions())
     assert _people(everyone.cars["ann"].arguments) == []
+
+
+def listed(*people: str) -> list[str]:
+    return ["--people-only", *(word for name in people for word in ("--person", name))]
 
 
 def _people(arguments: tuple[str, ...]) -> list[str]:

@@ -1,14 +1,13 @@
 """What a gateway learns of the e-stops that the other gateways of its fleet know, on a real bus."""
 
 import asyncio
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import zenoh
 
 from gateway.bus.estop_sync import EstopSync
-from gateway.control.safety import Estop
+from gateway.control.safety import PersistedSafety
 from schemas.bus import Bus, Handover, reply
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.messages import encoding_of
@@ -33,8 +32,8 @@ async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) ->
                 safety = pb.Safety(car="blue", estops=[pb.Estop(id="e1", by="mia", scope="fleet")])
                 reply(query, KEY, safety.SerializeToString(), encoding_of("fleet.v1.Safety"))
 
-    def unite(estops: Sequence[Estop], _: Sequence[str], told_by: str) -> None:
-        learned.extend((estop.id, told_by) for estop in estops)
+    def unite(other: PersistedSafety, told_by: str) -> None:
+        learned.extend((estop.id, told_by) for estop in other.estops)
 
     try:
         with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as blue, fleet.bus as opened:
@@ -66,7 +65,7 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
         with query:
             reply(query, f"fleet/{car}/state/safety", pb.Safety(car=car).SerializeToString(), SAFETY)
 
-    def learn(_: Sequence[Estop], __: Sequence[str], told_by: str) -> None:
+    def learn(_: PersistedSafety, told_by: str) -> None:
         learned.append(told_by)
 
     try:

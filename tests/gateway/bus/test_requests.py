@@ -239,8 +239,8 @@ def test_zero_bytes_are_a_message_without_fields(encoding: str) -> None:
 
 
 @pytest.mark.parametrize("verb", COMMANDS)
-def test_only_stop_estop_and_resume_may_be_asked_by_wildcard(verb: str) -> None:
-    if verb in ("stop", "estop", "resume"):
+def test_only_what_concerns_the_fleet_may_be_asked_by_wildcard(verb: str) -> None:
+    if verb in ("stop", "estop", "resume", "pause", "unpause"):
         assert ask(verb, {}, by_wildcard=True).verb == verb
     else:
         assert "takes no wildcard: name one car" in refused(verb, {}, by_wildcard=True).words

@@ -14,9 +14,12 @@ from gateway.control.commands import (
     Command,
     Drive,
     EmergencyStop,
+    EndLoan,
     Fan,
     Find,
+    Lend,
     OneShot,
+    Pause,
     Reason,
     Resume,
     Sender,
@@ -24,8 +27,9 @@ from gateway.control.commands import (
     SetMode,
     Stop,
     TakeLease,
+    Unpause,
 )
-from gateway.control.safety import Estop, LeaseState
+from gateway.control.safety import Estop, Hold, LeaseState
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
@@ -55,6 +59,10 @@ WHATS: list[Action] = [
     Fan(),
     Fan(on=True),
     Find(),
+    Pause("listen"),
+    Unpause(),
+    Lend("bob", 60.0),
+    EndLoan(),
 ]
 MOVES = (Drive, SetMode, ChangeSpeed, Fan)
 """What moves the car, or how it moves; with servo and arm it needs the lease."""
@@ -70,7 +78,7 @@ MODES = [
     (Mode.COLOR_LED, False),
 ]
 """The mode that was asked, and whether what is heard contradicts it."""
-RANK = [SenderKind.COORDINATOR, SenderKind.SCRIPT, SenderKind.PERSON]
+RANK = list(reversed(SenderKind))
 ESTOP = Estop("e1", "eve", "smoke", 1, fleet_wide=False)
 
 
@@ -88,7 +96,14 @@ def _situations() -> Iterator[CommandContext]:
         platform,
     ) in itertools.product(
         itertools.product(
-            (True, False), (True, False), (True, False), (None, "mia"), ((), (ESTOP,)), LEASES, ("", "flat"), (0, 8)
+            (True, False),
+            (True, False),
+            (True, False),
+            (None, Hold("mia", 1)),
+            ((), (ESTOP,)),
+            LEASES,
+            ("", "flat"),
+            (0, 8),
         ),
         MODES,
         ("arduino", "raspberry_pi", "unknown", "stm32+arm"),
@@ -103,7 +118,7 @@ def _situations() -> Iterator[CommandContext]:
             closing=closing,
             asked=asked,
             contradicted=contradicted,
-            held_by=held,
+            hold=held,
             estops=estopped,
             ended=("over",),
             lease=lease,
@@ -126,7 +141,12 @@ def test_every_command_in_every_state(what: Action, sender: Sender) -> None:
             refusal = refuse(command, at)
             seen.add(refusal and refusal[0])
             if refusal is not None:
-                assert at.car in refusal[1] or refusal[0] in (Reason.UNSUPPORTED, Reason.HELD, Reason.BATTERY_LOW)
+                assert at.car in refusal[1] or refusal[0] in (
+                    Reason.UNSUPPORTED,
+                    Reason.HELD,
+                    Reason.BATTERY_LOW,
+                    Reason.NOT_ALLOWED,
+                )
             _check(command, at, None if refusal is None else refusal[0])
     if isinstance(what, Drive) and what.motion is not Motion.STOP:
         every = {None, *(Reason.ESTOPPED, Reason.LEASED, Reason.BATTERY_LOW, Reason.LINK_DOWN, Reason.WRONG_MODE)}
@@ -139,18 +159,21 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     if isinstance(what, Stop | EmergencyStop):
         assert reason is None, "stop wins from every state"
         return
+    if isinstance(what, Pause | Unpause | Lend):
+        assert (reason is None) == (kind in (SenderKind.LEAD, SenderKind.PERSON))
+        return
     if isinstance(what, Resume):
         in_force = what.ids == ("e1",) and bool(at.estops)
         allowed = kind is not SenderKind.COORDINATOR and (not what.ids or what.ids == ("over",) or in_force)
         assert (reason is None) == allowed
         return
-    if what == TakeLease(release=True):
+    if what in (TakeLease(release=True), EndLoan()):
         assert reason is None
         return
     if reason is not None:
         return
     assert not at.estops, "an e-stopped car obeys nothing"
-    assert not (at.held_by and kind is SenderKind.COORDINATOR), "no coordinator's command moves a held car"
+    assert not (at.hold and kind is SenderKind.COORDINATOR), "no coordinator's command moves a held car"
     if not isinstance(what, TakeLease):
         assert at.link_open
         assert at.answering or isinstance(what, Fan), "a fan that runs silences a car"
@@ -158,7 +181,7 @@ def _check(command: Command, at: CommandContext, reason: Reason | None) -> None:
     moves = isinstance(what, MOVES) or (isinstance(what, OneShot) and _turns(what))
     if (moves or isinstance(what, TakeLease)) and at.lease is not None and at.lease.until > NOW:
         mine, theirs = RANK.index(kind), RANK.index(at.lease.holder.kind)
-        assert mine > theirs or (mine == theirs and command.take and kind is SenderKind.PERSON)
+        assert mine > theirs or (mine == theirs and command.take and kind in (SenderKind.PERSON, SenderKind.LEAD))
     if at.battery:
         assert not isinstance(what, Drive) or what.motion is Motion.STOP
         assert not isinstance(what, SetMode) or what.mode is Mode.MANUAL
@@ -180,7 +203,9 @@ def test_the_table_has_every_command() -> None:
         assert needs(what)
 
 
-@pytest.mark.parametrize("what", [what for what in WHATS if not isinstance(what, Stop | EmergencyStop)], ids=repr)
+@pytest.mark.parametrize(
+    "what", [what for what in WHATS if not isinstance(what, Stop | EmergencyStop | Pause)], ids=repr
+)
 def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
     calm = replace(
         situations()[0],
@@ -193,8 +218,8 @@ def test_what_came_too_late_is_stale_but_a_stop_never_is(what: Action) -> None:
     refusal = refuse(late, calm)
     assert refusal is not None
     assert refusal[0] is Reason.STALE
-    for stop in (Stop(), EmergencyStop()):
-        assert refuse(Command("c", "stop", Sender("ann"), stop, age_s=1e9, ttl_s=2.0), calm) is None
+    for stop in (Stop(), EmergencyStop(), Pause()):
+        assert refuse(Command("c", "stop", Sender("ann", SenderKind.PERSON), stop, age_s=1e9, ttl_s=2.0), calm) is None
 
 
 @pytest.mark.parametrize(
