@@ -105,7 +105,7 @@ _FUNCTIONS: Final = {name: where for section in COMMANDS.values() for name, (whe
 _EXTRAS: Final = {
     **dict.fromkeys(("rerun", "rerun_cli", "numpy", "PIL"), "view"),
     **dict.fromkeys(("pyarrow", "pandas", "matplotlib"), "analysis"),
-    **dict.fromkeys(("starlette", "uvicorn"), "console"),
+    **dict.fromkeys(("starlette", "uvicorn", "cryptography", "segno", "ifaddr"), "console"),
     "bleak": "ble",
 }
 """The extra that installs a module."""

@@ -1,18 +1,35 @@
 """`fleet console`: a web page that shows the fleet, drives cars and stops them."""
 
 import asyncio
+import http.client
 import ipaddress
+import json
+import sys
+import time
 import webbrowser
-from typing import Any, Final
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from fleet.aio import Fleet
-from fleet.commands.options import bus_options
+from fleet.client.client import default_sender
+from fleet.commands.group import DefaultCommandGroup, connect_option, fleet_option
+from fleet.commands.options import bus_options, cli_errors, json_option
+from fleet.commands.output import show_table
 from fleet.commands.params import Number
-from fleet.console.server import DEFAULT_PORT, LOOPBACK, listen, serve
+from fleet.console.pairing import RANKS, PagePerson
+from fleet.console.people_file import PeopleFile, people_path
+from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
+from schemas import keys
+from schemas.bus import resolve_endpoint
 
+if TYPE_CHECKING:
+    from fleet.console.lan import Lan
+
+DEFAULT_LAN_PORT: Final = 7443
 _LOOPBACK_NAMES: Final = ("localhost", "::1")
+_PROBE_TIMEOUT_S: Final = 1.0
 
 
 def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
@@ -23,18 +40,24 @@ def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
         is_loopback = False
     if not is_loopback:
         raise click.UsageError(
-            f"The console serves this computer only, not {host}: everyone who reaches it drives the cars. "
-            f"From another computer, type there: ssh -L {DEFAULT_PORT}:{LOOPBACK}:{DEFAULT_PORT} USER@THIS_COMPUTER"
+            f"Without a pairing the console serves this computer only, not {host}. "
+            "For phones and other computers, type: fleet console --lan"
         )
     return host
 
 
-@click.command(
+@click.group(cls=DefaultCommandGroup, default_command="serve", subcommand_metavar="[COMMAND | OPTIONS]")
+def console() -> None:
+    """Serve the fleet as a web page: watch, drive, STOP. Without a command, serve."""
+
+
+@console.command(
+    "serve",
     epilog="""\b
 examples:
-  fleet console
+  fleet console serve
   fleet console --open
-  fleet console --port 8080"""
+  fleet console --lan""",
 )
 @click.option(
     "--port", type=Number(int, 0, 65535), default=DEFAULT_PORT, show_default=True, help="Port, 0 for any free one."
@@ -48,26 +71,173 @@ examples:
     expose_value=False,
     help="Address: loopback only.",
 )
+@click.option("--lan", "on_lan", is_flag=True, help="Serve paired devices on the network, too, over HTTPS.")
+@click.option(
+    "--lan-port",
+    type=Number(int, 0, 65535),
+    default=DEFAULT_LAN_PORT,
+    show_default=True,
+    help="Port on the network, 0 for any free one.",
+)
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @bus_options
-def console(*, port: int, opens: bool, connect: str | None, fleet: str) -> None:
-    """Serve the fleet as a web page on this computer, until Ctrl-C. STOP is Escape on every page."""
+def serve_console(*, port: int, opens: bool, on_lan: bool, lan_port: int, connect: str | None, fleet: str) -> None:
+    """Serve the page on this computer, until Ctrl-C. STOP is Escape on every page."""
     try:
         listener = listen(port)
     except OSError as error:
-        raise click.ClickException(
-            f"Port {port} is not free ({error.strerror}). `fleet console --port 0` takes a free one."
-        ) from None
+        raise click.ClickException(f"{_port_in_use(port, error)} `fleet console --port 0` takes a free one.") from None
     address = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
 
-    def on_ready() -> None:
-        click.echo(f"Console: {address} (Ctrl-C ends it)")
-        if opens:
-            webbrowser.open(address)
-
-    async def run() -> Any:
-        async with Fleet(connect, fleet, kind="person") as client:
-            await serve(client, listener, on_ready)
-
     with listener:
-        asyncio.run(run())
+        lan = _open_lan(lan_port, PeopleFile(people_path(resolve_endpoint(connect), fleet))) if on_lan else None
+
+        def on_ready() -> None:
+            click.echo(f"Console: {address} (Ctrl-C ends it)")
+            if lan is not None:
+                _describe_lan(lan)
+            if opens:
+                webbrowser.open(address)
+
+        async def run() -> Any:
+            async with Fleet(connect, fleet, kind="person") as client:
+                await serve(client, listener, on_ready, lan)
+
+        try:
+            asyncio.run(run())
+        finally:
+            if lan is not None:
+                lan.listener.close()
+
+
+@console.command(
+    epilog="""\b
+examples:
+  fleet console pair
+  fleet console pair group_a
+  fleet console pair teacher --rank lead""",
+)
+@click.argument("name", required=False)
+@click.option(
+    "--rank",
+    type=click.Choice(RANKS),
+    default=RANKS[0],
+    show_default=True,
+    metavar="RANK",
+    help="Rank: person or lead.",
+)
+@connect_option()
+@fleet_option()
+def pair(name: str | None, rank: str, connect: str | None, fleet: str) -> None:
+    """Make a code that pairs one device with the console as the person NAME (default: you)."""
+    person = PagePerson(name or _own_name(), rank)
+    with cli_errors():
+        people = PeopleFile(people_path(resolve_endpoint(connect), fleet))
+        address = people.read().address
+        if not address:
+            raise click.ClickException("No console has served the network yet. Type: fleet console --lan")
+        _show_code(people, address, person)
+
+
+@console.command(
+    epilog="""\b
+examples:
+  fleet console people
+  fleet console people --revoke group_a""",
+)
+@click.option("--revoke", metavar="NAME", multiple=True, help="Revoke all devices of a person, or one by its id.")
+@json_option
+@connect_option()
+@fleet_option()
+def people(revoke: tuple[str, ...], *, as_json: bool, connect: str | None, fleet: str) -> None:
+    """List the devices that are paired with the console, or revoke some."""
+    with cli_errors():
+        file = PeopleFile(people_path(resolve_endpoint(connect), fleet))
+        if revoke:
+            _revoke(file, revoke)
+            return
+    now = time.time()
+    devices = [each for each in file.read().devices if each.state(now) == "valid"]
+    rows = [
+        {
+            "id": each.id,
+            "name": each.person.name,
+            "rank": each.person.rank,
+            "expires": f"{datetime.fromtimestamp(each.expires_s, UTC):%Y-%m-%d}",
+            "device": each.device,
+        }
+        for each in devices
+    ]
+    if as_json:
+        for row in rows:
+            click.echo(json.dumps(row))
+    elif rows:
+        show_table(tuple(rows[0]), rows)
+    else:
+        click.echo("No device is paired. `fleet console pair NAME` makes a code.", err=True)
+
+
+def _revoke(file: PeopleFile, names: tuple[str, ...]) -> None:
+    known = {word for each in file.read().devices for word in (each.id, each.person.name)}
+    if missing := [name for name in names if name not in known]:
+        raise click.UsageError(f"No paired device is {missing[0]!r}. `fleet console people` lists them.")
+    for each in file.change(lambda book: book.revoke(names)):
+        click.echo(f"{each.id} ({each.person.name}) is revoked. Its pages are closed.")
+
+
+def _network() -> Any:
+    from fleet.console import lan  # its packages cost 0.1 s that only the network needs
+
+    return lan
+
+
+def _open_lan(port: int, people: PeopleFile) -> "Lan":
+    network = _network()
+    try:
+        listener = network.LimitedListener.on_port(port)
+    except OSError as error:
+        raise click.ClickException(
+            f"Port {port} is not free ({error.strerror}). `fleet console --lan --lan-port 0` takes a free one."
+        ) from None
+    try:
+        lan: Lan = network.Lan(listener, people)
+    except OSError as error:
+        listener.close()
+        raise click.ClickException(
+            f"The console cannot serve the network: {error.filename}: {error.strerror}"
+        ) from None
+    return lan
+
+
+def _describe_lan(lan: "Lan") -> None:
+    click.echo(f"On the network: {lan.address}")
+    click.echo(f"Certificate SHA-256: {lan.certificate.fingerprint}")
+    _show_code(lan.people, lan.address, PagePerson(_own_name()))
+
+
+def _show_code(people: PeopleFile, address: str, person: PagePerson) -> None:
+    network = _network()
+    try:
+        code = network.issue_code(people, person)
+    except OSError as error:
+        raise click.ClickException(f"{people.path} cannot be written: {error.strerror}") from None
+    network.show_code(address, code, person, click.echo, draws=sys.stdout.isatty())
+
+
+def _own_name() -> str:
+    name = default_sender().partition("@")[0].lower()
+    return name if keys.is_name(name) else "me"
+
+
+def _port_in_use(port: int, error: OSError) -> str:
+    """Return what uses a port of loopback, in words."""
+    probe = http.client.HTTPConnection(LOOPBACK, port, timeout=_PROBE_TIMEOUT_S)
+    try:
+        probe.request("GET", "/hello")
+        if probe.getresponse().read(len(HELLO)) == HELLO.encode():
+            return f"Another console is at http://{LOOPBACK}:{port}."
+    except (OSError, http.client.HTTPException):
+        pass
+    finally:
+        probe.close()
+    return f"Port {port} is not free ({error.strerror})."

@@ -8,6 +8,8 @@ from collections.abc import Awaitable, Callable, MutableMapping
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final
 
+from fleet.console.pairing import CookieState, PairedDevice
+
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -33,6 +35,12 @@ STOP_PATH: Final = "/stop"
 
 PERSON: Final = "fleet.person"
 """Where the scope of a request from the network has its `PagePerson`."""
+DEVICE: Final = "fleet.device"
+"""Where the scope of a request from the network has the id of its `PairedDevice`."""
+PAIR_PATH: Final = "/pair"
+PUBLIC_PATHS: Final = frozenset({PAIR_PATH, "/static/pair.js", "/static/style.css"})
+"""All that a device can read that is not paired."""
+_HTTPS_PORT: Final = 443
 
 
 class Guard:
@@ -60,7 +68,7 @@ class Guard:
         headers = _headers(scope)
         if words := self._refusal(scope, headers):
             self._on_refusal(f"{scope['type']} {scope['path']!r} refused: {words}")
-            await _refuse(scope, receive, send, words)
+            await self._refuse(scope, receive, send, words)
             return
 
         async def send_with_headers(message: Message) -> None:
@@ -83,17 +91,85 @@ class Guard:
             return "no valid cookie (reload the page)"
         return ""
 
+    async def _refuse(self, scope: Scope, receive: Receive, send: Send, words: str) -> None:
+        await _refuse(scope, receive, send, words)
+
     def _has_cookie(self, headers: dict[str, str]) -> bool:
-        try:
-            morsel = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
-        except CookieError:
-            return False
-        return morsel is not None and hmac.compare_digest(morsel.value.encode(), self._token.encode())
+        value = cookie_value(headers, self._cookie)
+        return value is not None and hmac.compare_digest(value.encode(), self._token.encode())
 
     def _new_cookie(self, scope: Scope, headers: dict[str, str]) -> list[tuple[bytes, bytes]]:
         if scope["path"] not in COOKIE_PATHS or self._has_cookie(headers):
             return []
         return [(b"set-cookie", f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict".encode())]
+
+
+class NetworkGuard(Guard):
+    """The same for the network: only paired devices pass. All others can read the page that pairs, and nothing else.
+
+    names: returns the host names of this computer. device_of: returns the device of a cookie, and what the cookie
+    may do. on_device: called with the address of each connection that has shown a cookie.
+    """
+
+    def __init__(
+        self,
+        app: App,
+        *,
+        names: Callable[[], frozenset[str]],
+        cookie: str,
+        device_of: Callable[[str], tuple[PairedDevice | None, CookieState]],
+        on_device: Callable[[tuple[str, int], PairedDevice], object],
+        on_refusal: Callable[[str], object],
+    ) -> None:
+        super().__init__(app, hosts=frozenset(), cookie=cookie, token="", on_refusal=on_refusal)
+        self._names = names
+        self._device_of = device_of
+        self._on_device = on_device
+
+    def _refusal(self, scope: Scope, headers: dict[str, str]) -> str:
+        host = headers.get("host", "").lower()
+        # The address at which the connection arrived is always one of ours: no foreign name stands for it.
+        address, port = scope["server"]
+        ours = {f"{name}:{port}" for name in (*self._names(), address)}
+        if port == _HTTPS_PORT:
+            ours |= {*self._names(), address}
+        if host not in ours:
+            return "another Host (open the address that the console printed)"
+        method = scope.get("method", "")
+        reads = scope["type"] == "http" and method in ("GET", "HEAD")
+        if reads and scope["path"] in PUBLIC_PATHS:
+            return ""
+        if not reads and headers.get("origin", "") != f"https://{host}":
+            return "another Origin (only the console's own pages may do this)"
+        if scope["type"] == "http" and scope["path"] == PAIR_PATH:
+            return ""
+        device, state = self._device_of(cookie_value(headers, self._cookie) or "")
+        stops = scope["type"] == "http" and scope["path"] == STOP_PATH and method == "POST"
+        if device is None or (state != "valid" and not stops):
+            return "this device is not paired (open /pair)"
+        scope[PERSON], scope[DEVICE] = device.person, device.id
+        self._on_device(tuple(scope["client"]), device)
+        return ""
+
+    async def _refuse(self, scope: Scope, receive: Receive, send: Send, words: str) -> None:
+        if (scope["type"], scope["path"], words.startswith("this device")) != ("http", "/", True):
+            await _refuse(scope, receive, send, words)
+            return
+        headers = [(b"location", PAIR_PATH.encode()), (b"content-length", b"0"), *_HEADERS]
+        await send({"type": "http.response.start", "status": 303, "headers": headers})
+        await send({"type": "http.response.body", "body": b""})
+
+    def _new_cookie(self, scope: Scope, headers: dict[str, str]) -> list[tuple[bytes, bytes]]:  # noqa: ARG002 - Guard's
+        return []  # only a pairing code earns one
+
+
+def cookie_value(headers: dict[str, str], name: str) -> str | None:
+    """Return the value of a cookie. None if there is none."""
+    try:
+        morsel = SimpleCookie(headers.get("cookie", "")).get(name)
+    except CookieError:
+        return None
+    return None if morsel is None else morsel.value
 
 
 def _headers(scope: Scope) -> dict[str, str]:

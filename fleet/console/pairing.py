@@ -1,9 +1,44 @@
 """Who may open the console from the network: pairing codes, paired devices and their people. Pure.
 
-Times are seconds since the epoch, since the book outlives the process.
+Times are seconds since the epoch, since the book outlives the process. A code or a cookie is stored as its hash.
 """
 
-from dataclasses import dataclass
+import hashlib
+import hmac
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final, Literal, Self
+
+from schemas import keys
+
+CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
+"""Letters and digits that nobody confuses."""
+CODE_LENGTH: Final = 8
+"""40 random bits. At 1,000 guesses per second a code is found in its two minutes once in nine million times."""
+CODE_LIFETIME_S: Final = 120.0
+COOKIE_LIFETIME_S: Final = 30 * 86_400.0
+COOKIE_MEMORY_S: Final = 90 * 86_400.0
+"""How long an expired cookie still stops the cars."""
+MAX_CODES: Final = 16
+"""Maximum number of open codes. A new one replaces the oldest."""
+MAX_DEVICES: Final = 256
+"""Maximum number of paired devices. A new one replaces the oldest."""
+FREE_GUESSES: Final = 5
+"""Wrong codes of one address before it must wait."""
+MAX_GUESS_DELAY_S: Final = 300.0
+GUESS_MEMORY_S: Final = 3600.0
+"""Time after which the wrong codes of an address are forgotten."""
+MAX_GUESSERS: Final = 1024
+"""Maximum number of remembered addresses. More are forgotten, the oldest first."""
+MAX_DEVICE_NAME_LENGTH: Final = 60
+RANKS: Final = ("person", "lead")
+
+CookieState = Literal["unknown", "expired", "valid"]
+
+
+class BadBook(ValueError):
+    """The text is not a book of people."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,3 +48,163 @@ class PagePerson:
     name: str
     rank: str = "person"
     """`person` or `lead`."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairingCode:
+    """A code that pairs one device, once."""
+
+    digest: str
+    person: PagePerson
+    issued_s: float
+
+    def is_open(self, now: float) -> bool:
+        """Return True in the two minutes after it was made. A clock that was set back ends it."""
+        return 0 <= now - self.issued_s < CODE_LIFETIME_S
+
+
+@dataclass(frozen=True, slots=True)
+class PairedDevice:
+    """A browser with a cookie of the console."""
+
+    id: str
+    person: PagePerson
+    device: str
+    """What the browser calls itself."""
+    digest: str
+    paired_s: float
+
+    @property
+    def expires_s(self) -> float:
+        """When its cookie expires."""
+        return self.paired_s + COOKIE_LIFETIME_S
+
+    def state(self, now: float) -> CookieState:
+        """Return whether its cookie opens the console, only stops the cars, or neither."""
+        if now < self.expires_s:
+            return "valid"
+        return "expired" if now < self.expires_s + COOKIE_MEMORY_S else "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class PeopleBook:
+    """The open codes and the paired devices of one console, oldest first."""
+
+    codes: tuple[PairingCode, ...] = ()
+    devices: tuple[PairedDevice, ...] = ()
+    address: str = ""
+    """Where the console last served the network."""
+
+    def issue(self, code: str, person: PagePerson, now: float) -> Self:
+        """Add a code for a person. Raises ValueError."""
+        keys.check_name(person.name, "a person's name")
+        if person.rank not in RANKS:
+            raise ValueError(f"There is no rank {person.rank!r}.")
+        open_codes = [each for each in self.codes if each.is_open(now)]
+        codes = (*open_codes, PairingCode(digest(normal_code(code)), person, now))
+        return replace(self, codes=codes[-MAX_CODES:])
+
+    def redeem(self, code: str, cookie: str, device_id: str, device: str, now: float) -> Self | None:
+        """Pair a device: end the code and add the device. None if the code is wrong, used or too old."""
+        wanted = digest(normal_code(code))
+        # Each is compared, in constant time.
+        matching = [each for each in self.codes if hmac.compare_digest(each.digest, wanted) & each.is_open(now)]
+        if not matching:
+            return None
+        words = "".join(letter for letter in device if letter.isprintable())[:MAX_DEVICE_NAME_LENGTH]
+        added = PairedDevice(device_id, matching[0].person, words, digest(cookie), now)
+        codes = tuple(each for each in self.codes if each is not matching[0])
+        devices = [each for each in self.devices if each.state(now) != "unknown"]
+        return replace(self, codes=codes, devices=(*devices, added)[-MAX_DEVICES:])
+
+    def revoke(self, names: Iterable[str]) -> tuple[Self, list[PairedDevice]]:
+        """Remove the devices with these ids or of these people. Return the removed ones, too."""
+        chosen = set(names)
+        gone = [each for each in self.devices if chosen & {each.id, each.person.name}]
+        # An open code of a person would pair the device again.
+        codes = tuple(each for each in self.codes if each.person.name not in chosen)
+        return replace(self, codes=codes, devices=tuple(each for each in self.devices if each not in gone)), gone
+
+    def device_of(self, cookie: str, now: float) -> tuple[PairedDevice | None, CookieState]:
+        """Return the device of a cookie, and what the cookie may do."""
+        wanted = digest(cookie)
+        found = None
+        for each in self.devices:
+            if hmac.compare_digest(each.digest, wanted):
+                found = each
+        state = "unknown" if found is None else found.state(now)
+        return (None, "unknown") if state == "unknown" else (found, state)
+
+    def as_text(self) -> str:
+        """Return the book as JSON."""
+        return json.dumps(asdict(self), indent=1)
+
+    @classmethod
+    def of_text(cls, text: str) -> Self:
+        """Parse a book. Raises BadBook."""
+        try:
+            fields = json.loads(text)
+            codes = tuple(PairingCode(**_with_person(each)) for each in fields["codes"])
+            devices = tuple(PairedDevice(**_with_person(each)) for each in fields["devices"])
+            hashes = [each.digest for each in codes] + [each.digest for each in devices]
+            if not all(isinstance(each, str) for each in hashes):
+                raise BadBook("a hash is not a text")
+            return cls(codes, devices, str(fields["address"]))
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            raise BadBook(str(error)) from None
+
+
+@dataclass(slots=True)
+class GuessLimit:
+    """Counts wrong codes and slows down the addresses that they come from. Times are monotonic."""
+
+    wrong: int = 0
+    """All wrong codes."""
+    _guessers: dict[str, tuple[int, float]] = field(default_factory=dict)
+    """Number of wrong codes and time of the last one, by address."""
+
+    def wait_s(self, address: str, now: float) -> float:
+        """Return how long this address must still wait before another try. 0 if it may try."""
+        count, last = self._guessers.get(address, (0, now))
+        if count < FREE_GUESSES or now - last >= GUESS_MEMORY_S:
+            return 0.0
+        delay = min(2.0 ** min(count - FREE_GUESSES, 32), MAX_GUESS_DELAY_S)
+        return max(0.0, last + delay - now)
+
+    def on_wrong(self, address: str, now: float) -> int:
+        """Count a wrong code. Return the number of those of this address."""
+        count, last = self._guessers.pop(address, (0, now))
+        count = 1 if now - last >= GUESS_MEMORY_S else count + 1
+        self._guessers[address] = count, now
+        if len(self._guessers) > MAX_GUESSERS:
+            del self._guessers[next(iter(self._guessers))]
+        self.wrong += 1
+        return count
+
+    def on_right(self, address: str) -> None:
+        """Forget the wrong codes of an address that has paired."""
+        self._guessers.pop(address, None)
+
+
+def new_code(choose: Callable[[str], str]) -> str:
+    """Return a code. choose: picks one letter at random, as `secrets.choice`."""
+    return "".join(choose(CODE_ALPHABET) for _ in range(CODE_LENGTH))
+
+
+def code_words(code: str) -> str:
+    """Return a code as a person reads it: K7QF-3MXP."""
+    return f"{code[: CODE_LENGTH // 2]}-{code[CODE_LENGTH // 2 :]}"
+
+
+def normal_code(text: str) -> str:
+    """Return what a person typed without blanks and dashes, in capitals."""
+    return "".join(letter for letter in text.upper() if letter.isalnum())
+
+
+def digest(secret: str) -> str:
+    """Return the hash under which a code or a cookie is stored."""
+    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _with_person(fields: dict[str, Any]) -> dict[str, Any]:
+    return fields | {"person": PagePerson(**fields["person"])}

@@ -1,13 +1,13 @@
-"""Serves the console on loopback: the page's files, STOP by fetch, and one WebSocket for each page."""
+"""Serves the console: the page's files, STOP by fetch, and one WebSocket for each page."""
 
 import asyncio
 import logging
 import secrets
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import uvicorn
 from starlette.applications import Starlette
@@ -19,9 +19,13 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fleet.aio import Fleet
 from fleet.console.console import Console, TooManyPages
-from fleet.console.guard import PERSON, STOP_PATH, App, Guard
+from fleet.console.guard import PERSON, STOP_PATH, App, Guard, NetworkGuard
+from fleet.console.people_routes import pair_routes, people_routes
 from schemas.bus import LARGEST_PAYLOAD
 from schemas.process import signals
+
+if TYPE_CHECKING:  # only `--lan` needs its packages
+    from fleet.console.lan import Lan
 
 STATIC: Final = Path(__file__).parent / "static"
 DEFAULT_PORT: Final = 7480
@@ -29,6 +33,8 @@ DEFAULT_PORT: Final = 7480
 LOOPBACK: Final = "127.0.0.1"
 MAX_MESSAGE_BYTES: Final = 16_384
 """Maximum size of a page's message."""
+HELLO: Final = "fleet console"
+"""What `/hello` answers. A second console finds the first one by it."""
 _MAX_STOP_ID_LENGTH: Final = 64
 _PLAN_MESSAGE_ROOM: Final = 1024
 """Room for what a message contains beside the text of a plan, bytes."""
@@ -54,7 +60,8 @@ class ConsoleServer(uvicorn.Server):
 
 def listen(port: int) -> socket.socket:
     """Return a listening socket on loopback. Raises OSError if the port is in use."""
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    # asyncio sets TCP_NODELAY only if the socket names its protocol. Without it, a message may wait 40 ms.
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((LOOPBACK, port))
@@ -65,11 +72,11 @@ def listen(port: int) -> socket.socket:
     return listener
 
 
-def guarded_app(console: Console, port: int) -> App:
-    """Return the ASGI app of a console on this port."""
+def guarded_app(console: Console, port: int, lan: "Lan | None" = None) -> App:
+    """Return the ASGI app of a console on this port of loopback."""
     hosts = frozenset(f"{host}:{port}" for host in (LOOPBACK, "localhost"))
     return Guard(
-        _app(console),
+        _app(console, lan),
         hosts=hosts,
         cookie=f"fleet_console_{port}",  # a browser sends cookies to all ports of a host
         token=secrets.token_urlsafe(32),
@@ -77,11 +84,21 @@ def guarded_app(console: Console, port: int) -> App:
     )
 
 
-async def serve(fleet: Fleet, listener: socket.socket, on_ready: Callable[[], object]) -> None:
-    """Serve until Ctrl-C or SIGTERM. Then stop the cars that pages drive."""
-    console = Console(fleet)
-    config = uvicorn.Config(
-        guarded_app(console, listener.getsockname()[1]),
+def network_app(console: Console, lan: "Lan") -> App:
+    """Return the ASGI app for the network."""
+    return NetworkGuard(
+        _app(console, lan, pair_routes(lan)),
+        names=lambda: lan.names,
+        cookie=lan.cookie,
+        device_of=lan.device_of,
+        on_device=lan.on_device,
+        on_refusal=lan.on_refusal,
+    )
+
+
+def _config(app: App) -> uvicorn.Config:
+    return uvicorn.Config(
+        app,
         ws_max_size=MAX_MESSAGE_BYTES,
         ws_max_queue=64,
         log_config=None,
@@ -90,26 +107,46 @@ async def serve(fleet: Fleet, listener: socket.socket, on_ready: Callable[[], ob
         server_header=False,
         timeout_graceful_shutdown=int(_CLOSE_TIMEOUT_S),
     )
-    server = ConsoleServer(config)
-    signals.calls_in(asyncio.get_running_loop(), lambda _: server.end())
-    running = asyncio.ensure_future(console.run())
-    running.add_done_callback(lambda _: server.end())
+
+
+async def serve(
+    fleet: Fleet, listener: socket.socket, on_ready: Callable[[], object], lan: "Lan | None" = None
+) -> None:
+    """Serve until Ctrl-C or SIGTERM. Then stop the cars that pages drive. lan: what serves the network, too."""
+    console = Console(fleet)
+    servers = [(ConsoleServer(_config(guarded_app(console, listener.getsockname()[1], lan))), listener)]
+    running = [asyncio.ensure_future(console.run())]
+    if lan is not None:
+        config = _config(network_app(console, lan))
+        config.load()
+        config.ssl = lan.context
+        servers.append((ConsoleServer(config), lan.listener))
+        running.append(asyncio.ensure_future(lan.run()))
+
+    def end(_: object) -> None:
+        for server, _listener in servers:
+            server.end()
+
+    signals.calls_in(asyncio.get_running_loop(), end)
+    for each in running:
+        each.add_done_callback(end)
     try:
         on_ready()
-        await server.serve(sockets=[listener])
+        await asyncio.gather(*(server.serve(sockets=[listens]) for server, listens in servers))
     finally:
         await console.close()
-        running.cancel()
-        with suppress(asyncio.CancelledError):
-            await running
+        for each in running:
+            each.cancel()
+            with suppress(asyncio.CancelledError):
+                await each
 
 
-def _app(console: Console) -> Starlette:
+def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Starlette:
     async def page(_: Request) -> Response:
         return FileResponse(STATIC / "index.html")
 
     async def hello(_: Request) -> Response:
-        return PlainTextResponse("")
+        return PlainTextResponse(HELLO)
 
     async def stop(request: Request) -> Response:
         stop_id = request.query_params.get("id", "")[:_MAX_STOP_ID_LENGTH]
@@ -125,7 +162,7 @@ def _app(console: Console) -> Starlette:
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()
         try:
-            async with _joined(console, socket_) as on_text:
+            async with _joined(console, socket_, lan) as on_text:
                 while True:
                     on_text(await socket_.receive_text())
         except TooManyPages:
@@ -141,6 +178,8 @@ def _app(console: Console) -> Starlette:
             Route(STOP_PATH, stop, methods=["POST"]),
             Route("/plan/check", check_plan, methods=["POST"]),
             Route("/plan/set", set_plan, methods=["POST"]),
+            *people_routes(lan),
+            *more,
             WebSocketRoute("/ws", connect),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
@@ -167,19 +206,30 @@ async def _read_text(request: Request) -> str | None:
 
 
 @asynccontextmanager
-async def _joined(console: Console, socket_: WebSocket) -> AsyncIterator[Callable[[str], None]]:
+async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> AsyncIterator[Callable[[str], None]]:
     """Join a page to the console. Yield the function that takes its messages."""
     page = console.add_page(socket_.send_text, socket_.scope.get(PERSON))
     sending = asyncio.ensure_future(page.run())
 
+    def end() -> None:
+        console.remove_page(page)
+        console.operator.spawn(_close(socket_))
+
     def on_sent(task: "asyncio.Task[None]") -> None:
         if not task.cancelled() and task.exception() is not None:  # the page does not read, or has gone
-            console.remove_page(page)
-            console.operator.spawn(_close(socket_))
+            end()
+
+    def on_text(text: str) -> None:
+        if from_network is None or from_network.is_current(socket_.scope):
+            console.on_text(page, text)
+        else:
+            end()
 
     sending.add_done_callback(on_sent)
+    from_network = lan if PERSON in socket_.scope else None
     try:
-        yield lambda text: console.on_text(page, text)
+        with nullcontext() if from_network is None else from_network.connected(socket_.scope, end):
+            yield on_text
     finally:
         console.remove_page(page)
         sending.cancel()

@@ -1,0 +1,174 @@
+"""The console's certificate for HTTPS: one key for each user, and a certificate for this computer's names."""
+
+import fcntl
+import hashlib
+import ipaddress
+import os
+import re
+import socket
+import ssl
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Final
+
+import ifaddr
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from schemas.atomic_file import write_atomically
+from schemas.state_dir import default_directory
+
+LIFETIME: Final = timedelta(days=397)
+"""Lifetime of a certificate. Browsers refuse much longer ones."""
+RENEWAL_BEFORE: Final = timedelta(days=30)
+MAX_NAMES: Final = 24
+"""Maximum number of names and addresses in a certificate."""
+_HOST_NAME: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?(\.[A-Za-z0-9-]{1,63})*")
+
+
+class BadKeyFile(OSError):
+    """The key file is not a key."""
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """A certificate and its key, as files."""
+
+    path: Path
+    key_path: Path
+    names: tuple[str, ...]
+    """Addresses and host names, the current ones first."""
+    expires: datetime
+    fingerprint: str
+    """SHA-256, as browsers show it."""
+
+    def load_into(self, context: ssl.SSLContext) -> None:
+        """Use it for new connections."""
+        context.load_cert_chain(self.path, self.key_path)
+
+
+def own_addresses() -> list[str]:
+    """Return the IPv4 addresses of this computer in its networks. The one of the default route is the first."""
+    listed = [str(each.ip) for adapter in ifaddr.get_adapters() for each in adapter.ips if each.is_IPv4]
+    found = [each for each in listed if not ipaddress.ip_address(each).is_loopback]
+    first = _default_address()
+    return sorted(dict.fromkeys(found), key=lambda address: (address != first, address))
+
+
+def _default_address() -> str:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # an address for documentation; connecting UDP sends nothing
+        except OSError:
+            return ""
+        return str(probe.getsockname()[0])
+
+
+def own_names() -> list[str]:
+    """Return the host names of this computer."""
+    name = socket.gethostname().lower()
+    return [name, f"{name.partition('.')[0]}.local"] if _HOST_NAME.fullmatch(name) else []
+
+
+def names_to_certify(current: Iterable[str], certified: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of a new certificate: the current ones, and earlier ones, so that a move back needs none."""
+    return tuple(dict.fromkeys((*current, *certified)))[:MAX_NAMES]
+
+
+def needs_renewal(current: Iterable[str], certified: Iterable[str], expires: datetime, now: datetime) -> bool:
+    """Return True if a name is missing in the certificate, or if it expires soon."""
+    return now >= expires - RENEWAL_BEFORE or not {*current} <= {*certified}
+
+
+def ensure_certificate(names: Iterable[str], now: datetime | None = None, directory: Path | None = None) -> Certificate:
+    """Return the certificate. Make the key, once, and a new certificate if it is needed. Raises OSError."""
+    now = datetime.now(UTC) if now is None else now
+    directory = default_directory() / "console" if directory is None else directory
+    directory.mkdir(parents=True, exist_ok=True)
+    current = tuple(dict.fromkeys(names))[:MAX_NAMES]
+    with (directory / "lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        key_path, path = directory / "key.pem", directory / "certificate.pem"
+        key = _ensure_key(key_path)
+        found = _read(path, key_path, key)
+        if found is not None and not needs_renewal(current, found.names, found.expires, now):
+            return found
+        wanted = names_to_certify(current, () if found is None else found.names)
+        write_atomically(path, _signed(key, wanted, now), sync=True, private=True)
+        made = _read(path, key_path, key)
+    assert made is not None
+    return made
+
+
+def _ensure_key(path: Path) -> Any:
+    if not path.exists():
+        made = ec.generate_private_key(ec.SECP256R1())
+        words = made.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+        write_atomically(path, words, sync=True, private=True)
+    if path.stat().st_mode & 0o077:
+        os.chmod(path, 0o600)  # noqa: PTH101 - also on what a link names
+    try:
+        key = serialization.load_pem_private_key(path.read_bytes(), None)
+    except ValueError:
+        key = None
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise BadKeyFile(0, "it is not a key of the console; delete it, and a new one is made", str(path))
+    return key
+
+
+def _read(path: Path, key_path: Path, key: Any) -> Certificate | None:
+    """Return the stored certificate. None if there is none of this key."""
+    try:
+        found = x509.load_pem_x509_certificate(path.read_bytes())
+        names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except (FileNotFoundError, ValueError, x509.ExtensionNotFound):
+        return None
+    if found.public_key() != key.public_key():
+        return None
+    listed = (str(each.value) for each in names)
+    digest = hashlib.sha256(found.public_bytes(serialization.Encoding.DER)).hexdigest().upper()
+    fingerprint = ":".join(digest[index : index + 2] for index in range(0, len(digest), 2))
+    return Certificate(path, key_path, tuple(listed), found.not_valid_after_utc, fingerprint)
+
+
+def _signed(key: Any, names: Iterable[str], now: datetime) -> bytes:
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fleet console")])
+    usage = x509.KeyUsage(
+        digital_signature=True,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=False,
+        crl_sign=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))  # clocks of phones differ
+        .not_valid_after(now + LIFETIME)
+        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(usage, critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    return bytes(made.public_bytes(serialization.Encoding.PEM))
+
+
+def _general_name(name: str) -> Any:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        return x509.DNSName(name)

@@ -1,0 +1,94 @@
+"""How many connections from the network the console keeps. Pure: time is an argument (s, monotonic).
+
+Strangers must not use up the file descriptors and the time of the process that stops the cars.
+"""
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from typing import Final
+
+MAX_CONNECTIONS: Final = 192
+"""Maximum number of connections from the network."""
+MAX_STRANGERS_PER_ADDRESS: Final = 24
+STRANGER_TIMEOUT_S: Final = 10.0
+"""Timeout of a connection that has shown no cookie of a paired device."""
+CONNECTION_BURST: Final = 100.0
+CONNECTIONS_PER_S: Final = 20.0
+"""Rate of new connections. A TLS handshake takes a millisecond or two of the loop that stops the cars."""
+
+
+@dataclass(slots=True)
+class _OpenConnection:
+    address: str
+    since_s: float
+    is_paired: bool = False
+
+
+@dataclass(slots=True)
+class ConnectionLimit:
+    """The open connections, oldest first, by any key."""
+
+    _open: dict[Hashable, _OpenConnection] = field(default_factory=dict)
+    _budget: float = CONNECTION_BURST
+    _budget_at: float | None = None
+
+    def admit(self, key: Hashable, address: str, now: float) -> tuple[bool, Hashable | None]:
+        """Decide on a new connection. Return whether it stays, and the key of another one that must end for it."""
+        if self._budget_at is not None:
+            self._budget = min(CONNECTION_BURST, self._budget + (now - self._budget_at) * CONNECTIONS_PER_S)
+        self._budget_at = now
+        if self._budget < 1.0:
+            return False, None
+        self._budget -= 1.0
+        strangers = [other for other, each in self._open.items() if not each.is_paired]
+        neighbors = [other for other in strangers if self._open[other].address == address]
+        ended: Hashable | None = None
+        if len(neighbors) >= MAX_STRANGERS_PER_ADDRESS:
+            ended = neighbors[0]
+        elif len(self._open) >= MAX_CONNECTIONS:
+            if not strangers:
+                return False, None
+            ended = strangers[0]
+        if ended is not None:
+            del self._open[ended]
+        self._open[key] = _OpenConnection(address, now)
+        return True, ended
+
+    def on_paired(self, key: Hashable) -> None:
+        """Keep a connection: it has shown the cookie of a paired device."""
+        if key in self._open:
+            self._open[key].is_paired = True
+
+    def on_closed(self, key: Hashable) -> None:
+        """Forget a connection."""
+        self._open.pop(key, None)
+
+    def expire(self, now: float) -> list[Hashable]:
+        """Remove the connections of strangers that have lasted too long. Return their keys."""
+        late = [
+            key for key, each in self._open.items() if not each.is_paired and now - each.since_s >= STRANGER_TIMEOUT_S
+        ]
+        for key in late:
+            del self._open[key]
+        return late
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+
+@dataclass(slots=True)
+class LogLimit:
+    """Lets one message pass for each interval, and counts the others."""
+
+    interval_s: float = 10.0
+    _last: float | None = None
+    _left_out: int = 0
+
+    def words(self, words: str, now: float) -> str | None:
+        """Return what to log: the words, with the number of messages left out before. None: nothing."""
+        if self._last is not None and now - self._last < self.interval_s:
+            self._left_out += 1
+            return None
+        more = f" ({self._left_out} more since the last message)" if self._left_out else ""
+        self._last, self._left_out = now, 0
+        return f"{words}{more}"

@@ -1,0 +1,287 @@
+"""The console on the network: HTTPS, pairing, and who is connected. The decisions are in the pure modules."""
+
+import asyncio
+import io
+import logging
+import secrets
+import socket
+import ssl
+import time
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+import segno
+
+from fleet.console.certificate import Certificate, ensure_certificate, own_addresses, own_names
+from fleet.console.connection_limit import ConnectionLimit, LogLimit
+from fleet.console.guard import DEVICE, PAIR_PATH, Scope
+from fleet.console.pairing import (
+    CODE_LIFETIME_S,
+    COOKIE_LIFETIME_S,
+    COOKIE_MEMORY_S,
+    CookieState,
+    GuessLimit,
+    PagePerson,
+    PairedDevice,
+    PeopleBook,
+    code_words,
+    new_code,
+)
+from fleet.console.people_file import PeopleFile
+
+REVOCATION_INTERVAL_S: Final = 0.25
+"""Interval at which the people file is read for revoked devices."""
+ADDRESS_INTERVAL_S: Final = 60.0
+"""Interval at which this computer's addresses are read."""
+
+log = logging.getLogger("fleet")
+
+
+class LimitedListener(socket.socket):
+    """A listening socket that refuses too many connections where they are accepted: before TLS and HTTP."""
+
+    limit: ConnectionLimit
+    _accepted: dict[Hashable, socket.socket]
+
+    @classmethod
+    def on_port(cls, port: int) -> "LimitedListener":
+        """Listen on all IPv4 addresses. Raises OSError if the port is in use."""
+        made = cls(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # for TCP_NODELAY, as in `listen`
+        made.limit, made._accepted = ConnectionLimit(), {}
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            made.bind(("0.0.0.0", port))  # noqa: S104 - `--lan` asks for it
+            made.listen()
+        except OSError:
+            made.close()
+            raise
+        return made
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept a connection. Raises ConnectionAbortedError for one too many, which asyncio expects."""
+        connection, address = super().accept()
+        self._forget_closed()
+        admitted, ended = self.limit.admit(address, address[0], time.monotonic())
+        if ended is not None:
+            self._end(ended)
+        if not admitted:
+            connection.close()
+            raise ConnectionAbortedError
+        self._accepted[address] = connection
+        return connection, address
+
+    def expire(self) -> None:
+        """End connections of strangers that have lasted too long."""
+        self._forget_closed()
+        for key in self.limit.expire(time.monotonic()):
+            self._end(key)
+
+    def _forget_closed(self) -> None:
+        for key in [key for key, each in self._accepted.items() if each.fileno() == -1]:
+            del self._accepted[key]
+            self.limit.on_closed(key)
+
+    def _end(self, key: Hashable) -> None:
+        """End a connection whose transport is asyncio's: the transport reads the end and closes it."""
+        connection = self._accepted.pop(key, None)
+        if connection is not None:
+            try:
+                connection.shutdown(socket.SHUT_RDWR)
+            except OSError:  # it has just closed
+                return
+
+
+class Lan:
+    """What pages on the network share. Making it raises OSError if there can be no certificate."""
+
+    # The file is changed in threads: whoever else holds its lock must not hold up a STOP.
+
+    def __init__(self, listener: LimitedListener, people: PeopleFile) -> None:
+        self.listener = listener
+        self.people = people
+        self.port: int = listener.getsockname()[1]
+        self.cookie = f"__Host-fleet_console_{self.port}"
+        self.guesses = GuessLimit()
+        self.addresses = own_addresses()
+        self.names = frozenset(own_names())
+        self.certificate: Certificate = ensure_certificate((*self.addresses, *own_names()))
+        self.context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        self.context.minimum_version = ssl.TLSVersion.TLSv1_2
+        self.certificate.load_into(self.context)
+        self._refusals = LogLimit()
+        self._connected: dict[int, tuple[str, str, Callable[[], object]]] = {}
+        """Device, address and the function that closes it, by number of the socket."""
+        self._last_socket = 0
+        people.change(lambda book: (PeopleBook(book.codes, book.devices, self.address), None))
+
+    @property
+    def address(self) -> str:
+        """The address to open on a phone."""
+        return f"https://{self.addresses[0] if self.addresses else '127.0.0.1'}:{self.port}"
+
+    # ------------------------------------------------------------------ pairing
+
+    async def issue(self, person: PagePerson) -> str:
+        """Return a new code, good once and for two minutes. Raises ValueError or OSError."""
+        return await asyncio.to_thread(issue_code, self.people, person)
+
+    async def offer(self, person: PagePerson) -> dict[str, Any]:
+        """Return a new code as JSON values: as words and as a picture. Raises ValueError or OSError."""
+        code = await self.issue(person)
+        qr = segno.make(pairing_link(self.address, code)).svg_data_uri(scale=5, border=4, light="#fff", dark="#000")
+        return {"code": code_words(code), "qr": qr, "address": self.address, "lifetime_s": CODE_LIFETIME_S}
+
+    async def pair(
+        self, code: str, client: tuple[str, int], device: str
+    ) -> tuple[str | None, float, PagePerson | None]:
+        """Pair a device. Return its cookie, else None and the time to wait before the next try, s."""
+        now, address = time.monotonic(), client[0]
+        if (wait_s := self.guesses.wait_s(address, now)) > 0:
+            self.guesses.wrong += 1
+            return None, wait_s, None
+        cookie = secrets.token_urlsafe(32)
+        found = self.people.read().redeem(code, cookie, "", device, time.time())
+        if found is not None:
+            found = await asyncio.to_thread(self.people.change, lambda book: self._redeemed(book, code, cookie, device))
+        if found is None:
+            count = self.guesses.on_wrong(address, now)
+            log.warning("%s typed a wrong pairing code (%d from there, %d in all)", address, count, self.guesses.wrong)
+            return None, self.guesses.wait_s(address, now), None
+        self.guesses.on_right(address)
+        paired = found.devices[-1]
+        log.warning("%s paired as %s, %s (%s)", address, paired.person.name, paired.person.rank, paired.id)
+        self.listener.limit.on_paired(client)
+        return cookie, 0.0, paired.person
+
+    @staticmethod
+    def _redeemed(book: PeopleBook, code: str, cookie: str, device: str) -> tuple[PeopleBook, PeopleBook | None]:
+        found = book.redeem(code, cookie, secrets.token_hex(3), device, time.time())
+        return (book, None) if found is None else (found, found)
+
+    def set_cookie(self, cookie: str) -> str:
+        """Return the header that gives a browser its cookie."""
+        # The browser keeps it for longer than it opens the console: an expired cookie still stops the cars.
+        age = int(COOKIE_LIFETIME_S + COOKIE_MEMORY_S)
+        return f"{self.cookie}={cookie}; Path=/; Max-Age={age}; Secure; HttpOnly; SameSite=Strict"
+
+    # ------------------------------------------------------------------ devices
+
+    def device_of(self, cookie: str) -> tuple[PairedDevice | None, CookieState]:
+        """Return the device of a cookie, and what the cookie may do."""
+        return self.people.read().device_of(cookie, time.time())
+
+    def on_device(self, client: tuple[str, int], device: PairedDevice) -> None:
+        """Handle a connection that has shown a cookie: it stays. Warn if two computers use one cookie."""
+        self.listener.limit.on_paired(client)
+        others = {address for id_, address, _ in self._connected.values() if id_ == device.id} - {client[0]}
+        if others and (words := self._refusals.words("", time.monotonic())) is not None:
+            log.warning(
+                "the cookie of %s (%s) is in use at %s and %s%s. If that is not one device, revoke it: "
+                "fleet console people --revoke %s",
+                device.person.name, device.id, client[0], *others, words, device.id,
+            )  # fmt: skip
+
+    def on_refusal(self, words: str) -> None:
+        """Log a refused request, of a flood of them only some."""
+        if (shown := self._refusals.words(words, time.monotonic())) is not None:
+            log.warning("%s", shown)
+
+    def is_current(self, scope: Scope) -> bool:
+        """Return True if the device of an open socket may still send."""
+        now = time.time()
+        return any(each.id == scope[DEVICE] and each.state(now) == "valid" for each in self.people.read().devices)
+
+    @contextmanager
+    def connected(self, scope: Scope, close: Callable[[], object]) -> Iterator[None]:
+        """Keep a socket in the list of those that revocation closes."""
+        self._last_socket += 1
+        number = self._last_socket
+        self._connected[number] = scope[DEVICE], scope["client"][0], close
+        try:
+            yield
+        finally:
+            self._connected.pop(number, None)
+
+    def close_revoked(self) -> None:
+        """Close the sockets of devices that were revoked or whose cookie has expired."""
+        now = time.time()
+        current = {each.id for each in self.people.read().devices if each.state(now) == "valid"}
+        for device, address, close in list(self._connected.values()):
+            if device not in current:
+                log.warning("closed the page of %s at %s: revoked or expired", device, address)
+                close()
+
+    async def revoke(self, names: list[str]) -> list[PairedDevice]:
+        """Revoke devices by id or person, and close their pages at once."""
+        gone: list[PairedDevice] = await asyncio.to_thread(self.people.change, lambda book: book.revoke(names))
+        self.close_revoked()
+        return gone
+
+    async def run(self) -> None:
+        """Close pages of revoked devices and renew the certificate until the task is cancelled."""
+        next_look = time.monotonic() + ADDRESS_INTERVAL_S
+        while True:
+            await asyncio.sleep(REVOCATION_INTERVAL_S)
+            self.listener.expire()
+            self.close_revoked()
+            if time.monotonic() >= next_look:
+                next_look = time.monotonic() + ADDRESS_INTERVAL_S
+                try:
+                    await asyncio.to_thread(self._renew)
+                except OSError as error:
+                    log.error("the certificate cannot be renewed: %s", error)
+
+    def _renew(self) -> None:
+        addresses = own_addresses()
+        renewed = ensure_certificate((*addresses, *own_names()))
+        self.addresses = addresses
+        if renewed.fingerprint != self.certificate.fingerprint:
+            renewed.load_into(self.context)
+            self.certificate = renewed
+            log.warning("the network is now %s, with a new certificate: SHA-256 %s", self.address, renewed.fingerprint)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what the page of the paired devices shows, as JSON values."""
+        now = time.time()
+        devices = [
+            {
+                "id": each.id,
+                "name": each.person.name,
+                "rank": each.person.rank,
+                "device": each.device,
+                "paired_s": int(each.paired_s),
+                "days_left": int((each.expires_s - now) // 86_400),
+                "addresses": sorted({address for id_, address, _ in self._connected.values() if id_ == each.id}),
+            }
+            for each in self.people.read().devices
+            if each.state(now) == "valid"
+        ]
+        return {
+            "address": self.address,
+            "fingerprint": self.certificate.fingerprint,
+            "wrong_codes": self.guesses.wrong,
+            "devices": devices,
+        }
+
+
+def issue_code(people: PeopleFile, person: PagePerson) -> str:
+    """Return a new code, good once and for two minutes. Raises ValueError or OSError."""
+    code = new_code(secrets.choice)
+    people.change(lambda book: (book.issue(code, person, time.time()), None))
+    return code
+
+
+def pairing_link(address: str, code: str) -> str:
+    """Return what the QR code contains. The code is in the fragment, which browsers do not send."""
+    return f"{address}{PAIR_PATH}#{code}"
+
+
+def show_code(address: str, code: str, person: PagePerson, write: Callable[[str], object], *, draws: bool) -> None:
+    """Write a pairing code to a terminal. draws: also as a QR code."""
+    if draws:
+        picture = io.StringIO()
+        segno.make(pairing_link(address, code)).terminal(picture, compact=True, border=2)
+        write(picture.getvalue())
+    write(f"To pair a device as {person.name}, scan, or open {address} and type {code_words(code)}")
+    write("The code is good once, for 2 minutes. For another one, type: fleet console pair NAME")

@@ -1,0 +1,62 @@
+"""The file of the paired devices. The console and `fleet console people` share it, so each change holds a lock."""
+
+import fcntl
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, TypeVar
+
+from fleet.console.pairing import BadBook, PeopleBook
+from schemas.atomic_file import write_atomically
+from schemas.state_dir import directory_of
+
+T = TypeVar("T")
+_NO_FILE: Final = (0, 0, 0)
+
+log = logging.getLogger("fleet")
+
+
+def people_path(endpoint: str, fleet: str) -> Path:
+    """Return the file of one fleet."""
+    return directory_of(endpoint) / f"{fleet}.@console.json"
+
+
+class PeopleFile:
+    """A book of people on disk, for the user alone (0600)."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._book = PeopleBook()
+        self._version: tuple[int, int, int] | None = None
+
+    def read(self) -> PeopleBook:
+        """Return the book as it is now. A damaged or missing one is empty: everybody pairs again."""
+        version = self._stat()
+        if version != self._version:
+            self._book, self._version = self._load(), version
+        return self._book
+
+    def change(self, function: Callable[[PeopleBook], tuple[PeopleBook, T]]) -> T:
+        """Replace the book by what the function returns, and return its second value. Raises OSError."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.with_name(f"{self.path.name}.lock").open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            book, value = function(self._load())
+            write_atomically(self.path, book.as_text().encode(), sync=True, private=True)
+        return value
+
+    def _stat(self) -> tuple[int, int, int]:
+        try:
+            found = self.path.stat()
+        except OSError:
+            return _NO_FILE
+        return found.st_mtime_ns, found.st_size, found.st_ino
+
+    def _load(self) -> PeopleBook:
+        try:
+            return PeopleBook.of_text(self.path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return PeopleBook()
+        except (OSError, UnicodeDecodeError, BadBook) as error:
+            log.error("%s cannot be read, so all devices must pair again: %s", self.path, error)
+            return PeopleBook()

@@ -1,0 +1,87 @@
+"""The routes that pair devices, list them and revoke them."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from fleet.console.guard import PAIR_PATH, PERSON, Scope
+from fleet.console.pairing import PagePerson
+from fleet.console.requests import BadPageMessage, PageMessage
+
+if TYPE_CHECKING:  # only `--lan` needs its packages
+    from fleet.console.lan import Lan
+
+PAIR_PAGE: Final = Path(__file__).parent / "static" / "pair.html"
+_MAX_BODY_BYTES: Final = 1024
+_MAX_DEVICE_LENGTH: Final = 256
+
+
+def pair_routes(lan: "Lan") -> list[Route]:
+    """Return the routes for devices that are not paired."""
+
+    async def page(_: Request) -> Response:
+        return FileResponse(PAIR_PAGE)
+
+    async def pair(request: Request) -> Response:
+        code = await _read_short(request)
+        if request.client is None or code is None:
+            return _failure("This is no pairing code.", 400)
+        device = request.headers.get("user-agent", "")[:_MAX_DEVICE_LENGTH]
+        cookie, wait_s, person = await lan.pair(code, (request.client.host, request.client.port), device)
+        if cookie is None or person is None:
+            words = "This code is wrong, used or older than two minutes."
+            if wait_s == 0:
+                return _failure(words, 403)
+            wait = str(math.ceil(wait_s))
+            return _failure(f"{words} Wait {wait} s before the next try.", 429, {"retry-after": wait})
+        return JSONResponse({"ok": True, "name": person.name}, headers={"set-cookie": lan.set_cookie(cookie)})
+
+    return [Route(PAIR_PATH, page), Route(PAIR_PATH, pair, methods=["POST"])]
+
+
+def people_routes(lan: "Lan | None") -> list[Route]:
+    """Return the routes for those who may pair and revoke: pages of this computer, and leads."""
+
+    async def people(request: Request) -> Response:
+        may_pair = _may_pair(request.scope)
+        return JSONResponse({"may_pair": may_pair, "lan": lan.as_dict() if lan is not None and may_pair else None})
+
+    async def change(request: Request) -> Response:
+        if lan is None or not _may_pair(request.scope):
+            return _failure("Only the console's own computer or a lead may do this.", 403)
+        text = await _read_short(request)
+        try:
+            message = PageMessage.of(text or "")
+            if message.kind == "revoke":
+                gone = await lan.revoke([message.text("id")])
+                return JSONResponse({"ok": bool(gone)})
+            person = PagePerson(message.text("name"), message.text("rank"))
+            return JSONResponse({"ok": True, **await lan.offer(person)})
+        except (BadPageMessage, ValueError) as error:
+            return _failure(str(error), 400)
+        except OSError as error:
+            return _failure(f"The list of people cannot be written: {error.strerror}.", 500)
+
+    return [Route("/people", people), Route("/people", change, methods=["POST"])]
+
+
+def _may_pair(scope: Scope) -> bool:
+    return PERSON not in scope or scope[PERSON].rank == "lead"
+
+
+def _failure(words: str, status: int, headers: dict[str, Any] | None = None) -> Response:
+    return JSONResponse({"ok": False, "words": words}, status, headers)
+
+
+async def _read_short(request: Request) -> str | None:
+    """Return the body of a request. None if it is too long: the rest is not read."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > _MAX_BODY_BYTES:
+            return None
+    return body.decode("utf-8", "replace")

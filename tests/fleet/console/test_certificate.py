@@ -1,0 +1,73 @@
+"""The certificate of the console: made once, renewed for new addresses, private."""
+
+import ssl
+import stat
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from fleet.console import certificate
+from fleet.console.certificate import BadKeyFile, ensure_certificate, needs_renewal
+from fleet.console.pairing import PagePerson, PeopleBook
+from fleet.console.people_file import PeopleFile
+
+NOW = datetime(2026, 11, 22, tzinfo=UTC)
+
+
+def test_a_certificate_is_kept_until_an_address_is_new_or_it_expires(tmp_path: Path) -> None:
+    made = ensure_certificate(["192.168.1.5", "laptop.local"], NOW, tmp_path)
+    assert made.names == ("192.168.1.5", "laptop.local")
+    key = made.key_path.read_bytes()
+    for path in (made.path, made.key_path):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    made.load_into(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER))
+    assert ensure_certificate(["192.168.1.5"], NOW + timedelta(days=300), tmp_path) == made
+    moved = ensure_certificate(["10.0.0.7"], NOW, tmp_path)
+    assert moved.names == ("10.0.0.7", "192.168.1.5", "laptop.local")
+    assert moved.fingerprint != made.fingerprint
+    assert ensure_certificate(["192.168.1.5"], NOW, tmp_path) == moved, "a move back needs no new one"
+    late = ensure_certificate(["10.0.0.7"], NOW + timedelta(days=380), tmp_path)
+    assert late.expires > moved.expires
+    assert key == made.key_path.read_bytes(), "the key stays"
+
+
+def test_a_key_that_others_can_read_is_closed_and_a_damaged_one_is_named(tmp_path: Path) -> None:
+    made = ensure_certificate(["10.0.0.7"], NOW, tmp_path)
+    made.key_path.chmod(0o644)
+    ensure_certificate(["10.0.0.7"], NOW, tmp_path)
+    assert stat.S_IMODE(made.key_path.stat().st_mode) == 0o600
+    made.path.write_text("damaged")
+    assert ensure_certificate(["10.0.0.7"], NOW, tmp_path).names == ("10.0.0.7",)
+    made.key_path.write_text("damaged")
+    with pytest.raises(BadKeyFile, match="delete it"):
+        ensure_certificate(["10.0.0.7"], NOW, tmp_path)
+
+
+def test_another_key_makes_another_certificate(tmp_path: Path) -> None:
+    made = ensure_certificate(["10.0.0.7"], NOW, tmp_path)
+    made.key_path.unlink()
+    assert ensure_certificate(["10.0.0.7"], NOW, tmp_path).fingerprint != made.fingerprint
+
+
+def test_a_computer_with_many_addresses_needs_no_new_certificate_each_time(tmp_path: Path) -> None:
+    many = [f"10.0.{number}.1" for number in range(certificate.MAX_NAMES + 5)]
+    assert ensure_certificate(many, NOW, tmp_path) == ensure_certificate(many, NOW, tmp_path)
+
+
+def test_a_certificate_is_renewed_a_month_before_its_end() -> None:
+    for days, needed in ((31, False), (30, True), (-1, True)):
+        assert needs_renewal(["a"], ["a"], NOW + timedelta(days=days), NOW) is needed
+
+
+def test_the_people_file_is_private_shared_and_survives_damage(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "fleet.@console.json"
+    ours, theirs = PeopleFile(path), PeopleFile(path)
+    assert ours.read() == PeopleBook()
+    theirs.change(lambda book: (book.issue("K7QF3MXP", PagePerson("mia"), 1.8e9), None))
+    assert len(ours.read().codes) == 1
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    ours.change(lambda book: (book.redeem("K7QF3MXP", "c", "d", "", 1.8e9) or book, None))
+    assert [each.id for each in theirs.read().devices] == ["d"]
+    path.write_text("{")
+    assert theirs.read() == PeopleBook()

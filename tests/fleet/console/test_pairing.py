@@ -1,0 +1,204 @@
+"""Pairing codes, cookies and the slow-down, on virtual time."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.console import pairing
+from fleet.console.connection_limit import (
+    CONNECTION_BURST,
+    CONNECTIONS_PER_S,
+    MAX_CONNECTIONS,
+    MAX_STRANGERS_PER_ADDRESS,
+    STRANGER_TIMEOUT_S,
+    ConnectionLimit,
+    LogLimit,
+)
+from fleet.console.pairing import BadBook, GuessLimit, PagePerson, PeopleBook, code_words, new_code
+
+MIA = PagePerson("mia")
+CODES = st.text(pairing.CODE_ALPHABET, min_size=pairing.CODE_LENGTH, max_size=pairing.CODE_LENGTH)
+NOW = 1.8e9
+
+
+def paired(code: str = "K7QF3MXP", cookie: str = "cookie", now: float = NOW) -> PeopleBook:
+    found = PeopleBook().issue(code, MIA, now).redeem(code, cookie, "d1", "Phone", now)
+    assert found is not None
+    return found
+
+
+@given(CODES, CODES, st.floats(-1e6, 1e6))
+def test_a_code_pairs_once_within_two_minutes_and_no_other_code_does(code: str, other: str, age_s: float) -> None:
+    book = PeopleBook().issue(code, MIA, NOW)
+    assert (book.redeem(other, "c", "d1", "", NOW) is not None) is (other == code)
+    found = book.redeem(code_words(code).lower(), "c", "d1", "", NOW + age_s)
+    assert (found is not None) is (0 <= (NOW + age_s) - NOW < pairing.CODE_LIFETIME_S)
+    if found is not None:
+        assert found.redeem(code, "c2", "d2", "", NOW + age_s) is None, "a replay"
+        assert found.devices[0].person == MIA
+
+
+def test_a_new_code_does_not_end_another_and_old_ones_are_forgotten() -> None:
+    book = PeopleBook()
+    for number in range(pairing.MAX_CODES + 3):
+        book = book.issue(f"CODE{number:04}", MIA, NOW)
+    assert len(book.codes) == pairing.MAX_CODES
+    assert book.redeem("CODE0000", "c", "d", "", NOW) is None
+    assert book.redeem("CODE0007", "c", "d", "", NOW) is not None
+    assert len(book.issue("LATER234", MIA, NOW + pairing.CODE_LIFETIME_S).codes) == 1
+
+
+@pytest.mark.parametrize("person", [PagePerson("Mia M"), PagePerson(""), PagePerson("mia", "king"), PagePerson("a/b")])
+def test_a_code_is_for_a_name_and_a_rank(person: PagePerson) -> None:
+    with pytest.raises(ValueError):
+        PeopleBook().issue("K7QF3MXP", person, NOW)
+
+
+def test_a_cookie_opens_for_a_month_then_only_stops_then_is_forgotten() -> None:
+    book = paired()
+    states = [book.device_of("cookie", NOW + days * 86_400)[1] for days in (0, 29.9, 30.1, 119.9, 120.1)]
+    assert states == ["valid", "valid", "expired", "expired", "unknown"]
+    assert book.device_of("cookie", NOW + 121 * 86_400)[0] is None
+    assert book.device_of("guess", NOW) == (None, "unknown")
+    assert book.device_of("", NOW) == (None, "unknown")
+
+
+def test_neither_codes_nor_cookies_are_stored() -> None:
+    book = paired().issue("ABCDEFGH", MIA, NOW)
+    assert "cookie" not in book.as_text()
+    assert "ABCDEFGH" not in book.as_text()
+    assert "K7QF3MXP" not in book.as_text()
+
+
+@given(st.lists(st.tuples(CODES, st.text(max_size=80)), max_size=5))
+def test_a_book_survives_a_restart(pairs: list[tuple[str, str]]) -> None:
+    book = PeopleBook(address="https://192.168.1.5:7443")
+    for index, (code, device) in enumerate(pairs):
+        book = book.issue(code, PagePerson("teacher", "lead"), NOW)
+        book = book.redeem(code, f"cookie{index}", f"id{index}", device, NOW) or book
+    assert PeopleBook.of_text(book.as_text()) == book
+    assert all(each.device.isprintable() for each in book.devices)
+
+
+@given(st.text())
+def test_a_damaged_book_is_refused(text: str) -> None:
+    with pytest.raises(BadBook):
+        PeopleBook.of_text(text)
+    with pytest.raises(BadBook):
+        PeopleBook.of_text(paired().as_text().replace('"digest": "', '"digest": 1, "x": "'))
+
+
+@pytest.mark.parametrize("name", ["d1", "mia"])
+def test_a_revoked_device_is_unknown_and_its_person_has_no_open_code(name: str) -> None:
+    book, gone = paired().issue("ABCDEFGH", MIA, NOW).revoke([name])
+    assert [each.id for each in gone] == ["d1"]
+    assert book.device_of("cookie", NOW) == (None, "unknown")
+    assert (book.redeem("ABCDEFGH", "c", "d", "", NOW) is None) is (name == "mia")
+
+
+def test_a_thousand_guesses_of_one_address_take_days() -> None:
+    limit, now = GuessLimit(), 0.0
+    for _ in range(1000):
+        now += limit.wait_s("10.0.0.9", now)
+        assert limit.wait_s("10.0.0.9", now) == 0
+        limit.on_wrong("10.0.0.9", now)
+    assert now > 3 * 86_400
+    assert limit.wrong == 1000
+    assert limit.wait_s("10.0.0.5", now) == 0, "nobody else waits"
+
+
+@given(st.lists(st.integers(0, 1000), max_size=40))
+def test_waits_grow_up_to_a_limit_and_are_forgotten(pauses: list[int]) -> None:
+    limit, now, before = GuessLimit(), 0.0, 0.0
+    for pause in pauses:
+        now += pause
+        limit.on_wrong("a", now)
+        wait = limit.wait_s("a", now)
+        assert before <= wait <= pairing.MAX_GUESS_DELAY_S
+        before = wait
+    assert limit.wait_s("a", now + pairing.GUESS_MEMORY_S) == 0
+    limit.on_right("a")
+    assert limit.wait_s("a", now) == 0
+
+
+def test_the_memory_of_guesses_is_bounded() -> None:
+    limit = GuessLimit()
+    for number in range(pairing.MAX_GUESSERS + 50):
+        limit.on_wrong(str(number), 0.0)
+    assert len(limit._guessers) == pairing.MAX_GUESSERS
+
+
+def test_codes_have_no_letters_that_are_confused() -> None:
+    assert new_code(lambda letters: letters[0]) == "22222222"
+    assert not {*"01IO"} & {*pairing.CODE_ALPHABET}
+
+
+# ---------------------------------------------------------------- connections
+
+EVENTS = st.lists(
+    st.tuples(st.sampled_from(["open", "pair", "close", "expire"]), st.integers(0, 300), st.floats(0, 2)), max_size=600
+)
+
+
+@given(EVENTS)
+def test_strangers_are_few_and_paired_devices_stay(events: list[tuple[str, int, float]]) -> None:
+    limit, now, opened, admitted = ConnectionLimit(), 0.0, 0, 0
+    strangers: dict[int, float] = {}
+    paired_ones: set[int] = set()
+    for kind, number, pause in events:
+        now += pause
+        match kind:
+            case "open":
+                opened += 1
+                key = 1000 + opened
+                stays, ended = limit.admit(key, str(number % 3), now)
+                assert ended not in paired_ones
+                if isinstance(ended, int):
+                    del strangers[ended]
+                admitted += stays
+                if stays:
+                    strangers[key] = now
+            case "pair" if strangers:
+                key = sorted(strangers)[number % len(strangers)]
+                limit.on_paired(key)
+                del strangers[key]
+                paired_ones.add(key)
+            case "close" if strangers:
+                key = sorted(strangers)[number % len(strangers)]
+                limit.on_closed(key)
+                del strangers[key]
+            case _:
+                late = limit.expire(now)
+                assert set(late) == {key for key, since in strangers.items() if now - since >= STRANGER_TIMEOUT_S}
+                strangers = {key: since for key, since in strangers.items() if key not in late}
+        assert len(limit) == len(strangers) + len(paired_ones) <= MAX_CONNECTIONS
+        assert len(strangers) <= 3 * MAX_STRANGERS_PER_ADDRESS
+    assert admitted <= CONNECTION_BURST + now * CONNECTIONS_PER_S + 1e-6
+
+
+def test_a_flood_is_refused_and_ends() -> None:
+    limit = ConnectionLimit()
+    admitted = sum(limit.admit(number, f"10.0.{number // 20}.1", 0.0)[0] for number in range(5000))
+    assert admitted == CONNECTION_BURST
+    assert limit.admit("later", "10.0.0.7", 1.0)[0]
+    for number in range(1000):
+        limit.admit(("more", number), f"10.1.{number}.1", 1.0 + number)
+    assert len(limit) <= MAX_CONNECTIONS
+
+
+def test_a_full_house_ends_the_oldest_stranger_never_a_paired_device() -> None:
+    limit = ConnectionLimit()
+    for number in range(MAX_CONNECTIONS):
+        assert limit.admit(number, str(number), float(number)) == (True, None)
+        if number:
+            limit.on_paired(number)
+    assert limit.admit("new", "x", 1000.0) == (True, 0)
+    limit.on_paired("new")
+    assert limit.admit("one more", "y", 1001.0) == (False, None)
+
+
+def test_a_flood_of_messages_is_counted_not_logged() -> None:
+    limit = LogLimit(10.0)
+    assert [limit.words("refused", now) for now in (0.0, 1.0, 9.9)] == ["refused", None, None]
+    assert limit.words("refused", 10.0) == "refused (2 more since the last message)"
+    assert limit.words("refused", 20.0) == "refused"

@@ -1,0 +1,74 @@
+"""A device on the console's network side: raw HTTPS requests and a WebSocket, with a cookie or without."""
+
+import http.client
+import json
+import re
+import ssl
+from typing import Any
+
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
+
+from tests.support.console import ConsoleProcess
+from tests.support.processes import wait_for
+
+
+def untrusting() -> ssl.SSLContext:
+    """TLS that takes the console's own certificate."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    return context
+
+
+class NetworkDevice:
+    """A browser without a face. `127.0.0.1` is an address of the network's port like any other."""
+
+    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+        self.host, self.port = host, port
+        self.origin = f"https://{host}:{port}"
+        self.cookie = ""
+
+    def ask(self, verb: str, path: str, body: str | None = None, **headers: str) -> tuple[int, bytes]:
+        """Ask the console; its status and its text. A new cookie is kept. A header without value is left out."""
+        connection = http.client.HTTPSConnection(self.host, self.port, timeout=30, context=untrusting())
+        sent = {"Origin": self.origin, "Cookie": self.cookie} | headers
+        connection.request(verb, path, body=body, headers={name: value for name, value in sent.items() if value})
+        response = connection.getresponse()
+        if (cookie := response.getheader("set-cookie")) is not None:
+            self.cookie = cookie.partition(";")[0]
+            self.cookie_flags = cookie
+        found = response.status, response.read()
+        connection.close()
+        return found
+
+    def pair(self, code: str) -> Any:
+        """Pair with a code; the answer."""
+        return json.loads(self.ask("POST", "/pair", code)[1])
+
+    def socket(self, **headers: str) -> ClientConnection:
+        """Open the page's socket."""
+        sent = {"Origin": self.origin, "Cookie": self.cookie} | headers
+        origin = Origin(sent.pop("Origin"))
+        return connect(
+            f"wss://{self.host}:{self.port}/ws", origin=origin, additional_headers=sent, ssl=untrusting(), proxy=None
+        )
+
+
+def network_port(console: ConsoleProcess) -> int:
+    """The port of a console with `--lan`."""
+    return int(find_line(console, r"On the network: https://.*:(\d+)"))
+
+
+def first_code(console: ConsoleProcess) -> str:
+    """The pairing code that it printed."""
+    return find_line(console, r"type (\w{4}-\w{4})$")
+
+
+def find_line(console: ConsoleProcess, pattern: str) -> str:
+    """What a line that the console prints has at this place."""
+
+    def found() -> str | None:
+        console.lines.extend(console.process.lines())
+        return next((match[1] for line in console.lines if (match := re.search(pattern, line))), None)
+
+    return str(wait_for(found, pattern))
