@@ -255,6 +255,7 @@ class CarGateway:
             data = await link.read()
             read_at = now = self._loop.time()
             self._health.on_bytes(len(data), now)
+            self._on_gap(now)  # before the bytes: reports that are read late may look like a pause
             before = self._shown_state
             for start in range(0, len(data), SLICE_BYTES):
                 if start:
@@ -341,7 +342,7 @@ class CarGateway:
     async def _write_due(self) -> None:
         """Write the frames that are due."""
         now = self._loop.time()
-        self._on_gap(now - self._alive_at - CHECK_INTERVAL_S, now)
+        self._on_gap(now)
         self._on_events(self._decoder.tick(now))
         while (link := self._link) is not None and (write := self._control.poll(self._loop.time())) is not None:
             self._decoder.sent(write.data, self._loop.time())  # an echo may arrive before the write returns
@@ -403,7 +404,7 @@ class CarGateway:
             await asyncio.sleep(CHECK_INTERVAL_S)
             now = self._loop.time()
             worst = max(worst, now - due)
-            self._on_gap(now - due, now)
+            self._on_gap(now)
             self._alive_at = now
             if self._attempts.check_proven(now, has_reading=False):
                 self._log_open()
@@ -437,8 +438,9 @@ class CarGateway:
                 self._publish_health(now, worst)
                 worst = 0.0
 
-    def _on_gap(self, gap_s: float, now: float) -> None:
+    def _on_gap(self, now: float) -> None:
         """Handle a gap of the loop: a stalled process may have lost the bus, and stops a driven car."""
+        gap_s = now - self._alive_at - CHECK_INTERVAL_S
         if gap_s > BUS_LOSS_GAP_S:
             self._publisher.on_bus_lost(now)
         self._control.on_stall(gap_s, now)

@@ -1,0 +1,51 @@
+"""A whole gateway in the process of the test, with a real bus and a TCP car, so that its loop can be held up."""
+
+import asyncio
+import time
+from pathlib import Path
+from typing import Any
+
+from gateway.bus.service import CarService
+from gateway.car import CarGateway, Settings
+from gateway.link import parse_url
+from gateway.protocol.platforms import parse_platform
+from schemas import bus
+from tests.support.ports import free_endpoint
+from tests.support.processes import MODE00, REPORT, REPORT_S, FleetProcesses, TcpCar, wait_for
+
+
+async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(tmp_path: Path) -> None:
+    """The car obeys one `MODE00`, but not the next. The loop stalls until the gap of reports is like a pause."""
+    fleet, car = FleetProcesses(free_endpoint(), tmp_path), TcpCar()
+    shown: list[int] = []
+
+    def listen(sample: bus.Sample) -> None:
+        said: Any = sample.message()
+        if (said.motors, said.motors_basis) == ("off", "shown"):
+            shown.append(car.received.count(MODE00))
+
+    async def until_closed(count: int) -> None:
+        await asyncio.to_thread(wait_for, lambda: car.received.count(MODE00) >= count, f"{count} MODE00 have come")
+
+    fleet.bus.subscribe("fleet/red/state/safety", listen)
+    with bus.Bus.open(fleet.endpoint) as opened:
+        settings = Settings(
+            "red", parse_url(car.link), parse_platform("arduino"), auto=False, fleet="fleet", state_dir=tmp_path,
+            retry=True,
+        )  # fmt: skip
+        gateway = CarGateway(settings, opened, CarService(opened, "fleet", "red"))
+        serving = asyncio.ensure_future(gateway.run())
+        try:
+            await until_closed(1)
+            car.obey()
+            await until_closed(3)  # after the first pause the next MODE00 is written at once
+            time.sleep(REPORT_S)  # noqa: ASYNC251 - the loop stalls
+            car.send(REPORT)  # as if the car had not got it
+            time.sleep(2.2 - REPORT_S)  # noqa: ASYNC251
+            await asyncio.to_thread(wait_for, lambda: shown or car.received.count(MODE00) > 3, "it goes on")
+            assert not shown, "one pause is no evidence"
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            car.close()
+            fleet.close()
