@@ -19,7 +19,7 @@ from fleet.supervisor.child import parse_log_line, runs_directory
 from fleet.supervisor.service import ask_service
 from fleet.supervisor.shutdown import NOT_STOPPED
 from schemas import keys, messages
-from schemas.bus import Bus, BusError, resolve_endpoint
+from schemas.bus import Bus, BusError, messages_of, resolve_endpoint
 from schemas.process import signals, startup
 from schemas.suggestion import did_you_mean
 
@@ -78,7 +78,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         received: list[Any] = []
-        bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.append(sample.message()))
+        bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.extend(messages_of([sample])))
         if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", default_sender())) is None:
             raise not_running(fleet)
         if answer.status == "rejected":

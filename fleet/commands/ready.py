@@ -12,7 +12,7 @@ from fleet.client.supervision import ask_status
 from fleet.commands.options import not_running
 from fleet.supervisor.car_status import CarStatus, describe_missing, describe_start
 from schemas import keys
-from schemas.bus import Bus, BusError, Sample
+from schemas.bus import Bus, BusError, messages_of
 from schemas.topics import Qos
 
 READY_WAIT_S: Final = 30.0
@@ -68,10 +68,9 @@ def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
         return cars, missing
     rows = {key.rpartition("/")[2]: CarStatus(key.rpartition("/")[2]) for key in bus.tokens(keys.car_token(fleet, "*"))}
     for topic in _STATES:
-        for answer in bus.query(f"{fleet}/*/{topic}", qos=Qos.STATE):
-            key = keys.parse(answer.key) if isinstance(answer, Sample) else None
-            if key is not None and isinstance(answer, Sample) and key.car in rows:
-                rows[key.car].take(topic, answer.message(), time.monotonic())
+        for message in messages_of(bus.query(f"{fleet}/*/{topic}", qos=Qos.STATE)):
+            if message.car in rows:
+                rows[message.car].take(topic, message, time.monotonic())
     return sorted(rows), {car: why for car, row in sorted(rows.items()) if (why := describe_missing(row))}
 
 

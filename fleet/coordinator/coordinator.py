@@ -402,7 +402,9 @@ class Coordinator:
     def _reply(self, query: zenoh.Query, observer: FleetObserver) -> None:
         begin, _, verb = str(query.key_expr).rpartition("/")
         if begin.endswith("/@cmd"):
-            if verb == PLAN_VERB:
+            if "*" in verb:
+                query.reply_err(f"{query.key_expr}: name the command", encoding="text/plain")
+            elif verb == PLAN_VERB:
                 self._on_plan(query, observer)
             else:
                 self._on_request(query, PlanRequest(verb))

@@ -12,7 +12,17 @@ import zenoh
 from fleet.client.services import send_command
 from fleet.client.supervision import SUPERVISOR_STATUS
 from schemas import keys, messages
-from schemas.bus import Bus, Failure, Handover, Sample, Singleton, is_json_wanted, reply_message, reply_value
+from schemas.bus import (
+    Bus,
+    Failure,
+    Handover,
+    Sample,
+    Singleton,
+    is_json_wanted,
+    messages_of,
+    reply_message,
+    reply_value,
+)
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import Qos
@@ -115,7 +125,7 @@ class SupervisorService:
         answers = self.bus.query(
             f"{self.fleet}/{keys.COORDINATOR}/plan", timeout_s=SERVICE_QUERY_TIMEOUT_S, qos=Qos.STATE
         )
-        return next((answer.message() for answer in answers if isinstance(answer, Sample)), None)
+        return next(messages_of(answers), None)
 
     def send_plan(self, text: str) -> bool:
         """Send the coordinator another plan. Return True if it accepted. Call it on a thread."""

@@ -21,7 +21,16 @@ from schemas.bus.hub_keeper import HubKeeper
 from schemas.bus.key_expressions import canon, intersects
 from schemas.bus.publisher import Publisher
 from schemas.bus.replies import BUSY, is_json_wanted, refuse, reply, reply_message, reply_value
-from schemas.bus.sample import LARGEST_PAYLOAD, LONGEST_SELECTOR, Failure, Sample, sample_of, sequence_of, unread
+from schemas.bus.sample import (
+    LARGEST_PAYLOAD,
+    LONGEST_SELECTOR,
+    Failure,
+    Sample,
+    messages_of,
+    sample_of,
+    sequence_of,
+    unread,
+)
 from schemas.bus.session import Bus
 from schemas.bus.singleton import Singleton
 
@@ -50,6 +59,7 @@ __all__ = [
     "intersects",
     "is_json_wanted",
     "is_loopback",
+    "messages_of",
     "refuse",
     "reply",
     "reply_message",

@@ -1,12 +1,17 @@
 """Publications and replies as values, and size limits of queries."""
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
+from schemas import topics
+
 if TYPE_CHECKING:  # a gateway joins the bus before it imports protobuf
+    from collections.abc import Iterable, Iterator
+
     from google.protobuf.message import Message
 
 
@@ -40,7 +45,9 @@ class Sample:
         name = messages.name_in(self.encoding)
         if name is None:
             raise messages.BadPayload(f"{self.key}: encoding {self.encoding!r} names no message")
-        return messages.parse(name, self.payload, self.encoding)
+        # Anybody may publish or answer under any key. Readers use the fields of the topic's message.
+        topic = topics.of_key(self.key)
+        return messages.parse(name if topic is None else topic.message, self.payload, self.encoding)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +55,14 @@ class Failure:
     """An error reply."""
 
     words: str
+
+
+def messages_of(answers: "Iterable[Sample | Failure]") -> "Iterator[Any]":
+    """Yield the messages of answers. Skip error replies, and those of programs that are none of this fleet."""
+    for answer in answers:
+        if isinstance(answer, Sample):
+            with suppress(ValueError, KeyError):  # messages.BadPayload is a ValueError
+                yield answer.message()
 
 
 def sequence_of(info: zenoh.SourceInfo) -> int:

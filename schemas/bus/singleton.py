@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from schemas.bus.replies import BUSY
-from schemas.bus.sample import Failure
+from schemas.bus.sample import Failure, messages_of
 from schemas.bus.session import Bus
 
 
@@ -27,14 +27,9 @@ class Singleton:
         found: list[Any] = []
         deadline, busy = time.monotonic() + self._timeout_s, True
         while busy and time.monotonic() < deadline:
-            busy = False
-            for answer in self._bus.query(self._status_key, timeout_s=self._timeout_s):
-                if isinstance(answer, Failure):
-                    busy = busy or answer.words == BUSY  # there is one, and it will answer soon
-                    continue
-                status: Any = answer.message()
-                if status.boot_id != self._bus.boot_id:
-                    found.append(status)
+            answers = list(self._bus.query(self._status_key, timeout_s=self._timeout_s))
+            busy = Failure(BUSY) in answers  # there is one, and it will answer soon
+            found += [status for status in messages_of(answers) if status.boot_id != self._bus.boot_id]
         return found
 
     def check_alone(self) -> None:

@@ -277,3 +277,23 @@ def test_a_reply_in_json_is_protobufs_mapping() -> None:
     text = messages.to_json(pb.Line(car="red", left_inner=True, seq=7))
     assert '"left_inner":true' in text
     assert '"seq":"7"' in text
+
+
+def test_a_message_is_of_its_keys_type_and_answers_of_other_programs_are_skipped() -> None:
+    def answer(
+        message: pb.Safety | pb.Plan, payload: bytes | None = None, key: str = "fleet/red/state/safety"
+    ) -> bus.Sample:
+        data = message.SerializeToString() if payload is None else payload
+        return bus.Sample(key, data, messages.encoding_of(message.DESCRIPTOR.full_name), 1, 1)
+
+    ours, other = pb.Safety(car="red"), pb.Plan(text="x")
+    answers: list[bus.Sample | bus.Failure] = [
+        bus.Failure("busy"),
+        answer(other),
+        answer(ours, b"\xff"),
+        answer(ours),
+        answer(other, key="fleet/red/mine"),
+    ]
+    assert list(bus.messages_of(answers)) == [ours, other], "a key without a topic takes any message"
+    with pytest.raises(messages.BadPayload, match=r"is a fleet.v1.Plan, this key takes fleet.v1.Safety"):
+        answer(other).message()

@@ -21,7 +21,7 @@ import zenoh
 from fleet.recording.writing.backfill import Backfill
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas import keys, messages
-from schemas.bus import Bus, Sample, reply_value
+from schemas.bus import Bus, messages_of, reply_value
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import TOPICS
 
@@ -183,10 +183,8 @@ class Recorder:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
             return
         where = "to an unknown place"
-        for answer in self._bus.query(f"{self._fleet}/{STATUS_TOPIC.name}", timeout_s=STATUS_TIMEOUT_S):
-            if isinstance(answer, Sample):
-                message: Any = answer.message()
-                where = f"to {message.session}"
+        for message in messages_of(self._bus.query(f"{self._fleet}/{STATUS_TOPIC.name}", timeout_s=STATUS_TIMEOUT_S)):
+            where = f"to {message.session}"
         raise AnotherRecorder(
             f"{keys.describe_fleet(self._fleet).capitalize()} is recorded already, {where}. One recorder is enough."
         )
