@@ -69,7 +69,7 @@ class Console:
         """Serve the pages until the task is cancelled."""
         bus, name = self._fleet.sync.bus, self._fleet.sync.name
         for family in ("sensor", "state"):
-            bus.subscribe(f"{name}/*/{family}/*", lambda sample: self._readings(sample.key, sample))
+            bus.subscribe(f"{name}/*/{family}/*", self._on_reading)
         bus.subscribe(f"{name}/*/event/*", self._events)
         bus.subscribe(f"{name}/{keys.COORDINATOR}/*", self._plan_samples)
         loop = asyncio.get_running_loop()
@@ -84,6 +84,11 @@ class Console:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tick())
             tasks.create_task(self.operator.renew_leases())
+
+    def _on_reading(self, sample: Sample) -> None:
+        """Note a reading. Runs on a Zenoh thread."""
+        self._readings(sample.key, sample)
+        self._plots.on_sample(sample)
 
     async def _read_plan(self) -> None:
         """Read what the coordinator published before the console started."""
@@ -103,6 +108,7 @@ class Console:
             self._take_readings(now)
             if self._pages:
                 self._show("state", self._state(now))
+            self._plots.take_samples()
             for page in self._pages.values():
                 self._plots.send(page)
             for number, text in self._inspections.texts().items():

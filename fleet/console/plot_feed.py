@@ -1,9 +1,9 @@
 """Feeds the plots of the pages with every reading, at full rate, only while a page shows them."""
 
-import asyncio
 import json
 import logging
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Coroutine, Sequence
 from typing import Any, Final
 
 from fleet.aio import Fleet
@@ -11,7 +11,7 @@ from fleet.console.bus_message import message_in
 from fleet.console.page_link import PageLink
 from fleet.console.plot_buffer import PlotBuffer, Series
 from schemas import keys, topics
-from schemas.bus import BusError, Handover, Sample
+from schemas.bus import BusError, Sample
 
 _MAX_PLOT_SAMPLES: Final = 16_384
 
@@ -24,20 +24,21 @@ class PlotFeed:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._buffers: dict[int, PlotBuffer] = {}
-        self._subscriptions: dict[tuple[str, str], Any] = {}
+        self._plotted: frozenset[str] = frozenset()
+        """The keys of the bus that pages plot."""
+        # Twenty cars send 500 samples a second. To wake the loop for each would cost more than to decode it.
+        self._samples: deque[Sample] = deque(maxlen=_MAX_PLOT_SAMPLES)
 
-    async def begin(self, page: int, series: Sequence[Series], since_s: float) -> None:
-        """Plot these series on a page instead of those before. The gateways' history comes first."""
-        buffer = self._buffers[page] = PlotBuffer(series)
+    def begin(self, page: int, series: Sequence[Series], since_s: float) -> Coroutine[Any, Any, None]:
+        """Plot these series on a page instead of those before. Return what reads the gateways' history."""
+        self._buffers[page] = PlotBuffer(series)
+        self._note_plotted()
+        return self._read_history(page, self._buffers[page], since_s)
+
+    async def _read_history(self, page: int, buffer: PlotBuffer, since_s: float) -> None:
         for car, topic in buffer.keys:
-            if (car, topic) not in self._subscriptions:
-                samples = Handover[Sample](
-                    asyncio.get_running_loop(), self._on_sample, limit=_MAX_PLOT_SAMPLES, newest=True
-                )
-                key = keys.topic_key(self._fleet.sync.name, car, topic)
-                self._subscriptions[(car, topic)] = self._fleet.sync.bus.subscribe(key, samples)
-        self._forget()
-        for car, topic in buffer.keys:
+            if self._buffers.get(page) is not buffer:  # it has gone, or plots something else
+                return
             if topics.TOPICS[topic].history_size > 1:
                 try:
                     past = await self._fleet.history(f"{car}/{topic}", since_s=since_s)
@@ -50,7 +51,20 @@ class PlotFeed:
     def end(self, page: int) -> None:
         """Plot nothing on a page."""
         if self._buffers.pop(page, None) is not None:
-            self._forget()
+            self._note_plotted()
+
+    def on_sample(self, sample: Sample) -> None:
+        """Note a sample if a page plots it. Runs on a Zenoh thread."""
+        if sample.key in self._plotted:
+            self._samples.append(sample)
+
+    def take_samples(self) -> None:
+        """Give the samples since the last call to the pages that plot them."""
+        for _ in range(len(self._samples)):
+            if (found := message_in(self._samples.popleft())) is not None:
+                key, message = found
+                for buffer in self._buffers.values():
+                    buffer.add(key.car, key.topic, message)
 
     def send(self, page: PageLink) -> None:
         """Send the new values to a page, unless the last ones still wait: then they go together."""
@@ -58,13 +72,8 @@ class PlotFeed:
         if buffer is not None and not page.has_unsent("samples") and (values := buffer.take()):
             page.show("samples", json.dumps({"t": "samples", "values": values}, separators=(",", ":")))
 
-    def _forget(self) -> None:
-        used = {key for buffer in self._buffers.values() for key in buffer.keys}
-        for key in set(self._subscriptions) - used:
-            self._subscriptions.pop(key).undeclare()
-
-    def _on_sample(self, sample: Sample) -> None:
-        if (found := message_in(sample)) is not None:
-            key, message = found
-            for buffer in self._buffers.values():
-                buffer.add(key.car, key.topic, message)
+    def _note_plotted(self) -> None:
+        name = self._fleet.sync.name
+        self._plotted = frozenset(
+            keys.topic_key(name, car, topic) for buffer in self._buffers.values() for car, topic in buffer.keys
+        )

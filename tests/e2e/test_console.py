@@ -21,6 +21,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+from gateway.protocol.enums import Light, Motion, ServoAction
+from gateway.protocol.frames import General, encode
 from tests.support.console import CARS, ConsoleProcess, ConsoleStage, browser_process, pids
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
@@ -177,7 +179,13 @@ def test_several_cars_are_driven_together_by_keys(stage: ConsoleStage) -> None:
 
 def test_a_page_that_loses_the_focus_or_is_hidden_lets_go(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
-    for lost in ("window.dispatchEvent(new Event('blur'))", "window.dispatchEvent(new Event('pagehide'))"):
+    hide = "Object.defineProperty(document, 'visibilityState', { value: 'hidden', configurable: true })"
+    for lost in (
+        "window.dispatchEvent(new Event('blur'))",
+        "window.dispatchEvent(new Event('pagehide'))",
+        "document.dispatchEvent(new Event('freeze'))",
+        f"{hide}; document.dispatchEvent(new Event('visibilitychange')); delete document.visibilityState",
+    ):
         with stage.held(page, "back"):
             page.evaluate(lost)
             stage.stands()
@@ -248,33 +256,142 @@ def test_a_console_that_is_killed_stops_the_car(stage: ConsoleStage) -> None:
     stage.stands()
 
 
-def test_each_control_does_what_it_says_to_the_car(stage: ConsoleStage) -> None:
-    page = stage.driving_page("blue")
-    say = stage.sim.say
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_each_control_does_what_it_says_to_the_car(stage: ConsoleStage, size: str) -> None:
+    phone = size == "phone"
+    page = stage.driving_page("blue", **(stage.playwright.devices["Pixel 7"] if phone else {}))
 
-    def truth(name: str) -> object:
-        return say({"car": "blue", "ask": "truth"})[name]
+    def truth(name: str) -> Any:
+        return stage.sim.say({"car": "blue", "ask": "truth"})[name]
+
+    def use(selector: str) -> None:
+        page.locator(selector).tap() if phone else page.locator(selector).click()
+
+    def reaches(frame: bytes, selector: str, car: str = "blue") -> None:
+        frames = stage.judges[car].frames
+        before = len(frames)
+        use(selector)
+        wait_for(lambda: any(frame in data for *_, data in frames[before:]), f"{frame!r} reaches {car}")
 
     page.locator("input[type=color]").fill("#ff8000")
-    page.locator("[data-do=led]").click()
+    use("[data-do=led]")
     wait_for(lambda: truth("led") == "#ff8000", "its LED is orange")
-    page.locator("[data-light=red]").click()
+    reaches(encode(General(Motion.STOP, light=Light.RED)), "[data-light=red]")
+    reaches(encode(General(Motion.STOP, whistle=True)), "[data-do=whistle]")
     page.locator("input[name=servo]").fill("30")
-    page.locator("[data-do=whistle]").click()
-    page.locator("[data-do=faster]").click()
-    frames = stage.judges["blue"].frames
-    for part in (b"PTZ30", b"CLR255,CLG128,CLB0"):
-        wait_for(lambda part=part: any(part in data for *_, data in frames), part.decode())
-    page.locator("[data-do=arm]").click()
-    wait_for(lambda: any(b"ServoJ190" in data for *_, data in frames), "the arm")
-    page.locator("[data-do=fan]").click()
-    wait_for(lambda: truth("fan") is True, "its fan runs")
-    page.locator("[data-do=fan]").click()
-    wait_for(lambda: truth("fan") is False, "its fan stands")
-    page.locator("[data-mode=tracking]").click()
-    wait_for(lambda: truth("mode") == "tracking", "it tracks")
-    page.locator("[data-mode=manual]").click()
-    wait_for(lambda: truth("mode") == "manual", "it stands")
+    wait_for(lambda: truth("servo") == 150, "its servo has turned")
+    before = truth("speed")
+    use("[data-do=slower]")
+    wait_for(lambda: truth("speed") < before, "it is slower")
+    use("[data-do=faster]")
+    wait_for(lambda: truth("speed") == before, "it is faster")
+    page.locator(".joints input").nth(1).fill("45")
+    reaches(b",J245,", "[data-do=arm]")
+    for on in (True, False):
+        use("[data-do=fan]")
+        wait_for(lambda on=on: truth("fan") is on, "its fan is toggled")
+    modes = [button.get_attribute("data-mode") for button in page.locator("[data-mode]").all()]
+    assert len(modes) > 4
+    for mode in (*modes[1:], "manual"):
+        use(f"[data-mode={mode}]")
+        wait_for(lambda mode=mode: truth("mode") == mode, f"it is in mode {mode}")
+    page.locator("input[name=select-blue]").uncheck()
+    page.locator("input[name=select-green]").check()
+    up = encode(General(Motion.STOP, servo=ServoAction.VERTICAL_UP))
+    reaches(up, "[data-control=servo_vertical] button >> nth=0", "green")
+    left = encode(General(Motion.STOP, servo=ServoAction.HORIZONTAL_LEFT))
+    reaches(left, "[data-control=servo_horizontal] button >> nth=0", "green")
+
+
+def test_a_stick_drives_until_it_is_let_go(stage: ConsoleStage) -> None:
+    page = stage.driving_page("red")
+    page.evaluate("window.stick = [0, 0]; navigator.getGamepads = () => [null, { axes: window.stick }]")
+
+    def drives() -> bool:
+        page.evaluate("window.stick = [0, -0.9]")
+        try:
+            wait_for(lambda: stage.judges["red"].driving, "it drives", seconds=3.0)
+        except AssertionError:
+            page.evaluate("window.stick = [0, 0]")
+            time.sleep(0.7)
+            return False
+        return True
+
+    wait_for(drives, "it drives")
+    page.evaluate("window.stick = [0, 0.1]")
+    stage.stands()
+
+
+def test_everything_works_by_keyboard_alone(stage: ConsoleStage) -> None:
+    page = stage.page("#/drive")
+    page.locator("input[name=select-red]").focus()
+    page.keyboard.press("Space")
+    page.locator("[data-motion=forward]").focus()
+
+    def drives() -> bool:
+        page.keyboard.down("Enter")
+        try:
+            wait_for(lambda: stage.judges["red"].driving, "it drives", seconds=3.0)
+        except AssertionError:
+            page.keyboard.up("Enter")
+            time.sleep(0.7)
+            return False
+        return True
+
+    wait_for(drives, "it drives")
+    page.keyboard.up("Enter")
+    stage.stands()
+    for number in range(page.locator("nav a").count()):
+        page.locator("nav a").nth(number).focus()
+        page.keyboard.press("Enter")
+        page.locator("nav a").nth(number).and_(page.locator("[aria-current=page]")).wait_for()
+        page.locator("main h1").wait_for()
+        assert unreachable(page) == []
+
+
+def unreachable(page: Page) -> list[str]:
+    """The controls of a page that Tab does not reach."""
+    controls = "document.querySelectorAll('a[href], button, input, select, textarea, summary')"
+    page.evaluate("document.activeElement.blur()")
+    for _ in range(2 * page.evaluate(f"{controls}.length")):
+        page.keyboard.press("Tab")
+        page.evaluate("document.activeElement.dataset.reached = ''")
+    missed = f"[...{controls}].filter((each) => !('reached' in each.dataset) && each.getClientRects().length > 0)"
+    found: list[str] = page.evaluate(f"{missed}.map((each) => each.outerHTML.slice(0, 120))")
+    return found
+
+
+def test_a_stop_is_repeated_until_the_console_is_back(stage: ConsoleStage) -> None:
+    page = stage.page()
+    page.locator("[data-car=red]").wait_for()
+    stage.console.process.kill()
+    stage.console.process.wait()
+    page.get_by_text("The console does not answer").wait_for()
+    drive_all(stage)
+    page.keyboard.press("Escape")
+    page.get_by_text("STOP has not reached the console").wait_for()
+    assert stage.judges["red"].driving
+    stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)
+    page.get_by_text("STOP has not reached the console").wait_for(state="hidden")
+    for car in CARS:
+        wait_for(lambda car=car: stage.fleet.state("safety", car).HasField("hold"), f"{car} is on hold")
+        stage.stands(car)
+
+
+def test_stops_wait_for_no_gateway_that_hangs(stage: ConsoleStage) -> None:
+    page = stage.page()
+    stage.gateways["red"].popen.send_signal(signal.SIGSTOP)
+    try:
+        for _ in range(40):
+            page.keyboard.press("Escape")
+        wait_for(lambda: stage.person.car("blue").drive("forward", 10.0, wait=False).ok, "the last stop is over")
+        wait_for(lambda: stage.judges["blue"].driving, "blue drives")
+        pressed_ns = time.time_ns()
+        page.keyboard.press("Escape")
+        assert stage.stands("blue", since_ns=pressed_ns) < STOPPED_WITHIN_S
+    finally:
+        stage.gateways["red"].popen.send_signal(signal.SIGCONT)
+    page.locator("[data-car=red]").get_by_text("online").wait_for()
 
 
 def test_what_a_car_cannot_do_is_not_offered_and_says_why(stage: ConsoleStage) -> None:
@@ -331,14 +448,15 @@ def serious(page: Page) -> list[str]:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_serious_violation(stage: ConsoleStage, scheme: str) -> None:
+def test_axe_finds_no_serious_violation_on_any_page(stage: ConsoleStage, scheme: str) -> None:
     page = stage.driving_page("red", "green", viewport={"width": 1280, "height": 900}, color_scheme=scheme)
     page.keyboard.press("Escape")
     page.locator("[data-stop=red].stop-shown").wait_for()
-    assert serious(page) == []
+    for link in page.locator("nav a").all():
+        link.click()
+        link.and_(page.locator("[aria-current=page]")).wait_for()
+        assert serious(page) == [], link.inner_text()
     page.locator("#estop").click()
-    page.locator("nav a").first.click()
-    page.locator("[data-car=red]").wait_for()
     assert serious(page) == []
 
 

@@ -116,6 +116,7 @@ class App extends Component {
         <span class="fleet-name">${state?.fleet ?? ""}</span>
       </header>
       ${state !== null && (store.lost || !store.connected) && html`<${Banner} words=${t.consoleLost} />`}
+      ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
       ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
       <main id="content" tabindex="-1">
         ${state === null ? html`<h1>${t.title}</h1><p>${t.connecting}</p>` : html`<${Page} key=${here} cars=${state.cars} />`}

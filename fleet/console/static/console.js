@@ -3,6 +3,7 @@
 const RECONNECT_MS = 500;
 const LOST_MS = 1500;
 const MAX_RESULTS = 6;
+const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
 
 const listeners = new Set();
 export const store = {
@@ -13,6 +14,7 @@ export const store = {
   hello: null,
   connected: false,
   lost: false,
+  stopUnsent: false, // the last STOP has not reached the console
   press: null, // the motion that is held: {id, motion, cars, source}
   results: [],
   selected: new Set(),
@@ -57,12 +59,30 @@ const newId = () => Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte)
 export function stopAll() {
   const id = newId();
   send({ t: "stop", id });
-  fetch(`/stop?id=${id}`, { method: "POST", keepalive: true }).catch(() => {});
+  postStop(id, performance.now() + STOP_RETRY_MS);
   store.press = null;
   changed();
 }
 
+let newestStop = "";
+async function postStop(id, until) {
+  newestStop = id;
+  for (;;) {
+    let reached = false;
+    try {
+      reached = (await fetch(`/stop?id=${id}`, { method: "POST", keepalive: true })).ok;
+    } catch {}
+    if (newestStop !== id) return; // a later press says how it went
+    reached ||= store.connected && !store.lost; // by the socket
+    store.stopUnsent = !reached;
+    changed();
+    if (reached || performance.now() > until) return;
+    await new Promise((resume) => setTimeout(resume, RECONNECT_MS));
+  }
+}
+
 export function estopAll(why) {
+  if (!store.connected) stopAll();
   send({ t: "estop", id: newId(), why });
   store.press = null;
   changed();
@@ -85,7 +105,8 @@ export function release(source) {
   changed();
 }
 
-for (const name of ["blur", "pagehide", "freeze"]) window.addEventListener(name, () => release());
+for (const name of ["blur", "pagehide"]) window.addEventListener(name, () => release());
+document.addEventListener("freeze", () => release());
 document.addEventListener("visibilitychange", () => {
   if (document.visibilityState !== "visible") release();
 });

@@ -2,7 +2,7 @@
 
 import { command, lease, onTick, press, release, store, changed } from "./console.js";
 import { modes, motions, pad, t } from "./texts.js";
-import { html, useEffect, useState } from "./ui.js";
+import { html, Results, useEffect, useState } from "./ui.js";
 
 const KEYS = {
   ArrowUp: "forward", ArrowDown: "back", ArrowLeft: "spin_left", ArrowRight: "spin_right",
@@ -96,14 +96,11 @@ function PadButton({ motion, symbol, words, letter }) {
   </button>`;
 }
 
-const Pad = () => html`<section aria-label=${t.padLabel}>
-  <h2>${t.padLabel}</h2>
-  <p class="hint" id="pad-hint">${t.padHint}</p>
+const Pad = () => html`<p class="hint" id="pad-hint">${t.padHint}</p>
   <div class="pads">
     ${pad.map(([motion, symbol, words, letter]) => html`<${PadButton} ...${{ motion, symbol, words, letter }} />`)}
   </div>
-  <p class="driving" role="status">${store.press ? t.driving(motions[store.press.motion], store.press.cars) : ""}</p>
-</section>`;
+  <p class="driving" role="status">${store.press ? t.driving(motions[store.press.motion], store.press.cars) : ""}</p>`;
 
 function Selection({ cars }) {
   const toggle = (name) => {
@@ -246,12 +243,6 @@ const Controls = ({ cars }) => html`
   <${Offer} title=${t.fan} needs="fan" cars=${cars}><${Fan} cars=${cars} /><//>
 `;
 
-const Results = () => html`<section class="results" aria-live="polite" aria-label=${t.results}>
-  <ul class="plain">
-    ${store.results.map((result) => html`<li key=${result.key} class=${result.bad ? "bad" : ""}>${result.bad ? "⚠ " : "✓ "}${result.words}</li>`)}
-  </ul>
-</section>`;
-
 export function DrivePage({ cars }) {
   useDriving();
   const driven = selected();
@@ -260,7 +251,7 @@ export function DrivePage({ cars }) {
     <div class="drive">
       <div class="drive-pad">
         <${Selection} cars=${cars} />
-        <${Pad} />
+        <${Offer} title=${t.padLabel} needs="drive" cars=${driven}><${Pad} /><//>
         <${Results} />
       </div>
       <div class="drive-controls">${driven.length === 0 ? html`<p>${t.selectHint}</p>` : html`<${Controls} cars=${driven} />`}</div>

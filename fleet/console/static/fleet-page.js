@@ -2,7 +2,7 @@
 
 import { command, store } from "./console.js";
 import { links, modes, motions, motors, t, trends, verdicts } from "./texts.js";
-import { html, Memo, useState, Verdict } from "./ui.js";
+import { html, Memo, Results, useState, Verdict } from "./ui.js";
 
 export const motorName = (car) => {
   const { state, basis } = car.motors;
@@ -116,6 +116,7 @@ function Card({ car }) {
 
 export const FleetPage = ({ cars }) => html`
   <h1>${t.fleet}</h1>
+  <${Results} />
   ${cars.length === 0 && html`<p>${t.noCars}</p>`}
   <div class="cards">
     ${cars.map((car) => html`<${Memo} key=${car.name} data=${JSON.stringify(car)} draw=${() => html`<${Card} car=${car} />`} />`)}

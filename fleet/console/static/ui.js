@@ -3,6 +3,8 @@
 import { Component, h, render } from "./vendor/preact.js";
 import { useEffect, useRef, useState } from "./vendor/preact-hooks.js";
 import htm from "./vendor/htm.js";
+import { store } from "./console.js";
+import { t } from "./texts.js";
 
 export const html = htm.bind(h);
 export { Component, render, useEffect, useRef, useState };
@@ -24,3 +26,9 @@ export class Memo extends Component {
     return draw();
   }
 }
+
+export const Results = () => html`<section class="results" aria-live="polite" aria-label=${t.results}>
+  <ul class="plain">
+    ${store.results.map((result) => html`<li key=${result.key} class=${result.bad ? "bad" : ""}>${result.bad ? "⚠ " : "✓ "}${result.words}</li>`)}
+  </ul>
+</section>`;
