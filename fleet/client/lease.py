@@ -20,7 +20,7 @@ LEASE_RENEWAL_INTERVAL_S: Final = 0.8
 """Interval of renewals. A lease expires after 2 s, so one renewal may be lost."""
 SAFETY_RETRY_DELAY_S: Final = 0.2
 """Delay before a gateway that did not answer is queried again."""
-_STOP_NOT_NEEDED: Final = frozenset({"leased", "estopped", "superseded"})
+_STOP_NOT_NEEDED: Final = frozenset({"leased", "lent", "paused", "estopped", "superseded"})
 """Reasons that make the final stop unnecessary: another sender has or stops the car."""
 
 
@@ -59,7 +59,7 @@ class LeaseMonitor:
 
     def on_outcome(self, outcome: Outcome) -> None:
         """Handle the outcome of a command of ours."""
-        if outcome.reason == "leased":
+        if outcome.reason in ("leased", "lent", "paused"):
             self.lost = self.lost or outcome.words
 
 

@@ -136,6 +136,8 @@ class FleetObserver:
         link, mode, motion, safety = (readings[topic].fields for topic in REQUIRED_TOPICS)
         hold, lease = safety.get("hold"), safety.get("lease")
         estops: Any = safety.get("estops") or ()
+        pauses: Any = safety.get("pauses") or ()
+        loan = safety.get("loan")
         driver = motion["owner"]
         if not driver and isinstance(lease, pb.Lease) and lease.kind != "coordinator":
             driver = lease.holder
@@ -148,6 +150,8 @@ class FleetObserver:
             motors=str(safety["motors"]),
             held_by=hold.by if isinstance(hold, pb.Hold) else None,
             estopped_by=estops[0].by if estops else None,
+            paused_by=pauses[-1].by if pauses else None,
+            lent_to=loan.to if isinstance(loan, pb.Loan) else None,
             driven_by=str(driver) or None,
         )
 

@@ -170,7 +170,7 @@ def _step_stopped(
         known = snapshot.cars.get(car, UNKNOWN_CAR)
         # A mode command may have been on its way when the plan was stopped: only a later one shows that it is over.
         rests = tried.count and known.mode == Mode.MANUAL and known.verdict != CONTRADICTED and known.refused is None
-        taken = known.estopped_by is not None or known.held_by is not None or known.driven_by is not None
+        taken = known.taken_by is not None or known.driven_by is not None
         waits = car in memory.to_rest and not taken and (barrier is not None or known.busy or not rests)
         if waits:
             if barrier is None and not known.busy and now >= tried.again_at:
@@ -246,6 +246,12 @@ def _find_barrier(car: str, known: CarSnapshot) -> tuple[Barrier, bool] | None:
         return Barrier(
             f"{car} is e-stopped by {known.estopped_by}", f"a person or script ends it (`fleet resume {car} --estops`)"
         ), True
+    if known.paused_by is not None:
+        return Barrier(
+            f"{car} is paused with the whole fleet by {known.paused_by}", "somebody ends it (`fleet unpause`)"
+        ), True
+    if known.lent_to is not None:
+        return Barrier(f"{car} is lent to {known.lent_to}", f"the loan ends (`fleet lend {car} --end`)"), True
     if known.held_by is not None:
         return Barrier(
             f"{car} is on hold by {known.held_by}",

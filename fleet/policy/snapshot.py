@@ -87,6 +87,9 @@ class CarSnapshot:
     """From its gateway or the fleet file; empty: not known."""
     capabilities: frozenset[str] = frozenset()
     estopped_by: str | None = None
+    paused_by: str | None = None
+    """Who paused the whole fleet."""
+    lent_to: str | None = None
     held_by: str | None = None
     driven_by: str | None = None
     """The holder of a motion or a lease; never a coordinator."""
@@ -97,6 +100,11 @@ class CarSnapshot:
     refused: Refusal | None = None
     busy: bool = False
     """True if a command to it has no outcome yet."""
+
+    @property
+    def taken_by(self) -> str | None:
+        """Return who keeps the coordinator from the car until a person or a lead gives it back; None: nobody."""
+        return self.estopped_by or self.paused_by or self.lent_to or self.held_by
 
     @property
     def profile(self) -> Profile | None:

@@ -233,21 +233,21 @@ def _unlisted(sender: Sender, context: CommandContext) -> Refusal:
     )
 
 
-def may_end_estop(estop: Estop, sender: Sender, people: People) -> bool:
+def may_end_estop(estop: Estop, sender: Sender, context: CommandContext) -> bool:
     """Return True if the sender may end this e-stop.
 
     A lead's e-stop ends only a lead. An e-stop of this car ends who may drive the car, a fleet-wide one every person of
     the fleet, so that all gateways decide alike. Everybody ends their own.
     """
+    people, person = context.people, sender.person
     if sender.kind is SenderKind.COORDINATOR or not people.may_end(sender, estop.rank):
         return False
-    person, role = sender.person, people.role(sender.person)
-    own = person == Sender(estop.by).person
-    return own or people.may_drive(person) or (estop.fleet_wide and role is PersonRole.OTHER)
+    mine = person in (Sender(estop.by).person, context.loan and context.loan.to)
+    return mine or people.may_drive(person) or (estop.fleet_wide and people.role(person) is PersonRole.OTHER)
 
 
 def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal | None:
-    car, people = context.car, context.people
+    car = context.car
     if sender.kind is SenderKind.COORDINATOR:
         return Reason.HELD, f"{car} stays on hold: only a person or a script may resume it, not the coordinator."
     in_force = {estop.id: estop for estop in context.estops}
@@ -255,7 +255,7 @@ def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal 
         there = f"In force: {', '.join(in_force)}." if in_force else "None is in force."
         return Reason.BAD_VALUE, f"{car} has no e-stop {', '.join(resume.ids)}. {there}"
     named = [estop for estop in context.estops if resume.all or estop.id in resume.ids]
-    stays = [estop for estop in named if not may_end_estop(estop, sender, people)]
+    stays = [estop for estop in named if not may_end_estop(estop, sender, context)]
     if len(stays) < len(named) or (resume.ids and not named):
         return None
     hold = refuse_end_of_hold(sender, context)

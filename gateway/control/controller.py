@@ -341,7 +341,7 @@ class Controller:
         """End e-stops, the hold, or both, as far as the sender may. Tell what stays."""
         sender, safety = pending.command.sender, self.safety
         named = tuple(each.id for each in safety.estops) if resume.all else resume.ids
-        mine = [each for each in safety.estops if arbiter.may_end_estop(each, sender, self.people)]
+        mine = [each for each in safety.estops if arbiter.may_end_estop(each, sender, self._context(now))]
         if ended := safety.end(each.id for each in mine if each.id in named):
             which = " ".join(estop.id for estop in ended)
             self._log.log(Level.WARNING, "estop_ended", f"e-stop {which} was ended by {sender.name}", now)
@@ -355,9 +355,9 @@ class Controller:
             self._end_hold(sender, now)
         if safety.estops:
             parts = (
-                [self._still_estopped(sender)]
+                [self._still_estopped(sender, now)]
                 if not resume.ids and not ended
-                else [*parts, self._still_estopped(sender)]
+                else [*parts, self._still_estopped(sender, now)]
             )
         elif safety.hold is not None:
             fix = f": `fleet resume {self.car}`" if self.people.may_end(sender, safety.hold.rank) else " (a lead)"
@@ -418,7 +418,7 @@ class Controller:
             self._executor.halt(words, now)
             self.stops.begin_full(now)
 
-    def _still_estopped(self, sender: Sender) -> str:
+    def _still_estopped(self, sender: Sender, now: float) -> str:
         """Return which e-stops are in force, with their ids if there are several, and who can release them."""
         estops = self.safety.estops
         several = len(estops) > 1
@@ -427,7 +427,7 @@ class Controller:
             for estop in estops
         ]
         words, them = f"still emergency-stopped {', '.join(each)}", "them" if several else "it"
-        if not any(arbiter.may_end_estop(estop, sender, self.people) for estop in estops):
+        if not any(arbiter.may_end_estop(estop, sender, self._context(now)) for estop in estops):
             return f"{words}. {sender.person} cannot release {them}"
         return f"{words}. Release {them} with `fleet resume {self.car} --estops`"
 

@@ -40,10 +40,11 @@ class People:
         return tuple(sorted(name for name, role in roles.items() if role is PersonRole.LEAD))
 
     def ranked(self, sender: Sender) -> Sender:
-        """Return the sender with its rank: a person whom the table names as a lead is one."""
-        if sender.kind is SenderKind.PERSON and self.role(sender.person) is PersonRole.LEAD:
-            return replace(sender, kind=SenderKind.LEAD)
-        return sender
+        """Return the sender with its rank: only a person whom the table names as a lead is one."""
+        if sender.kind not in (SenderKind.PERSON, SenderKind.LEAD):
+            return sender
+        leads = self.role(sender.person) is PersonRole.LEAD
+        return replace(sender, kind=SenderKind.LEAD if leads else SenderKind.PERSON)
 
     def role(self, person: str) -> PersonRole | None:
         """Return what a person is to this car; None for a person who is not listed."""

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.safety import Estop, Hold, PersistedSafety
+from gateway.control.commands import SenderKind
+from gateway.control.safety import Estop, FleetPause, Hold, Loan, PersistedSafety
 from gateway.state_file import SafetyStateFile
 
 NOW = 1_800_000_000_000_000_000
@@ -15,8 +16,15 @@ NOW = 1_800_000_000_000_000_000
 
 def test_a_hold_is_read_back_by_the_next_process(tmp_path: Path) -> None:
     directory = tmp_path / "not" / "yet" / "there"
-    estop = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=True)
-    kept = PersistedSafety(Hold("mia", NOW - 5), (estop,), ("e0",))
+    estop = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=True, rank=SenderKind.LEAD)
+    kept = PersistedSafety(
+        Hold("mia", NOW - 5, SenderKind.LEAD),
+        (estop,),
+        ("e0",),
+        (FleetPause("p1", "mia", "listen", NOW - 5, SenderKind.LEAD),),
+        ("p0",),
+        Loan("bob", "mia", SenderKind.LEAD, NOW - 5, 60.0),
+    )
     SafetyStateFile(directory, "fleet", "red").save(kept)
     assert SafetyStateFile(directory, "fleet", "red").load(NOW) == kept
     assert SafetyStateFile(directory, "fleet", "blue").load(NOW) == PersistedSafety()
@@ -36,6 +44,27 @@ def test_a_file_of_a_version_without_e_stops_is_read(tmp_path: Path) -> None:
     store = SafetyStateFile(tmp_path, "fleet", "red")
     store.path.write_text('{"hold": {"by": "mia", "since_ns": 7}}')
     assert store.load(NOW) == PersistedSafety(Hold("mia", 7))
+
+
+def test_a_file_of_a_version_without_ranks_is_read(tmp_path: Path) -> None:
+    store = SafetyStateFile(tmp_path, "fleet", "red")
+    estop = {"id": "e1", "by": "mia", "why": "", "at_ns": 7, "fleet_wide": True}
+    store.path.write_text(json.dumps({"hold": {"by": "mia", "since_ns": 7}, "estops": [estop], "ended": ["e0"]}))
+    person = SenderKind.PERSON
+    assert store.load(NOW) == PersistedSafety(
+        Hold("mia", 7, person), (Estop("e1", "mia", "", 7, fleet_wide=True, rank=person),), ("e0",)
+    )
+
+
+def test_a_loan_that_is_over_is_forgotten(tmp_path: Path) -> None:
+    store = SafetyStateFile(tmp_path, "fleet", "red")
+    loan = Loan("bob", "mia", SenderKind.LEAD, NOW, 60.0)
+    store.save(PersistedSafety(loan=loan))
+    assert store.load(NOW + 59_000_000_000).loan == loan
+    assert store.load(NOW + 60_000_000_000).loan is None
+    earlier = store.load(NOW - 1).loan
+    assert earlier is not None
+    assert earlier.left_s(NOW - 1) == 60.0, "a clock that was set back prolongs no loan"
 
 
 def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -> None:
@@ -71,6 +100,10 @@ def test_what_cannot_be_saved_is_said_and_leaves_the_old_state(tmp_path: Path) -
         '{"hold": null, "estops": [3]}',
         '{"hold": null, "estops": [{"id": "e"}]}',
         '{"hold": null, "ended": 3}',
+        '{"hold": {"by": "mia", "since_ns": 3, "rank": "king"}}',
+        '{"hold": null, "pauses": [{"id": "p"}]}',
+        '{"hold": null, "loan": {"to": "bob"}}',
+        '{"hold": null, "loan": {"to": "b", "by": "a", "rank": "lead", "since_ns": 1, "duration_s": "long"}}',
         "[" * 100_000,
         '{"hold": {"by": "mia", "since_ns": ' + "9" * 5000 + "}}",
     ],

@@ -44,6 +44,8 @@ rules:
         (CarSnapshot(), None, False),
         (replace(HERE, held_by="ann"), None, False),
         (replace(HERE, estopped_by="ann"), None, False),
+        (replace(HERE, paused_by="ann"), None, False),
+        (replace(HERE, lent_to="ann"), None, False),
         (replace(HERE, mode="tracking", verdict="contradicted", held_by="ann"), None, False),
         (replace(HERE, driven_by="ann"), None, False),
         (replace(HERE, present=False), None, False),
@@ -92,6 +94,22 @@ def test_a_persons_word_frees_a_role_at_once() -> None:
     run.at(0.0)
     run.change("green", held_by="ann")
     assert run.at(0.1).roles == {"red": "scout"}
+
+
+def test_a_paused_fleet_is_out_of_the_plan_and_goes_on_with_it_after_the_pause() -> None:
+    run = PolicyRun(ONE, "green", "red")
+    before = run.at(0.0).roles
+    for car in run.cars:
+        run.change(car, paused_by="teacher", mode="manual")
+    run.until(30.0)
+    assert run.roles == {}
+    assert run.of("red").why == "red is paused with the whole fleet by teacher"
+    asked = len(run.asked)
+    for car in run.cars:
+        run.change(car, paused_by=None)
+    run.until(32.0)
+    assert run.roles == before
+    assert len(run.asked) == asked + 1
 
 
 def test_the_higher_priority_is_filled_first_and_by_whom_it_costs_least() -> None:

@@ -48,6 +48,8 @@ CHANGES: dict[str, dict[str, Any]] = {
     "link lost": {"link": "lost"},
     "on hold": {"held_by": "ann"},
     "e-stopped": {"estopped_by": "ann"},
+    "paused": {"paused_by": "ann"},
+    "lent": {"lent_to": "ann"},
     "driven": {"driven_by": "bob"},
 }
 

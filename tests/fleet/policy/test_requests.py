@@ -95,7 +95,10 @@ def test_a_command_that_was_on_its_way_does_not_pass_for_rest() -> None:
     assert not run.memory.to_rest
 
 
-@pytest.mark.parametrize("fields", [{"held_by": "bob"}, {"estopped_by": "bob"}, {"driven_by": "bob"}])
+@pytest.mark.parametrize(
+    "fields",
+    [{"held_by": "bob"}, {"estopped_by": "bob"}, {"paused_by": "bob"}, {"lent_to": "bob"}, {"driven_by": "bob"}],
+)
 def test_what_a_person_has_taken_is_left_to_that_person(fields: dict[str, str]) -> None:
     run = started(FLAT, "red")
     ask(run, "stop")

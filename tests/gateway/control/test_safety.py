@@ -1,10 +1,24 @@
 """Hold, e-stops and lease as values; e-stops united among gateways in any order end alike."""
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.commands import Sender, SenderKind
-from gateway.control.safety import MAX_ENDED_ESTOPS, MAX_ESTOPS, Estop, Hold, LeaseState, PersistedSafety, Safety
+from gateway.control.safety import (
+    MAX_ENDED_ESTOPS,
+    MAX_ENDED_PAUSES,
+    MAX_ESTOPS,
+    MAX_PAUSES,
+    Estop,
+    FleetPause,
+    Hold,
+    LeaseState,
+    Loan,
+    PersistedSafety,
+    Safety,
+)
 
 ANN, BOB = Sender("ann", SenderKind.PERSON), Sender("bob", SenderKind.PERSON)
 SCRIPT, PLAN = Sender("ann", SenderKind.SCRIPT), Sender("plan", SenderKind.COORDINATOR)
@@ -103,6 +117,66 @@ def test_gateways_that_see_each_other_agree(steps: list[tuple[int, str, bool]]) 
     assert len({frozenset(each.id for each in car.estops) for car in cars}) == 1
     ended = {each for car in cars for each in car.ended}
     assert not ended & {each.id for car in cars for each in car.estops}
+
+
+@given(st.permutations(range(4)), st.lists(st.tuples(st.integers(0, 3), st.sampled_from("abcd"), st.booleans())))
+def test_gateways_agree_on_pauses_in_whatever_order_they_see_each_other(
+    order: list[int], steps: list[tuple[int, str, bool]]
+) -> None:
+    """A pause of one id may reach them with another time, and its end may reach them first."""
+    cars = [Safety() for _ in order]
+    for number, identity, ends in steps:
+        if ends:
+            cars[number].end_pauses([identity])
+        else:
+            cars[number].pause(FleetPause(identity, "eve", "", number, list(SenderKind)[number]))
+    seen = [(car.pauses, car.ended_pauses) for car in cars]
+    first, last = Safety(), Safety()
+    for number in order:
+        first.merge_pauses(*seen[number])
+    for pauses, ended in reversed([seen[number] for number in order]):
+        last.merge_pauses(pauses, ended)
+    ended_ids = {each for _, ended in seen for each in ended}
+    assert first.pauses == last.pauses
+    assert set(first.ended_pauses) == set(last.ended_pauses) == ended_ids
+    assert {each.id for each in first.pauses} == {each.id for pauses, _ in seen for each in pauses} - ended_ids
+    before = first.persisted
+    for pauses, ended in seen:
+        assert first.merge_pauses(pauses, ended) == ([], [])
+    assert first.persisted == before
+
+
+def test_pauses_are_bounded_and_an_ended_one_stays_ended() -> None:
+    safety = Safety()
+    assert all(safety.pause(FleetPause(str(number), "eve", "", number)) for number in range(MAX_PAUSES))
+    assert not safety.pause(FleetPause("one more", "eve", "", 99))
+    assert len(safety.end_pauses([each.id for each in safety.pauses])) == MAX_PAUSES
+    assert not safety.pause(FleetPause("7", "eve", "", 7))
+    assert safety.end_pauses(["not known yet"]) == []
+    assert not safety.pause(FleetPause("not known yet", "eve", "", 7))
+    safety.end_pauses(str(number) for number in range(1000, 1000 + MAX_ENDED_PAUSES))
+    assert len(safety.ended_pauses) == MAX_ENDED_PAUSES
+
+
+def test_nobody_lowers_the_rank_of_another_ones_e_stop_or_hold() -> None:
+    safety = Safety()
+    lead = Estop("a", "eve", "", 1, fleet_wide=False, rank=SenderKind.LEAD)
+    safety.latch(lead)
+    assert safety.latch(replace(lead, by="bob", rank=SenderKind.PERSON, fleet_wide=True)) == replace(
+        lead, fleet_wide=True
+    )
+    safety.put_on_hold("bob", 2, SenderKind.PERSON)
+    assert safety.hold == Hold("eve", 1, SenderKind.LEAD)
+
+
+def test_a_loan_is_restored_for_the_time_that_is_left() -> None:
+    loan = Loan("bob", "eve", SenderKind.LEAD, 1_000_000_000, 10.0)
+    safety = Safety.restore(PersistedSafety(loan=loan), now=500.0, now_ns=4_000_000_000)
+    assert safety.loan_until == 507.0
+    assert safety.loan_at(506.9) == loan
+    assert safety.loan_at(507.0) is None
+    assert loan.left_s(0) == 10.0, "a clock that was set back prolongs no loan"
+    assert safety.persisted.loan == loan
 
 
 def test_a_lease() -> None:

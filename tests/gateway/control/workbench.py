@@ -5,6 +5,7 @@ from collections.abc import Callable
 from gateway.control.commands import Action, Answer, Command, Phase, Reason, Sender, SenderKind
 from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, FrameOrigin, Level, LogRecord
+from gateway.control.people import NO_PEOPLE, People
 from gateway.control.safety import PersistedSafety
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode
@@ -80,9 +81,13 @@ class ObedientCar:
 class Workbench:
     """Drives a controller exactly as its loop does: it is woken by what it says, and by what happens."""
 
-    def __init__(self, platform: str = "arduino", *, kept: PersistedSafety | None = None) -> None:
+    def __init__(
+        self, platform: str = "arduino", *, kept: PersistedSafety | None = None, people: People = NO_PEOPLE
+    ) -> None:
         self.now = 100.0
-        self.control = Controller("red", parse_platform(platform), persisted=kept)
+        self.control = Controller(
+            "red", parse_platform(platform), persisted=kept, people=people, now=self.now, now_ns=int(self.now * 1e9)
+        )
         self.car = ObedientCar(platform, self.now)
         self.sent: list[tuple[float, bytes, FrameOrigin]] = []
         self.records: list[CommandRecord] = []

@@ -1,0 +1,401 @@
+"""Who may do what: rank by action by state, at the arbiter; and pauses and loans, through control."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from gateway.control.arbiter import CommandContext, refuse
+from gateway.control.commands import (
+    Action,
+    Command,
+    Drive,
+    EmergencyStop,
+    EndLoan,
+    Find,
+    Lend,
+    OneShot,
+    Pause,
+    Phase,
+    Reason,
+    Resume,
+    Sender,
+    SenderKind,
+    SetMode,
+    Stop,
+    TakeLease,
+    Unpause,
+)
+from gateway.control.people import NO_PEOPLE, People
+from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, PersistedSafety
+from gateway.protocol.enums import Mode, Motion
+from gateway.protocol.frames import ColorLed
+from gateway.protocol.platforms import parse_platform
+from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench
+
+LEAD, PERSON, SCRIPT, COORDINATOR = SenderKind
+NOW = 100.0
+PEOPLE = People.parse(["teacher:lead", "ann", "bob", "cid:other"])
+ACTIONS: dict[str, Action] = {
+    "stop": Stop(),
+    "e-stop": EmergencyStop(),
+    "drive": Drive(Motion.FORWARD),
+    "release": Drive(Motion.STOP),
+    "mode": SetMode(Mode.TRACKING),
+    "manual": SetMode(Mode.MANUAL),
+    "led": OneShot(ColorLed(1, 2, 3)),
+    "find": Find(),
+    "lease": TakeLease(),
+    "free": TakeLease(release=True),
+    "resume": Resume(),
+    "resume id": Resume(("e1",)),
+    "resume all": Resume(all=True),
+    "pause": Pause(),
+    "unpause": Unpause(),
+    "lend": Lend("dan", 60.0),
+    "end loan": EndLoan(),
+}
+SENDERS = {
+    "lead": Sender("teacher@lab-1", LEAD),
+    "person": Sender("ann@lab-2", PERSON),
+    "script": Sender("ann@lab-3", SCRIPT),
+    "plan": Sender("plan@lab-4", COORDINATOR),
+    "other": Sender("cid@lab-5", PERSON),
+    "nobody": Sender("dan@lab-6", PERSON),
+}
+"""A lead, a person who drives the car, her script, the coordinator, a person of other cars, one who is not listed."""
+
+
+def names(kind: SenderKind) -> str:
+    """Somebody else of this rank."""
+    return {LEAD: "head", PERSON: "bob", SCRIPT: "bob", COORDINATOR: "plan2"}[kind] + "@lab-9"
+
+
+FREE = CommandContext(
+    car="red",
+    profile=parse_platform("arduino"),
+    now=NOW,
+    link_open=True,
+    link_reason="",
+    answering=True,
+    closing=False,
+    asked=Mode.MANUAL,
+    contradicted=False,
+    hold=None,
+    estops=(),
+    ended=(),
+    lease=None,
+    battery="",
+    fan=False,
+    queued=0,
+    people=PEOPLE,
+)
+ESTOPS: list[tuple[Estop, ...]] = [
+    (),
+    *(
+        (Estop("e1", by, "", 1, wide, rank),)
+        for by, rank, wide in [
+            *((names(kind), kind, False) for kind in SenderKind),
+            ("ann@x", PERSON, False),
+            ("cid@x", PERSON, False),
+            ("eve@x", PERSON, True),
+        ]
+    ),
+]
+HOLDS = [None, *(Hold(names(kind), 1, kind) for kind in SenderKind)]
+PAUSES: list[tuple[FleetPause, ...]] = [(), *((FleetPause("p", names(kind), "", 1, kind),) for kind in SenderKind)]
+LEASES = [None, *(LeaseState(Sender(names(kind), kind), NOW + 1) for kind in SenderKind)]
+LOANS = [None, *(Loan(to, "teacher", LEAD, 1, 60.0) for to in ("ann", "bob", "cid", "dan"))]
+TABLES: dict[str, dict[str, str] | None] = {
+    "no people": None,
+    "no leads": {"teacher": "", "ann": "", "cid": "other"},
+    "leads": {"teacher": "lead", "ann": "", "cid": "other"},
+}
+"""Without leads the person called teacher is one like any other."""
+
+
+def refused(what: Action, sender: Sender, at: CommandContext) -> tuple[Reason | None, str]:
+    return refuse(Command("c", "verb", sender, what), at) or (None, "")
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("who", SENDERS)
+def test_every_rank_every_action_every_state(who: str, table: str) -> None:
+    """Free, leased, held, e-stopped and paused by each rank, lent to oneself and to others, and not in `drives`."""
+    listed = TABLES[table]
+    people = NO_PEOPLE if listed is None else People.parse(":".join(filter(None, each)) for each in listed.items())
+    sender = people.ranked(SENDERS[who])
+    seen: set[Reason | None] = set()
+    for estops, hold, pauses, lease, loan in itertools.product(ESTOPS, HOLDS, PAUSES, LEASES, LOANS):
+        if sum(map(bool, (estops, hold, pauses, lease, loan))) > 3:
+            continue
+        at = replace(
+            FREE, people=people, estops=estops, hold=hold, pauses=pauses, lease=lease, loan=loan, loan_until=NOW + 60
+        )
+        for action, what in ACTIONS.items():
+            reason, words = refused(what, sender, at)
+            assert reason == expected(action, sender, listed, at), (action, sender, at)
+            assert reason in (None, Reason.BAD_VALUE, Reason.LEASED) or words[-1] == "."
+            seen.add(reason)
+    assert seen >= {None, Reason.ESTOPPED, Reason.HELD if who == "plan" else None}
+
+
+def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: CommandContext) -> Reason | None:
+    """The rules once more, from the words of docs/explanation/who-may-drive.md."""
+    person, lead, plan = sender.person, sender.kind is LEAD, sender.kind is COORDINATOR
+    leads = listed is not None and "lead" in listed.values()
+    borrows = at.loan is not None and at.loan.to == person
+    drives = listed is None or listed.get(person) in ("", "lead") or borrows
+    directs = lead or (not leads and sender.kind is PERSON and (listed is None or person in listed))
+    lent = at.loan is not None and not borrows and not lead and not (leads and person == "teacher")
+
+    def is_protected(rank: SenderKind) -> bool:
+        return rank is LEAD and leads and not lead
+
+    if action in ("stop", "e-stop", "free"):
+        return None
+    if action in ("pause", "unpause", "lend") or (action == "end loan" and at.loan is not None and not borrows):
+        if not directs:
+            return Reason.NOT_ALLOWED
+        if action == "lend" and not lead:
+            return Reason.LENT if lent else None if drives else Reason.NOT_ALLOWED
+        return None
+    if action == "end loan":
+        return None
+    if action.startswith("resume"):
+        return resumed(action, sender, listed, at, drives=drives, is_protected=is_protected)
+    if at.estops:
+        return Reason.ESTOPPED
+    if lent:
+        return Reason.LENT
+    if not (drives or plan):
+        return Reason.NOT_ALLOWED
+    if at.pauses and not lead:
+        return Reason.PAUSED
+    if at.hold is not None and (plan or is_protected(at.hold.rank)):
+        return Reason.HELD
+    ranks = [COORDINATOR, SCRIPT, PERSON, LEAD]
+    needs_lease = action in ("drive", "release", "mode", "manual", "lease")
+    if needs_lease and at.lease is not None and ranks.index(at.lease.holder.kind) >= ranks.index(sender.kind):
+        return Reason.LEASED
+    return None
+
+
+def resumed(
+    action: str,
+    sender: Sender,
+    listed: dict[str, str] | None,
+    at: CommandContext,
+    *,
+    drives: bool,
+    is_protected: Callable[[SenderKind], bool],
+) -> Reason | None:
+    if sender.kind is COORDINATOR:
+        return Reason.HELD
+    hold = None if drives else Reason.NOT_ALLOWED
+    if at.hold is not None and is_protected(at.hold.rank):
+        hold = Reason.HELD
+    if action == "resume" or (action == "resume all" and not at.estops):
+        return hold
+    if not at.estops:
+        return Reason.BAD_VALUE
+    (estop,) = at.estops
+    own, fleet = estop.by.startswith(sender.person + "@"), estop.fleet_wide and sender.person in (listed or ())
+    estopped = Reason.ESTOPPED if is_protected(estop.rank) else None if own or fleet or drives else Reason.NOT_ALLOWED
+    if action == "resume all" and at.hold is not None and hold is None:
+        return None
+    return estopped
+
+
+# ---------------------------------------------------------------------- through control
+
+FORWARD = Drive(Motion.FORWARD, 10.0)
+TEACHER, ANN, BOB, CID = (Sender(f"{name}@lab", PERSON) for name in ("teacher", "ann", "bob", "cid"))
+PLAN = Sender("plan@lab", COORDINATOR)
+
+
+@pytest.fixture
+def desk() -> Workbench:
+    return Workbench(people=PEOPLE).ready()
+
+
+def test_a_pause_stops_as_a_stop_does_and_only_a_lead_drives(desk: Workbench) -> None:
+    desk.ask(FORWARD, ANN, identity="d")
+    answer = desk.ask(Pause("listen"), TEACHER, identity="p")
+    assert (answer.status, answer.words) == (Phase.QUEUED, "the pause lasts until `fleet unpause`")
+    assert answer.worst_case_s > 0
+    desk.run(5.0)
+    assert desk.frames == [RUN, *SHOWN_STOP]
+    assert desk.life("p") == [Phase.ASKED, Phase.QUEUED, Phase.SENT, Phase.COMPLETE]
+    assert desk.end("d") == (Phase.SUPERSEDED, Reason.SUPERSEDED)
+    assert desk.control.safety.hold is None
+    for sender in (ANN, Sender("ann@lab", SCRIPT), PLAN):
+        refused = desk.ask(SetMode(Mode.TRACKING), sender)
+        assert refused.reason is Reason.PAUSED
+        assert refused.words == (
+            'red is paused with the whole fleet (teacher@lab: "listen"). A lead ends it with `fleet unpause`.'
+        )
+    assert desk.ask(Unpause(), ANN).words == "ann may not end the pause: only a lead may (teacher)."
+    assert desk.ask(Resume(all=True), ANN).words == (
+        "resumed: was not on hold; still paused by teacher@lab: `fleet unpause`"
+    )
+    assert desk.ask(FORWARD, TEACHER).status is Phase.QUEUED
+    desk.ask(Stop(), ANN)
+    desk.run(5.0)
+    desk.sent.clear()
+    assert desk.ask(Unpause(), TEACHER).words == "the pause has ended"
+    desk.run(5.0)
+    assert desk.frames == []
+    assert desk.ask(Unpause(), TEACHER).words == "was not paused"
+    assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
+    assert [log.code for log in desk.logs] == ["paused", "unpaused", "hold_ended"]
+
+
+def test_a_refused_pause_stops_nothing(desk: Workbench) -> None:
+    desk.ask(FORWARD, ANN)
+    assert desk.ask(Pause(), BOB).reason is Reason.NOT_ALLOWED
+    desk.run(1.0)
+    assert desk.frames == [RUN]
+
+
+def test_without_leads_each_person_may_pause_and_then_nobody_moves() -> None:
+    desk = Workbench().ready()
+    assert desk.ask(Pause(), Sender("bob", SCRIPT)).reason is Reason.NOT_ALLOWED
+    desk.ask(Pause(), BOB)
+    claimed = replace(BOB, kind=LEAD)
+    assert [desk.ask(FORWARD, each).reason for each in (BOB, ANN, claimed)] == [Reason.PAUSED] * 3
+    assert desk.ask(Unpause(), ANN).status is Phase.SENT
+
+
+def test_a_pause_of_a_car_out_of_reach_is_in_force_all_the_same(desk: Workbench) -> None:
+    desk.control.link_down("unplugged", desk.now)
+    answer = desk.ask(Pause(), TEACHER)
+    assert (answer.status, answer.reason) == (Phase.REJECTED, Reason.LINK_DOWN)
+    assert answer.words.startswith("NOT STOPPED: red is unreachable.")
+    desk.control.link_up(desk.now)
+    desk.run(10.0)
+    assert desk.ask(FORWARD, ANN).reason is Reason.PAUSED
+
+
+def test_a_pause_that_another_gateway_shows_stops_this_car_and_an_ended_one_stays_ended(desk: Workbench) -> None:
+    desk.ask(FORWARD, ANN)
+    pause = FleetPause("p1", "teacher@lab", "listen", 7, LEAD)
+    desk.control.merge_pauses([pause], [], "blue", desk.now)
+    desk.run(5.0)
+    assert desk.frames == [RUN, *SHOWN_STOP]
+    assert "paused with the whole fleet by teacher@lab: listen (seen from blue)" in desk.logs[0].words
+    desk.control.merge_pauses([pause], ["p1"], "green", desk.now)
+    assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
+    desk.control.merge_pauses([pause], [], "blue", desk.now)
+    desk.run(1.0)
+    assert desk.frames[-1] == RUN
+    answer = desk.ask(Pause("listen"), TEACHER, identity="p1")
+    assert (answer.status, answer.words) == (Phase.QUEUED, "this pause has ended already, and the car only stops")
+    assert desk.control.safety.pauses == ()
+
+
+def test_what_a_lead_stops_only_a_lead_ends(desk: Workbench) -> None:
+    desk.ask(Stop(), ANN)
+    desk.ask(Stop(), TEACHER)
+    desk.ask(Stop(), ANN)
+    assert desk.control.safety.hold is not None
+    assert desk.control.safety.hold.by == "teacher@lab"
+    words = "red is on hold: teacher@lab stopped it, and only a lead ends what a lead began (teacher)."
+    for what in (FORWARD, Resume(), Resume(all=True), SetMode(Mode.MANUAL)):
+        answer = desk.ask(what, ANN)
+        assert (answer.reason, answer.words) == (Reason.HELD, words)
+    desk.ask(EmergencyStop("wall"), TEACHER, identity="e1")
+    desk.ask(EmergencyStop("door"), ANN, identity="e2")
+    answer = desk.ask(Resume(("e1",)), ANN)
+    assert (answer.reason, answer.words) == (
+        Reason.ESTOPPED,
+        'red stays emergency-stopped: teacher@lab did it: "wall", and only a lead ends what a lead began (teacher).',
+    )
+    some = desk.ask(Resume(all=True), ANN)
+    assert (some.status, some.reason, some.words) == (
+        Phase.SENT,
+        Reason.ESTOPPED,
+        'e-stop released; still emergency-stopped by teacher@lab ("wall"). ann cannot release it',
+    )
+    assert desk.ask(Resume(all=True), TEACHER).words == "e-stop released; resumed: the hold by teacher@lab has ended"
+    desk.run(5.0)
+    desk.ask(Stop(), TEACHER)
+    desk.run(5.0)
+    assert desk.ask(FORWARD, TEACHER).status is Phase.QUEUED
+    assert desk.control.safety.hold is None
+
+
+def test_a_table_without_leads_keeps_no_car_stopped_for_ever() -> None:
+    kept = PersistedSafety(Hold("teacher@lab", 1, LEAD), (Estop("e1", "teacher@lab", "", 1, True, LEAD),))
+    desk = Workbench(kept=kept).ready()
+    assert desk.ask(Resume(all=True), ANN).reason is None
+    assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
+
+
+def test_a_lent_car_is_the_borrowers_until_the_end_which_stops_it(desk: Workbench) -> None:
+    desk.ask(FORWARD, ANN, identity="d")
+    assert desk.ask(Lend("cid", 60.0), TEACHER).words == "lent to cid for 60 s"
+    desk.run(5.0)
+    assert desk.frames == [RUN, *SHOWN_STOP], "lending stops who drives"
+    words = "red is lent to cid for another 55 s. teacher@lab ends that with `fleet lend red --end`."
+    for sender in (ANN, PLAN, Sender("ann@lab", SCRIPT)):
+        answer = desk.ask(FORWARD, sender)
+        assert (answer.reason, answer.words) == (Reason.LENT, words)
+    desk.sent.clear()
+    desk.run(50.0)
+    desk.ask(FORWARD, CID)
+    desk.run(8.0)
+    assert desk.frames[-5:] == [RUN, *SHOWN_STOP]
+    assert desk.control.safety.lease is None
+    assert desk.control.safety.loan is None
+    assert desk.ask(FORWARD, CID).reason is Reason.NOT_ALLOWED
+    assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
+    assert [log.code for log in desk.logs] == ["lent", "loan_ended"]
+
+
+def test_a_loan_that_ends_early_stops_a_mode_of_the_borrower_and_nobody_elses(desk: Workbench) -> None:
+    desk.ask(Lend("cid", 60.0), TEACHER)
+    desk.ask(SetMode(Mode.TRACKING), CID)
+    desk.run(5.0)
+    assert desk.control.asked is Mode.TRACKING
+    assert desk.ask(EndLoan(), ANN).reason is Reason.NOT_ALLOWED
+    assert desk.ask(EndLoan(), CID).words == "the loan to cid has ended"
+    desk.run(5.0)
+    assert desk.control.asked is Mode.MANUAL
+    assert desk.control.model.at_rest
+    desk.ask(Lend("cid", 60.0), TEACHER)
+    desk.ask(FORWARD, TEACHER)
+    desk.sent.clear()
+    assert desk.ask(EndLoan(), TEACHER).status is Phase.SENT
+    desk.run(2.0)
+    assert set(desk.frames) == {RUN}, "the lead drives on"
+    assert desk.ask(EndLoan(), TEACHER).words == "was not lent"
+
+
+def test_a_loan_goes_on_after_a_restart_for_the_time_that_is_left() -> None:
+    loan = Loan("cid", "teacher@lab", LEAD, int(60.0 * 1e9), 100.0)
+    desk = Workbench(kept=PersistedSafety(loan=loan), people=PEOPLE).ready()  # its clock begins at 100 s
+    assert desk.ask(FORWARD, ANN).reason is Reason.LENT
+    desk.run(161.0 - desk.now)
+    assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
+    assert desk.control.safety.persisted.loan is None
+
+
+def test_a_car_that_is_not_theirs_says_whose_word_it_is(desk: Workbench) -> None:
+    assert desk.ask(FORWARD, CID).words == (
+        "cid may not drive red: `people:` in the fleet file gives cid other cars. "
+        "teacher can lend it: `fleet lend red --to cid --for 10m`."
+    )
+    assert desk.ask(FORWARD, Sender("root@lab", PERSON)).words == (
+        "root may watch and stop red, nothing else: `people:` in the fleet file does not list root. "
+        "Say who you are with `--as NAME` or FLEET_AS."
+    )
+    assert desk.ask(Stop(), Sender("root@lab", PERSON)).status is Phase.QUEUED
+    assert desk.records[-1].command.sender.name == "root@lab"
+
+
+@pytest.mark.parametrize("entry", ["", "Ann", "ann:boss", "ann@lab", ":lead", "a" * 33])
+def test_what_is_no_person_is_refused(entry: str) -> None:
+    with pytest.raises(ValueError, match="write NAME, NAME:lead or NAME:other"):
+        People.parse([entry])
