@@ -3,6 +3,7 @@
 import time
 
 from fleet.client.client import Fleet as Client
+from fleet.client.commands import pause_request
 from tests.support.processes import TAKEN, FleetProcesses, driving, wait_for
 
 
@@ -97,3 +98,39 @@ def test_a_stop_with_a_broken_payload_stops(fleet: FleetProcesses) -> None:
     assert "the gateway stops the car in spite of an error: stop: sender 'a/b' is not allowed" in answer["words"]
     wait_for(lambda: not driving(sim), "it stands")
     assert time.monotonic() - began < 8
+
+
+def test_a_lead_pauses_all_cars_by_one_and_lends_one_and_both_outlive_a_gateway(fleet: FleetProcesses) -> None:
+    sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
+    table = ("--person", "teacher:lead", "--person", "ann", "--person", "bob:other")
+    fleet.gateway(red, *table)
+    killed = fleet.gateway(blue, *table, car="blue")
+    with (
+        Client(fleet.endpoint, person="teacher", kind="person") as teacher,
+        Client(fleet.endpoint, person="ann", kind="person") as ann,
+        Client(fleet.endpoint, person="bob", kind="person") as bob,
+    ):
+        for car in ("red", "blue"):
+            fleet.ready(car)
+        assert ann.car("blue").drive("forward", 10.0, wait=False).ok
+        wait_for(lambda: driving(sim, "blue"), "blue drives")
+        assert [outcome.reason for outcome in ann.pause()] == ["not_allowed"] * 2
+        assert teacher.car("red").do(pause_request("listen")).ok
+        wait_for(lambda: not driving(sim, "blue"), "blue has it from red, and stands")
+        wait_for(lambda: fleet.state("safety", "blue").pauses, "blue shows it")
+        assert teacher.lend(["blue"], "bob", 600.0)[0].ok
+        killed.kill()
+        fleet.gateway(blue, *table, car="blue")
+        fleet.ready("blue")
+        refused = bob.car("blue").drive("forward")
+        assert refused.reason == "paused"
+        assert "paused with the whole fleet (teacher@" in refused.words
+        assert teacher.car("blue").drive("forward", 0.2).ok
+        assert [outcome.effect for outcome in teacher.unpause()] == ["the pause has ended"] * 2
+        assert ann.car("blue").drive("forward").reason == "lent"
+        assert bob.car("blue").drive("forward").ok
+        safety = fleet.state("safety", "blue")
+        assert (safety.loan.to, safety.loan.rank, list(safety.pauses)) == ("bob", "lead", [])
+        assert 500 < safety.loan.expires_in_s < 600
+        assert bob.car("blue").end_loan().ok
+        assert bob.car("blue").drive("forward").reason == "not_allowed"

@@ -15,9 +15,12 @@ from gateway.control.commands import (
     Command,
     Drive,
     EmergencyStop,
+    EndLoan,
     Fan,
     Find,
+    Lend,
     OneShot,
+    Pause,
     Phase,
     Reason,
     Resume,
@@ -26,11 +29,13 @@ from gateway.control.commands import (
     SetMode,
     Stop,
     TakeLease,
+    Unpause,
 )
 from gateway.control.controller import Controller
 from gateway.control.estimate.trust import Basis, CarTrust
 from gateway.control.events import CommandRecord, FrameOrigin, OutgoingFrame
-from gateway.control.safety import Estop
+from gateway.control.people import NO_PEOPLE, People
+from gateway.control.safety import Estop, FleetPause
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
@@ -38,6 +43,11 @@ from gateway.protocol.platforms import Platform, parse_platform
 
 PLATFORMS = ("arduino", "stm32", "raspberry_pi", "unknown", "arduino+arm", "raspberry_pi+arm+imu")
 SENDERS = [Sender(f"{kind}-{number}", kind) for kind in SenderKind for number in range(3)]
+TABLES = [
+    NO_PEOPLE,
+    People.parse(["lead-0:lead", "lead-1:lead", "lead-2", "person-0", "script-0", "person-1:other"]),
+    People.parse(["person-0", "script-0", "person-1:other"]),
+]
 MANUAL = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
 PI = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
 READINGS = (
@@ -80,12 +90,16 @@ def anything(moments: random.Random) -> Action:
             return Fan(moments.choice([None, True, False]))
         case 7:
             return moments.choice([Find(), TakeLease(), TakeLease(release=True)])  # type: ignore[return-value]  # joined to object
+        case 11 if moments.random() < 0.5:
+            borrower = moments.choice(SENDERS).name
+            lent = [Lend(borrower, 5.0), Lend(borrower, 1e4)]
+            return moments.choice([Pause(), Unpause(), Unpause(), *lent, EndLoan()])  # type: ignore[return-value]  # joined to object
         case 8:
             return Stop()
         case 9:
             return EmergencyStop(fleet_wide=moments.random() < 0.5) if moments.random() < 0.1 else Drive(Motion.STOP)
         case 10:
-            return Resume(moments.choice([(), ("id7",), ALL]))
+            return moments.choice([Resume(), Resume(("id7",)), Resume(ALL), Resume(all=True)])
         case _:
             return Drive(moments.choice(list(Motion)), moments.choice([0.01, 0.5, 0.5, 2.0, 10.0]))
 
@@ -112,12 +126,18 @@ class Wild:
         self.now = 0.0
         self.writes = 0
         self.stops = 0
-        self.kinds: dict[str, SenderKind] = {}
         self._restart()
 
     def _restart(self) -> None:
         kept = self.control.safety.persisted if hasattr(self, "control") else None
-        self.control = Controller("red", parse_platform(self.moments.choice(PLATFORMS)), persisted=kept)
+        self.control = Controller(
+            "red",
+            parse_platform(self.moments.choice(PLATFORMS)),
+            persisted=kept,
+            people=self.moments.choice(TABLES),
+            now=self.now,
+            now_ns=int(self.now * 1e9),
+        )
         self.decoder = Decoder()
         self.linked = False
         self.ending = False
@@ -150,6 +170,9 @@ class Wild:
             estops = [Estop(f"id{moments.randrange(40)}", "ann", "", 1, moments.random() < 0.9)]
             shown = estops if moments.random() < 0.1 else []
             self.control.merge_estops(shown, [f"id{moments.randrange(40)}"], "blue", self.now)
+            pauses = [FleetPause(f"id{moments.randrange(40)}", "ann", "", 1, moments.choice(list(SenderKind)))]
+            shown_pauses = pauses if moments.random() < 0.1 else []
+            self.control.merge_pauses(shown_pauses, [f"id{moments.randrange(40)}"], "blue", self.now)
         elif chance < 0.9995:
             self.control.record_rejection(self._command(Stop()), Reason.BAD_VALUE, "no", self.now)
         elif chance < 0.9998:
@@ -163,14 +186,13 @@ class Wild:
 
     def _command(self, what: Action) -> Command:
         moments = self.moments
-        if isinstance(what, EmergencyStop):
+        if isinstance(what, EmergencyStop | Pause):
             identity = f"id{moments.randrange(40)}"
         else:
             identity = f"c{moments.randrange(10**9 if moments.random() < 0.9 else 50)}"
         if what == Resume(ALL):
             what = Resume(tuple(estop.id for estop in self.control.safety.estops))
         sender = moments.choice(SENDERS) if moments.random() < 0.95 else Sender(f"s{moments.random()}")
-        self.kinds[identity] = sender.kind
         return Command(
             identity,
             type(what).__name__,
@@ -178,14 +200,15 @@ class Wild:
             what,
             age_s=moments.choice([None, None, 0.0, 0.1, 9.0]),
             take=moments.random() < 0.1,
+            asked_ns=int(self.now * 1e9),
             streamed=isinstance(what, Drive) and moments.random() < 0.5,
         )
 
     def _ask(self, what: Action) -> None:
         answer = self.control.command(self._command(what), self.now)
         assert answer.status in (Phase.SENT, Phase.QUEUED, Phase.REJECTED)
-        # A resume that ends the hold of a car is carried out, and says that the car is emergency-stopped still.
-        half = isinstance(what, Resume) and answer.reason is Reason.ESTOPPED
+        # A resume that ends a part of what stops a car is carried out, and says what stays.
+        half = isinstance(what, Resume) and answer.reason in (Reason.ESTOPPED, Reason.HELD)
         assert half or (answer.reason is not None) == (answer.status is Phase.REJECTED)
         if answer.status is Phase.QUEUED:
             self._owe(what)
@@ -261,17 +284,31 @@ class Wild:
         if write.why in (FrameOrigin.COMMAND, FrameOrigin.REPEAT) and not isinstance(frame, ModeClose):
             stopping = isinstance(frame, General) and frame == General(Motion.STOP)
             assert self.now >= self.free_at - 1e-9 or stopping, "not into a block of ours"
-        self._check_motion(frame)
+        self._check_motion(write)
         self._check_once(frame, write.why)
 
-    def _check_motion(self, frame: Frame) -> None:
+    def _check_motion(self, write: OutgoingFrame) -> None:
         """E-stopped, held or ending, a car is never set going."""
+        frame = write.frame
         if isinstance(frame, ModeOpen) or (isinstance(frame, General) and frame.motion is not Motion.STOP):
             assert not self.control.safety.estops
             assert self.control.safety.hold is None
             assert not self.ending
+            self._check_mover(write)
             # A car that is heard but shows no stop may be driven by whoever sees it; a car of unknown state may not.
             assert self.control.model.known or self.control.model.trust.state is CarTrust.UNPROVEN
+
+    def _check_mover(self, write: OutgoingFrame) -> None:
+        """Paused, a car is set going by a lead only; lent, by the borrower or a lead."""
+        queue, people, safety = self.control._queue, self.control.people, self.control.safety
+        pending = queue.mode_change if isinstance(write.frame, ModeOpen) else queue.held and queue.held.pending
+        assert pending is not None, "nobody moves it"
+        mover, loan = pending.command.sender, safety.loan_at(self.now)
+        if mover.kind is not SenderKind.LEAD:
+            assert not safety.pauses
+            assert loan is None or mover.person == loan.to or mover.person in people.leads
+            borrowed = loan is not None and mover.person == loan.to
+            assert borrowed or mover.kind is SenderKind.COORDINATOR or people.may_drive(mover.person)
 
     def _check_once(self, frame: Frame, why: FrameOrigin) -> None:
         """What acts once is written once for each command that was accepted, and never repeated."""
@@ -297,7 +334,6 @@ class Wild:
             assert size <= SMALL, f"{name} holds {size}"
         for name, size in sizes(self.decoder):
             assert size <= SMALL, f"{name} holds {size}"
-        self.kinds.clear()
 
     def check_stop(self) -> None:
         """From the state that it is in now a stop is all that is written, and it completes; this state itself stays."""
