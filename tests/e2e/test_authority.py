@@ -125,7 +125,7 @@ def test_a_lead_pauses_all_cars_by_one_and_lends_one_and_both_outlive_a_gateway(
         refused = bob.car("blue").drive("forward")
         assert refused.reason == "paused"
         assert "paused with the whole fleet (teacher@" in refused.words
-        assert teacher.car("blue").drive("forward", 0.2).ok
+        assert teacher.car("red").drive("forward", 0.2).ok
         assert [outcome.effect for outcome in teacher.unpause()] == ["the pause has ended"] * 2
         assert ann.car("blue").drive("forward").reason == "lent"
         assert bob.car("blue").drive("forward").ok
