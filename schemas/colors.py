@@ -1,9 +1,10 @@
 """Names of colors, and the reader of `red` and `#ff0000`, for LEDs and for cars in pictures. Pure."""
 
-import difflib
 import re
 from collections.abc import Mapping
 from typing import Final
+
+from schemas.suggestion import did_you_mean
 
 Rgb = tuple[int, int, int]
 """Red, green and blue, 0 to 255 each."""
@@ -23,8 +24,7 @@ def parse_color(text: str) -> Rgb:
     match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", text)
     if match is not None:
         return int(match[1], 16), int(match[2], 16), int(match[3], 16)
-    near = difflib.get_close_matches(text.lower(), COLORS, n=1)
-    hint = f"Did you mean {near[0]}?" if near else f"Choose from: {', '.join(COLORS)}, or write '#ff8000'."
+    hint = did_you_mean(text, COLORS) or f"Choose from: {', '.join(COLORS)}, or write '#ff8000'."
     raise ValueError(f'"{text[:40]}" is not a color. {hint}')
 
 

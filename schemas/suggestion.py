@@ -1,24 +1,64 @@
-"""Words for users that name the likely fix: the name that was meant, and how to install an extra. Pure."""
+"""Words for users that name the likely fix: the name that was meant, and how to install an extra. Pure.
 
-import difflib
+One rule for all: a name is near if few letters differ, or if the word begins it, or begins a part of it. A name that is
+only somewhat like the word is never suggested: who types `parking` does not mean `tracking`.
+"""
+
+import re
 from collections.abc import Iterable
 from typing import Final
 
+_LETTERS_PER_FAULT: Final = 3
+"""Letters of a word for each letter that may be wrong, missing, too much or swapped; one always may."""
 _MIN_PART_LENGTH: Final = 3
-"""Minimum length of a word that is searched within names."""
+"""Minimum length of a word that is searched at the beginning of the parts of names."""
+_NO_WORD: Final = re.compile(r"[^a-z0-9]+")
+
+
+def misspelled(wrong: str, names: Iterable[str]) -> list[str]:
+    """Return the names from which only few letters of the word differ, the nearest first."""
+    word = wrong.lower()
+    allowed = min(max(1, len(word) // _LETTERS_PER_FAULT), len(word) - 1)
+    found = [(_faults(word, name.lower()), name) for name in names if abs(len(name) - len(word)) <= allowed]
+    return [name for faults, name in sorted(found, key=lambda each: each[0]) if faults <= allowed]
+
+
+def near_names(wrong: str, names: Iterable[str]) -> list[str]:
+    """Return the names that are likely meant, the likeliest first."""
+    known, word = list(names), wrong.lower()
+    begun = [name for name in known if len(word) > 1 and name.lower().startswith(word)]
+    part = [name for name in known if len(word) >= _MIN_PART_LENGTH and _begins_part(word, name.lower())]
+    longer = [name for name in known if name.lower() == _NO_WORD.split(word)[0]]
+    return list(dict.fromkeys([*misspelled(wrong, known), *begun, *part, *longer]))
+
+
+def _begins_part(word: str, name: str) -> bool:
+    return any(part.startswith(word) for part in _NO_WORD.split(name))
+
+
+def _faults(word: str, name: str) -> int:
+    """Return how many letters are wrong, missing, too much, or swapped with the next one."""
+    rows = [list(range(len(name) + 1))]
+    for at, letter in enumerate(word, 1):
+        row = [at]
+        for to, other in enumerate(name, 1):
+            best = min(rows[-1][to] + 1, row[-1] + 1, rows[-1][to - 1] + (letter != other))
+            if at > 1 and to > 1 and (letter, word[at - 2]) == (name[to - 2], other):
+                best = min(best, rows[-2][to - 2] + 1)
+            row.append(best)
+        rows.append(row)
+    return rows[-1][-1]
 
 
 def nearest(wrong: str, names: Iterable[str]) -> str | None:
-    """Return the name that is like `wrong`, or else the first that contains it. None if there is none."""
-    known, lower = list(names), wrong.lower()
-    containing = [name for name in known if lower in name] if len(lower) >= _MIN_PART_LENGTH else []
-    return next(iter([*difflib.get_close_matches(lower, known, n=1), *containing]), None)
+    """Return the name that is likely meant. None if there is none."""
+    return next(iter(near_names(wrong, names)), None)
 
 
-def did_you_mean(wrong: str, names: Iterable[str]) -> str:
-    """Return a question with the likely name. Empty if no name is near."""
-    near = nearest(wrong, names)
-    return f"Did you mean {near}?" if near else ""
+def did_you_mean(wrong: str, names: Iterable[str], count: int = 1) -> str:
+    """Return a question with the likely names, at most `count`. Empty if no name is near."""
+    near = near_names(wrong, names)[:count]
+    return f"Did you mean {' or '.join(near)}?" if near else ""
 
 
 def how_to_install(extra: str) -> str:

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from enum import StrEnum
 from typing import Final, Self
 
 from fleet.client.effects import NEXT_STEPS, STOP_VERBS, describe, with_code
+from schemas.suggestion import did_you_mean
 
 QUEUED: Final = "queued"
 SENT: Final = "sent"
@@ -178,9 +178,8 @@ class Progress:
 
     def on_missing(self, present: Sequence[str], at: float) -> None:
         """Give up: the car has no token."""
-        near = get_close_matches(self.car, present, n=1)
         there = f"Connected: {', '.join(present)}." if present else "No car is connected."
-        words = f'No car named "{self.car}". {f"Did you mean {near[0]}? " if near else ""}{there}'
+        words = f'No car named "{self.car}". {" ".join(filter(None, (did_you_mean(self.car, present), there)))}'
         if self._verb in STOP_VERBS:
             words = f"NOT STOPPED: {words} If it moves, go to the car."
         self._end(NO_ANSWER, "", words, at, ok=False)

@@ -3,7 +3,6 @@
 import json
 import time
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import Final
 
 import click
@@ -13,6 +12,7 @@ from fleet.commands.options import not_running
 from fleet.supervisor.car_status import CarStatus, describe_missing, describe_start
 from schemas import keys
 from schemas.bus import Bus, BusError, messages_of
+from schemas.suggestion import nearest
 from schemas.topics import Qos
 
 READY_WAIT_S: Final = 30.0
@@ -75,5 +75,5 @@ def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
 
 
 def _unknown(car: str, known: Sequence[str]) -> str:
-    near = get_close_matches(car, known, 1)
-    return f"no such car{f', did you mean {near[0]}?' if near else ''}"
+    near = nearest(car, known)
+    return f"no such car{f', did you mean {near}?' if near else ''}"

@@ -5,7 +5,6 @@ comparison: < <= > >= between numbers, == and != between two numbers, two words 
 words:      in quotes, 'low' or "low", and nothing is escaped in them
 """
 
-import difflib
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,6 +27,7 @@ from fleet.conditions.expression import (
     join_nodes,
     kind_of,
 )
+from schemas.suggestion import near_names
 
 MAX_CONDITION_LENGTH: Final = 1000
 """Maximum characters of a condition, as typed and as normalized."""
@@ -246,7 +246,7 @@ class _Parser:
         parts = [name for name in fitting if text in name.split(".")]
         words = [*fitting, *(() if expected not in (None, ValueKind.TRUTH) else _KEYWORDS)]
         aliases = [alias for alias, name in self._aliases.items() if name in fitting]
-        near = [*parts, *difflib.get_close_matches(text, words, n=2)] or difflib.get_close_matches(text, aliases, n=2)
+        near = [*parts, *near_names(text, words)] or near_names(text, aliases)
         return list(dict.fromkeys(near))[:2]
 
     def _fitting_names(self) -> list[str]:

@@ -3,7 +3,6 @@
 Every number cites its row of docs/reference/protocol.md. The times are in `timing` and `modes`.
 """
 
-import difflib
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -15,6 +14,7 @@ from gateway.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose,
 from gateway.protocol.modes import EVERY_MEASUREMENT, MODES, SILENT_MODES
 from gateway.protocol.sensor_fields import ATTRIBUTES
 from gateway.protocol.timing import RASPBERRY_PI_FAN_S, block_s
+from schemas.suggestion import did_you_mean
 
 
 class Platform(StrEnum):
@@ -260,8 +260,7 @@ def parse_platform(text: str) -> Profile:
     """Return the profile of a platform such as `arduino` or `raspberry_pi+arm+imu` in any case; raise ValueError."""
     kind, *options = text.lower().split("+")
     if kind not in set(Platform):
-        near = difflib.get_close_matches(kind, Platform, n=1, cutoff=0.7)
-        hint = f"Did you mean {near[0]}?" if near else f"There are {', '.join(Platform)}."
+        hint = did_you_mean(kind, Platform) or f"There are {', '.join(Platform)}."
         raise ValueError(f'Unknown platform "{kind[:40]}". {hint}')
     for option in options:
         if option not in OPTIONS:

@@ -3,9 +3,10 @@
 The allowed values come from the model's JSON schema, which knows all members of a union. document.py adds the place.
 """
 
-import difflib
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final
+
+from schemas.suggestion import did_you_mean
 
 _BOUNDS: Final = {
     "exclusiveMinimum": "more than",
@@ -54,9 +55,8 @@ def format_place(where: Where, tree: object = None) -> str:
 def suggest(word: str, allowed: Iterable[str]) -> str:
     """Return `Did you mean red?`, or the allowed words if none of them is close."""
     words = list(allowed)
-    lower = word.lower()
-    if near := difflib.get_close_matches(lower, words, n=1) or [each for each in words if each.startswith(lower)]:
-        return f"Did you mean {near[0]}?"
+    if near := did_you_mean(word, words):
+        return near
     return f"There {'are' if len(words) > 1 else 'is only' if words else 'is'} {list_words(words)}."
 
 

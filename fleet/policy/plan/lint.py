@@ -6,7 +6,6 @@ against cars of any platform.
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from enum import StrEnum
 from typing import Final
 
@@ -17,12 +16,11 @@ from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan,
 from fleet.policy.plan.reachability import ModeReachability, Outlook, can_be_true, list_unmeasured
 from fleet.policy.snapshot import CarSnapshot, topic_of
 from gateway.protocol.enums import Mode
+from schemas.suggestion import misspelled
 from schemas.yaml_document.document import BadFile, Problem
 from schemas.yaml_document.messages import suggest
 
 _WORDS_FOR_CARS: Final = (THIS_CAR, OTHER_CARS, ALL_CARS)
-_NEAR_MISS: Final = 0.8
-"""Minimum likeness of a name to one of these words that is taken for a misspelling of it."""
 
 
 class Severity(StrEnum):
@@ -133,7 +131,7 @@ class _Check:
                 words = [*_WORDS_FOR_CARS, *sorted(self._known)] if car in targets else sorted(self._known)
                 yield PlanFault(Severity.ERROR, f"car {car}", f"the fleet file has no such car. {suggest(car, words)}")
             elif self._known is None and car in targets:
-                for word in get_close_matches(car, _WORDS_FOR_CARS, 1, _NEAR_MISS):
+                for word in misspelled(car, _WORDS_FOR_CARS)[:1]:
                     wrong = f"it seems to be misspelled. Did you mean {word}?"
                     yield PlanFault(Severity.ERROR, f"car {car}", wrong)
 

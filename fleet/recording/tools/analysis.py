@@ -1,6 +1,5 @@
 """Tables of a session for pyarrow and pandas, which are imported only then: conversion, and joins by car and time."""
 
-import difflib
 import math
 import warnings
 from bisect import bisect_right
@@ -13,6 +12,7 @@ from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import
 from fleet.recording.tools.tables import Layout
 from schemas import messages, topics
 from schemas.commands import COMMANDS
+from schemas.suggestion import did_you_mean
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,8 +56,7 @@ def _empty_table(of: str, session: str) -> "pa.Table":
     known |= {name.rpartition(".")[2]: name for name in known.values()}
     if of in known:
         return ArrowSink(Layout(messages.message_class(known[of]).DESCRIPTOR).columns).table()
-    near = difflib.get_close_matches(of, known, n=2)
-    raise NoTable(f"{session} has no messages of {of}." + (f" Did you mean {' or '.join(near)}?" if near else ""))
+    raise NoTable(f"{session} has no messages of {of}. {did_you_mean(of, known, 2)}".rstrip())
 
 
 def data_frame(table: "pa.Table") -> "pd.DataFrame":
