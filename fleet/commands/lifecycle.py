@@ -115,7 +115,13 @@ def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> Any:
     return received[-1] if received else None
 
 
-@click.command(epilog="\b\nexample:\n  fleet reload")
+@click.command(
+    epilog="""\b
+example:
+  fleet reload
+
+Exit codes: 0 every change is in force, 1 some need a restart of the fleet, 2 the file is wrong and nothing changed."""
+)
 @json_option
 @bus_options
 def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
@@ -128,8 +134,8 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     if as_json:
         click.echo(messages.to_json(answer))
     else:
-        click.echo(answer.words, err=answer.status == "rejected")
-    raise SystemExit(2 if answer.status == "rejected" else 0)
+        click.echo(answer.words, err=answer.status != "sent")
+    raise SystemExit({"rejected": 2, "failed": 1}.get(answer.status, 0))
 
 
 def _complete_logs(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:

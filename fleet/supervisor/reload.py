@@ -27,16 +27,15 @@ class SpecChange:
     restarted: tuple[str, ...]
     """Cars whose gateway is started or restarted."""
     words: tuple[str, ...]
-    """One line for each change, and for each that needs a restart of the fleet."""
+    """One line for each change."""
+    needs_restart: tuple[str, ...] = ()
+    """What cannot change while the fleet runs, in words."""
 
 
 def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
     """Return the changes from `old` to `new`."""
-    words = [
-        f"{what} cannot change while the fleet runs. Restart it: `fleet down`, `fleet up`."
-        for name, what in _FIXED_PROPERTIES.items()
-        if getattr(old, name) != getattr(new, name)
-    ]
+    words = []
+    needs_restart = [what for name, what in _FIXED_PROPERTIES.items() if getattr(old, name) != getattr(new, name)]
     cars: dict[str, CarProcessSpec] = {}
     restarted = []
     for name, car in new.cars.items():
@@ -44,9 +43,7 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         if car == before:
             cars[name] = car
         elif SIMULATED in (car.link, before.link if before else "") and not _is_same_simulated(before, car):
-            words.append(
-                f"{name}, a simulated car, cannot change while the fleet runs. Restart it: `fleet down`, `fleet up`."
-            )
+            needs_restart.append(f"{name} (a simulated car)")
             if before is not None:
                 cars[name] = before
         else:
@@ -73,7 +70,7 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         listed=listed,
         warnings=new.warnings,
     )
-    return SpecChange(spec, removed, tuple(restarted), tuple(words))
+    return SpecChange(spec, removed, tuple(restarted), tuple(words), tuple(needs_restart))
 
 
 def _is_same_simulated(before: CarProcessSpec | None, now: CarProcessSpec) -> bool:

@@ -52,9 +52,13 @@ class ReloadRefused(Exception):
     """A command cannot be carried out. The text gives the reason and says that nothing has changed."""
 
 
+class RestartNeeded(Exception):
+    """A part of a reload needs a restart of the fleet; the rest is done. The text names both."""
+
+
 _log: Final = logging.getLogger(__name__)
 Service = Callable[[str], Awaitable[str]]
-"""Carries out a command of the given sender and returns words for the reply. Raises ReloadRefused."""
+"""Carries out a command of the given sender and returns words for the reply. Raises ReloadRefused, RestartNeeded."""
 
 
 class SupervisorService:
@@ -152,6 +156,8 @@ class SupervisorService:
             result.words = await services[verb](command.sender or "anonymous")
         except (ReloadRefused, messages.BadPayload) as error:
             result.status, result.reason, result.words = "rejected", "bad_value", str(error)
+        except RestartNeeded as error:
+            result.status, result.words = "failed", str(error)
         except Exception as error:  # noqa: BLE001 - reply to every query, whatever the error
             result.status, result.words = "rejected", f"internal error: {type(error).__name__}: {error}"
             _log.exception("%s went wrong", verb)

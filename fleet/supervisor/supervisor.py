@@ -22,7 +22,7 @@ from fleet.supervisor.child import Log, new_run, remove_links, write_copy
 from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import compare
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, RunState
-from fleet.supervisor.service import ReloadRefused, SupervisorService
+from fleet.supervisor.service import ReloadRefused, RestartNeeded, SupervisorService
 from fleet.supervisor.shutdown import NOT_TRIED, GatewayShutdown
 from fleet.supervisor.spec import (
     COORDINATOR,
@@ -525,7 +525,10 @@ class Supervisor:
         return "stopping every car, then closing the recording"
 
     async def _reload(self, sender: str) -> str:
-        """Read the spec again and apply it as far as possible. Return words about changes. Raises ReloadRefused."""
+        """Read the spec again and apply it as far as possible. Return words about changes.
+
+        Raises ReloadRefused if nothing was changed, RestartNeeded if only a part was.
+        """
         async with self._reloading:
             return await self._reload_alone(sender)
 
@@ -559,8 +562,14 @@ class Supervisor:
         assert self._service is not None  # the command came through it
         if planned := await self._set_plan(self._service, old, command):
             words.append(planned)
+        if found.needs_restart:
+            words.append(f"cannot change while the fleet runs: {', '.join(found.needs_restart)}")
         for line in words:
             self._say("process", SELF, f"reload by {sender}: {line}")
+        if found.needs_restart:
+            raise RestartNeeded(
+                "\n".join([*words, *found.spec.warnings, "Restart the fleet: `fleet down`, `fleet up`."])
+            )
         return "\n".join([*(words or ["nothing has changed"]), *found.spec.warnings])
 
     def _say(self, what: str, name: str, words: str) -> None:

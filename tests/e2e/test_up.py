@@ -420,10 +420,13 @@ def test_reload_does_what_can_be_done_and_a_bad_file_changes_nothing(fleet: Flee
 
         file.write_text(_text(red=red, blue=blue).replace("cars:", "name: lab\ncars:"))
         done = started.fleet("reload")
-        assert done.returncode == 0, done.stderr
-        assert "the fleet's name cannot change while the fleet runs" in done.stdout
-        assert "blue is added" in done.stdout
-        assert "green is removed" in done.stdout
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr.splitlines() == [
+            "blue is added",
+            "green is removed",
+            "cannot change while the fleet runs: the fleet's name",
+            "Restart the fleet: `fleet down`, `fleet up`.",
+        ]
         started.ready("blue")
         wait_for(lambda: started.state("green") is None, "green's gateway has ended")
         assert started.running("red") == before["red"]

@@ -162,12 +162,12 @@ def test_a_gateway_of_a_simulated_car_restarts_with_other_people() -> None:
         (replace(OLD, world=Path("w")), "the world"),
         (replace(OLD, recordings=Path("r")), "where recordings go"),
         (replace(OLD, record=False), "whether it records"),
-        (replace(OLD, cars={**OLD.cars, "two": CarProcessSpec("two", SIMULATED)}), "two, a simulated car,"),
-        (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", SIMULATED, "stm32")}), "sim, a simulated car,"),
-        (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", "/dev/sim")}), "sim, a simulated car,"),
+        (replace(OLD, cars={**OLD.cars, "two": CarProcessSpec("two", SIMULATED)}), "two (a simulated car)"),
+        (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", SIMULATED, "stm32")}), "sim (a simulated car)"),
+        (replace(OLD, cars={**OLD.cars, "sim": CarProcessSpec("sim", "/dev/sim")}), "sim (a simulated car)"),
     ],
 )
 def test_what_the_processes_are_bound_to_stays_and_is_said(new: FleetSpec, words: str) -> None:
     found = compare(OLD, new)
     assert found.spec == OLD
-    assert found.words == (f"{words} cannot change while the fleet runs. Restart it: `fleet down`, `fleet up`.",)
+    assert (found.words, found.needs_restart) == ((), (words,))
