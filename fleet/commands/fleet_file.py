@@ -80,7 +80,7 @@ def schema_text(kind: str) -> str:
     epilog="""\b
 examples:
   fleet init
-  fleet init --sim 3         simulated cars, and a first plan for them
+  fleet init --sim 3         # simulated cars, and a first plan for them
   fleet init --yes --out lab.yaml
   fleet init --link /dev/ttyUSB0 --link tcp://192.168.1.7:8888"""
 )

@@ -29,7 +29,7 @@ _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.comma
     epilog="""\b
 examples:
   fleet why red
-  fleet why              every car, role and phase
+  fleet why              # every car, role and phase
   fleet why patrol --json"""
 )
 @click.argument("subjects", nargs=-1, metavar="[CAR|ROLE|phase]...", shell_complete=complete_car)
@@ -106,9 +106,9 @@ _FIRST: Final = ("set", "show")
     cls=_PlanGroup,
     epilog="""\b
 examples:
-  fleet up --plan plan.yaml       run a plan with a fleet
-  fleet plan set other.yaml       change it while it runs
-  fleet plan stop                 let go of all cars
+  fleet up --plan plan.yaml       # run a plan with a fleet
+  fleet plan set other.yaml       # change it while it runs
+  fleet plan stop                 # let go of all cars
 
 `fleet check plan.yaml` looks for mistakes.""",
 )

@@ -55,7 +55,7 @@ _FILE: Final = click.Path(path_type=Path, dir_okay=False)
     default_command="run",
     epilog="""\b
 examples:
-  fleet record                  record until Ctrl-C, as `fleet record run`
+  fleet record                  # record until Ctrl-C, as `fleet record run`
   fleet record --quota 20GB
   fleet record status
   fleet mark "the blue one lost the line"

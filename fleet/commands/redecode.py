@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 examples:
   fleet sessions redecode
   fleet sessions redecode tests/vectors/recorded/tracking.jsonl
+
 Exit codes: 0 no difference, 1 some, or nothing to decode."""
 )
 @session_argument

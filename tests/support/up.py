@@ -22,7 +22,8 @@ from tests.support.processes import GatewayProcess, wait_for
 
 def fleet_command(*arguments: str, environment: dict[str, str]) -> "subprocess.CompletedProcess[str]":
     """Run `fleet` from its entry point on, in this process: a new one takes half a second of a processor."""
-    stdout, stderr = io.StringIO(), io.StringIO()
+    # With a buffer of bytes below, as a real stdout: tables are written as bytes.
+    stdout, stderr = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True), io.StringIO()
     with (
         pytest.MonkeyPatch.context() as patched,
         contextlib.redirect_stdout(stdout),
@@ -37,7 +38,8 @@ def fleet_command(*arguments: str, environment: dict[str, str]) -> "subprocess.C
         except SystemExit as ended:
             code = ended.code
     assert code is None or isinstance(code, int), code
-    return subprocess.CompletedProcess(arguments, code or 0, stdout.getvalue(), stderr.getvalue())
+    stdout.seek(0)
+    return subprocess.CompletedProcess(arguments, code or 0, stdout.read(), stderr.getvalue())
 
 
 class Up:
