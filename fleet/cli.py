@@ -10,7 +10,7 @@ from typing import Final
 
 import click
 
-from fleet.commands.group import CommandGroup, connect_option, fleet_option
+from fleet.commands.group import CommandGroup, as_option, connect_option, fleet_option
 from schemas.process import startup, stdio
 from schemas.suggestion import how_to_install
 
@@ -59,6 +59,9 @@ COMMANDS: Final = {
             "Emergency stop: cars refuse everything until `resume --estops`.",
         ),
         "resume": ("fleet.commands.drive:resume", "Let the plan use stopped cars again."),
+        "pause": ("fleet.commands.people:pause", "Stop all cars; nobody but a lead moves one until `unpause`."),
+        "unpause": ("fleet.commands.people:unpause", "End the pause. No car moves by it."),
+        "lend": ("fleet.commands.people:lend", "Lend cars to a person for a time."),
         "identify": ("fleet.commands.actuators:identify", "Blink and beep, without moving."),
     },
     "Lights and parts": {
@@ -149,6 +152,7 @@ Exit codes: 0 carried out, 1 not carried out, 2 wrong use, 130 Ctrl-C.""",
 )
 @connect_option("The bus of the fleet. Also accepted after the command.")
 @fleet_option()
+@as_option()
 def cli(connect: str | None, fleet: str) -> None:
     """Drive, watch and record small robot cars."""
 

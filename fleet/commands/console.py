@@ -14,7 +14,7 @@ import click
 
 from fleet.aio import Fleet
 from fleet.client.client import default_sender
-from fleet.commands.group import DefaultCommandGroup, connect_option, fleet_option
+from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option
 from fleet.commands.options import bus_options, cli_errors, json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number
@@ -100,7 +100,7 @@ def serve_console(*, port: int, opens: bool, on_lan: bool, lan_port: int, connec
                 webbrowser.open(address)
 
         async def run() -> Any:
-            async with Fleet(connect, fleet, kind="person") as client:
+            async with Fleet(connect, fleet, kind="person", person=chosen_person()) as client:
                 await serve(client, listener, on_ready, lan)
 
         try:
@@ -225,7 +225,7 @@ def _show_code(people: PeopleFile, address: str, person: PagePerson) -> None:
 
 
 def _own_name() -> str:
-    name = default_sender().partition("@")[0].lower()
+    name = default_sender(chosen_person()).partition("@")[0].lower()
     return name if keys.is_name(name) else "me"
 
 

@@ -7,10 +7,10 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.client.commands import MAX_DRIVE_S, drive_request, estop_request, mode_request, resume_request, stop_request
-from fleet.client.outcome import Outcome
 from fleet.commands.options import (
     carry_out,
     end_with,
+    end_with_any,
     json_option,
     print_outcomes,
     take_option,
@@ -88,7 +88,7 @@ def stop(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
 
     `fleet estop` also makes cars refuse every command. `fleet mode CAR manual` stops without a hold.
     """
-    _end_with_any(client.ask(stop_request(), _named(client, cars)), as_json=as_json)
+    end_with_any(client.ask(stop_request(), _named(client, cars)), as_json=as_json)
 
 
 @click.command(
@@ -108,7 +108,7 @@ def estop(client: Fleet, cars: tuple[str, ...], why: str, *, as_json: bool) -> N
     """
     named = _named(client, cars)
     request = estop_request(why, "fleet" if named is None else "car")
-    _end_with_any(client.ask(request, named), as_json=as_json)
+    end_with_any(client.ask(request, named), as_json=as_json)
 
 
 @click.command(
@@ -117,6 +117,7 @@ examples:
   fleet resume
   fleet resume red
   fleet resume red --estops
+  fleet resume --all
   fleet resume red blue --id 5f0c2e"""
 )
 @any_cars_argument
@@ -128,16 +129,25 @@ examples:
     help="Release this emergency stop (the beginning of its id is enough); may be repeated.",
 )
 @click.option("--estops", is_flag=True, help="Release every emergency stop of these cars. They stay on hold.")
+@click.option(
+    "--all", "everything", is_flag=True, help="End the hold and every emergency stop that you may end. Say what stays."
+)
 @json_option
 @with_client
-def resume(client: Fleet, cars: tuple[str, ...], ids: tuple[str, ...], *, estops: bool, as_json: bool) -> None:
+def resume(
+    client: Fleet, cars: tuple[str, ...], ids: tuple[str, ...], *, estops: bool, everything: bool, as_json: bool
+) -> None:
     """Let the plan use stopped cars again (no name: all cars).
 
     --estops also releases emergency stops. The cars stay stopped and wait for a second `resume`. An emergency stop of
-    the whole fleet ends on every car when it ends on one.
+    the whole fleet ends on every car when it ends on one. What a lead stopped, only a lead ends.
     """
     if estops and ids:
         raise click.UsageError("--estops releases every emergency stop: leave --id out")
+    if everything and (estops or ids):
+        raise click.UsageError("--all ends everything: leave --estops and --id out")
+    if everything:
+        end_with_any(client.resume(_named(client, cars), everything=True), as_json=as_json)
     named = resolve_cars(client, cars or [ALL_CARS])
     if not estops and not ids:
         carry_out(client, resume_request(), named, as_json=as_json)
@@ -169,9 +179,3 @@ def _complete_id(car: str, prefix: str, in_force: list[str]) -> str:
 def _named(client: Fleet, cars: tuple[str, ...]) -> list[str] | None:
     """Return the cars. None for all: one query reaches them at once, also cars that have just connected."""
     return resolve_cars(client, cars) if cars and ALL_CARS not in cars else None
-
-
-def _end_with_any(outcomes: list[Outcome], *, as_json: bool) -> None:
-    if not outcomes:
-        raise click.ClickException("No car is connected.")
-    end_with(outcomes, as_json=as_json)

@@ -2,13 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
 from click.core import ParameterSource
 
-from schemas.keys import DEFAULT_FLEET
+from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.suggestion import did_you_mean
+
+PERSON: Final = "fleet.person"
+"""Key of the value of --as in the context."""
 
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -64,3 +67,29 @@ def fleet_option(default: str | None = DEFAULT_FLEET) -> _Decorator:
     """Return the option --fleet. Without a default the fleet file has the name."""
     words = "Name of the fleet." if default else f"Name of the fleet (default: the file's, or {DEFAULT_FLEET})."
     return click.option("--fleet", metavar="NAME", default=default, show_default=True, callback=_from_group, help=words)
+
+
+def as_option(complete: Callable[..., list[str]] | None = None) -> _Decorator:
+    """Return the option --as. `chosen_person` has its value, before the command and after it."""
+    return click.option(
+        "--as",
+        metavar="PERSON",
+        expose_value=False,
+        callback=_choose_person,
+        shell_complete=complete,
+        help="Who you are: a person of the fleet file (default: FLEET_AS, or your login).",
+    )
+
+
+def _choose_person(ctx: click.Context, _: click.Parameter, value: str | None) -> None:
+    if value is not None:
+        try:
+            ctx.meta[PERSON] = check_name(value, "person")
+        except BadKey as error:
+            raise click.UsageError(str(error), ctx) from None
+
+
+def chosen_person() -> str | None:
+    """Return the value of --as. None if it was not given."""
+    person: str | None = click.get_current_context().meta.get(PERSON)
+    return person

@@ -11,10 +11,11 @@ from typing import IO, Any, Final
 
 import click
 
-from fleet.client.client import Fleet, default_sender
+from fleet.client.client import default_sender
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
+from fleet.commands.group import chosen_person
 from fleet.commands.observe import show_cars
-from fleet.commands.options import bus_options, json_option, not_running
+from fleet.commands.options import bus_options, json_option, not_running, open_client
 from fleet.supervisor.child import parse_log_line, runs_directory
 from fleet.supervisor.service import ask_service
 from fleet.supervisor.shutdown import NOT_STOPPED
@@ -56,7 +57,7 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
             for process in each.processes:
                 click.echo(_describe_process(process))
             continue
-        with Fleet(connect, fleet, kind="person") as client:
+        with open_client(connect, fleet) as client:
             show_cars(client)
         for name, why in each.missing.items():
             click.echo(f"not ready: {name.lstrip('@')} ({why})")
@@ -79,7 +80,8 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
     with Bus.open(connect) as bus:
         received: list[Any] = []
         bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.extend(messages_of([sample])))
-        if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", default_sender())) is None:
+        sender = default_sender(chosen_person())
+        if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", sender)) is None:
             raise not_running(fleet)
         if answer.status == "rejected":
             raise click.ClickException(answer.words)
@@ -128,7 +130,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Read the fleet file again and apply changes of cars and plan. Says which changes need a restart."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        answer = ask_service(bus, fleet, "reload", default_sender())
+        answer = ask_service(bus, fleet, "reload", default_sender(chosen_person()))
         if answer is None:
             raise not_running(fleet)
     if as_json:

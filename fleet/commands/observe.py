@@ -14,7 +14,7 @@ from fleet.client.condition import KeyCondition, check_key, topics_under
 from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
 from fleet.client.reading import Reading, Watch
 from fleet.client.wait import NotInTime
-from fleet.commands.options import bus_options, json_option, with_client
+from fleet.commands.options import bus_options, json_option, open_client, with_client
 from fleet.commands.output import json_text, line, show_table
 from fleet.commands.params import (
     Duration,
@@ -109,6 +109,8 @@ def row_of(car: str, readings: Mapping[str, Reading]) -> dict[str, Any]:
         "driver": safety.lease.holder if safety and safety.HasField("lease") else None,
         "driver_kind": safety.lease.kind if safety and safety.HasField("lease") else None,
         "hold": safety.hold.by if safety and safety.HasField("hold") else None,
+        "paused": safety.pauses[-1].by if safety and safety.pauses else None,
+        "lent": safety.loan.to if safety and safety.HasField("loan") else None,
         "estops": [estop.id for estop in safety.estops] if safety else [],
         "motors": safety.motors if safety else None,
         "battery_v": battery.voltage_v if battery else None,
@@ -132,8 +134,10 @@ def shown(name: str, row: Mapping[str, Any]) -> str:
             return "-"
         age = f", {row['battery_age_s']:.0f} s old" if "sensor/battery" in row["stale"] else ""
         return f"{row['battery_v']:.2f} V {row['battery_level']}{age}"
-    if name == "hold" and row["estops"]:
-        return f"e-stop {' '.join(row['estops'])}"
+    if name == "hold":
+        hold = f"e-stop {' '.join(row['estops'])}" if row["estops"] else row["hold"]
+        paused, lent = row["paused"], row["lent"]
+        return ", ".join(filter(None, (hold, paused and f"paused by {paused}", lent and f"lent to {lent}"))) or "-"
     if name == "driver" and row["driver"]:
         return f"{row['driver']} ({row['driver_kind']})"
     if name == "platform" and row["platform_contradictions"]:
@@ -180,7 +184,7 @@ def get(
     why_not = history.describe_missing_history(under) if past else ""
     if why_not:
         raise click.UsageError(why_not)
-    with Fleet(connect, fleet, kind="person") as client:
+    with open_client(connect, fleet) as client:
         readings = client.history(keyexpr, last=last, since_s=since) if past else client.get(keyexpr)
         if not readings:
             within = f" of the last {since:g} s" if since is not None else ""
@@ -225,7 +229,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     written = check_key(written_out(keyexpr, fleet))
     if when is not None:
         KeyCondition.of(when, written)
-    with Fleet(connect, fleet, kind="person") as client:
+    with open_client(connect, fleet) as client:
         warn_if_missing(written, client.cars())
         reported = shown = 0
         with client.watch(keyexpr, when=when) as readings:
@@ -261,7 +265,7 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
     """
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
     written = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
-    with Fleet(connect, fleet, kind="person") as client:
+    with open_client(connect, fleet) as client:
         found = _alive(client, written, look_s)
         if not found:
             what = f"under {written[0]}" if keyexpr else f"of {keys.describe_fleet(fleet)}"
@@ -365,7 +369,7 @@ def wait(
         for name in (fleet, *cars):
             keys.check_name(name.removeprefix("@"))
         if any(car.startswith("@") for car in cars):
-            with Fleet(connect, fleet, kind="person") as client:
+            with open_client(connect, fleet) as client:
                 cars = resolve_cars(client, cars)
         wait_ready(connect, fleet, cars, timeout_s or for_s or READY_WAIT_S, as_json=as_json)
         return
@@ -376,7 +380,7 @@ def wait(
     KeyCondition.of(condition, written)
     if for_s is not None and timeout_s is not None and for_s >= timeout_s:
         raise click.UsageError(f"--for {for_s:g} s cannot be over within --timeout {timeout_s:g} s: give more time")
-    with Fleet(connect, fleet, kind="person") as client:
+    with open_client(connect, fleet) as client:
         warn_if_missing(written, client.cars())
         try:
             reading = client.wait(keyexpr, condition, timeout_s=timeout_s, for_s=for_s or 0.0)

@@ -12,8 +12,8 @@ import click
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
 from fleet.client.outcome import Outcome
-from fleet.commands.group import connect_option, fleet_option
-from fleet.commands.params import resolve_cars
+from fleet.commands.group import as_option, chosen_person, connect_option, fleet_option
+from fleet.commands.params import complete_people, resolve_cars
 from schemas import keys
 from schemas.bus import BadEndpoint, BusError
 
@@ -27,10 +27,11 @@ json_option = click.option("--json", "as_json", is_flag=True, help="One JSON obj
 
 
 def bus_options(function: _Function) -> _Function:
-    """Add --connect and --fleet. Errors of the bus and of names become one line."""
+    """Add --connect, --fleet and --as. Errors of the bus and of names become one line."""
 
     @connect_option()
     @fleet_option()
+    @as_option(complete_people)
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> Any:
         with cli_errors():
@@ -45,10 +46,15 @@ def with_client(function: _Function) -> _Function:
     @bus_options
     @functools.wraps(function)
     def command(*args: Any, connect: str | None, fleet: str, **options: Any) -> Any:
-        with Fleet(connect, fleet, kind="person") as client:
+        with open_client(connect, fleet) as client:
             return function(client, *args, **options)
 
     return command
+
+
+def open_client(connect: str | None, fleet: str) -> Fleet:
+    """Open the client of the person whom --as or FLEET_AS names."""
+    return Fleet(connect, fleet, kind="person", person=chosen_person())
 
 
 def not_running(fleet: str) -> click.ClickException:
@@ -85,6 +91,13 @@ def carry_out(
 ) -> None:
     """Send a command to the cars, print each outcome, and exit with the code of `end_with`."""
     end_with(client.ask(replace(request, take=take), resolve_cars(client, cars)), as_json=as_json)
+
+
+def end_with_any(outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
+    """End as `end_with`. Fail if there is no outcome, because no car is connected."""
+    if not outcomes:
+        raise click.ClickException("No car is connected.")
+    end_with(outcomes, as_json=as_json)
 
 
 def end_with(outcomes: Sequence[Outcome], *, as_json: bool) -> Never:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 from click.shell_completion import CompletionItem
@@ -22,6 +22,9 @@ from schemas.colors import COLORS, parse_color
 from schemas.duration import duration_s, parse_duration
 from schemas.suggestion import did_you_mean
 from schemas.topics import likely_name
+
+if TYPE_CHECKING:
+    from fleet.fleetfile.fleet_file import FleetFile
 
 N = TypeVar("N", bound=float)
 
@@ -202,12 +205,8 @@ class SessionPath(click.ParamType[Path]):
 
 def sessions_place() -> Path:
     """Return the place of sessions: `sessions` here, or else where the fleet file here records to."""
-    if not DEFAULT_SESSIONS.is_dir() and Path("fleet.yaml").is_file():
-        from fleet.fleetfile.fleet_file import read_fleet
-
-        with suppress(ValueError):  # a BadFile
-            return read_fleet(Path("fleet.yaml"), unbound=True).recordings or DEFAULT_SESSIONS
-    return DEFAULT_SESSIONS
+    file = None if DEFAULT_SESSIONS.is_dir() else _file_here()
+    return (file and file.recordings) or DEFAULT_SESSIONS
 
 
 def newest_first(place: Path) -> list[Path]:
@@ -301,11 +300,24 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
 
 def _groups_of_file() -> Mapping[str, Sequence[str]]:
     """Return the groups in the fleet file here. Empty if there is no such file, or it is wrong."""
-    from fleet.fleetfile.fleet_file import read_fleet
+    file = _file_here()
+    return file.groups if file else {}
 
-    with suppress(ValueError):  # a BadFile
-        return read_fleet(Path("fleet.yaml"), unbound=True).groups
-    return {}
+
+def complete_people(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
+    """Return the people of the fleet file here for the shell. Never fails or prints."""
+    file = _file_here()
+    return sorted(name for name in (file and file.people) or () if name.startswith(incomplete))
+
+
+def _file_here() -> "FleetFile | None":
+    """Return the fleet file here. None if there is no such file, or it is wrong."""
+    if Path("fleet.yaml").is_file():
+        from fleet.fleetfile.fleet_file import read_fleet
+
+        with suppress(ValueError):  # a BadFile
+            return read_fleet(Path("fleet.yaml"), unbound=True)
+    return None
 
 
 def written_out(keyexpr: str, fleet: str) -> str:

@@ -14,7 +14,7 @@ from fleet.client.client import Fleet
 from fleet.client.reading import Reading
 from fleet.client.services import NO_PLAN, ask_coordinator
 from fleet.commands.group import CommandGroup
-from fleet.commands.options import WrongFile, bus_options, json_option, with_client
+from fleet.commands.options import WrongFile, bus_options, json_option, open_client, with_client
 from fleet.commands.params import complete_car
 from fleet.policy.requests import PlanRequest
 from schemas import keys
@@ -130,7 +130,7 @@ def set_plan(file: Path, *, as_json: bool, connect: str | None, fleet: str) -> N
 
     text = read_text(file)
     parse(text, str(file))  # before it is sent, for errors with the position in this file
-    with Fleet(connect, fleet, kind="person") as client:
+    with open_client(connect, fleet) as client:
         _request(client, "plan", text, source=str(file), as_json=as_json)
 
 

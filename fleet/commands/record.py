@@ -11,7 +11,7 @@ from typing import Any, Final
 import click
 
 from fleet.client.client import default_sender
-from fleet.commands.group import DefaultCommandGroup, connect_option, fleet_option
+from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import DEFAULT_SESSIONS, Choice, Duration
 from schemas import keys, messages
@@ -288,5 +288,5 @@ def mark(text: str, by: str | None, connect: str | None, fleet: str) -> None:
 
     if not text.strip() or len(text) > MAX_MARK_CHARACTERS:
         raise click.UsageError(f"A note must have 1 to {MAX_MARK_CHARACTERS} characters, and not only blanks")
-    found = _query("mark", connect, fleet, text=text, by=by or default_sender())
+    found = _query("mark", connect, fleet, text=text, by=by or default_sender(chosen_person()))
     click.echo(f"marked in {found.session}")

@@ -1,0 +1,62 @@
+"""`fleet pause, unpause, lend`: what a lead does with the cars of all."""
+
+from typing import Final
+
+import click
+
+from fleet.client.client import Fleet
+from fleet.commands.options import end_with_any, json_option, with_client
+from fleet.commands.params import Duration, cars_argument, complete_people, resolve_cars
+
+_DAY_S: Final = 86_400.0
+
+
+@click.command(epilog="\b\nexamples:\n  fleet pause\n  fleet pause --why 'look at the board' --as teacher")
+@click.option("--why", default="", metavar="WORDS", help="Why: shown to everyone whose command is refused.")
+@json_option
+@with_client
+def pause(client: Fleet, why: str, *, as_json: bool) -> None:
+    """Stop all cars. Until `fleet unpause` nobody but a lead moves one, also after a restart.
+
+    Without leads in the fleet file any person may pause, and nobody moves a car meanwhile.
+    """
+    end_with_any(client.pause(why), as_json=as_json)
+
+
+@click.command(epilog="\b\nexample:\n  fleet unpause --as teacher")
+@json_option
+@with_client
+def unpause(client: Fleet, *, as_json: bool) -> None:
+    """End the pause of the fleet. No car moves by it, and a stopped car stays on hold."""
+    end_with_any(client.unpause(), as_json=as_json)
+
+
+@click.command(
+    epilog="""\b
+examples:
+  fleet lend red,blue --to group_a --for 10m --as teacher
+  fleet lend red --end --as teacher"""
+)
+@cars_argument
+@click.option("--to", metavar="PERSON", shell_complete=complete_people, help="Who gets the cars.")
+@click.option("--for", "duration_s", type=Duration(_DAY_S), help="For how long, such as 10m; at most 24h.")
+@click.option("--end", is_flag=True, help="End the loan now. A car that the borrower drives is stopped.")
+@json_option
+@with_client
+def lend(
+    client: Fleet, cars: tuple[str, ...], *, to: str | None, duration_s: float | None, end: bool, as_json: bool
+) -> None:
+    """Lend cars to a person: for this time only that person and leads drive them.
+
+    Without leads in the fleet file any person may lend. At the end a car that the borrower drives is stopped.
+    """
+    if end and (to or duration_s):
+        raise click.UsageError("--end ends the loan: leave --to and --for out")
+    if not end and not (to and duration_s):
+        raise click.UsageError(f"Say to whom and for how long: fleet lend {','.join(cars)} --to PERSON --for 10m")
+    named = resolve_cars(client, cars)
+    if to is not None and duration_s is not None:
+        outcomes = client.lend(named, to, duration_s)
+    else:
+        outcomes = client.end_loan(named)
+    end_with_any(outcomes, as_json=as_json)
