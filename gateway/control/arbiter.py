@@ -32,6 +32,7 @@ from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan
 from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ArmSet, General, Ptz
 from gateway.protocol.platforms import Profile
+from schemas.suggestion import did_you_mean
 
 MAX_QUEUED_COMMANDS: Final = 8
 """Maximum one-shots in the queue; more are refused."""
@@ -156,7 +157,8 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
         case Unpause():
             return _may_direct(sender, "end the pause", context)
         case Lend():
-            return _may_direct(sender, f"lend {context.car}", context) or _may_drive(sender, context)
+            refusal = _may_direct(sender, f"lend {context.car}", context) or _may_drive(sender, context)
+            return refusal or _unknown_borrower(what.to, context)
         case EndLoan() if context.loan is not None and context.loan.to != sender.person:
             return _may_direct(sender, f"end the loan of {context.car}", context)
         case _:
@@ -205,6 +207,14 @@ def _may_direct(sender: Sender, deed: str, context: CommandContext) -> Refusal |
     if sender.kind is not SenderKind.PERSON:
         return Reason.NOT_ALLOWED, f'a {sender.kind} may not {deed}: only a person may. Send kind "person".'
     return _unlisted(sender, context) if context.people.role(person) is None else None
+
+
+def _unknown_borrower(person: str, context: CommandContext) -> Refusal | None:
+    roles = context.people.roles
+    if roles is None or person in roles:
+        return None
+    near = did_you_mean(person, roles) or f"There are: {', '.join(sorted(roles))}."
+    return Reason.BAD_VALUE, f'`people:` in the fleet file lists no "{person}". {near}'
 
 
 def _may_drive(sender: Sender, context: CommandContext) -> Refusal | None:

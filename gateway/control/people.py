@@ -36,8 +36,11 @@ class People:
     @property
     def leads(self) -> tuple[str, ...]:
         """Return the names of the leads, sorted."""
-        roles = self.roles or {}
-        return tuple(sorted(name for name, role in roles.items() if role is PersonRole.LEAD))
+        return self.named(PersonRole.LEAD)
+
+    def named(self, role: PersonRole) -> tuple[str, ...]:
+        """Return the names of the people with this role, sorted."""
+        return tuple(sorted(name for name, each in (self.roles or {}).items() if each is role))
 
     def ranked(self, sender: Sender) -> Sender:
         """Return the sender with its rank: only a person whom the table names as a lead is one."""

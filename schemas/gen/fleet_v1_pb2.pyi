@@ -296,6 +296,16 @@ class Loan(_message.Message):
     expires_in_s: float
     def __init__(self, to: _Optional[str] = ..., by: _Optional[str] = ..., rank: _Optional[str] = ..., since: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., expires_in_s: _Optional[float] = ...) -> None: ...
 
+class CarPeople(_message.Message):
+    __slots__ = ("leads", "drivers", "others")
+    LEADS_FIELD_NUMBER: _ClassVar[int]
+    DRIVERS_FIELD_NUMBER: _ClassVar[int]
+    OTHERS_FIELD_NUMBER: _ClassVar[int]
+    leads: _containers.RepeatedScalarFieldContainer[str]
+    drivers: _containers.RepeatedScalarFieldContainer[str]
+    others: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, leads: _Optional[_Iterable[str]] = ..., drivers: _Optional[_Iterable[str]] = ..., others: _Optional[_Iterable[str]] = ...) -> None: ...
+
 class Lease(_message.Message):
     __slots__ = ("holder", "kind", "expires_in_s")
     HOLDER_FIELD_NUMBER: _ClassVar[int]
@@ -307,7 +317,7 @@ class Lease(_message.Message):
     def __init__(self, holder: _Optional[str] = ..., kind: _Optional[str] = ..., expires_in_s: _Optional[float] = ...) -> None: ...
 
 class Safety(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s", "pauses", "ended_pauses", "loan")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "estops", "ended", "hold", "lease", "motors", "worst_stop_s", "motors_basis", "trust", "trust_evidence", "shown_age_s", "pauses", "ended_pauses", "loan", "people")
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -325,6 +335,7 @@ class Safety(_message.Message):
     PAUSES_FIELD_NUMBER: _ClassVar[int]
     ENDED_PAUSES_FIELD_NUMBER: _ClassVar[int]
     LOAN_FIELD_NUMBER: _ClassVar[int]
+    PEOPLE_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -342,7 +353,8 @@ class Safety(_message.Message):
     pauses: _containers.RepeatedCompositeFieldContainer[Pause]
     ended_pauses: _containers.RepeatedScalarFieldContainer[str]
     loan: Loan
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ..., pauses: _Optional[_Iterable[_Union[Pause, _Mapping]]] = ..., ended_pauses: _Optional[_Iterable[str]] = ..., loan: _Optional[_Union[Loan, _Mapping]] = ...) -> None: ...
+    people: CarPeople
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., estops: _Optional[_Iterable[_Union[Estop, _Mapping]]] = ..., ended: _Optional[_Iterable[str]] = ..., hold: _Optional[_Union[Hold, _Mapping]] = ..., lease: _Optional[_Union[Lease, _Mapping]] = ..., motors: _Optional[str] = ..., worst_stop_s: _Optional[float] = ..., motors_basis: _Optional[str] = ..., trust: _Optional[str] = ..., trust_evidence: _Optional[str] = ..., shown_age_s: _Optional[float] = ..., pauses: _Optional[_Iterable[_Union[Pause, _Mapping]]] = ..., ended_pauses: _Optional[_Iterable[str]] = ..., loan: _Optional[_Union[Loan, _Mapping]] = ..., people: _Optional[_Union[CarPeople, _Mapping]] = ...) -> None: ...
 
 class Health(_message.Message):
     __slots__ = ("stamp", "car", "seq", "boot_id", "host", "link", "pid", "version", "platform", "platform_evidence", "capabilities", "uptime_s", "loop_lag_s", "cpu", "rss_mb", "bus_drops", "platform_contradictions")
