@@ -3,7 +3,6 @@
 import time
 
 from fleet.client.client import Fleet as Client
-from fleet.client.commands import pause_request
 from tests.support.processes import TAKEN, FleetProcesses, driving, wait_for
 
 
@@ -12,7 +11,14 @@ def estops(fleet: FleetProcesses, car: str) -> list[str]:
     return [] if state is None else [estop.id for estop in state.estops]
 
 
-def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gateway(fleet: FleetProcesses) -> None:
+def pauses(fleet: FleetProcesses, car: str) -> list[str]:
+    state = fleet.state("safety", car)
+    return [] if state is None else [pause.id for pause in state.pauses]
+
+
+def test_a_fleet_wide_e_stop_and_a_pause_asked_of_one_car_stop_all_and_outlive_every_gateway(
+    fleet: FleetProcesses,
+) -> None:
     sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     gateways = [fleet.gateway(red), fleet.gateway(blue, car="blue")]
     for car in ("red", "blue"):
@@ -23,6 +29,10 @@ def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gatew
     assert "lasts until `fleet resume --estops`" in answer["words"]
     wait_for(lambda: estops(fleet, "blue") == ["e1"], "blue has it from red")
     wait_for(lambda: not driving(sim) and not driving(sim, "blue"), "both stand")
+    assert (
+        "lasts until `fleet unpause`" in fleet.ask("pause", id="p1", sender="mia", kind="person", why="listen")["words"]
+    )
+    wait_for(lambda: pauses(fleet, "blue") == ["p1"], "blue has the pause from red")
 
     # Green was not there; blue is killed, and its next gateway has only the file.
     gateways[1].kill()
@@ -30,15 +40,21 @@ def test_a_fleet_wide_e_stop_asked_of_one_car_stops_all_and_outlives_every_gatew
     fleet.gateway(green, car="green")
     wait_for(lambda: estops(fleet, "green") == ["e1"], "green has it from red")
     assert fleet.state("safety", "green").hold.by == "mia"
+    assert pauses(fleet, "green") == ["p1"]
     assert fleet.ask("drive", "green", motion="forward")["reason"] == "estopped"
 
-    # It ends while blue is away: blue comes back with it, and learns of its end.
+    # Both end while blue is away: blue comes back with it, and learns of its end.
     assert fleet.ask("resume", ids=["e1"], kind="person")["status"] == "sent"
     wait_for(lambda: estops(fleet, "green") == [], "green knows of its end")
+    assert fleet.ask("drive", "green", motion="forward", sender="mia")["reason"] == "paused"
+    assert fleet.ask("unpause", sender="mia", kind="person")["status"] == "sent"
+    wait_for(lambda: pauses(fleet, "green") == [], "green knows of the end of the pause")
     fleet.gateway(blue, car="blue")
     wait_for(lambda: fleet.state("safety", "blue") is not None, "blue is back")
     wait_for(lambda: estops(fleet, "blue") == [], "blue knows of its end")
-    assert list(fleet.state("safety", "blue").ended) == ["e1"]
+    wait_for(lambda: pauses(fleet, "blue") == [], "blue knows of the end of the pause")
+    safety = fleet.state("safety", "blue")
+    assert (list(safety.ended), list(safety.ended_pauses)) == (["e1"], ["p1"])
     fleet.ready("blue")
     assert fleet.ask("drive", "blue", motion="forward")["status"] in TAKEN
 
@@ -100,28 +116,24 @@ def test_a_stop_with_a_broken_payload_stops(fleet: FleetProcesses) -> None:
     assert time.monotonic() - began < 8
 
 
-def test_a_lead_pauses_all_cars_by_one_and_lends_one_and_both_outlive_a_gateway(fleet: FleetProcesses) -> None:
+def test_a_lead_pauses_the_fleet_and_lends_a_car(fleet: FleetProcesses) -> None:
     sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     table = ("--person", "teacher:lead", "--person", "ann", "--person", "bob:other")
     fleet.gateway(red, *table)
-    killed = fleet.gateway(blue, *table, car="blue")
+    fleet.gateway(blue, *table, car="blue")
     with (
         Client(fleet.endpoint, person="teacher", kind="person") as teacher,
         Client(fleet.endpoint, person="ann", kind="person") as ann,
         Client(fleet.endpoint, person="bob", kind="person") as bob,
     ):
-        for car in ("red", "blue"):
-            fleet.ready(car)
+        fleet.ready("blue")
         assert ann.car("blue").drive("forward", 10.0, wait=False).ok
         wait_for(lambda: driving(sim, "blue"), "blue drives")
         assert [outcome.reason for outcome in ann.pause()] == ["not_allowed"] * 2
-        assert teacher.car("red").do(pause_request("listen")).ok
-        wait_for(lambda: not driving(sim, "blue"), "blue has it from red, and stands")
-        wait_for(lambda: fleet.state("safety", "blue").pauses, "blue shows it")
+        assert driving(sim, "blue")
+        assert all(outcome.ok for outcome in teacher.pause("listen"))
+        wait_for(lambda: not driving(sim, "blue"), "it stands")
         assert teacher.lend(["blue"], "bob", 600.0)[0].ok
-        killed.kill()
-        fleet.gateway(blue, *table, car="blue")
-        fleet.ready("blue")
         refused = bob.car("blue").drive("forward")
         assert refused.reason == "paused"
         assert "paused with the whole fleet (teacher@" in refused.words
