@@ -1,8 +1,8 @@
 """The console: a web page that shows the fleet, drives cars and stops them. One more client of the bus.
 
 Read `server` first: it serves the page and one WebSocket per page, and `console` wires the rest. `operator` sends the
-commands, `page_link` the messages to a page. `lan` serves the network, with `certificate`, `people_file` and
-`people_routes`. Pure: `presses` (how long a car drives: the dead-man), `guard` (which requests are answered), `pairing`
-(codes, cookies and people), `connection_limit`, `requests`, `car_view`, `plan_view`, `frame_log`, `plot_buffer`,
-`abilities` and `stop_report`.
+commands of one person (`operators`: of all), `page_link` the messages to a page. `lan` serves the network, with
+`certificate`, `people_file` and `people_routes`. Pure: `presses` (how long a car drives: the dead-man), `guard`
+(which requests are answered), `pairing` (codes, cookies and people), `permissions` (who may do what),
+`connection_limit`, `requests`, `car_view`, `plan_view`, `frame_log`, `plot_buffer`, `abilities` and `stop_report`.
 """

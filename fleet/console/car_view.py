@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.frame_log import describe_gateway
+from fleet.console.permissions import CarRules
 from schemas import messages, topics
 
 TREND_WINDOW_S: Final = 240.0
@@ -57,6 +58,8 @@ class CarView:
         self.color = color
         self.ledger: deque[dict[str, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Commands and log records, the newest last."""
+        self.rules = CarRules(name)
+        """Who may do what."""
         self._newest: dict[str, tuple[Any, float]] = {}
         self._trend = BatteryTrend()
         self._present = False
@@ -76,6 +79,8 @@ class CarView:
                 self._newest[topic] = (value, now)
                 if topic == "sensor/battery":
                     self._trend.add(value.voltage_v, now)
+                elif topic == "state/safety":
+                    self.rules = CarRules.of(self.name, value)
 
     def on_presence(self, now: float, *, present: bool) -> None:
         """Handle that the car's gateway is on the bus, or not."""
@@ -92,16 +97,13 @@ class CarView:
         """Return what the car's gateway knows, as names and texts."""
         return describe_gateway(*(self._get(f"state/{name}") for name in ("link", "health", "safety", "mode")))
 
-    def as_dict(self, now: float, sender: str) -> dict[str, Any]:
-        """Return what a page shows of the car, as JSON values. Numbers are rounded, so that most are equal next time.
-
-        sender: the console's own name, which the page shows as "this console".
-        """
+    def as_dict(self, now: float) -> dict[str, Any]:
+        """Return what a page shows of the car, as JSON values. Numbers are rounded: most are equal next time."""
         shown: dict[str, Any] = {"name": self.name, "color": self.color, "gateway": self._present}
         if not self._present and self._changed_at is not None:
             shown["gone_s"] = int(now - self._changed_at)
         for part in (self._link, self._mode, self._motion, self._safety, self._health, self._sensors):
-            shown |= part(now, sender)
+            shown |= part(now)
         if self.ledger:
             shown["event"] = self.ledger[-1]
         return shown
@@ -118,7 +120,7 @@ class CarView:
             return None
         return found[0]
 
-    def _link(self, now: float, _: str) -> dict[str, Any]:
+    def _link(self, now: float) -> dict[str, Any]:
         found = self._newest.get("state/link")
         if found is None:
             return {"link": {"state": "unknown", "reason": "", "since_s": 0}}
@@ -128,7 +130,7 @@ class CarView:
             shown["since_s"] = 0  # a growing number that nobody needs would draw the card each second
         return {"link": shown}
 
-    def _mode(self, _: float, __: str) -> dict[str, Any]:
+    def _mode(self, _: float) -> dict[str, Any]:
         mode = self._get("state/mode")
         if mode is None:
             return {"mode": {"asked": "unknown", "inferred": "unknown", "verdict": "assumed", "evidence": ""}}
@@ -141,34 +143,40 @@ class CarView:
             }
         }
 
-    def _motion(self, now: float, sender: str) -> dict[str, Any]:
+    def _motion(self, now: float) -> dict[str, Any]:
         motion = self._fresh("state/motion", now)
         if motion is None:
             return {"motion": {"motion": "unknown", "owner": "", "speed": None, "fan": False, "servo_deg": None}}
         shown = {
             "motion": motion.motion,
             "source": motion.source,
-            "owner": _name(motion.owner, sender),
+            "owner": motion.owner,
             "speed": round(motion.speed, 2),
             "fan": motion.fan,
             "servo_deg": round(motion.servo_deg) if motion.HasField("servo_deg") else None,
         }
         return {"motion": shown}
 
-    def _safety(self, _: float, sender: str) -> dict[str, Any]:
+    def _safety(self, _: float) -> dict[str, Any]:
         safety = self._get("state/safety")
         state, basis = self.motors
         shown: dict[str, Any] = {"motors": {"state": state, "basis": basis}, "hold": None, "lease": None, "estops": []}
         if safety is None:
             return shown
         if safety.HasField("hold"):
-            shown["hold"] = _name(safety.hold.by, sender)
+            shown["hold"] = safety.hold.by
         if safety.HasField("lease"):
-            shown["lease"] = {"holder": _name(safety.lease.holder, sender), "kind": safety.lease.kind}
+            shown["lease"] = {"holder": safety.lease.holder, "kind": safety.lease.kind}
+        if safety.HasField("loan"):
+            until_s = round(safety.stamp.seconds + safety.loan.expires_in_s, -1)
+            shown["loan"] = {"to": safety.loan.to, "by": safety.loan.by, "until_s": until_s}
+        if safety.pauses:
+            shown["pause"] = {"by": safety.pauses[-1].by, "why": safety.pauses[-1].why}
+        shown["people"] = [*safety.people.drivers, *safety.people.others]
         shown["estops"] = [
             {
                 "id": each.id,
-                "by": _name(each.by, sender),
+                "by": each.by,
                 "why": each.why,
                 "scope": each.scope,
                 "since": each.stamp.seconds,
@@ -177,7 +185,7 @@ class CarView:
         ]
         return shown
 
-    def _health(self, _: float, __: str) -> dict[str, Any]:
+    def _health(self, _: float) -> dict[str, Any]:
         health = self._get("state/health")
         if health is None:
             return {"platform": "", **UNKNOWN_ABILITIES.as_dict()}
@@ -186,7 +194,7 @@ class CarView:
             **abilities_of(health.platform, tuple(health.capabilities)).as_dict(),
         }
 
-    def _sensors(self, now: float, _: str) -> dict[str, Any]:
+    def _sensors(self, now: float) -> dict[str, Any]:
         shown: dict[str, Any] = {}
         if (battery := self._fresh("sensor/battery", now)) is not None:
             shown["battery"] = {
@@ -215,15 +223,10 @@ class CarView:
         self.ledger.append({"at_ms": messages.stamp_ms(stamp), "words": words, "level": level})
 
 
-def _name(sender: str, ours: str) -> str:
-    return "this console" if sender == ours else sender
-
-
 class FleetView:
     """The cars that the console knows: all that were on the bus since it started."""
 
-    def __init__(self, sender: str, color_of: Any) -> None:
-        self._sender = sender
+    def __init__(self, color_of: Any) -> None:
         self._color_of = color_of
         self._cars: dict[str, CarView] = {}
 
@@ -246,4 +249,9 @@ class FleetView:
 
     def as_list(self, now: float) -> list[dict[str, Any]]:
         """Return what a page shows of each car, by name."""
-        return [self._cars[name].as_dict(now, self._sender) for name in self.names]
+        return [self._cars[name].as_dict(now) for name in self.names]
+
+    @property
+    def rules(self) -> dict[str, CarRules]:
+        """Who may do what, by car."""
+        return {name: self._cars[name].rules for name in self.names}

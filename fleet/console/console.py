@@ -10,17 +10,22 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from fleet.aio import Fleet
+from fleet.client.commands import CommandRequest, estop_request, pause_request, stop_request, unpause_request
+from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.console.bus_message import message_in
 from fleet.console.car_view import FleetView
 from fleet.console.inspections import Inspections
 from fleet.console.operator import ConsoleOperator
+from fleet.console.operators import Operators
 from fleet.console.page_link import PageLink
 from fleet.console.pairing import PagePerson
+from fleet.console.permissions import rights_of
 from fleet.console.plan_view import PlanView, coordinator_topic
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
 from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessage
+from fleet.console.stop_report import StopReport
 from fleet.policy.requests import PlanRequest
 from fleet.replay.colors import color
 from schemas import keys
@@ -32,6 +37,8 @@ MAX_PAGES: Final = 32
 _MAX_EVENTS: Final = 4096
 MAX_PLOT_S: Final = 600
 """Maximum time that a plot shows, s."""
+_MAX_STOP_IDS: Final = 256
+"""Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
 
 log = logging.getLogger("fleet")
 
@@ -46,8 +53,12 @@ class Console:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._presses = PressBook()
-        self._view = FleetView(fleet.sync.sender, _hex_color)
-        self.operator = ConsoleOperator(fleet, self._on_stop)
+        self._view = FleetView(_hex_color)
+        self._operators = Operators(fleet)
+        self._report: StopReport | None = None
+        """The course of the last STOP."""
+        self._stop_ids: dict[str, None] = {}
+        self._stops = 0
         self._pages: dict[int, PageLink] = {}
         self._last_page = 0
         self._coordinators: set[str] = set()
@@ -83,7 +94,13 @@ class Console:
         self.operator.spawn(self._read_plan())
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tick())
-            tasks.create_task(self.operator.renew_leases())
+            tasks.create_task(self._renew_leases())
+
+    async def _renew_leases(self) -> None:
+        while True:
+            await asyncio.sleep(LEASE_RENEWAL_INTERVAL_S)
+            for operator in self._operators:
+                operator.renew_leases()
 
     def _on_reading(self, sample: Sample) -> None:
         """Note a reading. Runs on a Zenoh thread."""
@@ -108,6 +125,7 @@ class Console:
             self._take_readings(now)
             if self._pages:
                 self._show("state", self._state(now))
+                self._show_rights()
             self._plots.take_samples()
             for page in self._pages.values():
                 self._plots.send(page)
@@ -118,6 +136,21 @@ class Console:
                 self._show("plan", self._plan_text())
             next_at = max(next_at + TICK_INTERVAL_S, loop.time())
             await asyncio.sleep(next_at - loop.time())
+
+    def _show_rights(self) -> None:
+        """Show each page what its person may not do, if that has changed. End presses that are refused by now."""
+        rules = self._view.rules
+        rights = {
+            sender: rights_of(sender, rules) for sender in {page.operator.sender for page in self._pages.values()}
+        }
+        for page in self._pages.values():
+            page.show_new("rights", rights[page.operator.sender])
+        for press in self._presses.alive:
+            page = self._pages[press.client]
+            refused = rights[page.operator.sender]["cars"]
+            words = [refused.get(car, {}).get("move") for car in press.cars]
+            if all(words) and self._presses.release(press.client, press.id):
+                self._end(press, str(words[0]))
 
     def _show(self, kind: str, text: str) -> None:
         for page in self._pages.values():
@@ -135,14 +168,14 @@ class Console:
             if (found := message_in(sample, logging.WARNING)) is not None:
                 key, message = found
                 self._view.car(key.car).on_message(key.topic, message, now)
-                if key.topic == "state/safety" and self.operator.report is not None:
-                    self.operator.report.on_safety(key.car, message, now)
+                if key.topic == "state/safety" and self._report is not None:
+                    self._report.on_safety(key.car, message, now)
         self._view.on_presence(self._fleet.sync.cars(), now)
         token = f"{self._fleet.sync.name}/{keys.COORDINATOR}"
         self._plan.on_presence(running=token in self._coordinators)
 
     def _state(self, now: float) -> str:
-        report = self.operator.report
+        report = self._report
         state = {
             "t": "state",
             "fleet": self._fleet.sync.name,
@@ -158,35 +191,50 @@ class Console:
             return
         (key, event), now = found, time.monotonic()
         self._view.car(key.car).on_message(key.topic, event, now)
-        if key.topic == "event/command" and event.sender == self._fleet.sync.sender and self.operator.report:
-            self.operator.report.on_event(key.car, event, now)
+        if key.topic == "event/command" and self._report is not None and event.sender == self._report.sender:
+            self._report.on_event(key.car, event, now)
 
     # ------------------------------------------------------------------ the pages
 
     @property
     def person(self) -> PagePerson:
         """The person of the pages on this computer."""
-        return PagePerson(self._fleet.sync.sender.partition("@")[0])
+        return PagePerson(self._operators.person)
 
-    def add_page(self, send: Callable[[str], Awaitable[None]], person: PagePerson | None = None) -> PageLink:
-        """Add a page of a person (None: of this computer). Raises TooManyPages."""
+    @property
+    def operator(self) -> ConsoleOperator:
+        """The operator of the pages on this computer."""
+        return self._operators.own
+
+    def operator_of(self, person: PagePerson | None) -> ConsoleOperator:
+        """Return the operator of a request (None: from this computer)."""
+        return self.operator if person is None else self._operators.of(person.name)
+
+    async def add_page(self, send: Callable[[str], Awaitable[None]], person: PagePerson | None = None) -> PageLink:
+        """Add a page of a person (None: of this computer). Raises TooManyPages and BusError."""
+        person = person or self.person
+        operator = await self._operators.join(person.name)
         if len(self._pages) >= MAX_PAGES:
+            self._operators.leave(person.name)
             raise TooManyPages
         self._last_page += 1
-        page = self._pages[self._last_page] = PageLink(self._last_page, send, person or self.person)
-        names = {"sender": self._fleet.sync.sender, "fleet": self._fleet.sync.name}
+        page = self._pages[self._last_page] = PageLink(self._last_page, send, person, operator)
+        names = {"sender": operator.sender, "fleet": self._fleet.sync.name}
         page.answer(t="hello", page=page.number, **names, person=asdict(page.person), plottable=plottable())
         page.show("plan", self._plan_text())
         return page
 
     def remove_page(self, page: PageLink) -> None:
         """Remove a page that has gone, and stop the cars that it drives."""
-        self._pages.pop(page.number, None)
+        if page.number not in self._pages:
+            return
         self._inspections.end(page.number)
         self._plots.end(page.number)
         for press in self._presses.drop_client(page.number):
             self._end(press, "The page has gone.")
-        self.operator.release_leases(page.number)
+        page.operator.release_leases(page.number)
+        del self._pages[page.number]
+        self._operators.leave(page.person.name)
 
     def on_text(self, page: PageLink, text: str) -> None:
         """Handle one message of a page. A bad one is answered, and changes nothing."""
@@ -196,10 +244,26 @@ class Console:
             log.warning("page %d sent a bad message: %s", page.number, error)
             page.answer(t="bad", words=str(error))
 
-    def stop_all(self, stop_id: str, *, estop: bool = False, why: str = "") -> None:
-        """Stop every car, once for each id."""
+    def stop_all(
+        self, stop_id: str, operator: ConsoleOperator | None = None, request: CommandRequest | None = None
+    ) -> None:
+        """Stop every car, once for each id: a page sends each STOP twice, over its socket and by fetch.
+
+        operator: of the page (None: of this computer). request: an e-stop or a pause (None: a stop).
+        """
+        if stop_id in self._stop_ids:
+            return
+        self._stop_ids[stop_id] = None
+        if len(self._stop_ids) > _MAX_STOP_IDS:
+            del self._stop_ids[next(iter(self._stop_ids))]
+        now, operator, request = time.monotonic(), operator or self.operator, request or stop_request()
+        for press in self._presses.on_stop(now):
+            self._end(press, "All cars were stopped.")
+        self._stops += 1
         present = {*self._fleet.sync.cars(), *self._view.names}
-        self.operator.stop_all(stop_id, present, estop=estop, why=why)
+        at_ms = time.time_ns() // 1_000_000
+        self._report = StopReport(self._stops, request.verb, operator.sender, present, now, at_ms)
+        operator.stop(request, self._report)
 
     def _on_message(self, page: PageLink, message: PageMessage) -> None:
         now = time.monotonic()
@@ -207,22 +271,28 @@ class Console:
             case "echo":
                 press = self._presses.echo(page.number, message.number("press"), message.number("n"), now)
                 if press is not None:
-                    self.operator.renew_press(press, now)
+                    page.operator.renew_press(press, now)
             case "press":
                 self._on_press(page, message, now)
             case "release":
                 released = self._presses.release(page.number, message.number("press"))
                 if released is not None:
-                    self.operator.end_press(released)
+                    page.operator.end_press(released)
             case "stop":
-                self.stop_all(message.text("id"))
+                self.stop_all(message.text("id"), page.operator)
             case "estop":
-                self.stop_all(message.text("id"), estop=True, why=message.text("why", MAX_REASON_LENGTH))
+                why = message.text("why", MAX_REASON_LENGTH)
+                self.stop_all(message.text("id"), page.operator, estop_request(why, "fleet"))
+            case "pause":
+                why = message.text("why", MAX_REASON_LENGTH)
+                self.stop_all(message.text("id"), page.operator, pause_request(why))
+            case "unpause":
+                page.operator.command(unpause_request(), None, self._answer_to(page, message))
             case "take":
-                self.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
+                page.operator.take_lease(page.number, message.cars(), self._answer_to(page, message))
             case "give_back":
                 self._stop_presses(set(message.cars()), "The car was given back.")
-                self.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
+                page.operator.release_leases(page.number, message.cars(), self._answer_to(page, message))
             case "inspect":
                 self._inspections.begin(page.number, message.cars()[0])
             case "inspect_end":
@@ -232,17 +302,17 @@ class Console:
                 self.operator.spawn(self._plots.begin(page.number, message.series(), since_s))
             case "plan":
                 verb = message.one_of("verb", frozenset(PlanRequest))
-                self.operator.spawn(self._ask_coordinator(page, message.number("id"), verb))
+                page.operator.spawn(self._ask_coordinator(page, message.number("id"), verb))
             case "do":
                 request, cars = message.request(), message.cars()
                 if request.verb in (*STOPS, "mode"):
                     self._stop_presses(set(cars), "The car was stopped.")
-                self.operator.command(request, cars, self._answer_to(page, message))
+                page.operator.command(request, cars, self._answer_to(page, message))
             case kind:
                 raise BadPageMessage(f"unknown message {kind!r}")
 
     async def _ask_coordinator(self, page: PageLink, request_id: int, verb: str) -> None:
-        ok, words = await self.operator.ask_coordinator(verb)
+        ok, words = await page.operator.ask_coordinator(verb)
         page.answer(t="plan_done", id=request_id, ok=ok, words=words)
 
     def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
@@ -254,8 +324,8 @@ class Console:
             page.answer(t="over", press=press_id, words=str(error))
             return
         if before is not None:  # another direction: a stop in between only for cars that are no longer driven
-            self.operator.end_press(before, [car for car in before.cars if car not in cars])
-        self.operator.begin_press(
+            page.operator.end_press(before, [car for car in before.cars if car not in cars])
+        page.operator.begin_press(
             press, lambda outcome: page.answer(t="refused", press=press_id, outcome=asdict(outcome))
         )
 
@@ -263,24 +333,20 @@ class Console:
         request_id = message.number("id")
         return lambda outcomes: page.answer(t="done", id=request_id, outcomes=outcomes)
 
-    def _on_stop(self) -> None:
-        for press in self._presses.on_stop(time.monotonic()):
-            self._end(press, "All cars were stopped.")
-
     def _stop_presses(self, cars: set[str], words: str) -> None:
         for press in self._presses.drop_cars(cars):
             self._end(press, words)
 
     def _end(self, press: HeldPress, words: str) -> None:
-        self.operator.end_press(press)
-        if (page := self._pages.get(press.client)) is not None:
-            page.answer(t="over", press=press.id, words=words)
+        page = self._pages[press.client]
+        page.operator.end_press(press)
+        page.answer(t="over", press=press.id, words=words)
 
     async def close(self) -> None:
         """Stop the cars that pages drive, and wait for their outcomes."""
         for press in self._presses.alive:
-            self.operator.end_press(press)
-        await self.operator.close()
+            self._pages[press.client].operator.end_press(press)
+        await self._operators.close()
 
 
 def _hex_color(car: str, index: int) -> str:

@@ -1,4 +1,4 @@
-"""Sends the commands of the pages: the stream of a held press, STOP, and single commands. One client of the bus."""
+"""Sends the commands of the pages of one person: the stream of a held press, STOP, and single commands."""
 
 import asyncio
 import logging
@@ -8,8 +8,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from fleet.aio import Fleet
-from fleet.client.commands import CommandRequest, drive_request, estop_request, lease_request, stop_request
-from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
+from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
 from fleet.client.services import NO_PLAN, ask_coordinator
 from fleet.console.presses import HeldPress
@@ -26,29 +25,26 @@ STREAM_INTERVAL_S: Final = 0.15
 """Minimum interval of the drives of one press."""
 STREAM_MAX_AGE_S: Final = 0.3
 """Maximum age of a drive when it arrives at the gateway."""
-_MAX_STOP_IDS: Final = 256
-"""Number of remembered STOP presses. Each comes twice: over the socket and by fetch."""
-
 log = logging.getLogger("fleet")
 
 
 class ConsoleOperator:
-    """The console's side of the bus."""
+    """One person's side of the bus: the client under whose name the pages of this person act."""
 
-    def __init__(self, fleet: Fleet, on_stop: Callable[[], object]) -> None:
+    def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._on_stop = on_stop
         self._tasks: set[asyncio.Task[None]] = set()
-        self._stop_ids: dict[str, None] = {}
         self._streams: dict[tuple[int, int], tuple[float, int]] = {}
         """Time of the last drive and number of drives, by press."""
         self._leases: dict[str, int] = {}
         """The cars that a page has taken, and the page."""
         self._renewals: set[str] = set()
         """Cars whose lease is being renewed."""
-        self._numbers = 0
-        self.report: StopReport | None = None
-        """The course of the last STOP."""
+
+    @property
+    def sender(self) -> str:
+        """The name of this operator on the bus."""
+        return self._fleet.sync.sender
 
     # ------------------------------------------------------------------ driving
 
@@ -101,19 +97,9 @@ class ConsoleOperator:
 
     # ------------------------------------------------------------------ STOP
 
-    def stop_all(self, stop_id: str, present: Iterable[str], *, estop: bool = False, why: str = "") -> None:
-        """Stop every car, once for each id: a page sends each STOP twice, over its socket and by fetch."""
-        if stop_id in self._stop_ids:
-            return
-        self._stop_ids[stop_id] = None
-        if len(self._stop_ids) > _MAX_STOP_IDS:
-            del self._stop_ids[next(iter(self._stop_ids))]
-        self._on_stop()
-        request = estop_request(why, "fleet") if estop else stop_request()
-        self._numbers += 1
-        now = time.monotonic()
-        self.report = StopReport(self._numbers, request.verb, present, now, time.time_ns() // 1_000_000)
-        self.spawn(self._stop(request, self.report))
+    def stop(self, request: CommandRequest, report: StopReport) -> None:
+        """Stop every car. The report gets the outcomes."""
+        self.spawn(self._stop(request, report))
 
     async def _stop(self, request: CommandRequest, report: StopReport) -> None:
         outcomes = await self._fleet.ask(request)
@@ -122,13 +108,13 @@ class ConsoleOperator:
     # ------------------------------------------------------------------ the rest
 
     def command(
-        self, request: CommandRequest, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]
+        self, request: CommandRequest, cars: Sequence[str] | None, on_outcomes: Callable[[list[dict[str, Any]]], object]
     ) -> None:
-        """Send one command to some cars and report the outcomes."""
+        """Send one command to some cars (None: to all) and report the outcomes."""
         self.spawn(self._command(request, cars, on_outcomes))
 
     async def _command(
-        self, request: CommandRequest, cars: Sequence[str], on_outcomes: Callable[[list[dict[str, Any]]], object]
+        self, request: CommandRequest, cars: Sequence[str] | None, on_outcomes: Callable[[list[dict[str, Any]]], object]
     ) -> None:
         on_outcomes([asdict(outcome) for outcome in await self._fleet.ask(request, cars)])
 
@@ -157,13 +143,11 @@ class ConsoleOperator:
         if released:
             self.command(lease_request(release=True), released, on_outcomes)
 
-    async def renew_leases(self) -> None:
-        """Renew the leases of the pages until the task is cancelled. A lease that another sender has taken is lost."""
-        while True:
-            await asyncio.sleep(LEASE_RENEWAL_INTERVAL_S)
-            for car in self._leases.keys() - self._renewals:
-                self._renewals.add(car)
-                self.spawn(self._renew_lease(car))
+    def renew_leases(self) -> None:
+        """Renew the leases of the pages. A lease that another sender has taken is lost."""
+        for car in self._leases.keys() - self._renewals:
+            self._renewals.add(car)
+            self.spawn(self._renew_lease(car))
 
     async def _renew_lease(self, car: str) -> None:
         """Renew one lease. A gateway that hangs must not cost a page its other leases."""

@@ -6,9 +6,10 @@ A page that does not read holds up no other page.
 import asyncio
 import json
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final
 
+from fleet.console.operator import ConsoleOperator
 from fleet.console.pairing import PagePerson
 
 SEND_TIMEOUT_S: Final = 5.0
@@ -20,12 +21,17 @@ _MAX_PAGE_ANSWERS: Final = 256
 class PageLink:
     """One connected page."""
 
-    def __init__(self, number: int, send: Callable[[str], Awaitable[None]], person: PagePerson) -> None:
+    def __init__(
+        self, number: int, send: Callable[[str], Awaitable[None]], person: PagePerson, operator: ConsoleOperator
+    ) -> None:
         self.number = number
         self.person = person
+        self.operator = operator
         self._send = send
         self._answers: deque[str] = deque(maxlen=_MAX_PAGE_ANSWERS)
         self._newest: dict[str, str] = {}
+        self._last: dict[str, Mapping[str, Any]] = {}
+        """The last value of each kind that is sent only when it changes."""
         self._not_empty = asyncio.Event()
 
     def answer(self, **fields: Any) -> None:
@@ -37,6 +43,12 @@ class PageLink:
         """Set the newest message of a kind (`tick`, `state`). An unsent older one is left out."""
         self._newest[kind] = text
         self._not_empty.set()
+
+    def show_new(self, kind: str, value: Mapping[str, Any]) -> None:
+        """Set the newest message of a kind if it differs from the last one."""
+        if self._last.get(kind) != value:
+            self._last[kind] = value
+            self.show(kind, json.dumps({"t": kind, **value}, separators=(",", ":")))
 
     def has_unsent(self, kind: str) -> bool:
         """Return True if the newest message of a kind still waits."""

@@ -141,6 +141,10 @@ def _arm(message: PageMessage) -> commands.CommandRequest:
     return commands.arm_request(message._numbers("joint_deg", 6))
 
 
+def _lend(message: PageMessage) -> commands.CommandRequest:
+    return commands.lend_request(message.text("to"), float(message.number("duration_s")))
+
+
 def _resume(message: PageMessage) -> commands.CommandRequest:
     ids = message.fields.get("ids", [])
     if not isinstance(ids, list) or len(ids) > MAX_CARS or not all(isinstance(each, str) for each in ids):
@@ -155,6 +159,8 @@ _BUILDERS: Final[Mapping[str, Callable[[PageMessage], commands.CommandRequest]]]
     "servo": _servo,
     "arm": _arm,
     "resume": _resume,
+    "lend": _lend,
+    "end_loan": lambda _: commands.end_loan_request(),
     "whistle": lambda _: commands.whistle_request(),
     "speed": lambda message: commands.speed_request(message.one_of("step", frozenset({"up", "down"}))),
     "fan": lambda _: commands.fan_request(),

@@ -21,7 +21,7 @@ from fleet.aio import Fleet
 from fleet.console.console import Console, TooManyPages
 from fleet.console.guard import PERSON, STOP_PATH, App, Guard, NetworkGuard
 from fleet.console.people_routes import pair_routes, people_routes
-from schemas.bus import LARGEST_PAYLOAD
+from schemas.bus import LARGEST_PAYLOAD, BusError
 from schemas.process import signals
 
 if TYPE_CHECKING:  # only `--lan` needs its packages
@@ -150,14 +150,14 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
 
     async def stop(request: Request) -> Response:
         stop_id = request.query_params.get("id", "")[:_MAX_STOP_ID_LENGTH]
-        console.stop_all(stop_id or secrets.token_hex(8))
+        console.stop_all(stop_id or secrets.token_hex(8), console.operator_of(request.scope.get(PERSON)))
         return Response(status_code=204)
 
     async def check_plan(request: Request) -> Response:
         return await _answer_plan(request, console.operator.check_plan)
 
     async def set_plan(request: Request) -> Response:
-        return await _answer_plan(request, console.operator.set_plan)
+        return await _answer_plan(request, console.operator_of(request.scope.get(PERSON)).set_plan)
 
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()
@@ -167,6 +167,8 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
                     on_text(await socket_.receive_text())
         except TooManyPages:
             await socket_.close(_TRY_AGAIN_LATER, "too many pages are open")
+        except BusError:
+            await socket_.close(_TRY_AGAIN_LATER, "the bus cannot be reached")
         except (WebSocketDisconnect, KeyError):  # KeyError: a binary message
             with suppress(RuntimeError):
                 await socket_.close()
@@ -208,7 +210,7 @@ async def _read_text(request: Request) -> str | None:
 @asynccontextmanager
 async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> AsyncIterator[Callable[[str], None]]:
     """Join a page to the console. Yield the function that takes its messages."""
-    page = console.add_page(socket_.send_text, socket_.scope.get(PERSON))
+    page = await console.add_page(socket_.send_text, socket_.scope.get(PERSON))
     sending = asyncio.ensure_future(page.run())
 
     def end() -> None:

@@ -10,8 +10,9 @@ from schemas.commands import STOPS
 class StopReport:
     """One STOP of the console. A car is `shown` only when its own readings show that it stands."""
 
-    def __init__(self, number: int, verb: str, cars: Iterable[str], now: float, at_ms: int) -> None:
+    def __init__(self, number: int, verb: str, sender: str, cars: Iterable[str], now: float, at_ms: int) -> None:
         self.number = number
+        self.sender = sender
         self._verb = verb
         self._asked_at = now
         self._at_ms = at_ms
@@ -23,8 +24,8 @@ class StopReport:
         return all(entry["state"] not in ("asked", "stopping") for entry in self._cars.values())
 
     def on_event(self, car: str, event: Any, now: float) -> None:
-        """Handle a command event of this console."""
-        if event.verb not in STOPS or self._is_over(car):
+        """Handle a command event of the sender of this STOP."""
+        if event.verb not in (*STOPS, "pause") or self._is_over(car):
             return
         match event.phase:
             case "complete":

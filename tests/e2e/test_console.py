@@ -85,7 +85,7 @@ def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: ConsoleStage, ho
     for car, kind in CARS.items():
         state = "sent" if kind == "raspberry_pi" else "shown"
         report.locator(f"[data-stop={car}].stop-{state}").wait_for()
-        page.locator(f"[data-car={car}]").get_by_text("On hold: this console").wait_for()
+        page.locator(f"[data-car={car}]").get_by_text("On hold: you stopped it").wait_for()
 
 
 def test_a_car_is_shown_as_stopped_only_when_its_readings_show_it(stage: ConsoleStage) -> None:
@@ -109,7 +109,7 @@ def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: Cons
     page.locator("input[name=why]").fill("smoke")
     page.get_by_role("button", name="E-stop all cars now").click()
     card = page.locator("[data-car=red]")
-    card.get_by_text("E-stop of the whole fleet by this console: smoke").wait_for()
+    card.get_by_text("E-stop of the whole fleet by you: smoke").wait_for()
     refused = stage.person.car("red").drive("forward")
     assert refused.reason == "estopped"
     card.get_by_role("button", name="End the e-stop…").click()

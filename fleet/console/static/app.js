@@ -1,13 +1,13 @@
 // The page: navigation, the STOP bar in the same place on every page, and the keys that stop.
 
-import { estopAll, setTexts, stopAll, store, subscribe } from "./console.js";
+import { estopAll, pauseAll, setTexts, stopAll, store, subscribe, unpause, who } from "./console.js";
 import { DrivePage } from "./drive-page.js";
 import { FleetPage } from "./fleet-page.js";
 import { InspectPage } from "./inspect-page.js";
 import { PlanPage } from "./plan-page.js";
 import { PlotsPage } from "./plots-page.js";
 import { stopStates, t } from "./texts.js";
-import { Component, html, render, useState, Verdict } from "./ui.js";
+import { Component, html, Refused, render, useState, Verdict } from "./ui.js";
 
 const SHOW_REPORT_MS = 30_000;
 const SAME_PRESS_MS = 1000;
@@ -64,26 +64,32 @@ function Report({ report }) {
 }
 
 function StopBar({ report }) {
-  const [asking, setAsking] = useState(false);
+  const [asking, setAsking] = useState(null); // estop, pause
   const [why, setWhy] = useState("");
-  const estop = () => {
-    estopAll(why);
-    setAsking(false);
+  const act = () => {
+    if (asking === "estop") estopAll(why);
+    else pauseAll(why);
+    setAsking(null);
     setWhy("");
   };
+  const toggle = (what) => setAsking(asking === what ? null : what);
+  const refused = store.rights.pause;
   return html`<section class="stopbar" aria-label="STOP">
     <${Report} report=${report} />
     ${asking &&
-    html`<div class="estop">
-      <label>${t.estopWhy} <input name="why" maxlength="200" value=${why} onInput=${(event) => setWhy(event.target.value)} /></label>
-      <button class="danger" onClick=${estop}>${t.estopNow}</button>
-      <button onClick=${() => setAsking(false)}>${t.cancel}</button>
+    html`<div class="estop" data-asking=${asking}>
+      <label>${asking === "estop" ? t.estopWhy : t.pauseWhy} <input name="why" maxlength="200" value=${why} onInput=${(event) => setWhy(event.target.value)} /></label>
+      <button class="danger" disabled=${asking === "pause" && refused !== ""} onClick=${act}>
+        ${asking === "estop" ? t.estopNow : t.pauseNow}</button>
+      <button onClick=${() => setAsking(null)}>${t.cancel}</button>
+      ${asking === "pause" && refused && html`<${Refused} words=${[refused]} />`}
     </div>`}
     <div class="stop-row">
       <button id="stop" onPointerDown=${onStopDown} onClick=${onStopClick}>
         <span aria-hidden="true">⬣</span> ${t.stop} <small>${t.stopKeys}</small>
       </button>
-      <button id="estop" aria-expanded=${asking} onClick=${() => setAsking(!asking)}>${t.estop}</button>
+      <button id="pause" aria-expanded=${asking === "pause"} onClick=${() => toggle("pause")}>${t.pause}</button>
+      <button id="estop" aria-expanded=${asking === "estop"} onClick=${() => toggle("estop")}>${t.estop}</button>
     </div>
   </section>`;
 }
@@ -91,6 +97,16 @@ function StopBar({ report }) {
 // ---------------------------------------------------------------- the page
 
 const Banner = ({ words }) => html`<p class="banner" role="alert">${words}</p>`;
+
+function Paused({ cars }) {
+  const pause = cars.find((car) => car.pause)?.pause;
+  if (pause === undefined) return null;
+  return html`<div class="banner" role="alert" data-paused>
+    ${t.paused(who(pause.by), pause.why)}${" "}
+    <button disabled=${store.rights.unpause !== ""} title=${store.rights.unpause} onClick=${unpause}>${t.unpause}</button>
+    ${store.rights.unpause && html`<${Refused} words=${[store.rights.unpause]} />`}
+  </div>`;
+}
 
 class App extends Component {
   componentDidMount() {
@@ -113,11 +129,13 @@ class App extends Component {
             ([to, [name]]) => html`<a key=${to} href=${to} aria-current=${to === here ? "page" : undefined}>${name}</a>`,
           )}
         </nav>
+        <span class="person">${store.hello ? t.youAre(store.hello.person.name, store.rights.lead) : ""}</span>
         <span class="fleet-name">${state?.fleet ?? ""}</span>
       </header>
       ${state !== null && (store.lost || !store.connected) && html`<${Banner} words=${t.consoleLost} />`}
       ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
       ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
+      <${Paused} cars=${state?.cars ?? []} />
       <main id="content" tabindex="-1">
         ${state === null ? html`<h1>${t.title}</h1><p>${t.connecting}</p>` : html`<${Page} key=${here} cars=${state.cars} />`}
       </main>

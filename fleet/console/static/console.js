@@ -8,6 +8,7 @@ const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
 const listeners = new Set();
 export const store = {
   state: null,
+  rights: { cars: {}, pause: "", unpause: "", lead: false }, // what this person may not do: words by car and action
   plan: null,
   inspection: null,
   planAnswer: null, // of the last request about the plan: {ok, words}
@@ -88,10 +89,37 @@ export function estopAll(why) {
   changed();
 }
 
+// ---------------------------------------------------------------- who may do what
+
+const personOf = (sender) => sender.split("@")[0];
+// Another program of the same person has its whole name.
+export function who(sender) {
+  const own = store.hello?.sender ?? "";
+  if (sender === own) return describe.you;
+  return personOf(sender) === personOf(own) ? sender : personOf(sender);
+}
+
+// Why cars refuse an action of this person, each once. The gateways decide; the page says it before.
+export function refusals(action, cars) {
+  return [...new Set(cars.map((car) => store.rights.cars[car]?.[action]).filter(Boolean))];
+}
+export const isRefused = (action, cars) => cars.length > 0 && cars.every((car) => store.rights.cars[car]?.[action]);
+
+export function pauseAll(why) {
+  send({ t: "pause", id: newId(), why });
+  store.press = null;
+  changed();
+}
+
+export function unpause() {
+  verbs.set(++requestNumber, "unpause");
+  send({ t: "unpause", id: requestNumber });
+}
+
 // ---------------------------------------------------------------- hold to drive
 
 export function press(motion, cars, source) {
-  if (cars.length === 0 || !store.connected || document.visibilityState !== "visible") return;
+  if (cars.length === 0 || isRefused("move", cars) || !store.connected || document.visibilityState !== "visible") return;
   store.press = { id: ++pressNumber, motion, cars, source };
   send({ t: "press", press: pressNumber, cars, motion, n: tick });
   changed();
@@ -175,6 +203,9 @@ function onMessage(text) {
       return;
     case "state":
       store.state = message;
+      break;
+    case "rights":
+      store.rights = message;
       break;
     case "samples":
       for (const listener of sampleListeners) listener(message.values);

@@ -1,8 +1,8 @@
 // The drive page: hold to drive, modes, and everything else that the selected cars can do.
 
-import { command, lease, onTick, press, release, store, changed } from "./console.js";
+import { changed, command, isRefused, lease, onTick, press, refusals, release, store, who } from "./console.js";
 import { modes, motions, pad, t } from "./texts.js";
-import { html, Results, useEffect, useState } from "./ui.js";
+import { html, Refused, Results, useEffect, useState } from "./ui.js";
 
 const KEYS = {
   ArrowUp: "forward", ArrowDown: "back", ArrowLeft: "spin_left", ArrowRight: "spin_right",
@@ -89,7 +89,8 @@ function PadButton({ motion, symbol, words, letter }) {
   };
   const keyUp = (event) => isHoldKey(event) && up();
   const held = store.press?.motion === motion;
-  return html`<button class=${held ? "pad held" : "pad"} data-motion=${motion} aria-label=${`${words}, hold`}
+  // Not `disabled`: a button that is disabled while it is held would lose the release.
+  return html`<button class=${held ? "pad held" : "pad"} data-motion=${motion} aria-disabled=${isRefused("move", names())} aria-label=${`${words}, hold`}
     aria-pressed=${held} onPointerDown=${down} onPointerUp=${up} onPointerCancel=${up} onLostPointerCapture=${up}
     onKeyDown=${keyDown} onKeyUp=${keyUp} onBlur=${up} onMouseDown=${prevent} onContextMenu=${prevent}>
     <span class="arrow" aria-hidden="true">${symbol}</span><span class="pad-words">${words} <kbd>${letter}</kbd></span>
@@ -124,22 +125,54 @@ const Leases = ({ cars }) => html`<section>
   <ul class="plain">
     ${cars.map(
       (car) => html`<li key=${car.name}>
-        <strong>${car.name}</strong>: ${car.lease ? t.leaseOf(car.lease.holder, car.lease.kind) : t.nobody}
-        ${car.lease?.holder === "this console"
+        <strong>${car.name}</strong>: ${car.lease ? t.leaseOf(who(car.lease.holder), car.lease.kind) : t.nobody}
+        ${car.lease?.holder === store.hello?.sender
           ? html`<button onClick=${() => lease("give_back", [car.name])} aria-label=${`${t.giveBack} ${car.name}`}>${t.giveBack}</button>`
-          : html`<button onClick=${() => lease("take", [car.name])} aria-label=${`${t.take} ${car.name}`}>${t.take}</button>`}
+          : html`<button disabled=${isRefused("take", [car.name])} onClick=${() => lease("take", [car.name])}
+              aria-label=${`${t.take} ${car.name}`}>${t.take}</button>`}
+        <${Refused} words=${refusals("take", [car.name])} />
       </li>`,
     )}
   </ul>
 </section>`;
 
+const LEND_MINUTES = [1, 5, 10, 30, 60];
+function Lend({ cars }) {
+  const people = [...new Set(cars.flatMap((car) => car.people))].sort();
+  const [to, setTo] = useState("");
+  const [minutes, setMinutes] = useState(10);
+  const chosen = people.includes(to) ? to : (people[0] ?? to);
+  const refused = isRefused("lend", names());
+  return html`<section data-control="lend">
+    <h2>${t.lend}</h2>
+    <fieldset class="bare controls" disabled=${refused}>
+      <label>${t.lendTo}${" "}
+        ${people.length > 0
+          ? html`<select name="to" value=${chosen} onChange=${(event) => setTo(event.target.value)}>
+              ${people.map((name) => html`<option key=${name}>${name}</option>`)}
+            </select>`
+          : html`<input name="to" maxlength="32" value=${to} onInput=${(event) => setTo(event.target.value)} />`}</label>
+      <label>${t.lendFor}${" "}
+        <select name="minutes" value=${minutes} onChange=${(event) => setMinutes(Number(event.target.value))}>
+          ${LEND_MINUTES.map((count) => html`<option key=${count} value=${count}>${t.minutes(count)}</option>`)}
+        </select></label>
+      <button data-do="lend" onClick=${() => command("lend", names(), { to: chosen, duration_s: minutes * 60 })}>${t.lend}</button>
+    </fieldset>
+    <${Refused} words=${refusals("lend", names())} />
+  </section>`;
+}
+
+const ACTS = ["led", "light", "whistle"];
+
 // A control that all cars have. Of the others, it says which car lacks it and why.
 function Offer({ title, needs, cars, children }) {
   const lacking = cars.filter((car) => needs in car.cannot);
+  const action = ACTS.includes(needs) ? "act" : "move";
   return html`<section data-control=${needs}>
     <h2>${title}</h2>
     ${lacking.length === 0
-      ? children
+      ? html`<fieldset class="bare" disabled=${needs !== "drive" && isRefused(action, names())}>${children}</fieldset>
+          <${Refused} words=${refusals(action, names())} />`
       : lacking.map((car) => html`<p class="cannot" key=${car.name}>${t.cannot(car.name, car.cannot[needs])}</p>`)}
   </section>`;
 }
@@ -222,6 +255,7 @@ const Fan = ({ cars }) => html`<button data-do="fan" onClick=${() => command("fa
 
 const Controls = ({ cars }) => html`
   <${Leases} cars=${cars} />
+  <${Lend} cars=${cars} />
   <${Offer} title=${t.mode} needs="mode" cars=${cars}><${Modes} cars=${cars} /><//>
   <${Offer} title=${t.speed} needs="speed" cars=${cars}><${Speed} cars=${cars} /><//>
   <${Offer} title=${t.led} needs="led" cars=${cars}><${Led} /><//>

@@ -1,8 +1,8 @@
 // The fleet page: a card for each car.
 
-import { command, store } from "./console.js";
+import { command, isRefused, refusals, store, who } from "./console.js";
 import { links, modes, motions, motors, t, trends, verdicts } from "./texts.js";
-import { html, Memo, Results, useState, Verdict } from "./ui.js";
+import { html, Memo, Refused, Results, useState, Verdict } from "./ui.js";
 
 export const motorName = (car) => {
   const { state, basis } = car.motors;
@@ -40,11 +40,12 @@ function Estops({ car }) {
   };
   return html`<div class="alarm">
     <p class="latched"><span aria-hidden="true">⛔</span> ${t.estopped}</p>
-    ${car.estops.map((estop) => html`<p key=${estop.id}>${t.estopLine(estop.by, estop.why, estop.scope)}</p>`)}
+    ${car.estops.map((estop) => html`<p key=${estop.id}>${t.estopLine(who(estop.by), estop.why, estop.scope)}</p>`)}
     ${sure
       ? html`<button class="danger" onClick=${end}>${t.endEstopSure}</button>
           <button onClick=${() => setSure(false)}>${t.cancel}</button>`
-      : html`<button onClick=${() => setSure(true)}>${t.endEstop}</button>`}
+      : html`<button disabled=${isRefused("end_estops", [car.name])} onClick=${() => setSure(true)}>${t.endEstop}</button>`}
+    <${Refused} words=${refusals("end_estops", [car.name])} />
   </div>`;
 }
 
@@ -52,8 +53,19 @@ const Hold = ({ car }) =>
   car.hold === null || car.estops.length > 0
     ? null
     : html`<div class="note">
-        <p>${t.held(car.hold)}</p>
-        <button onClick=${() => command("resume", [car.name])} aria-label=${`${t.resume} ${car.name}`}>${t.resume}</button>
+        <p>${t.held(who(car.hold))}</p>
+        <button disabled=${isRefused("resume", [car.name])} onClick=${() => command("resume", [car.name])}
+          aria-label=${`${t.resume} ${car.name}`}>${t.resume}</button>
+        <${Refused} words=${refusals("resume", [car.name])} />
+      </div>`;
+
+const Loan = ({ car }) =>
+  car.loan === undefined
+    ? null
+    : html`<div class="note">
+        <p>${t.lentTo(car.loan.to, who(car.loan.by), new Date(car.loan.until_s * 1000).toLocaleTimeString([], { timeStyle: "short" }))}</p>
+        <button disabled=${isRefused("end_loan", [car.name])} onClick=${() => command("end_loan", [car.name])}
+          aria-label=${`${t.endLoan} ${car.name}`}>${t.endLoan}</button>
       </div>`;
 
 function Card({ car }) {
@@ -69,6 +81,7 @@ function Card({ car }) {
     <${Trouble} car=${car} />
     <${Estops} car=${car} />
     <${Hold} car=${car} />
+    <${Loan} car=${car} />
     <dl>
       <${Row} name=${t.link}><${Verdict} table=${links} name=${car.gateway ? car.link.state : "unknown"} /><//>
       <${Row} name=${t.mode}>
@@ -77,7 +90,7 @@ function Card({ car }) {
           detail=${mode.verdict === "contradicted" ? (modes[mode.inferred] ?? modes.unknown)[0] : ""} />
       <//>
       <${Row} name=${t.motors}><${Verdict} table=${motors} name=${motorName(car)} /><//>
-      <${Row} name=${t.motion}>${motions[car.motion.motion]}${car.motion.owner ? ` (${car.motion.owner})` : ""}<//>
+      <${Row} name=${t.motion}>${motions[car.motion.motion]}${car.motion.owner ? ` (${who(car.motion.owner)})` : ""}<//>
       <${Row} name=${t.battery}>
         ${battery
           ? html`<span class=${`level-${battery.level}`}>
@@ -97,7 +110,7 @@ function Card({ car }) {
           ? html`<${Lamps} values=${car.obstacle} words=${t.seesObstacle(seen(car.obstacle, t.sideNames))} />`
           : t.notMeasured}
       <//>
-      <${Row} name=${t.control}>${car.lease ? t.leaseOf(car.lease.holder, car.lease.kind) : t.nobody}<//>
+      <${Row} name=${t.control}>${car.lease ? t.leaseOf(who(car.lease.holder), car.lease.kind) : t.nobody}<//>
       <${Row} name=${t.event}>
         ${event
           ? html`<time>${new Date(event.at_ms).toLocaleTimeString()}</time>${" "}
@@ -119,6 +132,6 @@ export const FleetPage = ({ cars }) => html`
   <${Results} />
   ${cars.length === 0 && html`<p>${t.noCars}</p>`}
   <div class="cards">
-    ${cars.map((car) => html`<${Memo} key=${car.name} data=${JSON.stringify(car)} draw=${() => html`<${Card} car=${car} />`} />`)}
+    ${cars.map((car) => html`<${Memo} key=${car.name} data=${JSON.stringify([car, store.rights.cars[car.name]])} draw=${() => html`<${Card} car=${car} />`} />`)}
   </div>
 `;

@@ -17,6 +17,9 @@ export const Verdict = ({ table, name, detail = "" }) => {
   >`;
 };
 
+// Why an action is refused, before it is tried.
+export const Refused = ({ words }) => words.map((each) => html`<p class="cannot refused" key=${each}>${each}</p>`);
+
 // Draws again only if its data has changed.
 export class Memo extends Component {
   shouldComponentUpdate(next) {

@@ -6,7 +6,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 
 
 def view_of(platform: str = "arduino", capabilities: tuple[str, ...] | None = None) -> FleetView:
-    view = FleetView("us", lambda *_: "#ff0000")
+    view = FleetView(lambda *_: "#ff0000")
     known = sorted(parse_platform(platform).capabilities) if capabilities is None else capabilities
     view.car("red").on_message("state/health", pb.Health(platform=platform, capabilities=known), 0.0)
     return view
@@ -36,16 +36,16 @@ def test_the_motors_rest_on_what_their_gateway_says() -> None:
     assert view.as_list(10.0)[0]["motors"] == {"state": "off", "basis": "sent"}
 
 
-def test_the_console_calls_itself_this_console() -> None:
+def test_each_sender_has_its_name() -> None:
     view = view_of()
     safety = pb.Safety(hold=pb.Hold(by="us"), lease=pb.Lease(holder="mia", kind="person"))
     safety.estops.add(id="e1", by="us", why="smoke", scope="fleet")
     view.car("red").on_message("state/safety", safety, 10.0)
     (car,) = view.as_list(10.0)
     assert (car["hold"], car["lease"], car["estops"][0]["by"]) == (
-        "this console",
+        "us",
         {"holder": "mia", "kind": "person"},
-        "this console",
+        "us",
     )
 
 

@@ -16,7 +16,7 @@ def event(phase: str, verb: str = "stop", **fields: Any) -> Any:
 
 
 def test_a_car_is_shown_only_by_a_complete_stop() -> None:
-    report = StopReport(1, "stop", ["red", "blue", "green"], 10.0, 0)
+    report = StopReport(1, "stop", "us", ["red", "blue", "green"], 10.0, 0)
     report.on_event("red", event("sent"), 10.1)
     report.on_event("blue", event("sent", basis="sent"), 10.2)
     assert states(report) == {"red": ("stopping", ""), "blue": ("sent", ""), "green": ("asked", "")}
@@ -29,7 +29,7 @@ def test_a_car_is_shown_only_by_a_complete_stop() -> None:
 
 
 def test_a_late_event_and_a_drive_change_nothing() -> None:
-    report = StopReport(1, "stop", ["red"], 10.0, 0)
+    report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
     report.on_event("red", event("complete", verb="drive"), 10.1)
     assert states(report)["red"][0] == "asked"
     report.on_event("red", event("complete", basis="shown"), 10.2)
@@ -38,7 +38,7 @@ def test_a_late_event_and_a_drive_change_nothing() -> None:
 
 
 def test_a_car_without_an_outcome_was_not_reached() -> None:
-    report = StopReport(1, "stop", ["red", "blue"], 10.0, 0)
+    report = StopReport(1, "stop", "us", ["red", "blue"], 10.0, 0)
     answer = Outcome("blue", ok=False, phase="no_answer", words="its gateway went away")
     found = Outcome("green", ok=True, phase="complete", basis="shown")
     report.on_outcomes([answer, found], 15.0)
@@ -50,7 +50,7 @@ def test_a_car_without_an_outcome_was_not_reached() -> None:
 
 
 def test_a_car_that_its_own_gateway_stops_later_is_shown() -> None:
-    report = StopReport(1, "stop", ["red"], 10.0, 0)
+    report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
     report.on_safety("red", pb.Safety(motors="off", motors_basis="shown"), 10.1)
     assert states(report)["red"][0] == "asked", "the state may be older than the stop"
     report.on_outcomes([], 12.0)

@@ -1,0 +1,128 @@
+"""What a page says of a person, an action and a car is what the gateway decides: both sides in one table."""
+
+import itertools
+from collections.abc import Iterator
+
+from fleet.console.permissions import ACTIONS, CarRules, refusals, rights_of
+from gateway.bus.publisher import _fill_safety
+from gateway.control import arbiter
+from gateway.control.commands import (
+    Action,
+    ChangeSpeed,
+    Command,
+    Drive,
+    EndLoan,
+    Find,
+    Lend,
+    OneShot,
+    Pause,
+    Resume,
+    Sender,
+    SenderKind,
+    SetMode,
+    TakeLease,
+    Unpause,
+)
+from gateway.control.people import NO_PEOPLE, People
+from gateway.control.safety import Estop, FleetPause, Hold, LeaseState, Loan, Safety
+from gateway.protocol.enums import Light, Mode, Motion, SpeedStep
+from gateway.protocol.frames import General, Ptz
+from schemas.gen import fleet_v1_pb2 as pb
+from tests.gateway.control.workbench import Workbench
+
+NOW = 1000.0
+PERSON, LEAD = SenderKind.PERSON, SenderKind.LEAD
+TEACHER, ANN, BOB, EVE, ZED = (
+    f"{name}@lab-{number}" for number, name in enumerate(("teacher", "ann", "bob", "eve", "zed"))
+)
+SENDERS = (TEACHER, ANN, BOB, EVE, ZED)
+TABLES = (
+    NO_PEOPLE,
+    People.parse(["teacher:lead", "ann", "bob", "eve:other"]),
+    People.parse(["ann", "bob", "eve:other"]),
+)
+ESTOPS = (
+    (),
+    (Estop("e1", BOB, "smoke", 1, fleet_wide=False, rank=PERSON),),
+    (Estop("e2", TEACHER, "fire", 1, fleet_wide=True, rank=LEAD),),
+    (
+        Estop("e2", TEACHER, "fire", 1, fleet_wide=True, rank=LEAD),
+        Estop("e3", EVE, "", 1, fleet_wide=True, rank=PERSON),
+    ),
+    (Estop("e4", ZED, "", 1, fleet_wide=False, rank=PERSON),),
+)
+HOLDS = (None, Hold(ANN, 1, PERSON), Hold(TEACHER, 1, LEAD))
+PAUSES = (None, FleetPause("p1", TEACHER, "listen", 1, LEAD), FleetPause("p2", ANN, "", 1, PERSON))
+LEASES = (None, Sender(ANN, PERSON), Sender(TEACHER, LEAD), Sender("script@lab-9", SenderKind.SCRIPT))
+LOANS = ("", "bob", "eve", "teacher")
+ASKED: dict[str, tuple[Action, ...]] = {
+    "move": (Drive(Motion.FORWARD), SetMode(Mode.TRACKING), OneShot(Ptz(90)), ChangeSpeed(SpeedStep.DOWN)),
+    "act": (OneShot(General(Motion.STOP, light=Light.RED)), Find()),
+    "take": (TakeLease(),),
+    "resume": (Resume(),),
+    "pause": (Pause("listen"),),
+    "unpause": (Unpause(),),
+    "lend": (Lend("bob", 60.0),),
+    "end_loan": (EndLoan(),),
+}
+RULES = {"leased", "lent", "not_allowed", "paused", "held", "estopped"}
+"""Reasons about who may do what. All others are about the car."""
+
+
+def cars() -> Iterator[tuple[arbiter.CommandContext, CarRules]]:
+    """Each state of a car: as its gateway has it, and as the console reads it in state/safety."""
+    control = Workbench().control
+    for people, estops, hold, pause, lease, loan in itertools.product(TABLES, ESTOPS, HOLDS, PAUSES, LEASES, LOANS):
+        if lease is not None and lease.kind is LEAD and not people.leads:
+            continue  # no lease outlives the gateway that gave it, nor its people
+        control.people, safety = people, Safety(hold)
+        control.safety = safety
+        for estop in estops:
+            safety.latch(estop)
+        if pause is not None:
+            safety.merge_pauses([pause], [])
+        if loan:
+            safety.lend(Loan(loan, TEACHER, LEAD, 1, 60.0), NOW)
+        if lease is not None:
+            safety.lease = LeaseState(lease, NOW + 1.0)
+        message = pb.Safety()
+        _fill_safety(message, control, NOW)
+        yield control._context(NOW), CarRules.of(control.car, message)
+
+
+def decided(context: arbiter.CommandContext, sender: str, action: Action) -> str | None:
+    """The rule by which the gateway refuses; None if it does not, or for another reason."""
+    ranked = context.people.ranked(Sender(sender, PERSON))
+    refusal = arbiter.refuse(Command("1", "any", ranked, action, take=isinstance(action, TakeLease)), context)
+    return str(refusal[0]) if refusal is not None and str(refusal[0]) in RULES else None
+
+
+def test_the_page_and_the_gateway_decide_alike() -> None:
+    seen = set()
+    for context, rules in cars():
+        asked = ASKED | {"end_estops": (Resume(tuple(each.id for each in context.estops)),) if context.estops else ()}
+        for sender in SENDERS:
+            refused = refusals(rules, sender)
+            for name, actions in asked.items():
+                code = refused[name][0] if name in refused else None
+                for action in actions:
+                    assert code == decided(context, sender, action), (sender, action, rules)
+                    seen.add((name, code))
+    assert {name for name, _ in seen} == set(ACTIONS)
+    assert {code for _, code in seen} == {None, *RULES}
+
+
+def test_the_words_name_the_person_the_car_and_the_rule() -> None:
+    rules = CarRules("red", listed=True, leads=("teacher",), drivers=("ann",), others=("eve",))
+    assert refusals(rules, EVE)["move"] == ("not_allowed", "eve drives other cars, not red.")
+    assert refusals(rules, ZED)["act"] == ("not_allowed", "zed watches and stops: the fleet file does not list zed.")
+    assert refusals(rules, ANN)["pause"] == ("not_allowed", "Only a lead may (teacher).")
+    assert refusals(rules, TEACHER) == {}
+
+
+def test_a_fleet_can_be_paused_if_one_car_lets_it() -> None:
+    strict = CarRules("red", listed=True, leads=("teacher",), drivers=("ann",))
+    assert rights_of(ANN, {"red": strict})["pause"] == "Only a lead may (teacher)."
+    assert rights_of(ANN, {"red": strict, "blue": CarRules("blue")})["pause"] == ""
+    assert rights_of(TEACHER, {"red": strict})["cars"] == {"red": {}}
+    assert rights_of(ANN, {})["pause"] == ""
