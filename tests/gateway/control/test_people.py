@@ -53,7 +53,8 @@ ACTIONS: dict[str, Action] = {
     "resume all": Resume(all=True),
     "pause": Pause(),
     "unpause": Unpause(),
-    "lend": Lend("dan", 60.0),
+    "lend": Lend("cid", 60.0),
+    "lend stranger": Lend("dan", 60.0),
     "end loan": EndLoan(),
 }
 SENDERS = {
@@ -155,6 +156,9 @@ def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: Com
 
     if action in ("stop", "e-stop", "free"):
         return None
+    if action == "lend stranger":
+        known = expected("lend", sender, listed, at)
+        return known if known is not None or listed is None else Reason.BAD_VALUE
     if action in ("pause", "unpause", "lend") or (action == "end loan" and at.loan is not None and not borrows):
         if not directs:
             return Reason.NOT_ALLOWED
