@@ -72,10 +72,11 @@ vectors: .venv/.ready ## write tests/vectors/stops.tsv, the distribution of stop
 proto: .venv/.ready ## generate schemas/gen from schemas/proto
 	$(BIN)/python -m schemas.generate
 
-pictures: .venv/.ready ## docs/pictures: the animation, `fleet up`, and Rerun's views (a Vulkan driver, which may be software)
+pictures: .venv/.ready browser ## docs/pictures: the animation, `fleet up`, the console, and Rerun's views (a Vulkan driver, which may be software)
 	@mkdir -p .tmp
 	$(BIN)/python -m tests.tools.hero docs/pictures
 	$(BIN)/python -m tests.tools.screenshots "$$(ls -td .tmp/pictures/sessions/*/ | head -n 1)" docs/pictures
+	$(BIN)/python -m tests.tools.console_pictures docs/pictures
 
 pages: .venv/.ready ## generate the pages and tables of docs/reference, and the numbers in other pages
 	$(BIN)/python -m tests.tools.pages

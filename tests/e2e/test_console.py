@@ -556,6 +556,28 @@ def test_bad_messages_and_reconnects_move_no_car_and_harm_no_page(stage: Console
     assert stage.judges["blue"].on_after(begun_ns) == []
 
 
+def test_a_thousand_reconnects_leave_nothing_behind(stage: ConsoleStage) -> None:
+    page = stage.driving_page("red")
+    process = psutil.Process(stage.console.process.pid)
+
+    def reconnect(times: int) -> None:
+        for _ in range(times):
+            with socket_of(stage) as socket_:
+                socket_.recv()
+
+    reconnect(100)
+    files, threads, rss = process.num_fds(), process.num_threads(), process.memory_info().rss
+    reconnect(900)
+    wait_for(lambda: process.num_fds() <= files, "each socket is closed")
+    grown_mb = (process.memory_info().rss - rss) / 1e6
+    print(f"\n1,000 reconnects: {grown_mb:+.1f} MB, {process.num_threads() - threads:+d} threads")
+    assert grown_mb < 10
+    assert process.num_threads() <= threads
+    with stage.held(page, "forward"):  # the page goes on
+        pass
+    stage.stands()
+
+
 def test_a_page_that_reads_nothing_holds_up_no_other(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     with socket_of(stage) as deaf:

@@ -16,7 +16,6 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses
 
 PLAN = "roles:\n  guide: {mode: tracking}\n  rest: {mode: manual, count: all, priority: -1}\n"
-PAGES = {"fleet": "", "drive": "#/drive", "plan": "#/plan", "plots": "#/plots", "inspect": "#/inspect"}
 COLORS = 64
 SETTLE_S = 4.0
 """Time for some readings of each car."""
@@ -34,7 +33,10 @@ def main(directory: Path) -> None:
             stage.person.ask(mode_request("light_seeking"), ["blue"])
             time.sleep(SETTLE_S)
             phone = stage.playwright.devices["Pixel 7"] | {"color_scheme": "dark", "device_scale_factor": 1.5}
-            for name, path in PAGES.items():
+            links = stage.page().locator("nav a").all()
+            pages = [link.get_attribute("href") or "" for link in links]
+            for path in pages:
+                name = path.removeprefix("#/") or "fleet"
                 for suffix, options in (("", {}), ("-phone", phone)):
                     page = stage.page(path, **options)
                     if name == "drive":
