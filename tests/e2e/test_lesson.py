@@ -4,6 +4,8 @@ The file, the options of the gateways and the commands are those of a class. The
 """
 
 import json
+import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +16,9 @@ from fleet.client.client import Fleet
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.supervisor.spec import UpOptions, build_spec
 from gateway.control.senders import STREAM_PAUSE_S
+from tests.e2e.test_newcomer import Newcomer, blocks, commands
 from tests.support import in_process
+from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, GatewayProcess, driving, wait_for
 
 LESSON = Path(__file__).parents[2] / "fleet/examples/fleets/lesson.yaml"
@@ -150,3 +154,27 @@ def test_a_lesson_with_six_cars(lesson: Lesson) -> None:
     lesson.type("teacher", "resume", "--all")
     lesson.hold_down("group_b", "green")
     assert lesson.moving() == {"green"}
+
+
+TUTORIAL = Path(__file__).parents[2] / "docs/tutorials/5-a-lesson-with-six-cars.md"
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(400)
+def test_the_tutorial_word_for_word(tmp_path: Path) -> None:
+    """Each command does what the page says; `# refused` stands behind those that exit with 1."""
+    programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    variables = {"PATH": programs, "FLEET_ENDPOINT": free_endpoint(), "FLEET_STATE_DIR": str(tmp_path / "state")}
+    student = Newcomer(tmp_path, os.environ | variables)
+    lines = [line for language, _, body in blocks(TUTORIAL) if language == "sh" for line in body.splitlines()]
+    lines.remove("fleet console --as teacher --open")  # it stays; tests/e2e/test_console_people.py opens it
+    down = lines.pop()
+    try:
+        for line in lines:
+            (command,) = commands(line)
+            if "# refused" in line:
+                assert not student.succeeds(command), line
+            else:
+                student.type(command)
+    finally:
+        student.type(down)
