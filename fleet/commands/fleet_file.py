@@ -13,7 +13,8 @@ from fleet.commands.options import cli_errors
 from fleet.commands.params import Choice, Duration, Number
 from fleet.fleetfile.fleet_file import FleetFile, default_color, parse_fleet, read_fleet
 from fleet.fleetfile.models import FileEntry, validate_car_name, validate_color, validate_link, validate_platform
-from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, NewCar, ScanFailed, format_new_file, format_new_plan, scan
+from fleet.fleetfile.scan import LIKELY_VERDICTS, FoundLink, ScanFailed, scan
+from fleet.fleetfile.template import NewCar, format_new_file, format_new_plan
 from fleet.links import LINK_SIM
 from fleet.supervisor.spec import MAX_SIMULATED_CARS
 from schemas import keys

@@ -45,7 +45,7 @@ class CoordinatorStateFile:
                 roles,
                 str(content["phase"]),
                 float(content["phase_since_s"]),
-                {int(index): str(that) for index, that in content["rules"].items()},
+                {int(index): str(trigger) for index, trigger in content["rules"].items()},
                 str(content.get("stopped_by", "")),
                 tuple(map(str, content.get("to_rest", ()))),
             )

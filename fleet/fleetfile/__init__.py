@@ -1,1 +1,1 @@
-"""The fleet file: `models`, reading (`fleet_file`), edits (`editor`), a first file from a `scan`, and `link_check`."""
+"""The fleet file: `models`, reading (`fleet_file`), edits (`editor`), new ones (`template`), `scan`, `link_check`."""

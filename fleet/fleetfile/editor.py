@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from fleet.fleetfile.fleet_file import FleetFile, parse_fleet
-from fleet.fleetfile.scan import format_key, quote
+from fleet.fleetfile.template import format_key, quote
 from schemas.yaml_document.document import BadFile, Document
 
 

@@ -422,7 +422,7 @@ def _command_leds(
         for position, effect in enumerate(plan.rules[index].effects):
             if not state.on or effect.led is None or effect.blink_s is not None:
                 continue
-            before = LedRequest(index, position, state.that, None)
+            before = LedRequest(index, position, state.trigger, None)
             if before in memory.led_requests:
                 result.add(before)
                 continue

@@ -35,7 +35,7 @@ class RuleState:
     when: Mapping[str, Debounced] = field(default_factory=dict)
     """The debounced condition by car."""
     until: Mapping[str, Debounced] = field(default_factory=dict)
-    that: str | None = None
+    trigger: str | None = None
     """The car that triggered the rule."""
     since: float = 0.0
     used: tuple[str, ...] = ()
@@ -89,19 +89,23 @@ def _follow_rule(rule: Rule, snapshot: FleetSnapshot, cars: CarSets, before: Rul
     true_for = [car for car, debounced in when.items() if debounced.on]
     until = _NO_CARS if rule.until is None else _follow(rule.until, snapshot, cars, before.until, now)
     ended = any(debounced.on for debounced in until.values())
-    that = before.that if before.that in cars.present and (rule.until is not None or before.that in true_for) else None
+    trigger = (
+        before.trigger
+        if before.trigger in cars.present and (rule.until is not None or before.trigger in true_for)
+        else None
+    )
     if before.on and rule.until is not None:
-        on = not ended and (that is not None or before.that is None or bool(true_for))
+        on = not ended and (trigger is not None or before.trigger is None or bool(true_for))
     else:
         on = bool(true_for) and not ended
     if not on:
         return RuleState(when=when, until=until)
-    if that is None and rule.when.of is not Quantifier.ALL:
-        that = min(true_for, key=lambda car: (car not in cars.free, when[car].since, car), default=None)
-    if before.on and that == before.that:
+    if trigger is None and rule.when.of is not Quantifier.ALL:
+        trigger = min(true_for, key=lambda car: (car not in cars.free, when[car].since, car), default=None)
+    if before.on and trigger == before.trigger:
         return replace(before, when=when, until=until)
-    used = _readings_used(rule.when, snapshot, cars, that, now)
-    return RuleState(on=True, when=when, until=until, that=that, since=now, used=used)
+    used = _readings_used(rule.when, snapshot, cars, trigger, now)
+    return RuleState(on=True, when=when, until=until, trigger=trigger, since=now, used=used)
 
 
 def _follow(
@@ -141,9 +145,9 @@ def _all_of(each: list[bool | None]) -> bool | None:
 
 
 def _readings_used(
-    condition: PlanCondition, snapshot: FleetSnapshot, cars: CarSets, that: str | None, now: float
+    condition: PlanCondition, snapshot: FleetSnapshot, cars: CarSets, trigger: str | None, now: float
 ) -> tuple[str, ...]:
-    of = [that] if that is not None else _watched(condition, cars, _NO_CARS)
+    of = [trigger] if trigger is not None else _watched(condition, cars, _NO_CARS)
     return tuple(reading for car in of for reading in snapshot.used(condition.expression, car, now))
 
 
@@ -153,10 +157,10 @@ def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: 
         case "":
             return
         case who if who == THIS_CAR:
-            if state.that is not None:
-                yield state.that
+            if state.trigger is not None:
+                yield state.trigger
         case who if who == OTHER_CARS:
-            yield from (car for car in subjects if car != state.that)
+            yield from (car for car in subjects if car != state.trigger)
         case who if who == ALL_CARS:
             yield from subjects
         case who if who in subjects:

@@ -62,7 +62,7 @@ class LedRequest:
     rule: int
     effect: int
     """Position of the rule in the plan, and of the effect in the rule."""
-    that: str | None
+    trigger: str | None
     car: str | None
     """None: every car, by the coordinator before a restart."""
 
@@ -153,14 +153,14 @@ def restore(plan: Plan, snapshot: FleetSnapshot, persisted: PersistedPolicy, now
     if persisted.version != plan.version or (persisted.phase and persisted.phase not in plan.phases):
         return PolicyState(held_roles=held_roles)
     rules = {
-        index: RuleState(on=True, when={that: Debounced(on=True, since=now)}, that=that or None, since=now)
-        for index, that in persisted.rules.items()
+        index: RuleState(on=True, when={trigger: Debounced(on=True, since=now)}, trigger=trigger or None, since=now)
+        for index, trigger in persisted.rules.items()
         if index < len(plan.rules)
     }
     age_s = max(0.0, wall_s - persisted.phase_since_s)
     phase = PhaseState(persisted.phase, now - age_s, why=IN_PHASE) if persisted.phase else PhaseState()
     led_requests = frozenset(
-        LedRequest(index, position, state.that, None)
+        LedRequest(index, position, state.trigger, None)
         for index, state in rules.items()
         for position in range(len(plan.rules[index].effects))
     )
@@ -174,7 +174,7 @@ def to_persisted(plan: Plan, memory: PolicyState, now: float, wall_s: float) -> 
         memory.roles,
         memory.phase.name,
         round(wall_s - (now - memory.phase.since), 1) if memory.phase.name else 0.0,
-        {index: state.that or "" for index, state in memory.rules.items() if state.on},
+        {index: state.trigger or "" for index, state in memory.rules.items() if state.on},
         memory.stopped_by,
         tuple(sorted(memory.to_rest)),
     )

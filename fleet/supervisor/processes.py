@@ -67,7 +67,7 @@ class ProcessSet:
     """All processes of one supervisor, by name.
 
     on_event: called with a name and words. on_line: called with each line of a stdout. on_exit: called when a process
-    has ended, with True if it was told to.
+    has ended, with True if the supervisor ended it.
     """
 
     def __init__(

@@ -21,7 +21,7 @@ from fleet.recording.reading.mcap_reader import McapReader, NotMcap, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.selection import EVERYTHING, Selection, key_expressions
 from fleet.recording.tools.analysis import arrow_table, data_frame, join_as_of
-from fleet.recording.writing.mcap_copy import Copy
+from fleet.recording.writing.mcap_copy import McapCopy
 from schemas.keys import DEFAULT_FLEET
 from schemas.suggestion import did_you_mean
 
@@ -173,7 +173,7 @@ class Session:
 
         For truncated or damaged files: other readers stop at the damage, or show corrupted messages.
         """
-        with Copy(out) as copy:
+        with McapCopy(out) as copy:
             for row in self.rows():
                 copy.add(row)
         if not copy.messages:

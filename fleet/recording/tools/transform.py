@@ -17,7 +17,7 @@ from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
 from fleet.recording.tools.tables import car_of
-from fleet.recording.writing.mcap_copy import Copy
+from fleet.recording.writing.mcap_copy import McapCopy
 
 COPIED: Final = ("fleet.yaml", "plan.yaml")
 MAX_SEGMENT_PAYLOAD_BYTES: Final = 256 << 20
@@ -125,7 +125,7 @@ def _copy(rows: Iterable[Row], new: Path, session: Session) -> int:
     while row is not None:
         number += 1
         size = 0
-        with Copy(session_dir.segment(new, number), {**about, "format": str(session_dir.FORMAT_VERSION)}) as copy:
+        with McapCopy(session_dir.segment(new, number), {**about, "format": str(session_dir.FORMAT_VERSION)}) as copy:
             while row is not None and size < MAX_SEGMENT_PAYLOAD_BYTES:
                 copy.add(row)
                 size += len(row[4])

@@ -14,7 +14,7 @@ CHUNK_NS: Final = 1_000_000_000
 """Maximum time span of a chunk. The recorder uses the same: reading a short part decompresses little else."""
 
 
-class Copy:
+class McapCopy:
     """One file to write; every method may raise OSError. After an exception the file stays truncated."""
 
     def __init__(self, path: Path, about: Mapping[str, str] | None = None) -> None:
@@ -45,7 +45,7 @@ class Copy:
     def add(self, row: Row) -> None:
         """Write one message unchanged."""
         info, sequence, log_ns, publish_ns, data = row
-        # Look it up by identity, which is fast. Storing the object too keeps its id from being reused.
+        # Channels are looked up by identity, which is fast. The stored object keeps its id from being reused.
         entry = self._channel_ids.get(id(info))
         if entry is None:
             entry = self._channel_ids[id(info)] = (info, self._channel(info))

@@ -18,7 +18,7 @@ import pytest
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
-from fleet.fleetfile.scan import NewCar, format_new_file
+from fleet.fleetfile.template import NewCar, format_new_file
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse as parse_plan
 from schemas.yaml_document.document import BadFile
