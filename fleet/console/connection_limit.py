@@ -12,9 +12,34 @@ MAX_CONNECTIONS: Final = 192
 MAX_STRANGERS_PER_ADDRESS: Final = 24
 STRANGER_TIMEOUT_S: Final = 10.0
 """Timeout of a connection that has shown no cookie of a paired device."""
-CONNECTION_BURST: Final = 100.0
-CONNECTIONS_PER_S: Final = 20.0
-"""Rate of new connections. A TLS handshake takes a millisecond or two of the loop that stops the cars."""
+# A TLS handshake takes a millisecond or two of the loop that stops the cars.
+ADDRESS_BURST: Final = 40.0
+"""New connections of one address at once: a page needs about ten."""
+ADDRESS_RATE: Final = 10.0
+"""New connections per second of one address."""
+TOTAL_BURST: Final = 200.0
+TOTAL_RATE: Final = 50.0
+MAX_ADDRESSES: Final = 1024
+"""Maximum number of remembered addresses. More are forgotten, the oldest first."""
+
+
+@dataclass(slots=True)
+class _Budget:
+    """A token bucket."""
+
+    burst: float
+    rate: float
+    left: float
+    at: float
+
+    def take(self, now: float) -> bool:
+        """Take one token. Return False if there is none."""
+        self.left = min(self.burst, self.left + max(0.0, now - self.at) * self.rate)
+        self.at = now
+        if self.left < 1.0:
+            return False
+        self.left -= 1.0
+        return True
 
 
 @dataclass(slots=True)
@@ -29,17 +54,18 @@ class ConnectionLimit:
     """The open connections, oldest first, by any key."""
 
     _open: dict[Hashable, _OpenConnection] = field(default_factory=dict)
-    _budget: float = CONNECTION_BURST
-    _budget_at: float | None = None
+    _total: _Budget = field(default_factory=lambda: _Budget(TOTAL_BURST, TOTAL_RATE, TOTAL_BURST, 0.0))
+    _addresses: dict[str, _Budget] = field(default_factory=dict)
 
     def admit(self, key: Hashable, address: str, now: float) -> tuple[bool, Hashable | None]:
         """Decide on a new connection. Return whether it stays, and the key of another one that must end for it."""
-        if self._budget_at is not None:
-            self._budget = min(CONNECTION_BURST, self._budget + (now - self._budget_at) * CONNECTIONS_PER_S)
-        self._budget_at = now
-        if self._budget < 1.0:
+        budget = self._addresses.pop(address, None) or _Budget(ADDRESS_BURST, ADDRESS_RATE, ADDRESS_BURST, now)
+        self._addresses[address] = budget
+        if len(self._addresses) > MAX_ADDRESSES:
+            del self._addresses[next(iter(self._addresses))]
+        # One address in a flood uses up its own budget, not that of all.
+        if not budget.take(now) or not self._total.take(now):
             return False, None
-        self._budget -= 1.0
         strangers = [other for other, each in self._open.items() if not each.is_paired]
         neighbors = [other for other in strangers if self._open[other].address == address]
         ended: Hashable | None = None

@@ -110,6 +110,7 @@ class Lan:
         self.context.minimum_version = ssl.TLSVersion.TLSv1_2
         self.certificate.load_into(self.context)
         self._refusals = LogLimit()
+        self._shared_cookies = LogLimit()
         self._connected: dict[int, tuple[str, str, Callable[[], object]]] = {}
         """Device, address and the function that closes it, by number of the socket."""
         self._last_socket = 0
@@ -175,11 +176,11 @@ class Lan:
         """Handle a connection that has shown a cookie: it stays. Warn if two computers use one cookie."""
         self.listener.limit.on_paired(client)
         others = {address for id_, address, _ in self._connected.values() if id_ == device.id} - {client[0]}
-        if others and (words := self._refusals.words("", time.monotonic())) is not None:
+        if others and (words := self._shared_cookies.words("", time.monotonic())) is not None:
+            places = ", ".join([client[0], *sorted(others)])
             log.warning(
-                "the cookie of %s (%s) is in use at %s and %s%s. If that is not one device, revoke it: "
-                "fleet console people --revoke %s",
-                device.person.name, device.id, client[0], *others, words, device.id,
+                "the cookie of %s is in use at %s%s. If that is not one device, type: fleet console people --revoke %s",
+                device.person.name, places, words, device.id,
             )  # fmt: skip
 
     def on_refusal(self, words: str) -> None:

@@ -111,7 +111,7 @@ class PeopleBook:
         matching = [each for each in self.codes if hmac.compare_digest(each.digest, wanted) & each.is_open(now)]
         if not matching:
             return None
-        words = "".join(letter for letter in device if letter.isprintable())[:MAX_DEVICE_NAME_LENGTH]
+        words = "".join(letter for letter in device if letter.isprintable())[:MAX_DEVICE_NAME_LENGTH].strip()
         added = PairedDevice(device_id, matching[0].person, words, digest(cookie), now)
         codes = tuple(each for each in self.codes if each is not matching[0])
         devices = [each for each in self.devices if each.state(now) != "unknown"]

@@ -169,7 +169,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
             await socket_.close(_TRY_AGAIN_LATER, "too many pages are open")
         except BusError:
             await socket_.close(_TRY_AGAIN_LATER, "the bus cannot be reached")
-        except (WebSocketDisconnect, KeyError):  # KeyError: a binary message
+        except (WebSocketDisconnect, KeyError, RuntimeError):  # a binary message; a socket that we have closed
             with suppress(RuntimeError):
                 await socket_.close()
 

@@ -1,5 +1,6 @@
 """A device on the console's network side: raw HTTPS requests and a WebSocket, with a cookie or without."""
 
+import contextlib
 import http.client
 import json
 import re
@@ -23,16 +24,25 @@ def untrusting() -> ssl.SSLContext:
 class NetworkDevice:
     """A browser without a face. `127.0.0.1` is an address of the network's port like any other."""
 
-    def __init__(self, port: int, host: str = "127.0.0.1") -> None:
+    def __init__(self, port: int, host: str = "127.0.0.1", source: str | None = None) -> None:
         self.host, self.port = host, port
+        self._source = None if source is None else (source, 0)
         self.origin = f"https://{host}:{port}"
         self.cookie = ""
 
+    def connection(self) -> http.client.HTTPSConnection:
+        """A connection for several requests."""
+        return http.client.HTTPSConnection(
+            self.host, self.port, timeout=30, context=untrusting(), source_address=self._source
+        )
+
     def ask(self, verb: str, path: str, body: str | None = None, **headers: str) -> tuple[int, bytes]:
         """Ask the console; its status and its text. A new cookie is kept. A header without value is left out."""
-        connection = http.client.HTTPSConnection(self.host, self.port, timeout=30, context=untrusting())
+        connection = self.connection()
         sent = {"Origin": self.origin, "Cookie": self.cookie} | headers
-        connection.request(verb, path, body=body, headers={name: value for name, value in sent.items() if value})
+        connection.connect()
+        with contextlib.suppress(ConnectionError, ssl.SSLEOFError):  # it refuses a large body before its end
+            connection.request(verb, path, body=body, headers={name: value for name, value in sent.items() if value})
         response = connection.getresponse()
         if (cookie := response.getheader("set-cookie")) is not None:
             self.cookie = cookie.partition(";")[0]
@@ -50,7 +60,12 @@ class NetworkDevice:
         sent = {"Origin": self.origin, "Cookie": self.cookie} | headers
         origin = Origin(sent.pop("Origin"))
         return connect(
-            f"wss://{self.host}:{self.port}/ws", origin=origin, additional_headers=sent, ssl=untrusting(), proxy=None
+            f"wss://{self.host}:{self.port}/ws",
+            origin=origin,
+            additional_headers=sent,
+            ssl=untrusting(),
+            proxy=None,
+            source_address=self._source,
         )
 
 

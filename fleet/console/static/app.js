@@ -4,6 +4,7 @@ import { estopAll, pauseAll, setTexts, stopAll, store, subscribe, unpause, who }
 import { DrivePage } from "./drive-page.js";
 import { FleetPage } from "./fleet-page.js";
 import { InspectPage } from "./inspect-page.js";
+import { PeoplePage } from "./people-page.js";
 import { PlanPage } from "./plan-page.js";
 import { PlotsPage } from "./plots-page.js";
 import { stopStates, t } from "./texts.js";
@@ -12,7 +13,7 @@ import { Component, html, Refused, render, useState, Verdict } from "./ui.js";
 const SHOW_REPORT_MS = 30_000;
 const SAME_PRESS_MS = 1000;
 
-const PAGES = { "#/": [t.fleet, FleetPage], "#/drive": [t.drive, DrivePage], "#/plan": [t.plan, PlanPage], "#/plots": [t.plots, PlotsPage], "#/inspect": [t.inspect, InspectPage] };
+const PAGES = { "#/": [t.fleet, FleetPage], "#/drive": [t.drive, DrivePage], "#/plan": [t.plan, PlanPage], "#/plots": [t.plots, PlotsPage], "#/inspect": [t.inspect, InspectPage], "#/people": [t.people, PeoplePage] };
 
 // ---------------------------------------------------------------- STOP
 
@@ -134,6 +135,7 @@ class App extends Component {
       </header>
       ${state !== null && (store.lost || !store.connected) && html`<${Banner} words=${t.consoleLost} />`}
       ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
+      ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired} <a href="/pair">${t.pairAgain}</a></p>`}
       ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
       <${Paused} cars=${state?.cars ?? []} />
       <main id="content" tabindex="-1">

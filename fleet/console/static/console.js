@@ -1,6 +1,7 @@
 // The page's side of the one WebSocket: the newest state, presses, STOP, commands and their outcomes.
 
 const RECONNECT_MS = 500;
+const UNPAIRED_MS = 5000;
 const LOST_MS = 1500;
 const MAX_RESULTS = 6;
 const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
@@ -16,6 +17,7 @@ export const store = {
   connected: false,
   lost: false,
   stopUnsent: false, // the last STOP has not reached the console
+  unpaired: false, // revoked, or expired: only STOP by fetch may still work
   press: null, // the motion that is held: {id, motion, cars, source}
   results: [],
   selected: new Set(),
@@ -255,9 +257,15 @@ export function onTick(listener) {
 async function connect() {
   // A console that was started again has another cookie.
   try {
-    await fetch("/hello");
+    const hello = await fetch("/hello");
+    store.unpaired = hello.status === 403;
   } catch {
     setTimeout(connect, RECONNECT_MS);
+    return;
+  }
+  if (store.unpaired) {
+    changed();
+    setTimeout(connect, UNPAIRED_MS);
     return;
   }
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);

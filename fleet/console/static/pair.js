@@ -19,12 +19,17 @@ document.getElementById("pair").addEventListener("submit", (event) => {
   pair(input.value);
 });
 
-const scanned = location.hash.slice(1);
-if (scanned !== "") {
+function onAddress() {
+  const scanned = location.hash.slice(1);
+  if (scanned === "") return false;
   history.replaceState(null, "", "/pair");
   input.value = scanned;
   pair(scanned);
-} else {
+  return true;
+}
+
+window.addEventListener("hashchange", onAddress);
+if (!onAddress()) {
   // A link from another program brings no cookie (SameSite=Strict). This request brings it.
   fetch("/hello")
     .then((response) => response.ok && location.replace("/"))

@@ -6,11 +6,13 @@ from hypothesis import strategies as st
 
 from fleet.console import pairing
 from fleet.console.connection_limit import (
-    CONNECTION_BURST,
-    CONNECTIONS_PER_S,
+    ADDRESS_BURST,
+    ADDRESS_RATE,
+    MAX_ADDRESSES,
     MAX_CONNECTIONS,
     MAX_STRANGERS_PER_ADDRESS,
     STRANGER_TIMEOUT_S,
+    TOTAL_BURST,
     ConnectionLimit,
     LogLimit,
 )
@@ -173,17 +175,18 @@ def test_strangers_are_few_and_paired_devices_stay(events: list[tuple[str, int, 
                 strangers = {key: since for key, since in strangers.items() if key not in late}
         assert len(limit) == len(strangers) + len(paired_ones) <= MAX_CONNECTIONS
         assert len(strangers) <= 3 * MAX_STRANGERS_PER_ADDRESS
-    assert admitted <= CONNECTION_BURST + now * CONNECTIONS_PER_S + 1e-6
+    assert admitted <= 3 * (ADDRESS_BURST + now * ADDRESS_RATE) + 1e-6
 
 
-def test_a_flood_is_refused_and_ends() -> None:
+def test_a_flood_is_refused_and_costs_no_other_address_a_connection() -> None:
     limit = ConnectionLimit()
-    admitted = sum(limit.admit(number, f"10.0.{number // 20}.1", 0.0)[0] for number in range(5000))
-    assert admitted == CONNECTION_BURST
-    assert limit.admit("later", "10.0.0.7", 1.0)[0]
-    for number in range(1000):
-        limit.admit(("more", number), f"10.1.{number}.1", 1.0 + number)
+    assert sum(limit.admit(number, "10.0.0.9", 0.0)[0] for number in range(5000)) == ADDRESS_BURST
+    assert limit.admit("phone", "10.0.0.7", 0.0)[0]
+    assert limit.admit("later", "10.0.0.9", 1.0)[0]
+    many = sum(limit.admit(("more", number), f"10.1.{number}.1", 1.0)[0] for number in range(5000))
+    assert many <= TOTAL_BURST
     assert len(limit) <= MAX_CONNECTIONS
+    assert len(limit._addresses) <= MAX_ADDRESSES
 
 
 def test_a_full_house_ends_the_oldest_stranger_never_a_paired_device() -> None:
