@@ -97,6 +97,7 @@ class Eavesdropper:
         """What each client has sent, by connection."""
         self._target = host, port
         self._listener = socket.create_server(("127.0.0.1", 0))
+        self._sockets = [self._listener]
         self.port: int = self._listener.getsockname()[1]
         threading.Thread(target=self._serve, daemon=True).start()
 
@@ -105,6 +106,7 @@ class Eavesdropper:
             while True:
                 near, _ = self._listener.accept()
                 far = socket.create_connection(self._target)
+                self._sockets += [near, far]
                 self.sent.append(b"")
                 threading.Thread(target=self._pass, args=(near, far, len(self.sent) - 1), daemon=True).start()
                 threading.Thread(target=self._pass, args=(far, near, None), daemon=True).start()
@@ -120,8 +122,11 @@ class Eavesdropper:
                 each.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Stop listening."""
-        self._listener.close()
+        """End everything."""
+        for each in self._sockets:
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
 
 
 def replay(host: str, port: int, recorded: bytes) -> bytes:
