@@ -1,11 +1,9 @@
 """Types of arguments and options that several subcommands take, and key expressions."""
 
 import logging
-import re
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -15,7 +13,7 @@ from click.shell_completion import CompletionItem
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
 from fleet.client.supervision import ask_status
-from fleet.recording.session_dir import is_session
+from fleet.recording.session_lookup import NoLatest, find_session, newest_first, sessions_in, sessions_place
 from schemas import keys
 from schemas.bus import Bus, canon
 from schemas.colors import COLORS, parse_color
@@ -30,10 +28,8 @@ N = TypeVar("N", bound=float)
 
 ALL_CARS: Final = "all"
 COMPLETION_TIMEOUT_S: Final = 0.3
-DEFAULT_SESSIONS: Final = Path("sessions")
 _PLACE: Final = "fleet.sessions"
 """Key of the value of --sessions in the context."""
-_SESSION_STAMP: Final = re.compile(r"\d{8}T\d{6}Z", re.ASCII)
 
 
 class Duration(click.ParamType[float]):
@@ -180,45 +176,20 @@ class SessionPath(click.ParamType[Path]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Return the path. Fail if there are not so many sessions."""
-        path = Path(value)
-        if path.exists() or ctx is None:
-            return path
-        place = ctx.meta.get(_PLACE) or sessions_place()
-        match = re.fullmatch(r"latest(?:~(\d{1,6}))?", str(value), re.ASCII)
-        if match is None:
-            return place / path if (place / path).exists() else path
-        found = newest_first(place)
-        if not found:
-            raise click.ClickException(f"No recordings here yet (in {place}). `fleet up` records everything.")
-        back = int(match[1] or 0)
-        if back >= len(found):
-            count = "is only 1 session" if len(found) == 1 else f"are only {len(found)} sessions"
-            self.fail(f"{value}: there {count} in {place}.", param, ctx)
-        return found[back]
+        place = (ctx.meta.get(_PLACE) if ctx is not None else None) or sessions_place()
+        try:
+            return find_session(value, place)
+        except NoLatest as error:
+            if newest_first(place):
+                self.fail(str(error), param, ctx)
+            raise click.ClickException(str(error)) from None
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's
         """Return the names of sessions, or let the shell complete a path."""
-        names = ["latest", *(each.name for each in newest_first(ctx.meta.get(_PLACE) or sessions_place()))]
+        there = sorted(each.name for each in sessions_in(ctx.meta.get(_PLACE) or sessions_place()))
+        names = ["latest", *reversed(there)]
         fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
         return fitting or [CompletionItem(incomplete, type="file")]
-
-
-def sessions_place() -> Path:
-    """Return the place of sessions: `sessions` here, or else where the fleet file here records to."""
-    file = None if DEFAULT_SESSIONS.is_dir() else _file_here()
-    return (file and file.recordings) or DEFAULT_SESSIONS
-
-
-def newest_first(place: Path) -> list[Path]:
-    """Return the sessions of a directory, the one that was begun last first. Empty if there is no such directory."""
-
-    def begun(path: Path) -> tuple[str, float]:
-        changed = path.stat().st_mtime
-        stamp = _SESSION_STAMP.match(path.name)
-        return stamp[0] if stamp else f"{datetime.fromtimestamp(changed, UTC):%Y%m%dT%H%M%SZ}", changed
-
-    found = (each for each in place.iterdir() if is_session(each)) if place.is_dir() else ()
-    return sorted(found, key=begun, reverse=True)
 
 
 def _flat(_: click.Context, __: click.Parameter, value: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:

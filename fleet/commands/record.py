@@ -13,7 +13,8 @@ import click
 from fleet.client.client import default_sender
 from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option
 from fleet.commands.options import bus_options, json_option
-from fleet.commands.params import DEFAULT_SESSIONS, Choice, Duration
+from fleet.commands.params import Choice, Duration
+from fleet.recording.session_lookup import DEFAULT_SESSIONS
 from schemas import keys, messages
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals

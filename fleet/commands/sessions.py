@@ -11,8 +11,9 @@ import click
 from fleet.commands.group import DefaultCommandGroup
 from fleet.commands.options import from_option, json_option, to_option
 from fleet.commands.output import progress_bar
-from fleet.commands.params import car_option, session_argument, sessions_place
+from fleet.commands.params import car_option, session_argument
 from fleet.commands.redecode import redecode, vector
+from fleet.recording.session_lookup import sessions_place
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session

@@ -4,7 +4,6 @@ A session is a directory (session_dir.py) or a single .mcap file of any writer. 
 """
 
 import json
-import os
 import re
 from collections.abc import Iterable, Iterator
 from copy import copy
@@ -20,6 +19,7 @@ from fleet.recording.reading.mcap_index import Index
 from fleet.recording.reading.mcap_reader import McapReader, NotMcap, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.selection import EVERYTHING, Selection, key_expressions
+from fleet.recording.session_lookup import NoLatest, find_session, sessions_place
 from fleet.recording.tools.analysis import arrow_table, data_frame, join_as_of
 from fleet.recording.writing.mcap_copy import McapCopy
 from schemas.keys import DEFAULT_FLEET
@@ -31,39 +31,16 @@ if TYPE_CHECKING:
 
 
 LATEST: Final = "latest"
-ROOT: Final = Path("sessions")
-"""Default directory of sessions."""
 
 
 class NoSession(Exception):
     """The path is no session. The message names the path and the reason."""
 
 
-def find_session(session: str | PathLike[str], root: Path = ROOT) -> Path:
-    """Return the path of a session: a path, a name below `root`, or `latest`, `latest~1`, ... Raises NoSession.
-
-    `latest` is the session that was recorded last. Sessions that a tool made from others (cut, recover) do not count.
-    """
-    path = Path(session)
-    nth = re.fullmatch(rf"{LATEST}(?:~(\d+))?", str(session))
-    # `os.path.exists` is false for a path that is too long or may not be read. The reader then says why.
-    if os.path.exists(path) or nth is None:  # noqa: PTH110
-        return root / path if not os.path.exists(path) and os.path.exists(root / path) else path  # noqa: PTH110
-    recorded = [
-        (info.started, each)
-        for each in (root.iterdir() if root.is_dir() else ())
-        if (info := session_dir.SessionInfo.read(each)) is not None and not info.origin
-    ]
-    back = int(nth[1] or 0)
-    if back >= len(recorded):
-        count = "is 1 recorded session" if len(recorded) == 1 else f"are {len(recorded)} recorded sessions"
-        raise NoSession(f"{session}: there {count} in {root.absolute()}. Name a session.")
-    return sorted(recorded)[-1 - back][1]
-
-
 def _near(path: Path) -> str:
     """Return a question with the likely session and a blank. Empty if no name is near."""
-    there = sorted(each.name for each in ROOT.iterdir() if each.is_dir()) if ROOT.is_dir() else []
+    place = sessions_place()
+    there = sorted(each.name for each in place.iterdir() if each.is_dir()) if place.is_dir() else []
     near = did_you_mean(path.name, [LATEST, *there])
     return near and f"{near} "
 
@@ -89,12 +66,16 @@ class Recorded:
 class Session:
     """A recorded session: `Session("latest").to_pandas("sensor/range")`.
 
-    path: a session's directory, an .mcap file, the name of a session in `./sessions`, or `latest` (`latest~1` is the
+    path: a session's directory, an .mcap file, the name of a session in `./sessions` (or where the fleet
+    file here records to), or `latest` (`latest~1` is the
     one before). Raises NoSession. Reading never changes a session, and finds what is damaged: see `damage_words`.
     """
 
     def __init__(self, path: str | PathLike[str] = LATEST) -> None:
-        path = find_session(path)
+        try:
+            path = find_session(path)
+        except NoLatest as error:
+            raise NoSession(str(error)) from None
         try:
             whole = path.is_dir()
             there = sorted(path.glob(session_dir.SEGMENTS)) if whole else [path]

@@ -13,9 +13,9 @@ from fleet.commands.params import (
     Duration,
     Number,
     cars_argument,
-    newest_first,
     session_argument,
 )
+from fleet.recording.session_lookup import newest_first
 from schemas.duration import format_duration, parse_duration
 
 
@@ -96,7 +96,7 @@ def test_the_newest_session_is_the_one_that_was_begun_last(place: Path) -> None:
         ("cut", "sessions/cut"),
         ("sessions/cut", "sessions/cut"),
         ("nothing", "nothing"),
-        ("latest~4", "latest~4: there are only 4 sessions in "),
+        ("latest~4", "latest~4: there are only 4 recorded sessions in "),
         ("--sessions elsewhere", "No recordings here yet (in elsewhere)."),
     ],
 )

@@ -1,0 +1,77 @@
+"""Finds the session that a name means: a path, a name in the directory of sessions, `latest`, or `latest~1`.
+
+One rule for the command line and Python. `latest` is the session whose recording began last. A session that a tool made
+from another one (cut, recover) does not count.
+"""
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from fleet.recording.session_dir import SessionInfo, is_session
+
+DEFAULT_SESSIONS: Final = Path("sessions")
+_FLEET_YAML: Final = Path("fleet.yaml")
+_LATEST: Final = re.compile(r"latest(?:~(\d{1,6}))?", re.ASCII)
+_STAMP: Final = re.compile(r"\d{8}T\d{6}Z", re.ASCII)
+
+
+class NoLatest(LookupError):
+    """There are not so many sessions. The text says how many, and where."""
+
+
+def sessions_place() -> Path:
+    """Return the directory of sessions: `sessions` here, or else where the fleet file here records to."""
+    if not DEFAULT_SESSIONS.is_dir() and _FLEET_YAML.is_file():
+        from fleet.fleetfile.fleet_file import read_fleet
+
+        with suppress(ValueError):  # a BadFile
+            return read_fleet(_FLEET_YAML, unbound=True).recordings or DEFAULT_SESSIONS
+    return DEFAULT_SESSIONS
+
+
+def sessions_in(place: Path) -> Iterator[Path]:
+    """Yield all sessions of a directory."""
+    yield from (each for each in (place.iterdir() if place.is_dir() else ()) if is_session(each))
+
+
+def newest_first(place: Path) -> list[Path]:
+    """Return the recorded sessions of a directory, the one that was begun last first."""
+    found = [(info, each) for each in sessions_in(place) if not ((info := SessionInfo.read(each)) and info.origin)]
+    return [path for _, path in sorted(found, key=lambda each: _begun(*each), reverse=True)]
+
+
+def _begun(info: SessionInfo | None, path: Path) -> tuple[str, float]:
+    """Return when a session was begun: by its description, by its name, or by the time of its last change."""
+    changed = path.stat().st_mtime
+    if info is not None and info.started:
+        return re.sub(r"[-:]|\.\d+", "", info.started), changed
+    stamp = _STAMP.match(path.name)
+    return stamp[0] if stamp else f"{datetime.fromtimestamp(changed, UTC):%Y%m%dT%H%M%SZ}", changed
+
+
+def find_session(session: str | os.PathLike[str], place: Path | None = None) -> Path:
+    """Return the path that a name means, also if nothing is there. Raises NoLatest.
+
+    place: the directory of sessions.
+    """
+    path = Path(session)
+    # `os.path.exists` is false for a path that is too long or may not be read. The reader then says why.
+    if os.path.exists(path):  # noqa: PTH110
+        return path
+    place = place or sessions_place()
+    match = _LATEST.fullmatch(str(session))
+    if match is None:
+        return place / path if os.path.exists(place / path) else path  # noqa: PTH110
+    found = newest_first(place)
+    if not found:
+        raise NoLatest(f"No recordings here yet (in {place}). `fleet up` records everything.")
+    back = int(match[1] or 0)
+    if back >= len(found):
+        count = "is only 1 recorded session" if len(found) == 1 else f"are only {len(found)} recorded sessions"
+        raise NoLatest(f"{session}: there {count} in {place}.")
+    return found[back]
