@@ -412,7 +412,7 @@ def test_a_car_that_another_person_drives_is_refused_until_it_is_taken(stage: Co
     page.get_by_text("mia (person)").wait_for()
     page.locator("[data-motion=back]").hover()
     page.mouse.down()
-    page.get_by_text("red is driven by mia").wait_for()
+    page.locator("[data-control=drive] .refused", has_text="mia drives red. Take it over.").wait_for()
     page.mouse.up()
     assert stage.judges["red"].driving
     page.get_by_role("button", name="Take over red").click()

@@ -168,11 +168,13 @@ const ACTS = ["led", "light", "whistle"];
 function Offer({ title, needs, cars, children }) {
   const lacking = cars.filter((car) => needs in car.cannot);
   const action = ACTS.includes(needs) ? "act" : "move";
+  // Once, beside the pad: what forbids the other controls forbids driving, too.
+  const words = needs === "drive" ? refusals(action, names()) : [];
   return html`<section data-control=${needs}>
     <h2>${title}</h2>
     ${lacking.length === 0
       ? html`<fieldset class="bare" disabled=${needs !== "drive" && isRefused(action, names())}>${children}</fieldset>
-          <${Refused} words=${refusals(action, names())} />`
+          <${Refused} words=${words} />`
       : lacking.map((car) => html`<p class="cannot" key=${car.name}>${t.cannot(car.name, car.cannot[needs])}</p>`)}
   </section>`;
 }
