@@ -57,7 +57,7 @@ function Plot({ title, cars, grid }) {
       const box = area.current.getBoundingClientRect();
       if (box.bottom < 0 || box.top > innerHeight) return;
       chart.setData(grid.data());
-    }, DRAW_MS);
+    }, Math.max(DRAW_MS, grid.slot_ms)); // within a slot nothing moves
     // For who cannot see the lines: the newest values as text.
     const telling = setInterval(() => {
       setNewest(cars.map((car, row) => `${car.name} ${grid.newest(row)}`).join(", "));
