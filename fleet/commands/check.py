@@ -167,7 +167,7 @@ def recognize(text: str) -> FileKind:
     """Return the kind of a file by its fields. A file of none is taken for a fleet file, whose errors then tell."""
     try:
         found: Any = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, RecursionError):  # not a date, nested too deep: parsing names the place
         found = None
     if not isinstance(found, dict):
         return FileKind.PLAN if text.lstrip().startswith(("roles:", "rules:")) else FileKind.FLEET

@@ -43,6 +43,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
         ("walls: []\ncars: {}", FileKind.WORLD),
         ("roles: {a: [", FileKind.PLAN),
         ("[1, 2]", FileKind.FLEET),
+        ("roles: " + 20_000 * "[", FileKind.PLAN),
+        ("name: 2020-99-99", FileKind.FLEET),
         ("", FileKind.FLEET),
     ],
 )
