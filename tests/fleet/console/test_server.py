@@ -236,7 +236,8 @@ def test_a_cookie_at_two_addresses_is_logged(stage: ServerStage) -> None:
     device = stage.device("owner")
     thief = NetworkDevice(stage.lan_port, source="127.0.0.5")
     thief.cookie = device.cookie
-    with device.socket():
+    with device.socket() as page:
+        page.recv()  # it has joined
         thief.ask("GET", "/hello")
         wait_for(lambda: "in use at 127.0.0.5, 127.0.0.1" in stage.log(), "the warning")
 
