@@ -46,7 +46,12 @@ def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
     return host
 
 
-@click.group(cls=DefaultCommandGroup, default_command="serve", subcommand_metavar="[COMMAND | OPTIONS]")
+@click.group(
+    cls=DefaultCommandGroup,
+    default_command="serve",
+    subcommand_metavar="[COMMAND | OPTIONS]",
+    epilog="\b\nexamples:\n  fleet console --open\n  fleet console --as teacher --lan\n  fleet console pair group_a",
+)
 def console() -> None:
     """Serve the fleet as a web page: watch, drive, STOP. Without a command, serve."""
 

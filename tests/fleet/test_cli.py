@@ -195,7 +195,7 @@ def test_every_help_has_an_example_and_words_for_each_option(context: click.Cont
             assert param.help.endswith((".", ")")), param.opts
         words = " ".join(param.get_help_record(context) or (param.make_metavar(context),))
         assert not re.search(r"TEXT|INTEGER|FLOAT|RANGE|<=", words), words
-    if len(context.command_path.split()) == 2 and context.info_name not in (*WITHOUT_BUS, "demo", "record"):
+    if len(context.command_path.split()) == 2 and context.info_name not in (*WITHOUT_BUS, "console", "demo", "record"):
         assert "--connect" in shown
         assert "--fleet" in shown
 
