@@ -170,8 +170,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
         except BusError:
             await socket_.close(_TRY_AGAIN_LATER, "the bus cannot be reached")
         except (WebSocketDisconnect, KeyError, RuntimeError):  # a binary message; a socket that we have closed
-            with suppress(RuntimeError):
-                await socket_.close()
+            await _close(socket_)
 
     return Starlette(
         routes=[
