@@ -1,5 +1,6 @@
 """Sends commands to the services of a fleet, such as the coordinator, and reads their results."""
 
+import json
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -8,6 +9,8 @@ from fleet.client.command_tracker import ANSWER_TIMEOUT_S
 from schemas import keys, messages, topics
 from schemas.bus import Bus, Failure
 
+RECORDER_TIMEOUT_S: Final = 15.0
+"""Timeout for the recorder's answer. It may have to wait for the disk."""
 NO_PLAN: Final = "No plan is running. Start one: `fleet plan run FILE`"
 
 
@@ -17,6 +20,14 @@ def send_command(bus: Bus, fleet: str, service: str, verb: str, command: Any, ti
     payload, encoding = command.SerializeToString(), messages.encoding_of(command.DESCRIPTOR.full_name)
     for answer in bus.query(key, payload=payload, encoding=encoding, timeout_s=timeout_s):
         yield answer if isinstance(answer, Failure) else messages.parse(topics.RESULT, answer.payload, answer.encoding)
+
+
+def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
+    """Send a command to the recorder. Return its fleet.v1.Recording or a Failure, None if there is no recorder."""
+    key, payload = keys.command_key(fleet, keys.RECORDER, verb), json.dumps(fields).encode()
+    for answer in bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=RECORDER_TIMEOUT_S):
+        return answer if isinstance(answer, Failure) else answer.message()
+    return None
 
 
 def ask_coordinator(client: Fleet, verb: str, plan_text: str = "") -> Any:

@@ -3,12 +3,6 @@
 For each link, a gateway runs for a moment under a temporary name. No car moves.
 """
 
-import contextlib
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -32,14 +26,11 @@ from fleet.fleetfile.fleet_file import FleetFile
 from fleet.fleetfile.models import validate_link
 from fleet.fleetfile.scan import FoundLink
 from fleet.links import may_be_same, parse_fleet_link
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from fleet.supervisor.temporary_gateway import temporary_gateway
 from schemas.links import TcpUrl
 from schemas.process import signals
 from schemas.yaml_document.document import BadFile, read_text
 
-_READY_S: Final = 15.0
-"""Timeout for a gateway. It starts in 1 s, and brings a car of an unknown platform to a known state within 6 s."""
-_READY_POLL_S: Final = 0.1
 _AGAIN: Final = "again"
 _NO_CAR: Final = "-"
 
@@ -75,7 +66,7 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
     ):
         for number, each in enumerate(found, 1):
             click.echo(f"\n{number} of {len(found)}: {each.url}\n  {each.words}")
-            with _gateway(client, f"bind-{number}", each.url) as name:
+            with temporary_gateway(client, f"bind-{number}", each.url, _print_error) as name:
                 if name is None:
                     continue
                 car = _which(client, name, file)
@@ -94,41 +85,8 @@ def _unknown(found: FoundLink, fleet: FleetFile) -> bool:
     return not any(may_be_same(link, parse_fleet_link(car.link)) for car in fleet.cars.values())
 
 
-@contextlib.contextmanager
-def _gateway(client: Fleet, name: str, link: str) -> Iterator[str | None]:
-    """Run a gateway for this link. Yield its car's name, or None if the gateway did not come up."""
-    with tempfile.TemporaryDirectory() as directory, (Path(directory) / "log").open("w+", encoding="utf-8") as log:
-        command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, "--with-parent"]
-        command += ["--fleet", client.name, "--connect", client.bus.endpoint, "--state-dir", directory]
-        # In its own session, so that Ctrl-C at the terminal reaches only us. We let the gateway stop its car.
-        gateway = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-        try:
-            yield name if _ready(client, name, gateway, log.name) else None
-        finally:
-            gateway.terminate()
-            try:
-                gateway.wait(GATEWAY_GRACE_S)
-            except subprocess.TimeoutExpired:
-                gateway.kill()
-                gateway.wait()
-
-
-def _ready(client: Fleet, name: str, gateway: "subprocess.Popen[bytes]", log: str) -> bool:
-    """Wait until the gateway serves and its car stands. Return True if it serves, also for a silent car."""
-    deadline, served = time.monotonic() + _READY_S, False
-    while time.monotonic() < deadline:
-        if gateway.poll() is not None:
-            lines = Path(log).read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            click.echo(f"  {lines[-1] if lines else 'its gateway ended'}", err=True)
-            return False
-        states = client.get(f"{name}/state/safety")
-        served = served or bool(states)
-        if any(each.value.motors == "off" for each in states):
-            return True
-        time.sleep(_READY_POLL_S)
-    if not served:
-        click.echo("  its gateway did not come up", err=True)
-    return served
+def _print_error(words: str) -> None:
+    click.echo(f"  {words}", err=True)
 
 
 def _which(client: Fleet, name: str, file: Path) -> str:

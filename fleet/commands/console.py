@@ -4,10 +4,15 @@ import asyncio
 import http.client
 import ipaddress
 import json
+import os
+import signal
+import socket
 import sys
 import time
 import webbrowser
+from contextlib import suppress
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -21,6 +26,7 @@ from fleet.commands.params import Number
 from fleet.console.pairing import RANKS, PagePerson
 from fleet.console.people_file import PeopleFile, people_path
 from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
+from fleet.recording.session_lookup import sessions_place
 from schemas import keys
 from schemas.bus import resolve_endpoint
 
@@ -28,6 +34,7 @@ if TYPE_CHECKING:
     from fleet.console.lan import Lan
 
 DEFAULT_LAN_PORT: Final = 7443
+HEARTBEAT_INTERVAL_S: Final = 1.0
 _LOOPBACK_NAMES: Final = ("localhost", "::1")
 _PROBE_TIMEOUT_S: Final = 1.0
 
@@ -44,6 +51,24 @@ def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
             "For phones and other computers, type: fleet console --lan"
         )
     return host
+
+
+def listen_or_fail(port: int | None, other: str) -> socket.socket:
+    """Return a listening socket. None: the default port. Raises ClickException with what to type for another one."""
+    port = DEFAULT_PORT if port is None else port
+    try:
+        return listen(port)
+    except OSError as error:
+        raise click.ClickException(f"{_port_in_use(port, error)} `{other}` takes another one.") from None
+
+
+async def _send_heartbeats(parent: int, address: str) -> None:
+    """Print the address each second for `fleet up`, and end with it."""
+    with suppress(OSError):  # nobody reads any more
+        while os.getppid() == parent:
+            click.echo(json.dumps({"console": address}))
+            await asyncio.sleep(HEARTBEAT_INTERVAL_S)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 @click.group(
@@ -84,21 +109,45 @@ examples:
     show_default=True,
     help="Port on the network, 0 for any free one.",
 )
+@click.option(
+    "--sessions",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Where the sessions are (default: as the file says, or sessions).",
+)
+@click.option(
+    "--fleet-file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("fleet.yaml"),
+    show_default=True,
+    help="The file that the page Set up writes links into.",
+)
+@click.option("--with-parent", is_flag=True, hidden=True, help="End when the process that started this ends.")
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @bus_options
-def serve_console(*, port: int, opens: bool, on_lan: bool, lan_port: int, connect: str | None, fleet: str) -> None:
+def serve_console(
+    *,
+    port: int,
+    opens: bool,
+    on_lan: bool,
+    lan_port: int,
+    sessions: Path | None,
+    fleet_file: Path,
+    with_parent: bool,
+    connect: str | None,
+    fleet: str,
+) -> None:
     """Serve the page on this computer, until Ctrl-C. STOP is Escape on every page."""
-    try:
-        listener = listen(port)
-    except OSError as error:
-        raise click.ClickException(f"{_port_in_use(port, error)} `fleet console --port 0` takes a free one.") from None
+    parent = os.getppid() if with_parent else None
+    listener = listen_or_fail(port, "fleet console --port 0")
     address = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
 
     with listener:
         lan = _open_lan(lan_port, PeopleFile(people_path(resolve_endpoint(connect), fleet))) if on_lan else None
 
         def on_ready() -> None:
-            click.echo(f"Console: {address} (Ctrl-C ends it)")
+            if parent is None:
+                click.echo(f"Console: {address} (Ctrl-C ends it)")
             if lan is not None:
                 _describe_lan(lan)
             if opens:
@@ -106,7 +155,10 @@ def serve_console(*, port: int, opens: bool, on_lan: bool, lan_port: int, connec
 
         async def run() -> Any:
             async with Fleet(connect, fleet, kind="person", person=chosen_person()) as client:
-                await serve(client, listener, on_ready, lan)
+                heartbeats = None if parent is None else asyncio.ensure_future(_send_heartbeats(parent, address))
+                await serve(client, listener, on_ready, sessions or sessions_place(), fleet_file, lan)
+                if heartbeats is not None:
+                    heartbeats.cancel()
 
         try:
             asyncio.run(run())

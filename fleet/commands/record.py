@@ -11,19 +11,18 @@ from typing import Any, Final
 import click
 
 from fleet.client.client import default_sender
+from fleet.client.services import ask_recorder
 from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import Choice, Duration
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
-from schemas import keys, messages
+from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
 
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
 """Time without a link after which the recorder restarts the hub."""
-_RECORDER_TIMEOUT_S: Final = 15.0
-"""Timeout for the recorder's answer. It may have to wait for the disk."""
 
 
 _SIZE_UNITS: Final = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
@@ -223,12 +222,11 @@ def _query(verb: str, connect: str | None, fleet: str, **fields: str) -> Any:
     """Send a command to the recorder and return its status. Raises click's errors."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        key = keys.command_key(fleet, keys.RECORDER, verb)
-        payload = json.dumps(fields).encode()
-        for answer in bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=_RECORDER_TIMEOUT_S):
-            if isinstance(answer, Failure):
-                raise click.ClickException(f"the recorder says: {answer.words}")
-            return answer.message()
+        answer = ask_recorder(bus, fleet, verb, **fields)
+        if isinstance(answer, Failure):
+            raise click.ClickException(f"the recorder says: {answer.words}")
+        if answer is not None:
+            return answer
         raise click.ClickException(
             f"No recorder of {keys.describe_fleet(fleet)} is on the bus at {bus.endpoint}. `fleet record` starts one."
         )

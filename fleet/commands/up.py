@@ -68,6 +68,8 @@ Exit codes: 0 every car was stopped (--detach: all are ready), 1 one was not or 
     metavar="DIR",
     help="Where sessions go (default: as the file says, or sessions).",
 )
+@click.option("--console", is_flag=True, help="Serve the fleet as a web page on this computer, too.")
+@click.option("--console-port", type=Number(int, 1, 65535), help="The same on this port (default: 7480).")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object for each thing that happens.")
 @connect_option("The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or port 7447).")
 @fleet_option(default=None)
@@ -82,6 +84,8 @@ def up(
     *,
     record: bool | None,
     out: Path | None,
+    console: bool,
+    console_port: int | None,
     as_json: bool,
     connect: str | None,
     fleet: str | None,
@@ -98,7 +102,9 @@ def up(
         file = DEFAULT_FILE
     if detach:
         raise SystemExit(_run_detached(_own_arguments(), as_json=as_json))
-    options = UpOptions(simulated or 0, plan, world, record, out, connect, fleet, insecure_lan)
+    options = UpOptions(
+        simulated or 0, plan, world, record, out, connect, fleet, insecure_lan, console, console_port or 0
+    )
     with cli_errors():
         if fleet is not None:
             keys.check_name(fleet, "fleet name")
@@ -107,6 +113,10 @@ def up(
             click.echo(f"fleet: {warning}", err=True)
         if not spec.cars:
             raise click.UsageError(f"{file} has no car with a link: fleet bind finds links, --sim {3} simulates cars")
+        if spec.console:
+            from fleet.commands.console import listen_or_fail  # needs an extra
+
+            listen_or_fail(spec.console_port or None, "fleet up --console-port 7481").close()
         endpoint = resolve_endpoint(spec.endpoint)
         if not accepts(endpoint):  # the hub will be ours
             check_listening(endpoint, insecure_lan=insecure_lan)

@@ -1,5 +1,6 @@
 """`fleet view`: shows the fleet live in Rerun."""
 
+import re
 import signal
 import threading
 import time
@@ -50,8 +51,6 @@ examples:
 @bus_options
 def view(*, web: bool, save: Path | None, seconds: float | None, memory: str, connect: str | None, fleet: str) -> None:
     """Show the fleet live in Rerun, until you close its window or press Ctrl-C. Cars go on."""
-    import re
-
     if web and save is not None:
         raise click.UsageError("Give --web or --save, not both.")
     if not re.fullmatch(r"[1-9]\d*(\.\d+)?([KMG]i?B|%)", memory):

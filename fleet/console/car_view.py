@@ -5,7 +5,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from fleet.client.diagnosis import CarEvidence, describe, diagnose
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
+from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
 from fleet.console.permissions import CarRules
 from schemas import messages, topics
@@ -60,6 +62,9 @@ class CarView:
         """Commands and log records, the newest last."""
         self.rules = CarRules(name)
         """Who may do what."""
+        self.commands = CommandLedger()
+        self._events: deque[tuple[float, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
+        """Time and event of the newest commands."""
         self._newest: dict[str, tuple[Any, float]] = {}
         self._trend = BatteryTrend()
         self._present = False
@@ -71,6 +76,8 @@ class CarView:
         match topic:
             case "event/command":
                 self._on_command(value)
+                self.commands.on_event(value)
+                self._events.append((now, value))
             case "event/log":
                 words = value.message.removeprefix(f"{self.name} ")
                 level = "error" if value.level >= 4 else "warning" if value.level == 3 else "info"
@@ -96,6 +103,18 @@ class CarView:
     def describe_gateway(self) -> list[tuple[str, str]]:
         """Return what the car's gateway knows, as names and texts."""
         return describe_gateway(*(self._get(f"state/{name}") for name in ("link", "health", "safety", "mode")))
+
+    def diagnose(self, now: float) -> dict[str, Any]:
+        """Return what `fleet doctor` says of the car, as far as its messages tell."""
+        evidence = CarEvidence(
+            self.name,
+            present=self._present,
+            states={topic: message for topic, (message, _) in self._newest.items()},
+            commands=[(now - at, event) for at, event in self._events],
+        )
+        # Recorder and plan have pages of their own.
+        facts = [(name, words) for name, words in describe(evidence) if name != "services"]
+        return {"findings": [str(finding) for finding in diagnose(evidence)], "facts": facts}
 
     def as_dict(self, now: float) -> dict[str, Any]:
         """Return what a page shows of the car, as JSON values. Numbers are rounded: most are equal next time."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, Final
 
 from fleet.aio import Fleet
@@ -25,6 +26,8 @@ from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
 from fleet.console.presses import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
 from fleet.console.requests import MAX_REASON_LENGTH, BadPageMessage, PageMessage
+from fleet.console.sessions_api import SessionsApi
+from fleet.console.setup_api import SetupApi
 from fleet.console.stop_report import StopReport
 from fleet.policy.requests import PlanRequest
 from fleet.replay.colors import color
@@ -50,8 +53,10 @@ class TooManyPages(Exception):
 class Console:
     """Everything that the pages share. All methods run on the loop."""
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: Fleet, place: Path, file: Path) -> None:
         self._fleet = fleet
+        self.sessions = SessionsApi(fleet, place)
+        self.setup = SetupApi(fleet, file)
         self._presses = PressBook()
         self._view = FleetView(_hex_color)
         self._operators = Operators(fleet)
@@ -347,6 +352,7 @@ class Console:
         for press in self._presses.alive:
             self._pages[press.client].operator.end_press(press)
         await self._operators.close()
+        await self.sessions.close()
 
 
 def _hex_color(car: str, index: int) -> str:

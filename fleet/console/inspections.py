@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -52,6 +53,8 @@ class Inspections:
             "car": car,
             "frames": self._logs[car].as_list(),
             "ledger": list(reversed(view.ledger)),
+            "commands": view.commands.as_list(),
+            "doctor": view.diagnose(time.monotonic()),
             "gateway": view.describe_gateway(),
         }
         return json.dumps(shown, separators=(",", ":"))
@@ -65,3 +68,5 @@ class Inspections:
         if (found := message_in(sample)) is not None and found[0].car in self._logs:
             key, frame = found
             self._logs[key.car].on_frame(key.topic, frame)
+            if key.topic == "frame/tx":
+                self._view_of(key.car).commands.on_frame(frame)

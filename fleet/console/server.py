@@ -110,10 +110,18 @@ def _config(app: App) -> uvicorn.Config:
 
 
 async def serve(
-    fleet: Fleet, listener: socket.socket, on_ready: Callable[[], object], lan: "Lan | None" = None
+    fleet: Fleet,
+    listener: socket.socket,
+    on_ready: Callable[[], object],
+    place: Path,
+    file: Path,
+    lan: "Lan | None" = None,
 ) -> None:
-    """Serve until Ctrl-C or SIGTERM. Then stop the cars that pages drive. lan: what serves the network, too."""
-    console = Console(fleet)
+    """Serve until Ctrl-C or SIGTERM. Then stop the cars that pages drive.
+
+    place: the sessions folder. file: the fleet file. lan: what serves the network, too.
+    """
+    console = Console(fleet, place, file)
     servers = [(ConsoleServer(_config(guarded_app(console, listener.getsockname()[1], lan))), listener)]
     running = [asyncio.ensure_future(console.run())]
     if lan is not None:
@@ -179,6 +187,8 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
             Route(STOP_PATH, stop, methods=["POST"]),
             Route("/plan/check", check_plan, methods=["POST"]),
             Route("/plan/set", set_plan, methods=["POST"]),
+            *console.sessions.routes(),
+            *console.setup.routes(),
             *people_routes(lan),
             *more,
             WebSocketRoute("/ws", connect),

@@ -16,6 +16,7 @@ from fleet.fleetfile.models import (
     DEFAULT_MAX_DRIVE_S,
     LOW_V,
     BatteryAction,
+    ConsoleEntry,
     FileEntry,
     LimitsEntry,
     PersonEntry,
@@ -85,6 +86,7 @@ class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
     endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: none.
+    console_port: of the web page; 0: the default.
     groups: the cars of each. people: who may drive; None: everyone. colors: of cars that have one in the file.
     unlinked: cars without a link, if allowed.
     """
@@ -96,6 +98,8 @@ class FleetFile:
     recordings: Path | None
     quota: str
     record: bool
+    console: bool
+    console_port: int
     world: Path | None
     text: str
     path: Path
@@ -145,6 +149,8 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
         endpoint=file.endpoint or None,
         cars=MappingProxyType({name: car for name, car in cars.items() if car.link}),
         record=file.record is not False,
+        console=file.console is not False,
+        console_port=file.console.port if isinstance(file.console, ConsoleEntry) else 0,
         recordings=_resolve_path(path, record.to or None if record else None),
         quota=record.quota if record else "",
         groups=MappingProxyType({name: tuple(cars) for name, cars in file.groups.items()}),

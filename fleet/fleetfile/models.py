@@ -181,6 +181,12 @@ class RecordEntry(Entry):
     )
 
 
+class ConsoleEntry(Entry):
+    """The web page of `fleet up`."""
+
+    port: int = Field(default=0, ge=0, le=65535, description="its port; 0 or left out: 7480")
+
+
 class FileEntry(Entry):
     """A fleet of cars, for `fleet up`."""
 
@@ -191,6 +197,9 @@ class FileEntry(Entry):
     plan: _Path = Field(default_factory=str, description="what the fleet should do, a file")
     record: bool | RecordEntry = Field(
         default=True, description="false: `fleet up` does not record; or where to, and how much"
+    )
+    console: bool | ConsoleEntry = Field(
+        default=False, description="true: `fleet up` serves the web page; or `{port: 8080}`"
     )
     world: _Path = Field(default_factory=str, description="the world of simulated cars, a file")
     defaults: CommonEntry = Field(default_factory=CommonEntry, description="for every car")

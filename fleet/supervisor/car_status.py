@@ -151,7 +151,7 @@ def describe_missing(row: CarStatus) -> str:
     return "" if row.motors in ("off", "on") else "not in a known state yet"
 
 
-def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str) -> str:
+def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str, console: str = "") -> str:
     """Describe the end of a start in one line: all cars are ready, or who is missing and why."""
     ready = [car for car in cars if car not in missing]
     if missing:
@@ -163,7 +163,8 @@ def describe_start(cars: Sequence[str], missing: Mapping[str, str], session: str
     else:
         names = f": {', '.join(cars)}" if len(cars) <= MAX_CARS_LISTED else ""
         words = f"All {len(cars)} cars are ready{names}."
-    return f"{words} Recording to {session}." if session else words
+    words = f"{words} Recording to {session}." if session else words
+    return f"{words} Console: {console}" if console else words
 
 
 def describe_old_stops(car: str, safety: Any, began_s: float, options: str = "") -> str:

@@ -13,6 +13,8 @@ _FIXED_PROPERTIES: Final[Mapping[str, str]] = {
     "recordings": "where recordings go",
     "quota": "how much it keeps",
     "record": "whether it records",
+    "console": "whether it serves the page",
+    "console_port": "the port of the page",
 }
 """Properties that cannot change while the fleet is running, with their names in messages."""
 

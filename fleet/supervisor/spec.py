@@ -29,6 +29,7 @@ HUB: Final = "@hub"
 SIMULATOR_PROCESS: Final = "@simulator"
 RECORDER: Final = "@recorder"
 COORDINATOR: Final = "@coordinator"
+CONSOLE: Final = "@console"
 SELF: Final = "@supervisor"
 """Names of processes. All other processes are gateways, and no car's name begins with @."""
 
@@ -41,6 +42,7 @@ class ProcessKind(StrEnum):
     GATEWAY = "gateway"
     COORDINATOR = "coordinator"
     RECORDER = "recorder"
+    CONSOLE = "console"
 
 
 PATIENCE: Final[Mapping[ProcessKind, Patience]] = {
@@ -50,6 +52,7 @@ PATIENCE: Final[Mapping[ProcessKind, Patience]] = {
     ProcessKind.GATEWAY: Patience(start_s=20.0, silence_s=4.0, to_the_end=True),  # state/health each second
     ProcessKind.COORDINATOR: Patience(start_s=20.0, silence_s=6.0),  # queried each second
     ProcessKind.RECORDER: Patience(start_s=20.0, silence_s=10.0),  # each second, from a thread that waits for the disk
+    ProcessKind.CONSOLE: Patience(start_s=20.0, silence_s=6.0),  # each second, from the loop that serves the pages
 }
 
 
@@ -95,6 +98,9 @@ class FleetSpec:
     world: Path | None = None
     listed: Mapping[str, CoordinatorCar] = field(default_factory=dict)
     """The coordinator's entries, by car."""
+    console: bool = False
+    console_port: int = 0
+    """Port of the web page. 0: the default of `fleet console`."""
     insecure_lan: bool = False
     """True if the hub may listen on an address that other machines can reach."""
     warnings: tuple[str, ...] = ()
@@ -118,6 +124,8 @@ class UpOptions:
     connect: str | None = None
     fleet: str | None = None
     insecure_lan: bool = False
+    console: bool = False
+    console_port: int = 0
 
 
 def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
@@ -148,6 +156,8 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         groups=file.groups if file else {},
         file=file.path if file else None,
         world=options.world or (file.world if file else None),
+        console=options.console or options.console_port > 0 or (file is not None and file.console),
+        console_port=options.console_port or (file.console_port if file else 0),
         insecure_lan=options.insecure_lan,
         listed={name: _listed(specs.get(name), car.platform) for name, car in cars.items()},
     )
@@ -266,3 +276,11 @@ def coordinator_command(spec: FleetSpec, plan: Path, listed: Path, endpoint: str
     """Return the command of the coordinator, with its copies of the plan and the fleet file in the run directory."""
     where = ("--fleet", spec.fleet, "--connect", endpoint, "--with-parent", "--run", plan.parent.name)
     return module("fleet.cli", "plan", "run", str(plan), "--fleet-file", str(listed), "--json", *where)
+
+
+def console_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
+    """Return the command of the web page."""
+    port = ("--port", str(spec.console_port)) if spec.console_port else ()
+    where = ("--fleet", spec.fleet, "--connect", endpoint, "--sessions", str(spec.recordings), "--with-parent")
+    file = () if spec.file is None else ("--fleet-file", str(spec.file))
+    return module("fleet.cli", "console", "serve", *port, *file, *where)

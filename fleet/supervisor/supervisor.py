@@ -25,6 +25,7 @@ from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, RunState
 from fleet.supervisor.service import ReloadRefused, RestartNeeded, SupervisorService
 from fleet.supervisor.shutdown import NOT_TRIED, GatewayShutdown
 from fleet.supervisor.spec import (
+    CONSOLE,
     COORDINATOR,
     HUB,
     RECORDER,
@@ -108,6 +109,8 @@ class Supervisor:
         self._sim_links: dict[str, str] = {}
         self._shown: object = None
         self._session = ""
+        self._console = ""
+        """Address of the web page."""
         self.starting = True
         self._progress = StartProgress()
         self._log: Log | None = None
@@ -199,7 +202,7 @@ class Supervisor:
         unreachable = all(row is not None and row.link == "lost" and row.reason != NOT_TRIED for row in rows)
         if not self._progress.has_ended(len(missing), now, unreachable=unreachable):
             return
-        words = describe_start(list(self._spec.cars), missing, self._session)
+        words = describe_start(list(self._spec.cars), missing, self._session, self._console)
         self._say(MISSING if missing else READY, SELF, words)
         self.starting = False
 
@@ -259,6 +262,8 @@ class Supervisor:
             self.processes.add(SIMULATOR_PROCESS, ProcessKind.SIMULATOR, command)
         for car in self._spec.cars.values():
             self._add_car(car)
+        if self._spec.console:
+            self.processes.add(CONSOLE, ProcessKind.CONSOLE, spec.console_command(self._spec, self.endpoint))
         if command := self._coordinator(self._spec):
             self.processes.add(COORDINATOR, ProcessKind.COORDINATOR, command)
 
@@ -430,6 +435,11 @@ class Supervisor:
             self._say("process", RECORDER, _describe_recording(values))
         elif process.kind is ProcessKind.COORDINATOR:
             self._say("decision", values["subject"], f"{values['decided']}, because: {values['why']}")
+        elif process.kind is ProcessKind.CONSOLE:
+            self._console = values["console"]
+            if self.processes.on_heartbeat(CONSOLE):
+                self._say("process", CONSOLE, f"serves {self._console}")
+            return False
         if process.kind is not ProcessKind.SIMULATOR:
             return True
         self.processes.on_heartbeat(SIMULATOR_PROCESS)
@@ -464,17 +474,18 @@ class Supervisor:
     # ------------------------------------------------------------------ shutdown
 
     async def _end_all(self, service: SupervisorService) -> None:
-        """Shut down in order: coordinator (it would start cars again), cars, recorder, simulator."""
+        """Shut down in order: coordinator and pages (they would start cars again), cars, recorder, simulator."""
         self._state = "ending"
         service.publish(self.status())
         gateways = self.processes.of(ProcessKind.GATEWAY)
-        for process in self.processes.of(ProcessKind.COORDINATOR):
+        movers = self.processes.of(ProcessKind.COORDINATOR, ProcessKind.CONSOLE)
+        for process in movers:
             self.processes.end(process, SERVICE_EXIT_TIMEOUT_S)
         stop_query = asyncio.ensure_future(asyncio.to_thread(service.stop_all))
         await asyncio.wait([stop_query], timeout=STOP_QUERY_TIMEOUT_S)
         for process in gateways:
             self._shutdown.begin(process)
-        await self._until_ended([*gateways, *self.processes.of(ProcessKind.COORDINATOR)])
+        await self._until_ended([*gateways, *movers])
         for kind, grace in (
             (ProcessKind.RECORDER, RECORDER_EXIT_TIMEOUT_S),
             (ProcessKind.SIMULATOR, SERVICE_EXIT_TIMEOUT_S),

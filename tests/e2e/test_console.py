@@ -635,6 +635,10 @@ def test_frames_stand_beside_what_they_became_with_the_ledger(stage: ConsoleStag
     stage.person.car("red").whistle().check()
     page.locator("tbody tr").filter(has_text="to the car").first.wait_for()
     page.locator(".ledger").get_by_text("whistle sent (mia)").wait_for()
+    whistle = page.locator("tbody tr").filter(has_text="whistle by mia (person)")
+    whistle.filter(has_text="sent").first.wait_for()
+    whistle.locator("code").filter(has_text="$0,0,").first.wait_for()
+    page.locator("[data-doctor]").get_by_text("frames in").wait_for()
     page.locator(".wide").get_by_text("rx_frames").wait_for()
     assert serious(page) == []
 

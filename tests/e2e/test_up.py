@@ -10,6 +10,8 @@ import sys
 import termios
 import threading
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,9 +33,12 @@ STARTS_S = 10.0
 @pytest.fixture(scope="module")
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
     """Two simulated cars, which need nothing but the clone."""
-    with Up(tmp_path_factory.mktemp("up"), free_endpoint(), "--sim", "2") as started:
+    port = free_port()
+    page = ("--console-port", str(port))
+    with Up(tmp_path_factory.mktemp("up"), free_endpoint(), "--sim", "2", *page) as started:
         words = started.until("ready", "@supervisor", "All 2 cars are ready: red, green. Recording to ")["words"]
-        assert words.endswith(f"{started.status().session}.")
+        assert words.endswith(f"{started.status().session}. Console: http://127.0.0.1:{port}")
+        assert get_page(port) == 200
         yield started
 
 
@@ -43,6 +48,12 @@ def jobs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
     directory = tmp_path_factory.mktemp("job")
     with Up(directory, free_endpoint(), str(_job(directory)), "--no-record") as started:
         yield started
+
+
+def get_page(port: int) -> int:
+    """The status of the console's page."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
+        return int(answer.status)
 
 
 @pytest.fixture
@@ -57,7 +68,7 @@ def job(jobs: Up) -> Up:
     return jobs
 
 
-@pytest.mark.parametrize("name", ["@hub", "@recorder", "@simulator", "red"])
+@pytest.mark.parametrize("name", ["@hub", "@recorder", "@simulator", "@console", "red"])
 def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) -> None:
     before = {each.name: each.pid for each in up.processes()}
     os.kill(up.running(name), signal.SIGKILL)
@@ -70,7 +81,7 @@ def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) 
         up.ready(car)
 
 
-@pytest.mark.parametrize("name", ["green", "@simulator", "@recorder"])
+@pytest.mark.parametrize("name", ["green", "@simulator", "@recorder", "@console"])
 def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
     pid = up.running(name)
     os.kill(pid, signal.SIGSTOP)
@@ -142,7 +153,9 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
     assert [line.split()[0] for line in cars] == ["green", "red"]
     assert f"process {up.running('red')}" in up.fleet("status", "--processes").stdout
     told = json.loads(up.fleet("status", "--json").stdout)
-    assert {"@hub", "@recorder", "@simulator", "red", "green"} == {each["name"] for each in told["processes"]}
+    assert {"@hub", "@recorder", "@simulator", "@console", "red", "green"} == {
+        each["name"] for each in told["processes"]
+    }
     assert "is open. The gateway stops the car first." in up.fleet("logs", "red").stdout
     assert " simulator | {" in up.fleet("logs", "simulator").stdout
     lines = [json.loads(line) for line in up.fleet("logs", "red", "--json").stdout.splitlines()]
@@ -170,14 +183,18 @@ def test_reload_of_simulated_cars_has_nothing_to_change(up: Up) -> None:
 
 
 def test_down_stops_every_car_and_waits(tmp_path: Path) -> None:
-    with Up(tmp_path, free_endpoint(), "--sim", "2") as started:
+    port = free_port()
+    with Up(tmp_path, free_endpoint(), "--sim", "2", "--console-port", str(port)) as started:
         for car in ("red", "green"):
             started.ready(car)
+        started.running("@console")
         assert started.ask("drive", "red", motion="forward", duration_s=10)["status"] in TAKEN
         done = started.fleet("down")
         assert done.returncode == 0, done.stderr
         assert done.stdout == "green: stopped\nred: stopped\n"
         assert started.process.wait() == 0
+        with pytest.raises(urllib.error.URLError):
+            get_page(port)
         closed = started.until("process", "@recorder", "recording closed")
         assert closed["words"].endswith(" 0 lost")
         assert not started.left()

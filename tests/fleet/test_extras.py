@@ -50,6 +50,7 @@ EXPECTED = {
     "replay SESSION --save OUT/one.rrd": VIEW,
     "view": VIEW,
     "console": CONSOLE,
+    "up --sim 1 --console": CONSOLE,
     "view --save OUT/live.rrd": VIEW,
     "sessions export SESSION --parquet OUT/parquet": ANALYSIS,
     "sessions export SESSION --csv OUT/csv": WORKS,

@@ -7,13 +7,15 @@ import { InspectPage } from "./inspect-page.js";
 import { PeoplePage } from "./people-page.js";
 import { PlanPage } from "./plan-page.js";
 import { PlotsPage } from "./plots-page.js";
+import { SessionsPage } from "./sessions-page.js";
+import { SetupPage } from "./setup-page.js";
 import { stopStates, t } from "./texts.js";
 import { Component, html, Refused, render, useState, Verdict } from "./ui.js";
 
 const SHOW_REPORT_MS = 30_000;
 const SAME_PRESS_MS = 1000;
 
-const PAGES = { "#/": [t.fleet, FleetPage], "#/drive": [t.drive, DrivePage], "#/plan": [t.plan, PlanPage], "#/plots": [t.plots, PlotsPage], "#/inspect": [t.inspect, InspectPage], "#/people": [t.people, PeoplePage] };
+const PAGES = { "#/": [t.fleet, FleetPage], "#/drive": [t.drive, DrivePage], "#/plan": [t.plan, PlanPage], "#/plots": [t.plots, PlotsPage], "#/inspect": [t.inspect, InspectPage], "#/people": [t.people, PeoplePage], "#/sessions": [t.sessions, SessionsPage], "#/setup": [t.setup, SetupPage] };
 
 // ---------------------------------------------------------------- STOP
 

@@ -187,6 +187,16 @@ export async function sendPlan(what, text) {
   changed();
 }
 
+// Ask the console by HTTP for what is not about driving. Always answers with an object.
+export async function ask(path, body) {
+  try {
+    const response = await fetch(path, body === undefined ? {} : { method: "POST", body });
+    return await response.json();
+  } catch {
+    return { ok: false, words: describe.unreachable };
+  }
+}
+
 // ---------------------------------------------------------------- the socket
 
 export let describe = { done: () => "", refused: () => "" };

@@ -32,6 +32,31 @@ const Ledger = ({ ledger }) => html`<section>
   </ul>
 </section>`;
 
+const Commands = ({ commands }) => html`<section>
+  <h2 id="commands">${t.commands}</h2>
+  <div class="scroll" tabindex="0" role="region" aria-labelledby="commands">
+    <table>
+      <thead><tr>${t.commandColumns.map((name) => html`<th key=${name} scope="col">${name}</th>`)}</tr></thead>
+      <tbody>
+        ${commands.map(
+          (each, index) => html`<tr key=${index} class=${each.bad ? "bad" : ""}>
+            <td>${time(each.at_ms)}</td><td>${each.requested}</td><td>${each.bad ? "⚠ " : ""}${each.decided}</td>
+            <td><code>${each.wire}</code></td><td>${each.evidence}</td>
+          </tr>`,
+        )}
+      </tbody>
+    </table>
+  </div>
+</section>`;
+
+const Doctor = ({ doctor }) => html`<section data-doctor>
+  <h2>${t.doctor}</h2>
+  <ul class="plain">
+    ${doctor.findings.length === 0 ? html`<li>✓ ${t.nothingOdd}</li>` : doctor.findings.map((words) => html`<li key=${words}>⚠ ${words}</li>`)}
+  </ul>
+  <dl class="wide">${doctor.facts.map(([name, words]) => html`<div class="row" key=${name}><dt>${name}</dt><dd>${words}</dd></div>`)}</dl>
+</section>`;
+
 const Gateway = ({ rows }) => html`<section>
   <h2>${t.gateway}</h2>
   <dl class="wide">${rows.map(([name, words]) => html`<div class="row" key=${name}><dt>${name}</dt><dd>${words}</dd></div>`)}</dl>
@@ -54,7 +79,9 @@ export function InspectPage({ cars }) {
       <button aria-pressed=${frozen !== null} onClick=${() => setFrozen(frozen === null ? shown : null)}>${t.freeze}</button>
     </div>
     ${shown !== null &&
-    html`<${Frames} frames=${shown.frames} />
+    html`<${Doctor} doctor=${shown.doctor} />
+      <${Frames} frames=${shown.frames} />
+      <${Commands} commands=${shown.commands} />
       <div class="columns"><${Ledger} ledger=${shown.ledger} /><${Gateway} rows=${shown.gateway} /></div>`}
   `;
 }

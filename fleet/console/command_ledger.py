@@ -1,0 +1,68 @@
+"""The commands of one car: who requested what, what its gateway decided, what went on the wire, what shows it. Pure."""
+
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from schemas import messages
+
+MAX_COMMANDS: Final = 40
+"""Number of commands that a page shows."""
+MAX_WIRE_FRAMES: Final = 6
+"""Number of frames of one command that a page shows."""
+
+
+@dataclass(slots=True)
+class LedgerCommand:
+    """One command, from its first event on."""
+
+    at_ms: int
+    requested: str
+    decided: list[str] = field(default_factory=list)
+    wire: list[str] = field(default_factory=list)
+    evidence: str = ""
+    bad: bool = False
+
+
+class CommandLedger:
+    """The newest commands by id, the newest last."""
+
+    def __init__(self) -> None:
+        self._commands: dict[str, LedgerCommand] = {}
+
+    def on_event(self, event: Any) -> None:
+        """Handle a command event."""
+        if event.id not in self._commands:
+            requested = f"{event.verb} by {event.sender}{f' ({event.kind})' if event.kind else ''}"
+            self._commands[event.id] = LedgerCommand(messages.stamp_ms(event.stamp), requested)
+            while len(self._commands) > MAX_COMMANDS:
+                del self._commands[next(iter(self._commands))]
+        command = self._commands[event.id]
+        words = event.phase + (f": {event.words or event.reason}" if event.words or event.reason else "")
+        if event.HasField("took_s"):
+            words += f" after {event.took_s:.2f} s"
+        if not command.decided or command.decided[-1] != words:  # a stream repeats itself
+            command.decided = [*command.decided, words][-MAX_WIRE_FRAMES:]
+        if event.evidence or event.basis:
+            command.evidence = "; ".join(filter(None, (event.basis, *event.evidence)))
+        command.bad = event.phase in ("failed", "rejected", "expired")
+
+    def on_frame(self, frame: Any) -> None:
+        """Handle a frame to the car (fleet.v1.TxFrame)."""
+        command = self._commands.get(frame.command_id)
+        if command is not None:
+            text = frame.data.decode("ascii", "backslashreplace")
+            command.wire = [*command.wire, text if frame.written else f"{text} NOT written"][-MAX_WIRE_FRAMES:]
+
+    def as_list(self) -> list[dict[str, Any]]:
+        """Return the commands, the newest first."""
+        return [
+            {
+                "at_ms": each.at_ms,
+                "requested": each.requested,
+                "decided": " → ".join(each.decided),
+                "wire": " ".join(each.wire),
+                "evidence": each.evidence,
+                "bad": each.bad,
+            }
+            for each in reversed(self._commands.values())
+        ]

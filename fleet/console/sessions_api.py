@@ -1,0 +1,245 @@
+"""What the pages do with recordings: the recorder, the list of sessions, verify, download, export, and Rerun.
+
+The work runs in processes of its own with a low priority: a session of gigabytes must not delay a STOP.
+"""
+
+import asyncio
+import json
+import os
+import shutil
+import sys
+import tempfile
+from asyncio.subprocess import PIPE, Process
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from fleet.aio import Fleet
+from fleet.client.services import ask_recorder
+from fleet.console.guard import PERSON
+from fleet.console.session_files import NotInFolder, files_of, read_file, session_path, zip_files
+from fleet.replay.rerun.viewer import VIEWER_HOST, NoViewer, Viewer, free_port
+from schemas.bus import Failure
+from schemas.suggestion import how_to_install
+
+MAX_SESSION_JOBS: Final = 2
+"""Maximum number of processes at work. More requests wait."""
+MAX_EXPORTS: Final = 4
+"""Maximum number of exports that wait for their download."""
+FORMATS: Final = ("csv", "parquet")
+_RECORDER_VERBS: Final = ("start", "stop", "mark", "status")
+_MAX_REQUEST_BYTES: Final = 8192
+_LOW_PRIORITY: Final = 5
+
+
+class SessionsApi:
+    """The routes, and the processes that they started. place: the sessions folder."""
+
+    def __init__(self, fleet: Fleet, place: Path) -> None:
+        self._fleet = fleet
+        self._place = place
+        self._slots = asyncio.Semaphore(MAX_SESSION_JOBS)
+        self._running: set[Process] = set()
+        self._scratch: Path | None = None
+        self._exports: dict[str, Path] = {}
+        self._number = 0
+        self._viewer: Viewer | None = None
+
+    def routes(self) -> list[Route]:
+        """Return the routes."""
+        return [
+            Route("/sessions", self._list),
+            Route("/sessions/{name}/download", self._download),
+            Route("/sessions/{name}/verify", self._verify, methods=["POST"]),
+            Route("/sessions/{name}/export/{format}", self._export, methods=["POST"]),
+            Route("/sessions/{name}/view", self._view, methods=["POST"]),
+            Route("/exports/{name}", self._download_export),
+            Route("/recording/{verb}", self._record, methods=["POST"]),
+        ]
+
+    async def close(self) -> None:
+        """End the processes, and remove what was exported."""
+        for process in list(self._running):
+            with suppress(ProcessLookupError):
+                process.kill()
+        if self._viewer is not None:
+            await asyncio.to_thread(self._viewer.close)
+        if self._scratch is not None:
+            await asyncio.to_thread(shutil.rmtree, self._scratch, ignore_errors=True)
+
+    # ------------------------------------------------------------------ the recorder
+
+    async def _record(self, request: Request) -> Response:
+        verb = request.path_params["verb"]
+        if verb not in _RECORDER_VERBS:
+            return refuse(f"the recorder has no command {verb!r}", 404)
+        fields = {}
+        if verb == "mark":
+            text = await read_body(request)
+            if not text.strip():
+                return refuse("A mark needs a text.")
+            person = request.scope.get(PERSON)
+            fields = {"text": text, "by": self._fleet.sync.sender if person is None else person.name}
+        answer = await self._fleet.call(ask_recorder, self._fleet.sync.bus, self._fleet.sync.name, verb, **fields)
+        if answer is None:
+            return refuse("No recorder is on the bus. `fleet record` starts one; `fleet up` records by itself.")
+        if isinstance(answer, Failure):
+            return refuse(answer.words)
+        return JSONResponse(
+            {
+                "ok": True,
+                "state": answer.state,
+                "session": Path(answer.session).name,
+                "messages": answer.messages,
+                "bytes": answer.bytes,
+                "free_bytes": answer.free_bytes,
+                "words": answer.error or answer.warning,
+            }
+        )
+
+    # ------------------------------------------------------------------ sessions
+
+    async def _list(self, _: Request) -> Response:
+        if not self._place.is_dir():
+            return JSONResponse({"place": str(self._place), "sessions": []})
+        code, out, err = await self._run("sessions", "list", str(self._place.absolute()), "--json")
+        if code:
+            return refuse(err)
+        listed = [json.loads(line) for line in out.splitlines()]
+        # Links are left out: they lead out of the folder, and `session_path` refuses them.
+        links = await asyncio.to_thread(
+            lambda: {path for path in self._place.absolute().iterdir() if path.is_symlink()}
+        )
+        found = [each for each in listed if Path(each["path"]) not in links]
+        shown = ("state", "words", "started", "length_s", "bytes", "messages", "lost", "cars", "marks", "kept")
+        rows = [
+            {"name": Path(each["path"]).name, **{field: each[field] for field in shown}} for each in reversed(found)
+        ]
+        return JSONResponse({"place": str(self._place), "sessions": rows})
+
+    async def _verify(self, request: Request) -> Response:
+        path, wrong = await self._find(request)
+        if path is None:
+            return wrong
+        code, out, err = await self._run("sessions", "verify", str(path))
+        return JSONResponse({"ok": code == 0, "words": out.strip() or err})
+
+    async def _download(self, request: Request) -> Response:
+        path, wrong = await self._find(request)
+        if path is None:
+            return wrong
+        if path.is_file():
+            return _stream(read_file(path), path.name)
+        return _stream(zip_files(files_of(path), path.name), f"{path.name}.zip")
+
+    async def _export(self, request: Request) -> Response:
+        path, wrong = await self._find(request)
+        if path is None:
+            return wrong
+        kind = request.path_params["format"]
+        if kind not in FORMATS:
+            return refuse(f"there is no format {kind!r}", 404)
+        out = self._new_path(f"{path.stem if path.is_file() else path.name}-{kind}")
+        code, said, err = await self._run("sessions", "export", str(path), f"--{kind}", str(out))
+        if code:
+            return refuse(err)
+        self._exports[out.name] = out
+        while len(self._exports) > MAX_EXPORTS:
+            shutil.rmtree(self._exports.pop(next(iter(self._exports))), ignore_errors=True)
+        return JSONResponse({"ok": True, "words": said.partition(": ")[2].strip(), "url": f"/exports/{out.name}"})
+
+    async def _download_export(self, request: Request) -> Response:
+        out = self._exports.get(request.path_params["name"])
+        if out is None:
+            return refuse("this export is gone: make it again", 404)
+        return _stream(zip_files(files_of(out), out.name), f"{out.name}.zip")
+
+    async def _view(self, request: Request) -> Response:
+        """Open the session in Rerun's viewer, at a port of its own: in a page of ours it would delay the STOP."""
+        path, wrong = await self._find(request)
+        if path is None:
+            return wrong
+        if PERSON in request.scope:
+            return refuse("Rerun opens on the computer of the console only.")
+        rrd = self._new_path("session").with_suffix(".rrd")
+        code, _, err = await self._run("replay", str(path), "--save", str(rrd))
+        if code:
+            return refuse(err)
+        try:
+            url = await asyncio.to_thread(self._open_viewer, rrd)
+        except ModuleNotFoundError:
+            return refuse(f"Rerun is not installed. Type: {how_to_install('view')}")
+        except NoViewer as error:
+            return refuse(str(error))
+        return JSONResponse({"ok": True, "words": "", "url": url})
+
+    def _open_viewer(self, rrd: Path) -> str:
+        """Start the viewer in place of an earlier one. Return its address. Raises NoViewer."""
+        if self._viewer is not None:
+            self._viewer.close()
+        port, page = free_port(), free_port()
+        self._viewer = Viewer("--serve-web", "--port", str(port), "--web-viewer-port", str(page), str(rrd))
+        self._viewer.wait_until_it_listens(page)
+        return f"http://{VIEWER_HOST}:{page}/?url=rerun%2Bhttp://{VIEWER_HOST}:{port}/proxy"
+
+    # ------------------------------------------------------------------ parts
+
+    async def _find(self, request: Request) -> tuple[Path | None, Response]:
+        """Return the session that a request names, or else the refusal."""
+        try:
+            return await asyncio.to_thread(session_path, self._place, request.path_params["name"]), Response()
+        except (NotInFolder, OSError) as error:
+            return None, refuse(str(error), 404)
+
+    def _new_path(self, name: str) -> Path:
+        if self._scratch is None:
+            self._scratch = Path(tempfile.mkdtemp(prefix="fleet-console-"))
+        self._number += 1
+        return self._scratch / f"{name}-{self._number}"
+
+    async def _run(self, *arguments: str) -> tuple[int, str, str]:
+        """Run `fleet` in a process. Return its exit code, output, and the last line of its errors."""
+        async with self._slots:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                *("-m", "fleet.cli", *arguments),
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=PIPE,
+                stderr=PIPE,
+            )
+            self._running.add(process)
+            with suppress(OSError, AttributeError):  # it has ended; there are no priorities (Windows)
+                os.setpriority(os.PRIO_PROCESS, process.pid, _LOW_PRIORITY)
+            try:
+                out, err = await process.communicate()
+            finally:
+                self._running.discard(process)
+        said = err.decode("utf-8", "replace").strip().splitlines()
+        return process.returncode or 0, out.decode("utf-8", "replace"), said[-1].removeprefix("fleet: ") if said else ""
+
+
+def _stream(data: Iterator[bytes], name: str) -> Response:
+    """Answer with a file. Its parts are read on a thread."""
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return StreamingResponse(data, media_type="application/octet-stream", headers=headers)
+
+
+def refuse(words: str, status: int = 200) -> Response:
+    """Answer that a request was not carried out, with words for the user."""
+    answer: dict[str, Any] = {"ok": False, "words": words}
+    return JSONResponse(answer, status)
+
+
+async def read_body(request: Request) -> str:
+    """Return the text of a request. The part beyond the maximum is not read."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > _MAX_REQUEST_BYTES:
+            break
+    return body[:_MAX_REQUEST_BYTES].decode("utf-8", "replace")

@@ -1,0 +1,150 @@
+"""What the pages do to set a fleet up: scan, let a car blink, write its link into the fleet file.
+
+Only pages of this computer may do it. A file is never replaced: links are inserted, and all else stays as it is.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from fleet.aio import Fleet
+from fleet.console.guard import PERSON
+from fleet.console.requests import PageMessage
+from fleet.console.sessions_api import read_body, refuse
+from fleet.fleetfile.editor import set_link
+from fleet.fleetfile.fleet_file import default_color, parse_fleet, read_fleet
+from fleet.fleetfile.models import validate_car_name, validate_link, validate_platform
+from fleet.fleetfile.scan import ScanFailed, scan
+from fleet.fleetfile.template import NewCar, format_new_file
+from fleet.links import may_be_same, parse_fleet_link
+from fleet.supervisor.temporary_gateway import temporary_gateway
+from gateway.protocol.platforms import AUTO
+from schemas.atomic_file import write_atomically
+from schemas.yaml_document.document import read_text
+
+MAX_SETUP_LINKS: Final = 64
+"""Maximum number of links or cars in one request."""
+
+
+class SetupApi:
+    """The routes. file: the fleet file."""
+
+    def __init__(self, fleet: Fleet, file: Path) -> None:
+        self._fleet = fleet
+        self._file = file
+        self._busy = asyncio.Lock()
+        """A scan and a gateway cannot have the same port."""
+        self._blinks = 0
+
+    def routes(self) -> list[Route]:
+        """Return the routes."""
+        steps = {"file": self._show, "scan": self._scan, "blink": self._blink, "write": self._write}
+        return [Route(f"/setup/{name}", self._answer(work), methods=["POST"]) for name, work in steps.items()]
+
+    def _answer(self, work: Callable[[Mapping[str, Any]], dict[str, Any]]) -> Callable[[Request], Awaitable[Response]]:
+        async def answer(request: Request) -> Response:
+            if PERSON in request.scope:
+                return refuse("Cars are set up on the computer of the console only.")
+            try:
+                fields = PageMessage.of(await read_body(request) or "{}").fields
+                return JSONResponse({"ok": True, **await asyncio.to_thread(work, fields)})
+            except (ValueError, ScanFailed, OSError) as error:  # also BadFile, CannotEdit
+                return refuse(str(error))
+
+        async def alone(request: Request) -> Response:
+            async with self._busy:
+                return await answer(request)
+
+        return alone
+
+    def _cars(self) -> Mapping[str, str]:
+        """Return the links of the cars in the file, by name; an empty one if it has none."""
+        if not self._file.exists():
+            return {}
+        file = read_fleet(self._file, unbound=True)
+        return {name: car.link for name, car in {**file.cars, **file.unlinked}.items()}
+
+    def _show(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        exists = self._file.exists()
+        return {"file": str(self._file), "exists": exists, "cars": [*self._cars().items()], "words": ""}
+
+    def _scan(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        links = _texts(fields.get("links", []))
+        for link in links:
+            validate_link(link)
+        cars = self._cars()
+        found = [
+            {
+                "url": each.url,
+                "verdict": each.verdict,
+                "words": each.words,
+                "platform": each.platform,
+                "car": _car_at(each.url, cars),
+            }
+            for each in scan(links, None)
+        ]
+        return {"found": found, "words": "" if found else "No car was found. Is it on? Is another program at its port?"}
+
+    def _blink(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Let the car at a link blink: by its own gateway if it has one, else by one of a moment."""
+        link = validate_link(str(fields.get("url", "")))
+        client = self._fleet.sync
+        car = _car_at(link, self._cars())
+        if car and car in client.cars():
+            outcome = client.car(car).find()
+        else:
+            self._blinks += 1
+            errors: list[str] = []
+            with temporary_gateway(client, f"setup-{self._blinks}", link, errors.append) as name:
+                if name is None:
+                    return {"ok": False, "words": errors[-1]}
+                outcome = client.car(name).find()
+        return {"ok": outcome.ok, "words": outcome.words or outcome.reason or outcome.phase}
+
+    def _write(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Write links of cars. `replace`: also of cars that have another link."""
+        entries = fields.get("cars")
+        if not isinstance(entries, list) or not 0 < len(entries) <= MAX_SETUP_LINKS:
+            raise ValueError("Give at least one car a name.")
+        cars = [_new_car(each, index) for index, each in enumerate(entries)]
+        if len({car.name for car in cars}) < len(cars):
+            raise ValueError("Two cars have the same name.")
+        known = self._cars()
+        other = [
+            f"{car.name} is at {known[car.name]}" for car in cars if known.get(car.name, car.link) not in ("", car.link)
+        ]
+        if other and fields.get("replace") is not True:
+            return {"ok": False, "confirm": True, "words": f"The file says: {'; '.join(other)}."}
+        if self._file.exists():
+            text = read_text(self._file)
+            for car in cars:
+                text = set_link(text, self._file, car.name, car.link)
+        else:
+            text = format_new_file(cars)
+            parse_fleet(text, self._file)
+        write_atomically(self._file.resolve(), text.encode())
+        return {"words": f"{self._file} has {', '.join(car.name for car in cars)}. Type: fleet reload, or fleet up"}
+
+
+def _new_car(entry: Any, index: int) -> NewCar:
+    fields = entry if isinstance(entry, dict) else {}
+    name, link, platform = (str(fields.get(field, "")) for field in ("name", "url", "platform"))
+    name = validate_car_name(name)
+    return NewCar(name, validate_link(link), validate_platform(platform or AUTO), default_color(name, index))
+
+
+def _car_at(url: str, cars: Mapping[str, str]) -> str:
+    """Return the car of the file that may be at this link. Empty if there is none."""
+    link = parse_fleet_link(url)
+    return next((car for car, each in cars.items() if each and may_be_same(link, parse_fleet_link(each))), "")
+
+
+def _texts(values: Any) -> Sequence[str]:
+    if not isinstance(values, list) or len(values) > MAX_SETUP_LINKS or not all(isinstance(e, str) for e in values):
+        raise ValueError(f"links is not a list of at most {MAX_SETUP_LINKS} texts")
+    return values

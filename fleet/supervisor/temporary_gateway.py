@@ -1,0 +1,56 @@
+"""Runs a gateway for one link for a moment, under a temporary name: its car blinks, and a person names it."""
+
+import contextlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from fleet.client.client import Fleet
+from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+
+_READY_S: Final = 15.0
+"""Timeout for a gateway. It starts in 1 s, and brings a car of an unknown platform to a known state within 6 s."""
+_READY_POLL_S: Final = 0.1
+
+
+@contextlib.contextmanager
+def temporary_gateway(client: Fleet, name: str, link: str, on_error: Callable[[str], object]) -> Iterator[str | None]:
+    """Run a gateway for this link. Yield its car's name, or None if the gateway did not come up. No car moves."""
+    with tempfile.TemporaryDirectory() as directory, (Path(directory) / "log").open("w+", encoding="utf-8") as log:
+        command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, "--with-parent"]
+        command += ["--fleet", client.name, "--connect", client.bus.endpoint, "--state-dir", directory]
+        # In its own session, so that Ctrl-C at the terminal reaches only us. We let the gateway stop its car.
+        gateway = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        try:
+            yield name if _is_ready(client, name, gateway, log.name, on_error) else None
+        finally:
+            gateway.terminate()
+            try:
+                gateway.wait(GATEWAY_GRACE_S)
+            except subprocess.TimeoutExpired:
+                gateway.kill()
+                gateway.wait()
+
+
+def _is_ready(
+    client: Fleet, name: str, gateway: "subprocess.Popen[bytes]", log: str, on_error: Callable[[str], object]
+) -> bool:
+    """Wait until the gateway serves and its car stands. Return True if it serves, also for a silent car."""
+    deadline, served = time.monotonic() + _READY_S, False
+    while time.monotonic() < deadline:
+        if gateway.poll() is not None:
+            lines = Path(log).read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            on_error(lines[-1] if lines else "its gateway ended")
+            return False
+        states = client.get(f"{name}/state/safety")
+        served = served or bool(states)
+        if any(each.value.motors == "off" for each in states):
+            return True
+        time.sleep(_READY_POLL_S)
+    if not served:
+        on_error("its gateway did not come up")
+    return served

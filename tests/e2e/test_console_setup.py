@@ -1,0 +1,70 @@
+"""The set-up page in a real browser: a simulated car is looked for, blinks, and gets its name in the fleet file."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.test_console import serious
+from tests.support.console import ConsoleProcess, ConsoleStage
+from tests.support.ports import free_endpoint
+from tests.support.processes import FleetProcesses, wait_for
+
+pytestmark = pytest.mark.soak  # needs Chromium (`make browser`)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("set-up") / "fleet.yaml"
+    path.write_text("# the cars of our lab\ncars:\n  ann: {}  # without a link yet\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def stage(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ConsoleStage]:
+    stage = ConsoleStage(FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("console")))
+    stage.console = ConsoleProcess(stage.fleet, "--fleet-file", str(file))
+    yield stage
+    stage.close()
+
+
+def test_a_car_is_found_blinks_and_is_written_with_the_comments_kept(stage: ConsoleStage, file: Path) -> None:
+    sim, (link,) = stage.fleet.simulate("new:arduino:pty")
+    page = stage.page("#/setup")
+    page.get_by_text("no link yet").wait_for()
+    page.locator("input[name=links]").fill(link)
+    page.locator("[data-setup=scan]").click()
+    card = page.locator("[data-link]")
+    card.wait_for()
+    blinks: list[bytes] = []
+    stage.fleet.bus.subscribe("fleet/setup-1/frame/tx", lambda sample: blinks.append(sample.payload))
+    card.locator("[data-setup=blink]").click()
+    card.get_by_text("It blinks and beeps now.").wait_for()
+    wait_for(lambda: len(blinks) > 3, "its gateway has sent lights")
+    truth = sim.say({"car": "new", "ask": "truth"})
+    assert (truth["motor_left"], truth["motor_right"]) == (0, 0)
+    card.locator("input[name=car]").fill("ann")
+    page.locator("[data-setup=write]").click()
+    page.get_by_text("fleet.yaml has ann.").wait_for()
+    text = file.read_text()
+    assert text.startswith("# the cars of our lab\n")
+    assert "# without a link yet" in text
+    assert link in text
+    assert serious(page) == []
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_the_stop_is_in_view_and_escape_stops(stage: ConsoleStage, size: str) -> None:
+    page = stage.phone("#/setup") if size == "phone" else stage.page("#/setup")
+    page.locator("[data-setup=scan]").wait_for()
+    assert serious(page) == []
+    box, window = page.locator("#stop").bounding_box(), page.viewport_size
+    assert box is not None
+    assert window is not None
+    assert box["y"] + box["height"] <= window["height"]
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    stage.person.car("red").drive("forward", 10.0, wait=False).check()
+    wait_for(lambda: stage.judges["red"].driving, "red drives")
+    page.locator("input[name=links]").focus()
+    page.keyboard.press("Escape")
+    stage.stands()

@@ -1,0 +1,82 @@
+"""The routes of the sessions page without a browser: recordings are served, and no path leads out of their folder."""
+
+import http.client
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.fleet.recording.damaged import written
+from tests.support.console import ConsoleProcess
+from tests.support.ports import free_endpoint
+from tests.support.processes import PATIENCE_S, FleetProcesses
+
+
+@pytest.fixture
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses]:
+    processes = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("server"))
+    yield processes
+    processes.close()
+
+
+def answer(port: int, verb: str, path: str, body: str = "", **headers: str) -> tuple[int, bytes]:
+    """Ask the console; its status and its text."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S * 2)
+    connection.request(verb, path, body, headers)
+    response = connection.getresponse()
+    found = response.status, response.read()
+    connection.close()
+    return found
+
+
+def cookie_of(port: int) -> str:
+    """The cookie that the console gives to its own pages."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S * 2)
+    connection.request("GET", "/hello")
+    found = connection.getresponse().getheader("Set-Cookie") or ""
+    connection.close()
+    return found.partition(";")[0]
+
+
+def test_recordings_are_listed_verified_downloaded_and_exported_and_no_path_leads_out(
+    fleet: FleetProcesses, tmp_path: Path
+) -> None:
+    place = tmp_path / "sessions"
+    secret = tmp_path / "20260101T000000Z-secret"
+    for path in (place / "20260921T141320Z-fleet", secret):
+        path.mkdir(parents=True)
+        written(path / "0001.mcap")
+    (place / "link").symlink_to(secret)
+    console = ConsoleProcess(fleet, "--sessions", str(place))
+    own = {"Origin": console.address, "Cookie": cookie_of(console.port)}
+
+    def ask(path: str, **headers: str) -> Any:
+        status, data = answer(console.port, "POST", path, **(own | headers))
+        return json.loads(data) if status == 200 else status
+
+    listed = json.loads(answer(console.port, "GET", "/sessions")[1])
+    assert [each["name"] for each in listed["sessions"]] == ["20260921T141320Z-fleet"]
+    name = listed["sessions"][0]["name"]
+    verdict = ask(f"/sessions/{name}/verify")
+    assert "session.json is missing" in verdict["words"]
+    status, data = answer(console.port, "GET", f"/sessions/{name}/download")
+    archive = zipfile.ZipFile(io.BytesIO(data))
+    assert status == 200
+    assert archive.read(f"{name}/0001.mcap") == (place / name / "0001.mcap").read_bytes()
+    exported = ask(f"/sessions/{name}/export/csv")
+    tables = zipfile.ZipFile(io.BytesIO(answer(console.port, "GET", exported["url"])[1]))
+    assert any(each.endswith("/fleet.v1.Range.csv") for each in tables.namelist()), tables.namelist()
+    assert "No recorder is on the bus." in ask("/recording/start")["words"]
+
+    for bad in ("..", "%2e%2e", f"..%2f{secret.name}", f"../{secret.name}", "link", "%2fetc", ".", "a%00b"):
+        assert answer(console.port, "GET", f"/sessions/{bad}/download")[0] == 404, bad
+        assert ask(f"/sessions/{bad}/verify") == 404, bad
+    for bad in ("%2e%2e", f"..%2f{name}", name):
+        assert answer(console.port, "GET", f"/exports/{bad}")[0] == 404, bad
+    assert ask(f"/sessions/{name}/verify", Origin="http://evil.example") == 403
+    assert ask("/recording/stop", Cookie="") == 403
+    assert console.process.end() == 0
