@@ -175,7 +175,7 @@ class _Judge:
         rules = self.rules
         if not self._may_end(estop):
             return False
-        drives = not rules.listed or self.person in (*rules.drivers, *rules.leads)
+        drives = not rules.listed or self.person in (*rules.drivers, *rules.leads, rules.loan_to)
         return self.person == estop.person or drives or (estop.fleet_wide and self.person in rules.others)
 
     def _leased(self, *, take: bool) -> Refusal | None:

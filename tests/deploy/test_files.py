@@ -29,12 +29,17 @@ def test_a_fleet_file_is_one(path: Path) -> None:
     assert len(fleet.cars) >= 3
     assert path.read_text().startswith(f"# yaml-language-server: $schema={SCHEMA}\n")
     links = {name: car.link.partition(":")[0] for name, car in fleet.cars.items()}
-    wanted = {"sim": {"sim"}, "bluetooth": {"ble"}, "mixed": {"serial", "tcp", "ble", "/dev/fleet/green"}}
+    wanted = {
+        "sim": {"sim"},
+        "lesson": {"sim"},
+        "bluetooth": {"ble"},
+        "mixed": {"serial", "tcp", "ble", "/dev/fleet/green"},
+    }
     assert set(links.values()) == wanted[path.stem]
 
 
 def test_there_is_one_for_each_start() -> None:
-    assert [path.name for path in FILES] == ["bluetooth.yaml", "mixed.yaml", "sim.yaml"]
+    assert [path.name for path in FILES] == ["bluetooth.yaml", "lesson.yaml", "mixed.yaml", "sim.yaml"]
 
 
 @pytest.mark.parametrize("kind", SCHEMAS)

@@ -87,7 +87,7 @@ def test_people_have_a_rank_and_cars() -> None:
 @pytest.mark.parametrize(
     ("people", "fault"),
     [
-        ('{lee: {drives: ["@b"]}}', "3:25: error: people.lee, drive 1: there is no group '@b'. There is only @a."),
+        ('{lee: {drives: ["@b"]}}', "3:25: error: people.lee, drive 1: there is no group '@b'. Did you mean @a?"),
         ("{lee: {drives: [rad]}}", "3:25: error: people.lee, drive 1: there is no car 'rad'. Did you mean red?"),
         ("{lee: {drives: [a]}}", "3:25: error: people.lee, drive 1: there is no car 'a'. Did you mean \"@a\"?"),
         ("{lee: {drives: [@a]}}", "3:25: error: this is not YAML: a text that begins with @. Write it in quotes"),

@@ -128,10 +128,14 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
 
         while sent < 300:
             publish()
-        wait_for(lambda: status(bus).bytes > 300 * 2000, "that is in the file")
+
+        def in_file() -> set[int]:
+            return {message.sequence for message in Session(session).messages() if message.key == out.key}
+
+        wait_for(lambda: set(range(1, 301)) <= in_file(), "that is in the file")
         there.fill()
         publish_until("full")
-        before = {message.sequence for message in Session(session).messages() if message.key == out.key}
+        before = in_file()
         assert set(range(1, 301)) <= before
         found = fleet(endpoint, "record", "status")
         assert found.returncode == 0
