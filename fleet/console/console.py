@@ -20,7 +20,7 @@ from fleet.console.operator import ConsoleOperator
 from fleet.console.operators import Operators
 from fleet.console.page_link import PageLink
 from fleet.console.pairing import PagePerson
-from fleet.console.permissions import rights_of
+from fleet.console.permissions import management_refusal, rights_of
 from fleet.console.plan_view import PlanView, coordinator_topic
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
@@ -55,7 +55,7 @@ class Console:
 
     def __init__(self, fleet: Fleet, place: Path, file: Path) -> None:
         self._fleet = fleet
-        self.sessions = SessionsApi(fleet, place)
+        self.sessions = SessionsApi(fleet, place, self.management_refusal)
         self.setup = SetupApi(fleet, file)
         self._presses = PressBook()
         self._view = FleetView(_hex_color)
@@ -215,6 +215,10 @@ class Console:
         """Return the operator of a request (None: from this computer)."""
         return self.operator if person is None else self._operators.of(person.name)
 
+    def management_refusal(self, person: PagePerson | None) -> str:
+        """Return why this person (None: of this computer) may not start and stop the recorder and plans."""
+        return management_refusal(self._view.rules.values(), (person or self.person).name)
+
     async def add_page(self, send: Callable[[str], Awaitable[None]], person: PagePerson | None = None) -> PageLink:
         """Add a page of a person (None: of this computer). Raises TooManyPages and BusError."""
         person = person or self.person
@@ -306,8 +310,11 @@ class Console:
                 since_s = float(min(message.number("since_s"), MAX_PLOT_S))
                 self.operator.spawn(self._plots.begin(page.number, message.series(), since_s))
             case "plan":
-                verb = message.one_of("verb", frozenset(PlanRequest))
-                page.operator.spawn(self._ask_coordinator(page, message.number("id"), verb))
+                request_id, verb = message.number("id"), message.one_of("verb", frozenset(PlanRequest))
+                if words := self.management_refusal(page.person):
+                    page.answer(t="plan_done", id=request_id, ok=False, words=words)
+                else:
+                    page.operator.spawn(self._ask_coordinator(page, request_id, verb))
             case "do":
                 request, cars = message.request(), message.cars()
                 if request.verb in (*STOPS, "mode"):

@@ -3,7 +3,7 @@
 The gateway decides (`gateway.control.arbiter`). A test compares both in one table.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Self
@@ -79,6 +79,26 @@ def refusals(rules: CarRules, sender: str) -> dict[str, Refusal]:
     judge = _Judge(rules, sender, person_of(sender))
     found = {action: judge.refusal(action) for action in ACTIONS}
     return {action: refusal for action, refusal in found.items() if refusal is not None}
+
+
+def management_refusal(cars: Iterable[CarRules], sender: str) -> str:
+    """Return why this person may not start and stop the recorder and plans. Empty if allowed.
+
+    Both are of the whole fleet. No gateway decides: the console holds its own pages to it.
+    """
+    known = list(cars)
+    everywhere = CarRules(
+        "",
+        any(rules.listed for rules in known),
+        _once(name for rules in known for name in rules.leads),
+        _once(name for rules in known for name in (*rules.drivers, *rules.others)),
+    )
+    refusal = _Judge(everywhere, sender, person_of(sender)).refusal("manage")
+    return "" if refusal is None else refusal[1]
+
+
+def _once(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,9 +214,10 @@ def _words(mark: Mark) -> str:
 
 
 def rights_of(sender: str, cars: Mapping[str, CarRules]) -> dict[str, Any]:
-    """Return the words of what is refused to this sender, by car and action; pause and unpause of the whole fleet."""
+    """Return the words of what is refused to this sender, by car and action, and for the whole fleet."""
     by_car = {car: _cached(rules, sender) for car, rules in cars.items()}
     fleet = {action: next(_common(by_car, action), "") for action in ("pause", "unpause")}
+    fleet["manage"] = management_refusal(cars.values(), sender)
     return {"cars": by_car, **fleet, "lead": any(person_of(sender) in rules.leads for rules in cars.values())}
 
 

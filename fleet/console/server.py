@@ -165,7 +165,10 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
         return await _answer_plan(request, console.operator.check_plan)
 
     async def set_plan(request: Request) -> Response:
-        return await _answer_plan(request, console.operator_of(request.scope.get(PERSON)).set_plan)
+        person = request.scope.get(PERSON)
+        if words := console.management_refusal(person):
+            return JSONResponse({"ok": False, "words": words}, 403)
+        return await _answer_plan(request, console.operator_of(person).set_plan)
 
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()

@@ -10,7 +10,7 @@ import shutil
 import sys
 import tempfile
 from asyncio.subprocess import PIPE, Process
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +22,7 @@ from starlette.routing import Route
 from fleet.aio import Fleet
 from fleet.client.services import ask_recorder
 from fleet.console.guard import PERSON
+from fleet.console.pairing import PagePerson
 from fleet.console.session_files import NotInFolder, files_of, read_file, session_path, zip_files
 from fleet.replay.rerun.viewer import VIEWER_HOST, NoViewer, Viewer, free_port
 from schemas.bus import Failure
@@ -38,11 +39,16 @@ _LOW_PRIORITY: Final = 5
 
 
 class SessionsApi:
-    """The routes, and the processes that they started. place: the sessions folder."""
+    """The routes, and the processes that they started.
 
-    def __init__(self, fleet: Fleet, place: Path) -> None:
+    place: the sessions folder. refusal: returns why a person (None: of this computer) may not start and stop the
+    recorder, empty if allowed.
+    """
+
+    def __init__(self, fleet: Fleet, place: Path, refusal: Callable[[PagePerson | None], str]) -> None:
         self._fleet = fleet
         self._place = place
+        self._refusal = refusal
         self._slots = asyncio.Semaphore(MAX_SESSION_JOBS)
         self._running: set[Process] = set()
         self._scratch: Path | None = None
@@ -78,12 +84,14 @@ class SessionsApi:
         verb = request.path_params["verb"]
         if verb not in _RECORDER_VERBS:
             return refuse(f"the recorder has no command {verb!r}", 404)
-        fields = {}
+        fields: dict[str, str] = {}
+        person = request.scope.get(PERSON)
+        if verb in ("start", "stop") and (words := self._refusal(person)):
+            return refuse(words, 403)
         if verb == "mark":
             text = await read_body(request)
             if not text.strip():
                 return refuse("A mark needs a text.")
-            person = request.scope.get(PERSON)
             fields = {"text": text, "by": self._fleet.sync.sender if person is None else person.name}
         answer = await self._fleet.call(ask_recorder, self._fleet.sync.bus, self._fleet.sync.name, verb, **fields)
         if answer is None:

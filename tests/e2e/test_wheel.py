@@ -1,8 +1,10 @@
-"""The wheel in an empty environment, outside the clone: first minutes without an extra, then with the extra `view`."""
+"""The wheel in an empty environment, outside the clone: without an extra, then with `console` and `view`."""
 
 import shutil
+import signal
 import subprocess
 import sys
+import urllib.request
 import venv
 from collections.abc import Iterator
 from importlib import metadata
@@ -80,10 +82,24 @@ class Environment:
         assert (done.returncode, done.stderr) == (0, ""), (command, done.stdout, done.stderr)
         return done.stdout
 
+    def served(self, *paths: str) -> list[bytes]:
+        """Serve the console for as long as it takes to read these paths of it; what they are."""
+        words = ["fleet", "console", "--port", "0"]
+        with subprocess.Popen(words, cwd=self.home, env=self.variables, stdout=subprocess.PIPE) as console:
+            try:
+                assert console.stdout is not None
+                address = console.stdout.readline().split()[1].decode()
+                found = [urllib.request.urlopen(address + path, timeout=30).read() for path in paths]
+            finally:
+                console.send_signal(signal.SIGINT)
+        assert console.returncode == 0
+        return found
+
 
 def test_the_first_minutes_from_the_wheel(tmp_path: Path) -> None:
     here = Environment(tmp_path)
-    hidden = "for module in ('rerun', 'pyarrow', 'numpy', 'PIL', 'bleak'): assert not find_spec(module), module"
+    extras = ("rerun", "pyarrow", "numpy", "PIL", "bleak", "uvicorn", "starlette")
+    hidden = f"for module in {extras}: assert not find_spec(module), module"
     here.succeeds(f'python -c "from importlib.util import find_spec\n{hidden}"')
     assert "1-patrol" in here.succeeds("fleet example list")
     assert "fleet up" in here.succeeds("fleet init --sim 3")
@@ -99,6 +115,13 @@ def test_the_first_minutes_from_the_wheel(tmp_path: Path) -> None:
         assert (refused.returncode, refused.stdout) == (1, "")
         assert refused.stderr.endswith("(from a clone: pip install '.[view]')\n")
         assert refused.stderr.count("\n") == 1
+        refused = here.run("fleet console")
+        assert (refused.returncode, refused.stdout) == (1, "")
+        assert refused.stderr.endswith("(from a clone: pip install '.[console]')\n")
+        here.install("console")
+        page, code = here.served("/", "/static/app.js")
+        assert b"/static/app.js" in page
+        assert b"import" in code
     finally:
         down = here.run("fleet down")
     assert down.returncode == 0, down.stderr

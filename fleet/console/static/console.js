@@ -9,7 +9,7 @@ const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
 const listeners = new Set();
 export const store = {
   state: null,
-  rights: { cars: {}, pause: "", unpause: "", lead: false }, // what this person may not do: words by car and action
+  rights: { cars: {}, pause: "", unpause: "", manage: "", lead: false }, // what this person may not do: words by car and action
   plan: null,
   inspection: null,
   planAnswer: null, // of the last request about the plan: {ok, words}

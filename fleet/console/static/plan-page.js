@@ -2,13 +2,14 @@
 
 import { plan, sendPlan, store } from "./console.js";
 import { t } from "./texts.js";
-import { html, useRef, useState } from "./ui.js";
+import { html, Refused, useRef, useState } from "./ui.js";
 
 const FAULT = /^plan:(\d+):(\d+): error: (.*)$/;
 
 function Status({ shown }) {
   if (shown.plan === null) return html`<p>${t.noPlan}</p>`;
   const { version, set_by } = shown.plan;
+  const refused = store.rights.manage;
   const words = !shown.running
     ? t.planOld(version)
     : shown.stopped_by
@@ -18,10 +19,11 @@ function Status({ shown }) {
     ${shown.phase && html`<p>${t.phase(shown.phase)}</p>`}
     ${shown.rules?.length > 0 && html`<p>${t.rules(shown.rules)}</p>`}
     <div class="controls">
-      <button data-plan="restart" onClick=${() => plan("restart")}>${t.planRestart}</button>
-      ${shown.phase && html`<button data-plan="next" onClick=${() => plan("next")}>${t.planNext}</button>`}
-      <button data-plan="stop" onClick=${() => plan("stop")}>${t.planStop}</button>
-    </div>`;
+      <button data-plan="restart" disabled=${refused !== ""} onClick=${() => plan("restart")}>${t.planRestart}</button>
+      ${shown.phase && html`<button data-plan="next" disabled=${refused !== ""} onClick=${() => plan("next")}>${t.planNext}</button>`}
+      <button data-plan="stop" disabled=${refused !== ""} onClick=${() => plan("stop")}>${t.planStop}</button>
+    </div>
+    ${refused && html`<${Refused} words=${[refused]} />`}`;
 }
 
 const Roles = ({ roles }) => html`<section>
@@ -86,8 +88,9 @@ function Editor({ inForce }) {
       onInput=${(event) => setText(event.target.value)}></textarea>
     <div class="controls">
       <button data-plan="check" onClick=${() => sendPlan("check", text)}>${t.planCheck}</button>
-      <button data-plan="set" onClick=${() => sendPlan("set", text)}>${t.planSet}</button>
+      <button data-plan="set" disabled=${store.rights.manage !== ""} onClick=${() => sendPlan("set", text)}>${t.planSet}</button>
     </div>
+    ${store.rights.manage && html`<${Refused} words=${[store.rights.manage]} />`}
     <${Answer} answer=${store.planAnswer} onFault=${show} />
   </section>`;
 }

@@ -1,8 +1,8 @@
 // The sessions page: the recorder, and the list of recordings with what can be done with each.
 
-import { ask } from "./console.js";
+import { ask, store } from "./console.js";
 import { t } from "./texts.js";
-import { html, useEffect, useState } from "./ui.js";
+import { html, Refused, useEffect, useState } from "./ui.js";
 
 const POLL_MS = 2000;
 
@@ -36,6 +36,7 @@ function Recorder({ onChange }) {
     onChange();
   };
   const on = status?.state === "recording";
+  const refused = store.rights.manage;
   return html`<section aria-labelledby="recording">
     <h2 id="recording">${t.recording}</h2>
     ${status !== null && html`<p data-recorder=${status.state ?? "none"}>
@@ -43,11 +44,12 @@ function Recorder({ onChange }) {
     </p>`}
     <div class="controls">
       ${status?.ok && (on
-        ? html`<button data-record="stop" onClick=${() => act("stop")}>${t.recordStop}</button>`
-        : html`<button data-record="start" onClick=${() => act("start")}>${t.recordStart}</button>`)}
+        ? html`<button data-record="stop" disabled=${refused !== ""} onClick=${() => act("stop")}>${t.recordStop}</button>`
+        : html`<button data-record="start" disabled=${refused !== ""} onClick=${() => act("start")}>${t.recordStart}</button>`)}
       ${on && html`<label>${t.markText} <input name="mark" maxlength="1000" value=${text} onInput=${(event) => setText(event.target.value)} /></label>
         <button data-record="mark" disabled=${text.trim() === ""} onClick=${() => act("mark", text)}>${t.markSet}</button>`}
     </div>
+    ${status?.ok && refused && html`<${Refused} words=${[refused]} />`}
     <p role="status">${said}</p>
   </section>`;
 }

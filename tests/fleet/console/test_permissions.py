@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator
 
-from fleet.console.permissions import ACTIONS, CarRules, refusals, rights_of
+from fleet.console.permissions import ACTIONS, CarRules, management_refusal, refusals, rights_of
 from gateway.bus.publisher import _fill_safety
 from gateway.control import arbiter
 from gateway.control.commands import (
@@ -118,6 +118,22 @@ def test_the_words_name_the_person_the_car_and_the_rule() -> None:
     assert refusals(rules, ZED)["act"] == ("not_allowed", "zed watches and stops: the fleet file does not list zed.")
     assert refusals(rules, ANN)["pause"] == ("not_allowed", "Only a lead may (teacher).")
     assert refusals(rules, TEACHER) == {}
+
+
+def test_the_recorder_and_the_plan_are_for_leads_where_the_fleet_has_some() -> None:
+    red = CarRules("red", listed=True, leads=("teacher",), drivers=("ann",), others=("eve",))
+    blue = CarRules("blue", listed=True, leads=("teacher",), drivers=("eve",), others=("ann",))
+    assert [management_refusal([red, blue], each) for each in (TEACHER, ANN, EVE, ZED)] == [
+        "",
+        *["Only a lead may (teacher)."] * 3,
+    ]
+    assert management_refusal([CarRules("green"), blue], ANN) == "Only a lead may (teacher).", "one car has leads"
+    no_leads = CarRules("red", listed=True, drivers=("ann",), others=("eve",))
+    assert [management_refusal([no_leads], each) for each in (ANN, EVE)] == ["", ""]
+    assert management_refusal([no_leads], ZED) == "zed watches and stops: the fleet file does not list zed."
+    assert management_refusal([CarRules("red")], ZED) == "", "nobody is listed"
+    assert rights_of(ANN, {"red": red})["manage"] == "Only a lead may (teacher)."
+    assert rights_of(ANN, {})["manage"] == ""
 
 
 def test_a_fleet_can_be_paused_if_one_car_lets_it() -> None:

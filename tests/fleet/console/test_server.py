@@ -3,10 +3,13 @@
 import contextlib
 import http.client
 import json
+import math
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import psutil
 import pytest
@@ -26,6 +29,9 @@ from tests.support.network_client import NetworkDevice, network_port, untrusting
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
+PEOPLE = ("teacher:lead", "mia", "thief")
+"""Who may drive red."""
+
 
 class ServerStage:
     """One car, its gateway, and a console that also serves the network."""
@@ -33,7 +39,8 @@ class ServerStage:
     def __init__(self, fleet: FleetProcesses) -> None:
         self.fleet = fleet
         _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
-        fleet.gateway(link, car="red", platform="arduino")
+        people = [word for name in PEOPLE for word in ("--person", name)]
+        fleet.gateway(link, *people, car="red", platform="arduino")
         self.judge = Judge.follow(fleet.bus, "red")
         self.console = ConsoleProcess(fleet, "--lan", "--lan-port", "0")
         self.lan_port = network_port(self.console)
@@ -67,7 +74,8 @@ class ServerStage:
     def rest(self) -> None:
         """Stop red if it drives."""
         if self.judge.driving:
-            self.person.stop(["red"])
+            self.person.ask(drive_request("stop"), ["red"])  # without a hold: the next test drives at once
+            wait_for(lambda: not self.judge.driving, "red stands")
 
     def log(self) -> str:
         """What the console has logged."""
@@ -165,18 +173,72 @@ def book_file(stage: ServerStage) -> PeopleFile:
         return PeopleFile(people_path(stage.fleet.endpoint, "fleet"))
 
 
+def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -> None:
+    driver, teacher = stage.device("mia"), stage.device("teacher", "--rank", "lead")
+    own = {"Origin": stage.console.address, "Cookie": loopback_cookie(stage)}
+    plan = "roles:\n  guide: {mode: tracking}\n"
+    for path in ("/recording/start", "/recording/stop", "/plan/set"):
+        refused = {"ok": False, "words": "Only a lead may (teacher)."}
+        status, text = driver.ask("POST", path, plan)
+        assert (status, json.loads(text)) == (403, refused), path
+        assert answer(stage.console.port, "POST", path, plan, **own)[0] == 403, "this computer's person is no lead"
+        status, text = teacher.ask("POST", path, plan)
+        assert status == 200
+        assert "is running" in text.decode() or "is on the bus" in text.decode(), "passed on to nobody"
+    with driver.socket() as page:
+        assert next_message(page, "rights")["manage"] == "Only a lead may (teacher)."
+        page.send(json.dumps({"t": "plan", "id": 7, "verb": "stop"}))
+        assert next_message(page, "plan_done")["words"] == "Only a lead may (teacher)."
+    for path in ("/recording/status", "/recording/mark", "/plan/check"):
+        assert driver.ask("POST", path, plan)[0] == 200, "for everyone"
+    assert driver.ask("GET", "/sessions")[0] == 200
+
+
+def next_message(page: ClientConnection, kind: str) -> Any:
+    """The next message of this kind that a page gets."""
+    while (found := json.loads(page.recv(timeout=30)))["t"] != kind:
+        pass
+    return found
+
+
+def hold(stage: ServerStage, page: ClientConnection) -> threading.Thread:
+    """Press forward on a page and hold it, as a browser does, until the console closes it."""
+    driving = threading.Thread(target=press_until_closed, args=(page,))
+    driving.start()
+    wait_for(lambda: stage.judge.driving, "red drives")
+    return driving
+
+
+def press_until_closed(page: ClientConnection) -> None:
+    """Press forward, echo each tick, and press again if that press ends: a gateway wants a pause after a stop."""
+    press, again_at = 0, -1.0
+    fields = {"cars": ["red"], "motion": "forward"}
+    with contextlib.suppress(ConnectionClosed):
+        while True:
+            message = json.loads(page.recv(timeout=30))
+            if message["t"] in ("over", "refused"):
+                again_at = time.monotonic() + 0.6
+            elif message["t"] == "tick" and time.monotonic() > again_at:
+                press, again_at = press + 1, math.inf
+                page.send(json.dumps({"t": "press", "press": press, "n": message["n"], **fields}))
+            elif message["t"] == "tick":
+                page.send(json.dumps({"t": "echo", "press": press, "n": message["n"]}))
+
+
 @pytest.mark.parametrize("how", ["command", "page"])
 def test_a_revoked_device_is_out_at_once(stage: ServerStage, how: str) -> None:
     device, lead = stage.device("thief"), stage.device("boss", "--rank", "lead")
     with device.socket() as page:
-        page.recv()
+        driving = hold(stage, page)
         if how == "command":
             assert "(thief) is revoked" in stage.run("people", "--revoke", "thief")
         else:
             listed = json.loads(lead.ask("GET", "/people")[1])["lan"]["devices"]
             (chosen,) = [each["id"] for each in listed if each["name"] == "thief"]
             assert lead.ask("POST", "/people", json.dumps({"t": "revoke", "id": chosen}))[0] == 200
-        read_to_the_end(page)
+        wait_for(lambda: not stage.judge.driving, "red stands")
+        driving.join(30)
+        assert not driving.is_alive(), "its page is closed"
     assert device.ask("GET", "/hello")[0] == 403
     assert device.ask("POST", "/stop")[0] == 403
     assert "thief" not in stage.run("people")
