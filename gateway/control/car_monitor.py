@@ -92,7 +92,7 @@ class CarMonitor:
             if not self._not_obeyed_logged:
                 self._not_obeyed_logged = True
                 self._log.log(Level.WARNING, "not_obeyed", self._not_obeyed(), now)
-        elif finding is Finding.SHOWN and self._not_obeyed_logged:
+        elif finding in (Finding.SHOWN, Finding.SETTLING) and self._not_obeyed_logged:
             self._not_obeyed_logged = False
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
 

@@ -97,6 +97,7 @@ class StopExecutor:
         self.running = StopInProgress(
             sequence, why, now, now, commands, worst_at=now + worst_s, timeout_s=timeout_s, case=self._case(sequence)
         )
+        model.evidence.settles_at = None
         model.learn(TrustEvent.STOP_BEGUN, now, f"{sequence.name} stop ({why})")
 
     def _case(self, sequence: StopSequence) -> StopCase:
@@ -157,6 +158,9 @@ class StopExecutor:
 
     def is_step_due(self, running: StopInProgress, now: float) -> bool:
         """Return True if the next frame of the stop is due. After the last frame, wait for evidence."""
+        if self.model.evidence.settle(now):
+            self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
+            return False
         if running.frames_sent:
             self._await(running, now)
             if self.running is not running or running.frames_sent:
@@ -169,7 +173,7 @@ class StopExecutor:
         if case is not None:
             self._finish(running, Basis.SENT, EVIDENCE[case].words.format(car=self.model.name), now, case)
             return
-        if now >= max(running.next_try_at, self.model.pacing.flight_until):
+        if self.model.evidence.settles_at is None and now >= max(running.next_try_at, self.model.pacing.flight_until):
             self._try_again(running, now)
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
@@ -310,6 +314,8 @@ class StopExecutor:
                 times.append(running.obeyed_at)
         else:
             times.append(running.due_at(self.model.pacing))
+        if self.model.evidence.settles_at is not None:
+            times.append(self.model.evidence.settles_at)
         if not running.overdue:
             times.append(running.gives_up_at)
         if self.shutting_down:

@@ -33,7 +33,7 @@ from tests.support.processes import (
 
 ANY_CLIENT = Path(__file__).parent / "any_client.py"
 
-SHOWN_S = 3.5
+SHOWN_S = 3.75
 """A driven car has shown its stop by then: two pauses of its reports, each around a `MODE00`."""
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"

@@ -47,6 +47,10 @@ NORMAL_MAX_S: Final = 1.4
 # around a stop do that, so one pause is not enough.
 PAUSES: Final = 2
 """Number of pauses that show a stop in mode 0."""
+# A link that holds the reports for two seconds leaves such a gap, too. Then the next report comes with the held one, or
+# 0.2 s later.
+SETTLING_S: Final = 0.25
+"""Time without a reading after the last pause, before the pauses count."""
 SHAPES: Final = 2
 """Number of consecutive readings with the shape of another mode that show that mode."""
 ROUND_TRIP_S: Final = 2.5
@@ -92,7 +96,7 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     ),
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
-        "two pauses of 1.9 s between reports, each around a `MODE00`",
+        "two pauses of 1.9 s between reports, each around a `MODE00`, and no reading for 0.25 s after the second",
         "the stop goes on",
     ),
     StopCase.NO_ECHO: EvidenceRow(
@@ -142,6 +146,8 @@ class Finding(StrEnum):
     """A report of mode 0 with an echo, and no `MODE00` before it to judge. The car can react to a `MODE00` now."""
     PAUSE = "pause"
     """The first pause; a second one is needed."""
+    SETTLING = "settling"
+    """The last pause that is needed. The stop is shown if no reading follows at once."""
     LOST = "lost"
     """Reports went on without a pause."""
     NO_ECHO = "no_echo"
@@ -158,6 +164,8 @@ class StopEvidence:
     """When the car last reacted to a frame; None if never on this link."""
     words: str = ""
     """The evidence for `SHOWN`."""
+    settles_at: float | None = None
+    """When the pauses count, unless a reading comes before; None if they do not suffice."""
     without_echo: int = 0
     """Number of consecutive reports without an echo."""
     _last_at: float = float("-inf")
@@ -195,7 +203,7 @@ class StopEvidence:
     def sent_motion(self) -> None:
         """Drop the evidence: the car may drive."""
         self._pauses = 0
-        self._pending = None
+        self._pending = self.settles_at = None
         self._leave_nothing()
 
     def opened(self, mode: Mode, now: float, *, silent: bool, shown: bool) -> None:
@@ -227,13 +235,13 @@ class StopEvidence:
     def on_noise(self, at: float, *, damaged: bool = True) -> None:
         """Record bytes that are no reading. `damaged`: they begin like a frame, so the next may be corrupted too."""
         self._last_at = at
-        self._before = None
+        self._before = self.settles_at = None
         if damaged:
             self._foreign_at = at
 
     def reset_times(self) -> None:
         """Drop the evidence that depends on times: after a stall of the loop the report times are too late."""
-        self._before = self._pending = None
+        self._before = self._pending = self.settles_at = None
         self._pauses = 0
 
     def is_settled(self, event: Sensors) -> bool:
@@ -244,6 +252,7 @@ class StopEvidence:
         """Record a reading. Return what it shows."""
         at, quiet_s = event.at, event.at - self._last_at
         self._last_at = at
+        self.settles_at = None
         if Mode.MANUAL not in event.candidates:
             self._other_mode(at)
             return Finding.NOTHING
@@ -272,6 +281,14 @@ class StopEvidence:
             return Finding.REPORT
         return self._compare(at - before, at - pending, at)
 
+    def settle(self, now: float) -> bool:
+        """Return True if the pauses count from now on: no reading came just after them."""
+        if self.settles_at is None or now < self.settles_at:
+            return False
+        self.settles_at = None
+        self._obeyed(self._last_at)
+        return True
+
     def _compare(self, gap_s: float, after_s: float, at: float) -> Finding:
         """Judge the interval of two reports. The later one came `after_s` after `MODE00`."""
         if after_s <= CLOSED_S:
@@ -283,7 +300,8 @@ class StopEvidence:
             if self._pauses < PAUSES:
                 return Finding.PAUSE
             self.words = f"{self._pauses} pauses in its reports, each after MODE00"
-            return self._obeyed(at)
+            self.settles_at = at + SETTLING_S
+            return Finding.SETTLING
         if after_s <= self._window_s and gap_s <= NORMAL_MAX_S:
             return Finding.NOTHING
         self._pending = None

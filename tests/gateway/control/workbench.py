@@ -7,6 +7,7 @@ from gateway.control.controller import Controller
 from gateway.control.events import CommandRecord, FrameOrigin, Level, LogRecord
 from gateway.control.people import NO_PEOPLE, People
 from gateway.control.safety import PersistedSafety
+from gateway.control.stops.evidence import SETTLING_S
 from gateway.protocol.decoder import Decoder
 from gateway.protocol.enums import Mode
 from gateway.protocol.frames import Frame, General, ModeClose, ModeOpen
@@ -102,7 +103,7 @@ class Workbench:
         self.pump()
         self.until(lambda: self.control.model.known, 12.0)
         assert self.control.model.motors == "off"
-        self.run(1.5)
+        self.run(1.5 - SETTLING_S)
         self.sent.clear()
         self.take()
         self.logs.clear()
