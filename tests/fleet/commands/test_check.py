@@ -47,6 +47,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
         ("name: 2020-99-99", FileKind.FLEET),
         ("", FileKind.FLEET),
     ],
+    ids=lambda value: str(value)[:40],
 )
 def test_a_file_is_recognized_by_its_content(text: str, kind: FileKind) -> None:
     assert recognize(text) is kind
