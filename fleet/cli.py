@@ -9,6 +9,7 @@ import sys
 from typing import Final
 
 import click
+from click.shell_completion import BashComplete, FishComplete, add_completion_class
 
 from fleet.commands.group import CommandGroup, as_option, connect_option, fleet_option
 from schemas.process import startup, stdio
@@ -112,6 +113,20 @@ _EXTRAS: Final = {
     "bleak": "ble",
 }
 """The extra that installs a module."""
+
+
+@add_completion_class
+class _BashCompletion(BashComplete):
+    """Completion for bash. Without the second part bash takes `@` for a word of its own, and completes no group."""
+
+    source_template = f"{BashComplete.source_template}\nCOMP_WORDBREAKS=${{COMP_WORDBREAKS//@/}}\n"
+
+
+@add_completion_class
+class _FishCompletion(FishComplete):
+    """Completion for fish, also of `red,blue`: only the first comma ends the type of a completion."""
+
+    source_template = FishComplete.source_template.replace('string split ","', 'string split -m 1 ","')
 
 
 class _LazyGroup(CommandGroup):

@@ -124,31 +124,39 @@ def complete_cars(ctx: click.Context, _param: click.Parameter, incomplete: str) 
     """Return connected cars for the shell, also after a comma, and groups. Never fails, prints, or takes long."""
     earlier, comma, begin = incomplete.rpartition(",")
     named = earlier.split(",")
-    names = [*connected_within(COMPLETION_TIMEOUT_S, ctx), ALL_CARS]
     if begin.startswith("@"):
-        names = [f"@{group}" for group in sorted(_groups_of_file())]
+        running = _ask_bus(ctx, lambda bus, fleet: _groups_of_status(ask_status(bus, fleet, COMPLETION_TIMEOUT_S)))
+        names = [f"@{group}" for group in running or sorted(_groups_of_file())]
+    else:
+        names = [*_connected(ctx), ALL_CARS]
     return [f"{earlier}{comma}{name}" for name in names if name.startswith(begin) and name not in named]
 
 
 def complete_car(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
     """Return connected cars for the shell, where neither `all` nor a group has a meaning."""
-    return [name for name in connected_within(COMPLETION_TIMEOUT_S, ctx) if name.startswith(incomplete)]
+    return [name for name in _connected(ctx) if name.startswith(incomplete)]
 
 
-def connected_within(timeout_s: float, ctx: click.Context) -> list[str]:
-    """Return the connected cars. Empty if the bus does not answer in time."""
+def _connected(ctx: click.Context) -> list[str]:
+    return _ask_bus(
+        ctx, lambda bus, fleet: [each.rpartition("/")[2] for each in bus.tokens(keys.car_token(fleet, "*"))]
+    )
+
+
+def _ask_bus(ctx: click.Context, ask: Callable[[Bus, str], Iterable[str]]) -> list[str]:
+    """Return the sorted names that the bus has for the fleet. Empty if it does not answer in time."""
     values = {**ctx.find_root().params, **{name: value for name, value in ctx.params.items() if value}}
     fleet = values.get("fleet") or keys.DEFAULT_FLEET  # click sets no defaults while it completes
     found: list[str] = []
 
     def look() -> None:
         with suppress(Exception), Bus.open(values.get("connect")) as bus:
-            found.extend(token.rpartition("/")[2] for token in bus.tokens(keys.car_token(fleet, "*")))
+            found.extend(ask(bus, fleet))
 
     logging.disable()
     thread = threading.Thread(target=look, daemon=True)
     thread.start()
-    thread.join(timeout_s)
+    thread.join(COMPLETION_TIMEOUT_S)
     return sorted(found)
 
 
@@ -254,11 +262,7 @@ def resolve_cars(client: Fleet, written: Sequence[str]) -> list[str]:
 def _members(client: Fleet, group: str) -> Sequence[str]:
     """Return the cars of a group, from the running fleet, or else from the fleet file here. Raises click's errors."""
     status = ask_status(client.bus, client.name)
-    groups: Mapping[str, Sequence[str]] = {
-        name: [car for car in cars.split(",") if car] for each in status for name, cars in each.groups.items()
-    }
-    if not status:
-        groups = _groups_of_file()
+    groups = _groups_of_status(status) if status else _groups_of_file()
     if group not in groups:
         near = did_you_mean(group, groups).replace("mean ", "mean @")
         there = f"Groups: @{', @'.join(sorted(groups))}." if groups else ""
@@ -267,6 +271,11 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
             there = f"{whose} can have some, `groups: {{a: [red, blue]}}`."
         raise click.ClickException(f'There is no group "@{group}". {near or there}')
     return groups[group]
+
+
+def _groups_of_status(status: Iterable[Any]) -> Mapping[str, Sequence[str]]:
+    """Return the groups that supervisors name."""
+    return {name: [car for car in cars.split(",") if car] for each in status for name, cars in each.groups.items()}
 
 
 def _groups_of_file() -> Mapping[str, Sequence[str]]:

@@ -1,4 +1,4 @@
-"""Commands and programs of docs/ are run word for word: here, or with README and tutorials in test_newcomer.py.
+"""Commands and programs of docs/ run word for word: here; those of README and tutorials in test_newcomer, test_lesson.
 
 What reads recordings runs on made sessions, the rest on one simulated fleet that all pages share. NOT_RUN names what is
 not run, with the reason. tests/test_documented.py parses all of it.
@@ -18,6 +18,7 @@ from typing import Final
 import pytest
 
 from gateway.capture import CapturedBytes, CaptureWriter
+from tests.e2e.test_lesson import TUTORIAL
 from tests.e2e.test_newcomer import NOT_RUN as NOT_TYPED
 from tests.e2e.test_newcomer import TRIED, blocks, commands
 from tests.fleet.replay.make_session import make
@@ -25,7 +26,7 @@ from tests.support.ports import free_endpoint
 from tests.support.up import fleet_command
 
 ROOT: Final = Path(__file__).parents[2]
-PAGES: Final = [page for page in sorted((ROOT / "docs").rglob("*.md")) if page not in TRIED]
+PAGES: Final = [page for page in sorted((ROOT / "docs").rglob("*.md")) if page not in (*TRIED, TUTORIAL)]
 VECTORS: Final = ROOT / "tests/vectors/recorded"
 
 NOT_RUN: Final = {
@@ -34,7 +35,7 @@ NOT_RUN: Final = {
     r".*192\.168\.1\.2:.*|ssh .*|zenohd .*": "needs a second computer",
     r"fleet replay|fleet replay (?!.*--save).*|fleet view( --web)?": "opens a window",
     r".*/media/disk.*": "needs a second disk",
-    r"eval .*": "is for a shell: tests/fleet/commands/test_shells.py",
+    r"eval .*": "is for a shell; tests/fleet/commands/test_shells.py runs it",
     r"fleet demo.*": "tests/fleet/test_demo.py runs it",
     r"fleet up.*": "stays or starts another fleet; tests/e2e/test_up.py and test_newcomer.py run it",
     r"fleet console.*": "stays, or changes who may open the console; tests/fleet/console runs it",
@@ -73,7 +74,16 @@ Made sessions have no raw bytes, and their clocks jump.
 """
 FIRST: Final = ("fleet wait", "fleet watch")
 """Commands before all others: red still has the wall ahead."""
-LAST: Final = ("fleet plan try", "fleet arm", "fleet fan", "fleet estop", "fleet resume", "fleet lend", "fleet pause")
+LAST: Final = (
+    "fleet plan try",
+    "fleet arm",
+    "fleet fan",
+    "fleet estop",
+    "fleet resume",
+    "fleet lend",
+    "fleet pause",
+    "fleet unpause",
+)
 """Commands after all others, in this order: with its fan on a car is silent, and an e-stop refuses the rest."""
 
 WORLD: Final = """

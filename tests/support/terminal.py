@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tests.support.processes import PATIENCE_S, wait_for
@@ -15,12 +15,18 @@ _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 class Terminal:
-    """`python -m MODULE ARGUMENTS...` whose stdin, stdout and stderr are one terminal."""
+    """A program, `python -m MODULE` if none is named, whose stdin, stdout and stderr are one terminal."""
 
-    def __init__(self, *arguments: str, environment: Mapping[str, str], directory: Path) -> None:
+    def __init__(
+        self,
+        *arguments: str,
+        environment: Mapping[str, str],
+        directory: Path,
+        program: Sequence[str] = (sys.executable, "-m"),
+    ) -> None:
         self._controller, device = pty.openpty()
         self.popen = subprocess.Popen(
-            [sys.executable, "-m", *arguments],
+            [*program, *arguments],
             stdin=device,
             stdout=device,
             stderr=device,
