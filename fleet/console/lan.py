@@ -114,7 +114,7 @@ class Lan:
         self._connected: dict[int, tuple[str, str, Callable[[], object]]] = {}
         """Device, address and the function that closes it, by number of the socket."""
         self._last_socket = 0
-        people.change(lambda book: (PeopleBook(book.codes, book.devices, self.address), None))
+        self._write_address()
 
     @property
     def address(self) -> str:
@@ -234,13 +234,19 @@ class Lan:
                     log.error("the certificate cannot be renewed: %s", error)
 
     def _renew(self) -> None:
-        addresses = own_addresses()
+        addresses, before = own_addresses(), self.address
         renewed = ensure_certificate((*addresses, *own_names()))
         self.addresses = addresses
+        if self.address != before:
+            self._write_address()
         if renewed.fingerprint != self.certificate.fingerprint:
             renewed.load_into(self.context)
             self.certificate = renewed
             log.warning("the network is now %s, with a new certificate: SHA-256 %s", self.address, renewed.fingerprint)
+
+    def _write_address(self) -> None:
+        """Write the address to the people file, where `fleet console pair` reads it."""
+        self.people.change(lambda book: (PeopleBook(book.codes, book.devices, self.address), None))
 
     def as_dict(self) -> dict[str, Any]:
         """Return what the page of the paired devices shows, as JSON values."""

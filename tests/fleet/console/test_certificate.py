@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet.console import certificate
+from fleet.console import certificate, lan
 from fleet.console.certificate import BadKeyFile, ensure_certificate, needs_renewal
 from fleet.console.pairing import PagePerson, PeopleBook
 from fleet.console.people_file import PeopleFile
@@ -58,6 +58,22 @@ def test_a_computer_with_many_addresses_needs_no_new_certificate_each_time(tmp_p
 def test_a_certificate_is_renewed_a_month_before_its_end() -> None:
     for days, needed in ((31, False), (30, True), (-1, True)):
         assert needs_renewal(["a"], ["a"], NOW + timedelta(days=days), NOW) is needed
+
+
+def test_a_new_address_is_written_for_fleet_console_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    addresses = ["192.168.1.5"]
+    monkeypatch.setattr(lan, "own_addresses", lambda: list(addresses))
+    people, listener = PeopleFile(tmp_path / "people.json"), lan.LimitedListener.on_port(0)
+    try:
+        served = lan.Lan(listener, people)
+        assert people.read().address == f"https://192.168.1.5:{served.port}"
+        addresses[:] = ["10.0.0.7", "192.168.1.5"]
+        served._renew()
+        assert people.read().address == f"https://10.0.0.7:{served.port}"
+        assert "10.0.0.7" in served.certificate.names
+    finally:
+        listener.close()
 
 
 def test_the_people_file_is_private_shared_and_survives_damage(tmp_path: Path) -> None:

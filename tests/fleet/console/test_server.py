@@ -270,11 +270,12 @@ def test_an_expired_cookie_opens_nothing_and_still_stops(stage: ServerStage) -> 
     wait_for(lambda: not stage.judge.driving, "red stands")
 
 
-def test_a_thousand_guesses_get_nothing_and_are_slowed_down(stage: ServerStage) -> None:
+def test_guesses_get_nothing_and_are_slowed_down(stage: ServerStage) -> None:
     stranger, code = NetworkDevice(stage.lan_port, source="127.0.0.3"), stage.code("late")
     connection = stranger.connection()
     statuses: list[int] = []
-    for number in range(1000):
+    # A thousand are in test_pairing, on virtual time.
+    for number in range(50):
         try:
             connection.request("POST", "/pair", f"AAAA{number:04}", {"Origin": stranger.origin})
             response = connection.getresponse()
@@ -284,11 +285,11 @@ def test_a_thousand_guesses_get_nothing_and_are_slowed_down(stage: ServerStage) 
         statuses.append(response.status)
         response.read()
     connection.close()
-    assert len(statuses) > 900
+    assert len(statuses) > 40
     assert set(statuses) <= {403, 429}
     assert statuses.count(403) < 10, "the others were not even compared"
     assert stranger.pair(code)["ok"] is False, "the right code must wait, too"
-    assert json.loads(answer(stage.console.port, "GET", "/people")[1])["lan"]["wrong_codes"] > 900
+    assert json.loads(answer(stage.console.port, "GET", "/people")[1])["lan"]["wrong_codes"] > 40
     assert stage.log().count("wrong pairing code") < 20
     assert NetworkDevice(stage.lan_port).pair(code)["ok"], "nobody else waits, and the code is not used up"
     assert not NetworkDevice(stage.lan_port, source="127.0.0.4").pair(code)["ok"], "a replay"
@@ -399,7 +400,9 @@ def test_a_second_console_says_where_the_first_is_and_another_port_works(stage: 
     done = CliRunner().invoke(cli, ["console", "--port", port], env=stage.fleet.environment)
     assert done.exit_code == 1
     assert f"Another console is at http://127.0.0.1:{port}." in done.output
-    done = CliRunner().invoke(cli, ["console", "--port", "0", "--lan", "--lan-port", str(stage.lan_port)])
+    done = CliRunner().invoke(
+        cli, ["console", "--port", "0", "--lan", "--lan-port", str(stage.lan_port)], env=stage.fleet.environment
+    )
     assert (done.exit_code, "--lan-port 0" in done.output) == (1, True)
     second = ConsoleProcess(stage.fleet)
     stage.drive()
