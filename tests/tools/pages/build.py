@@ -41,6 +41,7 @@ PARTS: Final[dict[str, tuple[str, Callable[[], str]]]] = {
     "platforms": ("docs/reference/platforms.md", tables.platform_table),
     "fleet file": ("docs/reference/fleet-file.md", lambda: files.schema_tables(files.fleet_schema())),
     "plan": ("docs/reference/plan-file.md", lambda: files.schema_tables(files.plan_schema())),
+    "world": ("docs/reference/world-file.md", lambda: files.schema_tables(files.world_schema())),
     "any_client": ("docs/how-to/use-any-zenoh-client.md", any_client),
     "drive_one": ("docs/how-to/drive-from-python.md", drive_one),
 }

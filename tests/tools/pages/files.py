@@ -9,6 +9,7 @@ from fleet.fleetfile.models import FileEntry
 from fleet.policy.plan import lint, parser
 from fleet.policy.plan.models import PlanEntry
 from gateway.sim import world_file
+from schemas.world import WorldEntry
 from schemas.yaml_document.document import schema_of
 from tests.tools.pages.command_line import escape
 
@@ -57,8 +58,9 @@ def _value(each: dict[str, Any], definitions: dict[str, Any]) -> str:
         return f"`{each['const']}`"
     kind = each.get("type", "")
     if kind == "array":
-        items = each.get("items", each.get("prefixItems", [{}])[0] if each.get("prefixItems") else {})
-        return f"list of {_value(items, definitions)}"
+        if points := each.get("prefixItems"):
+            return f"lists of {len(points)} numbers{_bounds(points[0])}"
+        return f"list of {_value(each.get('items', {}), definitions)}"
     if kind == "object":
         below = next(iter(each.get("patternProperties", {}).values()), each.get("additionalProperties", {}))
         return f"by name: {_value(below, definitions)}"
@@ -105,6 +107,11 @@ def fleet_schema() -> dict[str, Any]:
 def plan_schema() -> dict[str, Any]:
     """Return the schema of plans."""
     return schema_of(PlanEntry, "plan file")
+
+
+def world_schema() -> dict[str, Any]:
+    """Return the schema of world files."""
+    return schema_of(WorldEntry, "world file")
 
 
 def problems(kind: str, text: str) -> list[str]:
