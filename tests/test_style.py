@@ -136,3 +136,14 @@ def test_no_more_imports_are_lazy() -> None:
         for node in imports(path, lazy=True)
     ]
     assert len(lazy) <= LAZY_IMPORTS, "\n".join(lazy)
+
+
+def test_a_message_to_users_has_at_most_two_lines() -> None:
+    """Faults of a file and changes are lists: their lines are in no constant."""
+    raised = ("ClickException", "UsageError", "BadParameter", ".fail", ".echo", "stderr.write")
+    for path in source_files(*PRODUCT):
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(raised):
+                strings = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
+                words = "".join(each for each in strings if isinstance(each, str) and each.strip())
+                assert words.strip().count("\n") < 2, f"{path}:{node.lineno}"
