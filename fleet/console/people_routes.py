@@ -10,6 +10,7 @@ from starlette.routing import Route
 
 from fleet.console.guard import PAIR_PATH, PERSON, Scope
 from fleet.console.pairing import PagePerson
+from fleet.console.request_body import read_text
 from fleet.console.requests import BadPageMessage, PageMessage
 
 if TYPE_CHECKING:  # only `--lan` needs its packages
@@ -27,7 +28,7 @@ def pair_routes(lan: "Lan") -> list[Route]:
         return FileResponse(PAIR_PAGE)
 
     async def pair(request: Request) -> Response:
-        code = await _read_short(request)
+        code = await read_text(request, _MAX_BODY_BYTES)
         if request.client is None or code is None:
             return _failure("This is no pairing code.", 400)
         device = request.headers.get("user-agent", "")[:_MAX_DEVICE_LENGTH]
@@ -53,7 +54,7 @@ def people_routes(lan: "Lan | None") -> list[Route]:
     async def change(request: Request) -> Response:
         if lan is None or not _may_pair(request.scope):
             return _failure("Only the console's own computer or a lead may do this.", 403)
-        text = await _read_short(request)
+        text = await read_text(request, _MAX_BODY_BYTES)
         try:
             message = PageMessage.of(text or "")
             if message.kind == "revoke":
@@ -75,13 +76,3 @@ def _may_pair(scope: Scope) -> bool:
 
 def _failure(words: str, status: int, headers: dict[str, Any] | None = None) -> Response:
     return JSONResponse({"ok": False, "words": words}, status, headers)
-
-
-async def _read_short(request: Request) -> str | None:
-    """Return the body of a request. None if it is too long: the rest is not read."""
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > _MAX_BODY_BYTES:
-            return None
-    return body.decode("utf-8", "replace")

@@ -21,6 +21,7 @@ from fleet.aio import Fleet
 from fleet.console.console import Console, TooManyPages
 from fleet.console.guard import PERSON, STOP_PATH, App, Guard, NetworkGuard
 from fleet.console.people_routes import pair_routes, people_routes
+from fleet.console.request_body import read_text
 from schemas.bus import LARGEST_PAYLOAD, BusError
 from schemas.process import signals
 
@@ -202,21 +203,11 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
 
 async def _answer_plan(request: Request, ask: Callable[[str], Awaitable[tuple[bool, str]]]) -> Response:
     """Answer a request with the text of a plan."""
-    text = await _read_text(request)
+    text = await read_text(request, LARGEST_PAYLOAD - _PLAN_MESSAGE_ROOM)
     if text is None:
         return JSONResponse({"ok": False, "words": f"The plan has more than {LARGEST_PAYLOAD // 1024} KiB."}, 413)
     ok, words = await ask(text)
     return JSONResponse({"ok": ok, "words": words})
-
-
-async def _read_text(request: Request) -> str | None:
-    """Return the body of a request. None if it is too large for the bus: the rest is not read."""
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > LARGEST_PAYLOAD - _PLAN_MESSAGE_ROOM:
-            return None
-    return body.decode("utf-8", "replace")
 
 
 @asynccontextmanager

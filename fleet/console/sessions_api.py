@@ -23,6 +23,7 @@ from fleet.aio import Fleet
 from fleet.client.services import ask_recorder
 from fleet.console.guard import PERSON
 from fleet.console.pairing import PagePerson
+from fleet.console.request_body import read_start
 from fleet.console.session_files import NotInFolder, files_of, read_file, session_path, zip_files
 from fleet.replay.rerun.viewer import VIEWER_HOST, NoViewer, Viewer, free_port
 from schemas.bus import Failure
@@ -245,9 +246,4 @@ def refuse(words: str, status: int = 200) -> Response:
 
 async def read_body(request: Request) -> str:
     """Return the text of a request. The part beyond the maximum is not read."""
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > _MAX_REQUEST_BYTES:
-            break
-    return body[:_MAX_REQUEST_BYTES].decode("utf-8", "replace")
+    return (await read_start(request, _MAX_REQUEST_BYTES)).decode("utf-8", "replace")
