@@ -93,7 +93,7 @@ class LimitedListener(socket.socket):
 
 
 class Lan:
-    """What pages on the network share. Making it raises OSError if there can be no certificate."""
+    """The shared part of all pages on the network. Making it raises OSError if there can be no certificate."""
 
     # The file is changed in threads: whoever else holds its lock must not hold up a STOP.
 
@@ -172,6 +172,9 @@ class Lan:
         """Return the device of a cookie, and what the cookie may do."""
         return self.people.read().device_of(cookie, time.time())
 
+    def _open_devices(self, now: float) -> list[PairedDevice]:
+        return self.people.read().open_devices(now)
+
     def on_device(self, client: tuple[str, int], device: PairedDevice) -> None:
         """Handle a connection that has shown a cookie: it stays. Warn if two computers use one cookie."""
         self.listener.limit.on_paired(client)
@@ -190,8 +193,7 @@ class Lan:
 
     def is_current(self, scope: Scope) -> bool:
         """Return True if the device of an open socket may still send."""
-        now = time.time()
-        return any(each.id == scope[DEVICE] and each.state(now) == "valid" for each in self.people.read().devices)
+        return any(each.id == scope[DEVICE] for each in self._open_devices(time.time()))
 
     @contextmanager
     def connected(self, scope: Scope, close: Callable[[], object]) -> Iterator[None]:
@@ -206,8 +208,7 @@ class Lan:
 
     def close_revoked(self) -> None:
         """Close the sockets of devices that were revoked or whose cookie has expired."""
-        now = time.time()
-        current = {each.id for each in self.people.read().devices if each.state(now) == "valid"}
+        current = {each.id for each in self._open_devices(time.time())}
         for device, address, close in list(self._connected.values()):
             if device not in current:
                 log.warning("closed the page of %s at %s: revoked or expired", device, address)
@@ -261,8 +262,7 @@ class Lan:
                 "days_left": int((each.expires_s - now) // 86_400),
                 "addresses": sorted({address for id_, address, _ in self._connected.values() if id_ == each.id}),
             }
-            for each in self.people.read().devices
-            if each.state(now) == "valid"
+            for each in self._open_devices(now)
         ]
         return {
             "address": self.address,

@@ -1,4 +1,4 @@
-"""Who may open the console from the network: pairing codes, paired devices and their people. Pure.
+"""Pairing codes, paired devices and their people: they open the console from the network. Pure.
 
 Times are seconds since the epoch, since the book outlives the process. A code or a cookie is stored as its hash.
 """
@@ -70,7 +70,7 @@ class PairedDevice:
     id: str
     person: PagePerson
     device: str
-    """What the browser calls itself."""
+    """The browser's own name."""
     digest: str
     paired_s: float
 
@@ -134,6 +134,10 @@ class PeopleBook:
                 found = each
         state = "unknown" if found is None else found.state(now)
         return (None, "unknown") if state == "unknown" else (found, state)
+
+    def open_devices(self, now: float) -> list[PairedDevice]:
+        """Return the devices whose cookie opens the console."""
+        return [each for each in self.devices if each.state(now) == "valid"]
 
     def as_text(self) -> str:
         """Return the book as JSON."""
