@@ -33,6 +33,11 @@ def check_name(name: str, what: str = "car name") -> str:
     return name
 
 
+def person_of(sender: str) -> str:
+    """Return the person of a sender: `group_a` of `group_a@host-4711`."""
+    return sender.partition("@")[0]
+
+
 def describe_fleet(fleet: str) -> str:
     """Return a fleet's name for a person. The default name is left out."""
     return "the fleet" if fleet == DEFAULT_FLEET else f"fleet {fleet}"

@@ -213,8 +213,7 @@ def people(revoke: tuple[str, ...], *, as_json: bool, connect: str | None, fleet
         if revoke:
             _revoke(file, revoke)
             return
-    now = time.time()
-    devices = [each for each in file.read().devices if each.state(now) == "valid"]
+    devices = file.read().open_devices(time.time())
     rows = [
         {
             "id": each.id,
@@ -282,7 +281,7 @@ def _show_code(people: PeopleFile, address: str, person: PagePerson) -> None:
 
 
 def _own_name() -> str:
-    name = default_sender(chosen_person()).partition("@")[0].lower()
+    name = keys.person_of(default_sender(chosen_person())).lower()
     return name if keys.is_name(name) else "me"
 
 

@@ -8,6 +8,7 @@ from typing import Final
 from fleet.aio import Fleet
 from fleet.client.client import default_sender
 from fleet.console.operator import ConsoleOperator
+from schemas.keys import person_of
 
 IDLE_CLIENT_S: Final = 5.0
 """Time for which the client of a person without a page stays open: a page that is loaded again needs it."""
@@ -33,7 +34,7 @@ class Operators:
     @property
     def person(self) -> str:
         """The person of the console's own client."""
-        return self.own.sender.partition("@")[0]
+        return person_of(self.own.sender)
 
     def __iter__(self) -> Iterator[ConsoleOperator]:
         yield self.own
@@ -43,7 +44,7 @@ class Operators:
 
     def of(self, person: str) -> ConsoleOperator:
         """Return the operator of a person with an open page, else the console's own."""
-        return next((each for each in self if each.sender.partition("@")[0] == person), self.own)
+        return next((each for each in self if person_of(each.sender) == person), self.own)
 
     async def join(self, person: str) -> ConsoleOperator:
         """Return the operator for a page of this person. Raises BusError."""

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Self
 
+from schemas.keys import person_of
+
 ACTIONS: Final = ("move", "act", "take", "resume", "end_estops", "pause", "unpause", "lend", "end_loan")
 """`move`: drive, modes, speed, servos, arm, fan. `act`: lights and sound. A stop is always allowed."""
 _RANKS: Final = {"lead": 3, "person": 2, "script": 1, "coordinator": 0}
@@ -67,11 +69,6 @@ class CarRules:
             safety.loan.to,
             person_of(safety.loan.by),
         )
-
-
-def person_of(sender: str) -> str:
-    """Return the person of a sender: group_a of group_a@host-4711."""
-    return sender.partition("@")[0]
 
 
 def refusals(rules: CarRules, sender: str) -> dict[str, Refusal]:

@@ -5,6 +5,7 @@ from enum import StrEnum
 
 from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import Frame
+from schemas.keys import person_of
 
 
 class SenderKind(StrEnum):
@@ -67,7 +68,7 @@ class Sender:
     @property
     def person(self) -> str:
         """Return the person: `group_a` of `group_a@host-4711`."""
-        return self.name.partition("@")[0]
+        return person_of(self.name)
 
 
 @dataclass(frozen=True, slots=True)
