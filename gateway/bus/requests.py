@@ -7,9 +7,9 @@ import hashlib
 import json
 import math
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from gateway.control.commands import (
     Action,
@@ -39,6 +39,8 @@ from schemas.commands import COMMANDS, STOPS
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
 
+W = TypeVar("W", bound=str)
+
 DEFAULT_MAX_DRIVE_S: Final = 10.0
 """Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
 MAX_NAME_LENGTH: Final = 128
@@ -49,9 +51,9 @@ MAX_REASON_LENGTH: Final = 200
 """Maximum characters of an e-stop's reason. The rest is cut off, so that no e-stop fails for its reason."""
 _SAME_QUERY_NS: Final = 2_000_000_000
 """Maximum time in which one query reaches every gateway."""
-# One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
 _WIRE_KINDS: Final = tuple(kind for kind in SenderKind if kind is not SenderKind.LEAD)
 """The kinds that a command may claim."""
+# One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
 WILDCARD_VERBS: Final = tuple(verb for verb, row in COMMANDS.items() if row.wildcard)
 
 
@@ -154,7 +156,7 @@ def _parse_payload(blank: Command, request: ParsedRequest) -> Command:
     try:
         command = replace(command, id=_text("id", message.id) or blank.id)
         command = replace(command, sender=Sender(_text("sender", message.sender, "/*$#?") or "anonymous"))
-        kind: SenderKind = _word("kind", message.kind or SenderKind.SCRIPT, _WIRE_KINDS)
+        kind = _word("kind", message.kind or SenderKind.SCRIPT, _WIRE_KINDS)
         command = replace(command, sender=Sender(command.sender.name, kind), take=message.take)
         ttl_s = _seconds("ttl_s", message.ttl_s, 3600.0) if message.HasField("ttl_s") else None
         what = _drive(message, request.longest_drive_s, request.car) if verb == "drive" else _WHAT[verb](message)
@@ -177,7 +179,7 @@ def _encoding(request: ParsedRequest) -> str:
 def _age_s(message: Any, request: ParsedRequest) -> float | None:
     """Return the age of a request, s; None if unknown, and 0 if the sender's clock is ahead of ours."""
     if message.HasField("asked"):
-        asked_ns = message.asked.seconds * 1_000_000_000 + message.asked.nanos
+        asked_ns = messages.stamp_ns(message.asked)
     elif request.sampled_ns is not None:
         asked_ns = request.sampled_ns
     else:
@@ -197,13 +199,14 @@ def _text(field: str, value: str, forbidden: str = "") -> str:
     return value
 
 
-def _word(field: str, value: str, kind: Any) -> Any:
-    try:
-        return kind[kind.index(value)] if isinstance(kind, tuple) else kind(value)
-    except ValueError:
-        problem = f"{field} {value!r}" if value else f"{field} is missing"
-        near = did_you_mean(value, kind)
-        raise ValueError(f"{problem}. {near}" if near else f"{problem}: allowed are {', '.join(kind)}") from None
+def _word(field: str, value: str, allowed: Iterable[W]) -> W:
+    """Return the allowed word of this value. Raises ValueError with the likely one, else with all."""
+    words = list(allowed)
+    if value in words:
+        return words[words.index(value)]
+    problem = f"{field} {value!r}" if value else f"{field} is missing"
+    near = did_you_mean(value, words)
+    raise ValueError(f"{problem}. {near}" if near else f"{problem}: allowed are {', '.join(words)}")
 
 
 def _lend(message: Any) -> Action:
