@@ -274,8 +274,7 @@ class Controller:
             f"(e-stop {latched[0].id}, seen from {source})"
         )
         self._log.log(Level.ERROR, "estop_joined", words, now)
-        self._executor.halt(words, now)
-        self.stops.begin_full(now)
+        self._halt(words, now)
 
     def merge_pauses(self, pauses: Iterable[FleetPause], ended: Iterable[str], source: str, now: float) -> None:
         """Merge the pauses, in force and ended, of another gateway of the fleet."""
@@ -288,8 +287,7 @@ class Controller:
             why = f": {joined[0].why}" if joined[0].why else ""
             words = f"{self.car} is paused with the whole fleet by {joined[0].by}{why} (seen from {source})"
             self._log.log(Level.WARNING, "paused", words, now)
-            self._executor.halt(words, now)
-            self.stops.begin_full(now)
+            self._halt(words, now)
 
     # ------------------------------------------------------------------ each command
 
@@ -354,11 +352,9 @@ class Controller:
             parts.append(f"resumed: the hold by {hold.by} has ended" if hold else "resumed: was not on hold")
             self._end_hold(sender, now)
         if safety.estops:
-            parts = (
-                [self._still_estopped(sender, now)]
-                if not resume.ids and not ended
-                else [*parts, self._still_estopped(sender, now)]
-            )
+            if not resume.ids and not ended:
+                parts.clear()  # the end of the hold alone lets nobody drive
+            parts.append(self._still_estopped(sender, now))
         elif safety.hold is not None:
             fix = f": `fleet resume {self.car}`" if self.people.may_end(sender, safety.hold.rank) else " (a lead)"
             parts.append(f"still on hold by {safety.hold.by}{fix}")
@@ -415,8 +411,12 @@ class Controller:
         self.safety.lease = None
         waiting = self._queue.held is not None or self._queue.mode_change is not None or self._queue.one_shots
         if waiting or not self.model.at_rest:
-            self._executor.halt(words, now)
-            self.stops.begin_full(now)
+            self._halt(words, now)
+
+    def _halt(self, words: str, now: float) -> None:
+        """End what the car does or waits to do, and stop it."""
+        self._executor.halt(words, now)
+        self.stops.begin_full(now)
 
     def _still_estopped(self, sender: Sender, now: float) -> str:
         """Return which e-stops are in force, with their ids if there are several, and who can release them."""

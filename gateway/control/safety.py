@@ -188,7 +188,7 @@ class Safety:
     def end(self, ids: Iterable[str]) -> list[Estop]:
         """End e-stops. Return those that were in force."""
         ended = [self._estops.pop(each) for each in dict.fromkeys(ids) if each in self._estops]
-        self._remember(estop.id for estop in ended)
+        _remember(self._ended, (estop.id for estop in ended), MAX_ENDED_ESTOPS)
         return ended
 
     def merge(self, estops: Iterable[Estop], ended: Iterable[str]) -> tuple[list[Estop], list[Estop]]:
@@ -197,11 +197,6 @@ class Safety:
         known = {*self._estops, *self._ended}
         latched = [self.latch(each) for each in estops if each.fleet_wide and each.id not in known]
         return [each for each in latched if each.id in self._estops], removed
-
-    def _remember(self, ids: Iterable[str]) -> None:
-        self._ended.update(dict.fromkeys(ids))
-        while len(self._ended) > MAX_ENDED_ESTOPS:
-            del self._ended[next(iter(self._ended))]
 
     # ------------------------------------------------------------------ pauses
 
@@ -216,9 +211,7 @@ class Safety:
     def end_pauses(self, ids: Iterable[str]) -> list[FleetPause]:
         """End pauses, also such as are not known yet: they may arrive later. Return those that were in force."""
         named = list(ids)
-        self._ended_pauses.update(dict.fromkeys(named))
-        while len(self._ended_pauses) > MAX_ENDED_PAUSES:
-            del self._ended_pauses[next(iter(self._ended_pauses))]
+        _remember(self._ended_pauses, named, MAX_ENDED_PAUSES)
         return [self._pauses.pop(each) for each in named if each in self._pauses]
 
     def merge_pauses(
@@ -264,6 +257,13 @@ class Safety:
             return False
         self.lease = None
         return True
+
+
+def _remember(ended: dict[str, None], ids: Iterable[str], maximum: int) -> None:
+    """Add ended ids, and forget the oldest of too many."""
+    ended.update(dict.fromkeys(ids))
+    while len(ended) > maximum:
+        del ended[next(iter(ended))]
 
 
 def _strength(pause: FleetPause) -> tuple[int, int, str, str]:
