@@ -1,4 +1,4 @@
-"""What an engineer needs to know of a car that behaves oddly, and the likely causes. Pure.
+"""Finds the likely causes of a car that behaves oddly, and the facts behind them. Pure.
 
 `CHECKS` is the table of findings: condition, cause, and what to type. The likeliest cause comes first.
 """
@@ -17,7 +17,8 @@ _MIN_REJECTED: Final = 10
 MAX_AIRTIME: Final = 0.8
 MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
-_FAILED_PHASES: Final = ("rejected", "failed", "expired")
+FAILED_PHASES: Final = ("rejected", "failed", "expired")
+"""Phases of a command that was not carried out."""
 _NO_TROUBLE: Final = ("superseded", "duplicate")
 """Reasons of commands that ended early as somebody intended."""
 
@@ -52,7 +53,7 @@ class CarEvidence:
         return [
             (age, event)
             for age, event in self.commands
-            if event.phase in _FAILED_PHASES and event.reason not in _NO_TROUBLE
+            if event.phase in FAILED_PHASES and event.reason not in _NO_TROUBLE
         ]
 
     @property
@@ -69,7 +70,7 @@ class DoctorFinding:
     code: str
     cause: str
     todo: str
-    """What to type."""
+    """The command to type."""
 
     def __str__(self) -> str:
         return f"{self.cause} Type: {self.todo}"

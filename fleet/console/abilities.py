@@ -1,4 +1,4 @@
-"""What a car can do, and why not, from what its gateway publishes. Pure."""
+"""The abilities of a car, with the reasons of those that it lacks, from the states of its gateway. Pure."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

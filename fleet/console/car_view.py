@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from fleet.client.diagnosis import CarEvidence, describe, diagnose
+from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose
 from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
@@ -61,7 +61,7 @@ class CarView:
         self.ledger: deque[dict[str, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Commands and log records, the newest last."""
         self.rules = CarRules(name)
-        """Who may do what."""
+        """The rights of each person."""
         self.commands = CommandLedger()
         self._events: deque[tuple[float, Any]] = deque(maxlen=MAX_LEDGER_ENTRIES)
         """Time and event of the newest commands."""
@@ -235,7 +235,7 @@ class CarView:
         words = f"{event.verb} {event.phase}"
         if event.reason or event.words:
             words += f": {event.words or event.reason}"
-        level = "warning" if event.phase in ("failed", "rejected", "expired") else "info"
+        level = "warning" if event.phase in FAILED_PHASES else "info"
         self._note(event.stamp, f"{words} ({event.sender})", level)
 
     def _note(self, stamp: Any, words: str, level: str) -> None:
@@ -272,5 +272,5 @@ class FleetView:
 
     @property
     def rules(self) -> dict[str, CarRules]:
-        """Who may do what, by car."""
+        """The rights of each person, by car."""
         return {name: self._cars[name].rules for name in self.names}

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from fleet.client.diagnosis import FAILED_PHASES
 from schemas import messages
 
 MAX_COMMANDS: Final = 40
@@ -44,7 +45,7 @@ class CommandLedger:
             command.decided = [*command.decided, words][-MAX_WIRE_FRAMES:]
         if event.evidence or event.basis:
             command.evidence = "; ".join(filter(None, (event.basis, *event.evidence)))
-        command.bad = event.phase in ("failed", "rejected", "expired")
+        command.bad = event.phase in FAILED_PHASES
 
     def on_frame(self, frame: Any) -> None:
         """Handle a frame to the car (fleet.v1.TxFrame)."""

@@ -1,4 +1,4 @@
-"""What an engineer needs to know of a session: damage, gaps, stops, refused commands and broken links. Pure."""
+"""Finds what is odd in a session: damage, gaps, stops, refused commands and broken links. Pure."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
