@@ -16,7 +16,7 @@ MAX_POLL_GAP_S: Final = 0.5
 MANY_SHARE: Final = 0.25
 """Minimum share of silent processes that indicates a common cause."""
 MANY_SILENT_S: Final = 30.0
-"""Maximum silence of a process while many are silent. A stalled hub is replaced after 8 s."""
+"""Maximum silence of a process while many are silent. A blocked hub is replaced after 8 s."""
 SLOW_SILENT_S: Final = 30.0
 """Maximum silence of a slow process."""
 MOVING_SILENT_S: Final = 300.0
@@ -94,6 +94,15 @@ def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
     if sign is Sign.SLOW:
         longest = max(longest, MOVING_SILENT_S if may_move else SLOW_SILENT_S)
     return longest
+
+
+def longest_hub_silence_s(sign: Sign) -> float:
+    """Return the allowed silence of a hub if it is longer than the hub's own patience, else 0.
+
+    A hub that works is no hung one: a hundred sessions come back at once after it stood still. It has several threads,
+    so a whole CPU is work too.
+    """
+    return SLOW_SILENT_S if sign in (Sign.SLOW, Sign.SPINNING) else 0.0
 
 
 def are_many(silent: int, total: int) -> bool:

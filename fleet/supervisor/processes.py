@@ -14,7 +14,7 @@ from typing import Final
 from fleet.supervisor import cpu_time
 from fleet.supervisor.admission import Admission
 from fleet.supervisor.child import Child, Log
-from fleet.supervisor.hang import Pulse, WatchClock, are_many, longest_silence_s
+from fleet.supervisor.hang import Pulse, WatchClock, are_many, longest_hub_silence_s, longest_silence_s
 from fleet.supervisor.restart_policy import (
     GATEWAY_GRACE_S,
     HUNG,
@@ -151,7 +151,7 @@ class ProcessSet:
         for process in sorted(self, key=lambda each: each.status.due):
             if silent[process.name] > CPU_CHECK_SILENCE_S and process.child is not None and process.pulse.is_due(now):
                 process.pulse.add(now, cpu_time.read(process.child.pid))
-            leave_s = 0.0
+            leave_s = longest_hub_silence_s(process.pulse.sign)
             if process.kind in _HEARTBEAT_KINDS:
                 leave_s = longest_silence_s(process.pulse.sign, many=many, may_move=may_move(process))
                 leave_s = leave_s if self._admission.may_kill(now) else inf

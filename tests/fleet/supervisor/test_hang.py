@@ -20,6 +20,7 @@ from fleet.supervisor.hang import (
     Sign,
     WatchClock,
     are_many,
+    longest_hub_silence_s,
     longest_silence_s,
 )
 from tests.support.processes import wait_for
@@ -75,6 +76,19 @@ def test_only_the_last_seconds_count_and_a_system_that_does_not_tell_shows_nothi
 )
 def test_how_long_a_process_may_be_silent(sign: Sign, many: bool, may_move: bool, seconds: float) -> None:
     assert longest_silence_s(sign, many=many, may_move=may_move) == seconds
+
+
+@pytest.mark.parametrize(
+    ("sign", "seconds"),
+    [
+        (Sign.BLOCKED, 0.0),
+        (Sign.UNKNOWN, 0.0),
+        (Sign.SLOW, SLOW_SILENT_S),
+        (Sign.SPINNING, SLOW_SILENT_S),  # a hundred sessions come back to it at once
+    ],
+)
+def test_a_hub_that_works_is_not_hung(sign: Sign, seconds: float) -> None:
+    assert longest_hub_silence_s(sign) == seconds
 
 
 @pytest.mark.parametrize(
