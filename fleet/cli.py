@@ -4,7 +4,6 @@ Subcommands are imported when they are called, so that `fleet --help` is fast.
 """
 
 import importlib
-import os
 import sys
 from typing import Final
 
@@ -193,11 +192,11 @@ def main() -> None:
         sys.stderr.write(f"fleet: {_missing(error)}\n")
         code = 1
     except OSError as error:  # commands handle their own errors, so this one comes from the output
-        code = _no_output(error)
+        code = stdio.silence_broken(error, "fleet")
     try:
         sys.stdout.flush()
     except OSError as error:
-        code = _no_output(error)
+        code = stdio.silence_broken(error, "fleet")
     sys.exit(code)
 
 
@@ -208,14 +207,6 @@ def _missing(error: ModuleNotFoundError) -> str:
         raise error
     how = how_to_install(_EXTRAS[module]) if module in _EXTRAS else "pip install zenoh-car-fleet"
     return f"this command needs {module}, which is not installed. Type: {how}"
-
-
-def _no_output(error: OSError) -> int:
-    """Print that the output cannot be written, unless the reader has closed the pipe. Return the exit code."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if not isinstance(error, BrokenPipeError):
-        sys.stderr.write(f"fleet: the output cannot be written: {error.strerror}\n")
-    return 1
 
 
 def _command_path(error: click.UsageError) -> str:

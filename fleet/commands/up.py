@@ -27,7 +27,7 @@ from fleet.supervisor.spec import MAX_SIMULATED_CARS, FleetSpec, UpOptions, buil
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, MISSING, READY, Supervisor, SupervisorEvent
 from schemas import keys
 from schemas.bus import accepts, check_listening, resolve_endpoint
-from schemas.process import signals, startup
+from schemas.process import signals, startup, stdio
 from schemas.yaml_document.document import read_text
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
@@ -297,7 +297,7 @@ def _written(write: _Write, event: SupervisorEvent) -> None:
     try:
         write(event)
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        stdio.silence(sys.stdout)
 
 
 def _json(event: SupervisorEvent) -> None:

@@ -10,6 +10,7 @@ from typing import Any, Final
 from fleet.links import parse_fleet_link
 from gateway.protocol.platforms import AUTO, Platform
 from schemas.links import SerialUrl, UsbUrl
+from schemas.process.stdio import printable
 
 LIKELY_VERDICTS: Final = ("car", "ble", "given")
 POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, "silent", "busy")
@@ -56,12 +57,7 @@ def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
 
 def _found(fields: Mapping[str, Any]) -> FoundLink:
     if fields["kind"] == "ble":
-        words = f"Bluetooth device {_printable(fields['name']) or 'without a name'}, {fields['rssi']} dBm"
+        words = f"Bluetooth device {printable(fields['name']) or 'without a name'}, {fields['rssi']} dBm"
         return FoundLink(fields["url"], "ble" if fields["uart"] else "other", words)
     settled = fields["platform"] if fields["platform"] in set(Platform) - {Platform.UNKNOWN} else AUTO
-    return FoundLink(fields["url"], fields["verdict"], _printable(fields["words"]), settled)
-
-
-def _printable(text: str | None) -> str:
-    """Return a device's text without control characters, for one line of a terminal or a file."""
-    return "".join(each for each in text or "" if each.isprintable())
+    return FoundLink(fields["url"], fields["verdict"], printable(fields["words"]), settled)

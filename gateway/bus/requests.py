@@ -36,6 +36,7 @@ from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, EncodeError, General, Ptz, encode
 from schemas import messages
 from schemas.commands import COMMANDS, STOPS
+from schemas.process.stdio import printable
 from schemas.suggestion import did_you_mean
 from schemas.topics import PROTOBUF
 
@@ -297,7 +298,7 @@ def _estop(message: Any) -> Action:
 
 
 def _why(text: str) -> str:
-    return "".join(each if each.isprintable() else " " for each in text)[:MAX_REASON_LENGTH]
+    return printable(text, " ")[:MAX_REASON_LENGTH]
 
 
 def _checked(frame: ColorLed | Ptz | ArmSet) -> OneShot:

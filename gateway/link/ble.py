@@ -21,6 +21,7 @@ from bleak.backends.service import BleakGATTService
 
 from gateway.link.base import MAX_BUFFERED_BYTES, Busy, CannotOpen, Link, LinkLost
 from schemas.links import BleUrl
+from schemas.process.stdio import printable
 
 T = TypeVar("T")
 
@@ -321,7 +322,7 @@ def _listed(items: Iterable[str]) -> str:
     """Return the items as one line. A device chooses its own name: replace what cannot be printed."""
     every = list(items)
     more = f" and {len(every) - _MAX_LISTED} more" if len(every) > _MAX_LISTED else ""
-    return "".join(each if each.isprintable() else "?" for each in ", ".join(every[:_MAX_LISTED])) + more
+    return printable(", ".join(every[:_MAX_LISTED]), "?") + more
 
 
 def _cause(error: BaseException) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from gateway.link.base import CannotOpen
 from schemas.links import SerialUrl, UsbUrl
+from schemas.process.stdio import printable
 
 if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo
@@ -97,4 +98,4 @@ def check_same_device(
 
 def _named(ports: list[UsbSerialPort]) -> str:
     """Return the ports as one line. A device chooses its own name: replace what cannot be printed."""
-    return "".join(each if each.isprintable() else "?" for each in ", ".join(map(str, ports)))
+    return printable(", ".join(map(str, ports)), "?")

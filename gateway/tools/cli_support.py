@@ -48,9 +48,7 @@ def run_command(name: str, run: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         return startup.INTERRUPTED
     except OSError as error:  # the commands handle the errors of what they open; this one is of the output
-        stdio.silence(sys.stdout)
-        quiet = isinstance(error, BrokenPipeError)  # the reader of the pipe has seen enough
-        return 1 if quiet else _fail(f"{name}: the output cannot be written: {error.strerror}", 1)
+        return stdio.silence_broken(error, name)
     return 0
 
 

@@ -18,6 +18,7 @@ from gateway.protocol.frames import encode
 from gateway.tools import cli_support
 from gateway.tools.discovery import BleDevice, NoBluetooth, ble_devices, serial_ports
 from gateway.tools.probe import LinkProbe, LinkVerdict
+from schemas.process.stdio import printable
 
 DESCRIPTION: Final = "List the serial ports and Bluetooth LE devices, and find the cars among them."
 EPILOG: Final = """\
@@ -184,7 +185,7 @@ class _Scan:
                 yield f"  --link '{probe.port.url}'"
         likely = [device for device in self._devices if device.uart is not None]
         for device in likely:
-            yield f"{paint('cyan', device.address)}  {_safe(device.name) or 'no name'}, {device.rssi} dBm"
+            yield f"{paint('cyan', device.address)}  {printable(device.name) or 'no name'}, {device.rssi} dBm"
             yield f"  likely a car: it has the Bluetooth service {device.uart}; not connected to"
             yield f"  --link '{device.url}'"
         if others := len(self._devices) - len(likely):
@@ -199,14 +200,9 @@ def _name(probe: LinkProbe) -> str:
     if probe.port is None:
         return str(probe.url)
     usb = f"{probe.port.vid}:{probe.port.pid}" if probe.port.vid else ""
-    number = f"serial number {_safe(probe.port.serial_number)}" if probe.port.serial_number else ""
-    about = ", ".join(part for part in (_safe(probe.port.description), usb, number) if part)
+    number = f"serial number {printable(probe.port.serial_number)}" if probe.port.serial_number else ""
+    about = ", ".join(part for part in (printable(probe.port.description), usb, number) if part)
     return f"{probe.port.device}  {about}".rstrip()
-
-
-def _safe(text: str | None) -> str:
-    """Return a text that a device has chosen, without control characters."""
-    return "".join(each for each in text or "" if each.isprintable())
 
 
 def _words(probe: LinkProbe) -> str:

@@ -1,4 +1,4 @@
-"""Repairs closed or broken standard streams."""
+"""Repairs closed or broken standard streams, and makes foreign text printable."""
 
 import os
 import sys
@@ -26,3 +26,16 @@ def silence(stream: IO[str]) -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
+
+
+def silence_broken(error: OSError, program: str) -> int:
+    """Silence a broken stdout. Print why, unless the reader has closed the pipe. Return the exit code."""
+    silence(sys.stdout)
+    if not isinstance(error, BrokenPipeError):
+        sys.stderr.write(f"{program}: the output cannot be written: {error.strerror}\n")
+    return 1
+
+
+def printable(text: str | None, instead: str = "") -> str:
+    """Return a text that somebody else has chosen for one line of a terminal or a file, without control characters."""
+    return "".join(each if each.isprintable() else instead for each in text or "")

@@ -7,14 +7,14 @@ for a type, and empty where nothing was measured. Numbers, times and booleans ar
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from typing import Any, Final
 
 from fleet.client.reading import Reading
 from fleet.recording.time_spec import format_utc
 from fleet.recording.tools.table_formats import csv_cells
-from fleet.recording.tools.tables import RequestColumns, column_name
+from fleet.recording.tools.tables import Column, ColumnKind, RequestColumns, Values, column_name, column_of
 from schemas import topics
 
 _OMITTED_FIELDS: Final = frozenset({"stamp", "timestamp", "boot_id"})
@@ -22,18 +22,16 @@ _OMITTED_FIELDS: Final = frozenset({"stamp", "timestamp", "boot_id"})
 
 def table(readings: Sequence[Reading], topic: topics.Topic) -> str:
     """Return the table with its header. All readings must be of this topic."""
-    requests = RequestColumns.of(readings[0].value.DESCRIPTOR)
-    fields = [field for field in _fields(readings) if requests is None or field[0] != RequestColumns.FIELD]
-    names = [column_name(name, topic.units.get(name, ""), index) for name, index in fields]
-    rows = [[_cell(reading.value, *field) for field in fields] for reading in readings]
+    found = [reading.value for reading in readings]
+    columns, values = map(list, zip(*_columns(found, topic), strict=True))
+    requests = RequestColumns.of(found[0].DESCRIPTOR)
     if requests is not None:
-        names += [column.name for column in requests.columns]
-        cells = csv_cells(requests.columns, requests.fill([reading.value for reading in readings]))
-        rows = [[*row, *more] for row, more in zip(rows, cells, strict=True)]
+        columns, values = columns + requests.columns, values + requests.fill(found)
     lines = io.StringIO(newline="")
     writer = csv.writer(lines)
-    writer.writerow(["time", "key", *names])
-    writer.writerows([iso(reading.time), reading.key, *row] for reading, row in zip(readings, rows, strict=True))
+    writer.writerow(["time", "key", *(column.name for column in columns)])
+    cells = csv_cells(columns, values)
+    writer.writerows([iso(reading.time), reading.key, *row] for reading, row in zip(readings, cells, strict=True))
     return lines.getvalue()
 
 
@@ -42,32 +40,26 @@ def iso(time: datetime) -> str:
     return format_utc(time, "microseconds")
 
 
-def _fields(readings: Sequence[Reading]) -> Iterable[tuple[str, int | None]]:
-    """Yield each column as field and index. A list of numbers has one column per item of its longest value."""
-    for field in readings[0].value.DESCRIPTOR.fields:
-        if field.name in _OMITTED_FIELDS:
+def _columns(found: Sequence[Any], topic: topics.Topic) -> Iterator[tuple[Column, Values]]:
+    """Yield the columns. A list of numbers has one column per item of its longest value; other lists are JSON."""
+    for field in found[0].DESCRIPTOR.fields:
+        name, unit = field.name, topic.units.get(field.name, "")
+        if name in _OMITTED_FIELDS or (name == RequestColumns.FIELD and RequestColumns.of(found[0].DESCRIPTOR)):
             continue
         if field.is_repeated and field.cpp_type == field.CPPTYPE_DOUBLE:
-            longest = max(len(getattr(reading.value, field.name)) for reading in readings)
-            yield from ((field.name, index) for index in range(longest))
+            items = [getattr(message, name) for message in found]
+            for index in range(max(map(len, items))):
+                column = Column(column_name(name, unit, index), ColumnKind.FLOAT)
+                yield column, [each[index] if index < len(each) else None for each in items]
+        elif field.is_repeated or field.message_type is not None:
+            yield Column(column_name(name, unit), ColumnKind.JSON), [_json(message, name) for message in found]
         else:
-            yield field.name, None
+            column, fill = column_of(field, column_name(name, unit), unit)
+            yield column, fill(found)
 
 
-def _cell(message: Any, name: str, index: int | None) -> str:
-    field = message.DESCRIPTOR.fields_by_name[name]
-    if field.has_presence and not message.HasField(name):
-        return ""
-    value = getattr(message, name)
-    if index is not None:
-        return repr(value[index]) if index < len(value) else ""
-    if field.is_repeated or field.message_type is not None:
-        from google.protobuf import json_format
+def _json(message: Any, name: str) -> str | None:
+    from google.protobuf import json_format
 
-        whole = json_format.MessageToDict(message, preserving_proto_field_name=True)
-        return json.dumps(whole[name]) if name in whole else ""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, bytes):
-        return value.hex()
-    return value if isinstance(value, str) else repr(value)
+    whole = json_format.MessageToDict(message, preserving_proto_field_name=True)
+    return json.dumps(whole[name]) if name in whole else None

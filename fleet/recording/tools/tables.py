@@ -101,7 +101,7 @@ class Layout:
             while name in taken:
                 name = f"message_{name}"
             taken.add(name)
-            column, filler = _column(field, name, units.get(field.name, ""))
+            column, filler = column_of(field, name, units.get(field.name, ""))
             columns.append(column)
             self._fillers.append(filler)
         self.columns = (*COMMON_COLUMNS, *columns, *(self._requests.columns if self._requests is not None else ()))
@@ -134,7 +134,9 @@ class RequestColumns:
         self._fillers: dict[str, Callable[[Sequence[Any]], Values]] = {}
         for name, field in fields.items():
             unit = name.rpartition("_")[2]
-            column, self._fillers[name] = _column(field, f"{self.FIELD}_{name}", unit if unit in _REQUEST_UNITS else "")
+            column, self._fillers[name] = column_of(
+                field, f"{self.FIELD}_{name}", unit if unit in _REQUEST_UNITS else ""
+            )
             self.columns.append(column)
 
     @classmethod
@@ -199,7 +201,8 @@ def kind_of(field: FieldDescriptor) -> ColumnKind:
     return _COLUMN_KINDS[field.cpp_type]
 
 
-def _column(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Sequence[Any]], Values]]:
+def column_of(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Sequence[Any]], Values]]:
+    """Return the column of a field, and the function that fills it."""
     get = attrgetter(field.name)
     kind = kind_of(field)
     convert = _converter(field)
