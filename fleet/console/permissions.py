@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Self
 
+from fleet.policy.authority import Authority, merge_authority, unlisted_words
 from schemas.keys import person_of
 
 ACTIONS: Final = ("move", "act", "take", "resume", "end_estops", "pause", "unpause", "lend", "end_loan")
@@ -55,7 +56,7 @@ class CarRules:
     def of(cls, car: str, safety: Any) -> Self:
         """Return the rules of a car from its newest `state/safety`."""
         people = safety.people
-        pause = safety.pauses[-1] if safety.pauses else None
+        pause = max(reversed(safety.pauses), key=lambda each: each.rank == "lead", default=None)
         return cls(
             car,
             safety.HasField("people"),
@@ -70,6 +71,11 @@ class CarRules:
             person_of(safety.loan.by),
         )
 
+    @property
+    def authority(self) -> Authority:
+        """The people of the fleet, as the gateway of this car knows them."""
+        return Authority(self.leads, frozenset((*self.leads, *self.drivers, *self.others)) if self.listed else None)
+
 
 def refusals(rules: CarRules, sender: str) -> dict[str, Refusal]:
     """Return the actions that the gateway would refuse to this sender, a person, each with the reason and words."""
@@ -81,21 +87,9 @@ def refusals(rules: CarRules, sender: str) -> dict[str, Refusal]:
 def management_refusal(cars: Iterable[CarRules], sender: str) -> str:
     """Return why this person may not start and stop the recorder and plans. Empty if allowed.
 
-    Both are of the whole fleet. No gateway decides: the console holds its own pages to it.
+    Both are of the whole fleet. The coordinator decides by the same rule. The console holds its own pages to it.
     """
-    known = list(cars)
-    everywhere = CarRules(
-        "",
-        any(rules.listed for rules in known),
-        _once(name for rules in known for name in rules.leads),
-        _once(name for rules in known for name in (*rules.drivers, *rules.others)),
-    )
-    refusal = _Judge(everywhere, sender, person_of(sender)).refusal("manage")
-    return "" if refusal is None else refusal[1]
-
-
-def _once(names: Iterable[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(names))
+    return merge_authority(rules.authority for rules in cars).refusal(person_of(sender))
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,24 +121,22 @@ class _Judge:
                 return None
             case "lend":
                 return self._cannot_direct() or self._not_a_driver()
+            case "unpause":
+                return self._cannot_direct() or self._paused()
             case _:
                 return self._cannot_direct()
 
     def _cannot_direct(self) -> Refusal | None:
         """Return why this person may not pause or lend."""
-        if self._is_lead:
-            return None
-        if self.rules.leads:
-            return "not_allowed", f"Only a lead may ({', '.join(self.rules.leads)})."
-        return self._unlisted() if self._is_unlisted else None
+        words = self.rules.authority.refusal(self.person)
+        return ("not_allowed", words) if words else None
 
     @property
     def _is_unlisted(self) -> bool:
-        rules = self.rules
-        return rules.listed and self.person not in (*rules.leads, *rules.drivers, *rules.others)
+        return not self.rules.authority.lists(self.person)
 
     def _unlisted(self) -> Refusal:
-        return "not_allowed", f"{self.person} watches and stops: the fleet file does not list {self.person}."
+        return "not_allowed", unlisted_words(self.person)
 
     def _not_a_driver(self, *, even_if_lent: bool = False) -> Refusal | None:
         """Return why the people of the fleet or a loan keep this person from the car."""
@@ -170,7 +162,15 @@ class _Judge:
 
     def _may_end(self, mark: Mark) -> bool:
         """Return True if this person's rank ends this. Only a lead ends what a lead began."""
-        return mark.rank != "lead" or self._is_lead or not self.rules.leads
+        if mark.rank != "lead" or self._is_lead:
+            return True
+        return not self.rules.leads if self.rules.listed else self.person == mark.person
+
+    def _paused(self) -> Refusal | None:
+        pause = self.rules.pause
+        if pause is None or self._may_end(pause):
+            return None
+        return "paused", f"{_words(pause)}: only a lead ends this pause."
 
     def _held(self) -> Refusal | None:
         hold = self.rules.hold

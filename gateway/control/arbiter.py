@@ -155,7 +155,7 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
         case Resume():
             return _resume(what, sender, context)
         case Unpause():
-            return _may_direct(sender, "end the pause", context)
+            return _may_direct(sender, "end the pause", context) or _pause_stays(sender, context)
         case Lend():
             refusal = _may_direct(sender, f"lend {context.car}", context) or _may_drive(sender, context)
             return refusal or _unknown_borrower(what.to, context)
@@ -250,7 +250,7 @@ def may_end_estop(estop: Estop, sender: Sender, context: CommandContext) -> bool
     the fleet, so that all gateways decide alike. Everybody ends their own.
     """
     people, person = context.people, sender.person
-    if sender.kind is SenderKind.COORDINATOR or not people.may_end(sender, estop.rank):
+    if sender.kind is SenderKind.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):
         return False
     mine = person in (Sender(estop.by).person, context.loan and context.loan.to)
     return mine or people.may_drive(person) or (estop.fleet_wide and people.role(person) is PersonRole.OTHER)
@@ -285,19 +285,33 @@ def _may_drive_at_all(sender: Sender, context: CommandContext) -> Refusal | None
 
 
 def _estop_stays(estop: Estop, sender: Sender, context: CommandContext) -> Refusal:
-    if context.people.may_end(sender, estop.rank):
+    if context.people.may_end(sender, estop.by, estop.rank):
         return _may_drive_at_all(sender, context) or _unlisted(sender, context)
     why = f': "{estop.why}"' if estop.why else ""
-    words = f"{context.car} stays emergency-stopped: {estop.by} did it{why}, and only a lead ends what a lead began"
-    return Reason.ESTOPPED, f"{words} ({', '.join(context.people.leads)})."
+    words = f"{context.car} stays emergency-stopped: {estop.by} did it{why}, and {_only_leads(context)}"
+    return Reason.ESTOPPED, words
 
 
 def _hold_stays(sender: Sender, context: CommandContext) -> Refusal | None:
     hold = context.hold
-    if hold is None or context.people.may_end(sender, hold.rank):
+    if hold is None or context.people.may_end(sender, hold.by, hold.rank):
         return None
-    words = f"{context.car} is on hold: {hold.by} stopped it, and only a lead ends what a lead began"
-    return Reason.HELD, f"{words} ({', '.join(context.people.leads)})."
+    return Reason.HELD, f"{context.car} is on hold: {hold.by} stopped it, and {_only_leads(context)}"
+
+
+def _pause_stays(sender: Sender, context: CommandContext) -> Refusal | None:
+    for pause in context.pauses:
+        if not context.people.may_end(sender, pause.by, pause.rank):
+            return Reason.PAUSED, f"{context.car} stays paused: {pause.by} did it, and {_only_leads(context)}"
+    return None
+
+
+def _only_leads(context: CommandContext) -> str:
+    """Return the rule about what a lead began, and who the leads are."""
+    rule, leads = "only a lead ends what a lead began", context.people.leads
+    if leads:
+        return f"{rule} ({', '.join(leads)})."
+    return f"{rule}. The gateway of {context.car} knows no leads: start it by `fleet up`, or with `--person NAME:lead`."
 
 
 def _not_allowed(sender: Sender, context: CommandContext) -> Refusal | None:
@@ -313,7 +327,7 @@ def _not_allowed(sender: Sender, context: CommandContext) -> Refusal | None:
         return refusal
     last = context.pauses[-1]
     why = f': "{last.why}"' if last.why else ""
-    who = "A lead" if context.people.leads else "A person"
+    who = "A lead" if context.people.leads or last.rank is SenderKind.LEAD else "A person"
     return Reason.PAUSED, f"{car} is paused with the whole fleet ({last.by}{why}). {who} ends it with `fleet unpause`."
 
 

@@ -356,7 +356,8 @@ class Controller:
                 parts.clear()  # the end of the hold alone lets nobody drive
             parts.append(self._still_estopped(sender, now))
         elif safety.hold is not None:
-            fix = f": `fleet resume {self.car}`" if self.people.may_end(sender, safety.hold.rank) else " (a lead)"
+            ends = self.people.may_end(sender, safety.hold.by, safety.hold.rank)
+            fix = f": `fleet resume {self.car}`" if ends else " (a lead)"
             parts.append(f"still on hold by {safety.hold.by}{fix}")
         if safety.pauses and not resume.ids:
             parts.append(f"still paused by {safety.pauses[-1].by}: `fleet unpause`")

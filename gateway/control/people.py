@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Final, Self
 
 from gateway.control.commands import Sender, SenderKind
-from schemas.keys import NAME_RULE, is_name
+from schemas.keys import NAME_RULE, is_name, person_of
 
 
 class PersonRole(StrEnum):
@@ -57,10 +57,15 @@ class People:
         """Return True if this person, and the scripts of this person, may drive the car."""
         return self.role(person) in (PersonRole.DRIVER, PersonRole.LEAD)
 
-    def may_end(self, sender: Sender, rank: SenderKind) -> bool:
-        """Return True if this sender may end what a sender of this rank began. Only a lead ends what a lead began."""
+    def may_end(self, sender: Sender, by: str, rank: SenderKind) -> bool:
+        """Return True if this sender may end what `by` of this rank began. Only a lead ends what a lead began."""
+        if rank is not SenderKind.LEAD or sender.kind is SenderKind.LEAD:
+            return True
+        if self.roles is None:
+            # A gateway without a table knows one lead: who began it. All others must end it at the other gateways.
+            return sender.kind is SenderKind.PERSON and sender.person == person_of(by)
         # After a restart with another table there may be no lead: then the car must not stay stopped for ever.
-        return rank is not SenderKind.LEAD or sender.kind is SenderKind.LEAD or not self.leads
+        return not self.leads
 
 
 NO_PEOPLE: Final = People()

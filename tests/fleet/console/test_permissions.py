@@ -50,6 +50,7 @@ ESTOPS = (
         Estop("e3", EVE, "", 1, fleet_wide=True, rank=PERSON),
     ),
     (Estop("e4", ZED, "", 1, fleet_wide=False, rank=PERSON),),
+    (Estop("e5", "head@x", "", 1, fleet_wide=False, rank=LEAD),),
 )
 HOLDS = (None, Hold(ANN, 1, PERSON), Hold(TEACHER, 1, LEAD))
 PAUSES = (None, FleetPause("p1", TEACHER, "listen", 1, LEAD), FleetPause("p2", ANN, "", 1, PERSON))

@@ -152,7 +152,8 @@ def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: Com
     lent = at.loan is not None and not borrows and not lead and not (leads and person == "teacher")
 
     def is_protected(rank: SenderKind) -> bool:
-        return rank is LEAD and leads and not lead
+        # Without a table nobody of these senders is a lead, and none of them began anything as one.
+        return rank is LEAD and not lead and (leads or listed is None)
 
     if action in ("stop", "e-stop", "free"):
         return None
@@ -164,6 +165,8 @@ def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: Com
             return Reason.NOT_ALLOWED
         if action == "lend" and not lead:
             return Reason.LENT if lent else None if drives else Reason.NOT_ALLOWED
+        if action == "unpause" and any(is_protected(pause.rank) for pause in at.pauses):
+            return Reason.PAUSED
         return None
     if action == "end loan":
         return None
@@ -332,8 +335,28 @@ def test_what_a_lead_stops_only_a_lead_ends(desk: Workbench) -> None:
 
 def test_a_table_without_leads_keeps_no_car_stopped_for_ever() -> None:
     kept = PersistedSafety(Hold("teacher@lab", 1, LEAD), (Estop("e1", "teacher@lab", "", 1, True, LEAD),))
-    desk = Workbench(kept=kept).ready()
+    desk = Workbench(kept=kept, people=People.parse(["ann"])).ready()
     assert desk.ask(Resume(all=True), ANN).reason is None
+    assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
+
+
+def test_a_gateway_without_a_table_frees_nothing_that_a_lead_began() -> None:
+    kept = PersistedSafety(Hold("teacher@lab", 1, LEAD), (Estop("e1", "teacher@lab", "", 1, True, LEAD),))
+    desk = Workbench(kept=kept).ready()
+    desk.control.merge_pauses([FleetPause("p1", "teacher@lab", "listen", 7, LEAD)], [], "blue", desk.now)
+    rule = "only a lead ends what a lead began. The gateway of red knows no leads: "
+    for sender in (ANN, replace(ANN, kind=LEAD), Sender("teacher@lab", SCRIPT)):
+        answers = [desk.ask(what, sender) for what in (Resume(), Resume(("e1",)), Resume(all=True))]
+        assert [each.reason for each in answers] == [Reason.HELD, Reason.ESTOPPED, Reason.ESTOPPED]
+        assert all(rule in each.words for each in answers)
+        assert desk.ask(Unpause(), sender).reason in (Reason.PAUSED, Reason.NOT_ALLOWED)
+    assert rule in desk.ask(Unpause(), ANN).words
+    assert [pause.id for pause in desk.control.safety.pauses] == ["p1"]
+    assert desk.control.safety.ended_pauses == (), "no other gateway would follow"
+    # Who began it is the one lead that the state names.
+    teacher = Sender("teacher@phone", PERSON)
+    assert desk.ask(Unpause(), teacher).words == "the pause has ended"
+    assert desk.ask(Resume(all=True), teacher).reason is None
     assert desk.ask(FORWARD, ANN).status is Phase.QUEUED
 
 
