@@ -5,7 +5,10 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from typing import Any, Final
+
+from schemas.keys import person_of
 
 RECENT_COMMAND_S: Final = 600.0
 """Maximum age of a command that `fleet doctor` looks at."""
@@ -165,6 +168,20 @@ def _estopped(e: CarEvidence) -> str:
     return f"E-stopped by {estop.by}{f': {estop.why}' if estop.why else ''}. It accepts only stops."
 
 
+def _paused(e: CarEvidence) -> str:
+    safety = e.of("state/safety")
+    if safety is None or not safety.pauses:
+        return ""
+    return f"The fleet is paused by {_who(safety.pauses[-1], safety.pauses[-1].stamp)}."
+
+
+def _lent(e: CarEvidence) -> str:
+    safety = e.of("state/safety")
+    if safety is None or not safety.HasField("loan") or not any(event.reason == "lent" for _, event in e.failed):
+        return ""
+    return f"It is lent to {safety.loan.to} by {_who(safety.loan, safety.loan.since)}, so others are refused."
+
+
 def _other_mode(e: CarEvidence) -> str:
     mode = e.of("state/mode")
     if mode is None or mode.verdict != "contradicted":
@@ -256,9 +273,11 @@ CHECKS: Final = (
     DoctorCheck("silent", _silent_car, "fleet watch '{car}/sensor/*'"),
     DoctorCheck("damaged_frames", _damaged, "fleet watch {car}/frame/rx"),
     DoctorCheck("estopped", _estopped, "fleet resume {car} --estops"),
+    DoctorCheck("paused", _paused, "fleet unpause"),
     DoctorCheck("mode_contradicted", _other_mode, "fleet stop {car}"),
     DoctorCheck("battery_low", _weak, "fleet get {car}/sensor/battery"),
     DoctorCheck("leased", _leased, "fleet drive {car} forward --take"),
+    DoctorCheck("lent", _lent, "fleet lend {car} --end"),
     DoctorCheck("link_breaks", _breaks, "fleet logs {car}"),
     DoctorCheck("gateway_restarted", _restarted, "fleet logs {car}"),
     DoctorCheck("overloaded", _lags, "fleet status --processes"),
@@ -299,7 +318,7 @@ def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
         basis = f", {safety.motors_basis}" if safety.motors_basis else ""
         why = f": {safety.trust_evidence}" if safety.trust_evidence else ""
         yield "motors", f"{safety.motors}{basis}; {safety.trust}{why}"
-        yield "control", _control(safety)
+        yield "control", _control(evidence.car, safety)
     if health is not None:
         seen = "; ".join(health.platform_evidence) or "nothing was seen yet"
         yield "platform", f"{health.platform}: {seen}"
@@ -315,10 +334,32 @@ def as_dict(evidence: CarEvidence) -> dict[str, Any]:
     return {"car": evidence.car, "findings": found, "facts": dict(describe(evidence))}
 
 
-def _control(safety: Any) -> str:
-    lease = f"{safety.lease.holder} ({safety.lease.kind}) drives" if safety.HasField("lease") else "nobody drives"
-    hold = f"on hold by {safety.hold.by}" if safety.HasField("hold") else "no hold"
-    return f"{lease}, {hold}, {len(safety.estops) or 'no'} e-stop{'s' * (len(safety.estops) > 1)}"
+def describe_people(car: str, safety: Any) -> Iterator[tuple[str, str]]:
+    """Yield who stopped, paused, borrowed or drives a car, with rank and time, and the command that ends it."""
+    for estop in safety.estops:
+        yield f"e-stopped by {_who(estop, estop.stamp)}", f"fleet resume {car} --estops"
+    for pause in safety.pauses:
+        yield f"paused with the whole fleet by {_who(pause, pause.stamp)}", "fleet unpause"
+    if safety.HasField("hold"):
+        yield f"on hold by {_who(safety.hold, safety.hold.since)}", f"fleet resume {car}"
+    if safety.HasField("loan"):
+        loan = safety.loan
+        left = f"for another {loan.expires_in_s:.0f} s"
+        yield f"lent to {loan.to} by {_who(loan, loan.since)}, {left}", f"fleet lend {car} --end"
+    if safety.HasField("lease"):
+        yield f"driven by {safety.lease.holder} ({safety.lease.kind})", f"fleet drive {car} forward --take"
+
+
+def _who(deed: Any, stamp: Any) -> str:
+    """Return the person of an e-stop, a pause, a hold or a loan, with rank, time and reason."""
+    rank = f" ({deed.rank})" if deed.rank else ""
+    since = f" since {datetime.fromtimestamp(stamp.seconds).astimezone():%H:%M:%S}" if stamp.seconds else ""
+    why = f": {deed.why}" if getattr(deed, "why", "") else ""
+    return f"{person_of(deed.by) or deed.by}{rank}{since}{why}"
+
+
+def _control(car: str, safety: Any) -> str:
+    return "; ".join(words for words, _ in describe_people(car, safety)) or "nobody drives, no hold, no e-stop"
 
 
 def _describe_refused(evidence: CarEvidence) -> str:

@@ -4,6 +4,7 @@ import importlib
 import json
 import re
 import time
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Final
@@ -11,6 +12,7 @@ from typing import Final
 import click
 
 from fleet.client.client import Fleet
+from fleet.client.diagnosis import describe_people
 from fleet.client.reading import Reading
 from fleet.client.services import NO_PLAN, ask_coordinator
 from fleet.commands.group import CommandGroup
@@ -36,14 +38,18 @@ examples:
 @json_option
 @with_client
 def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
-    """Explain why a car does what it does: what the plan decided, from which readings, and what would change it."""
+    """Explain why a car does what it does: what the plan decided, from which readings, and what would change it.
+
+    Also who stopped, paused, borrowed or drives it, since when, and what ends that.
+    """
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}
+    people = _people(client, subjects)
     if not found and not client.bus.tokens(f"{client.name}/{keys.COORDINATOR}"):
-        stopped = {car: words for car in subjects if (words := _describe_stop(client, car))}
-        if not subjects or len(stopped) < len(subjects):
+        if not people or any(car not in people for car in subjects):
             raise click.ClickException(_no_plan(client))
-        for car, words in stopped.items():
+        for car, deeds in people.items():
+            words = "; ".join(deeds)
             click.echo(json.dumps({"car": car, "words": words}) if as_json else f"{car}: {words}. No plan is running.")
         return
     for subject in subjects or sorted(found):
@@ -52,7 +58,8 @@ def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
             names = [name.removeprefix("role ") for name in sorted(found)]
             near = did_you_mean(subject, names) or f"There are decisions about: {', '.join(names) or 'nothing yet'}."
             raise click.ClickException(f"No decision about {subject}. {near}")
-        click.echo(json.dumps(reading.as_dict()) if as_json else _describe(reading))
+        deeds = people.get(subject, [])
+        click.echo(json.dumps(reading.as_dict() | {"people": deeds}) if as_json else _describe(reading, deeds))
 
 
 def _no_plan(client: Fleet) -> str:
@@ -62,24 +69,24 @@ def _no_plan(client: Fleet) -> str:
     return f"{NO_PLAN}{other}."
 
 
-def _describe_stop(client: Fleet, car: str) -> str:
-    """Say who has stopped a car, and what ends that. Empty if nobody has."""
-    for reading in client.get(f"{car}/state/safety") if keys.is_name(car) else ():
-        safety = reading.value
-        if safety.estops:
-            by = ", ".join(f"{each.by}{f' ({each.why})' if each.why else ''}" for each in safety.estops)
-            return f"e-stopped by {by}; `fleet resume {car} --estops` releases it"
-        if safety.HasField("hold"):
-            return f"on hold by {safety.hold.by}; `fleet resume {car}` ends it"
-    return ""
+def _people(client: Fleet, cars: Sequence[str]) -> dict[str, list[str]]:
+    """Return who stopped, paused, borrowed or drives each of these cars (none: all), and what ends that."""
+    found = {}
+    for car in cars or ["*"]:
+        for reading in client.get(f"{car}/state/safety") if car == "*" or keys.is_name(car) else ():
+            deeds = [f"{words}; `{todo}` ends it" for words, todo in describe_people(reading.car, reading.value)]
+            if deeds:
+                found[reading.car] = deeds
+    return found
 
 
-def _describe(reading: Reading) -> str:
+def _describe(reading: Reading, people: Sequence[str]) -> str:
     decision = reading.value
     since_s = decision.since.seconds + decision.since.nanos / 1e9
     at = datetime.fromtimestamp(since_s).astimezone().strftime("%H:%M:%S")
     lasting = timedelta(seconds=max(0, int(time.time() - since_s)))
     lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})", f"  because: {decision.why}"]
+    lines += [f"  person: {each}" for each in people]
     lines += [f"  reading: {each}" for each in decision.readings]
     lines += [f"  would change if: {each}" for each in decision.would_change.split("; or ")]
     return "\n".join(lines)

@@ -47,6 +47,11 @@ ODD: dict[str, CarEvidence] = {
     "silent": with_states(link=STALE),
     "damaged_frames": with_states(link=pb.Link(state="online", rx_frames=90, rejects={"truncated": 8, "noise": 3})),
     "estopped": with_states(safety=pb.Safety(motors="off", trust="stopped", estops=[pb.Estop(by="ann", why="smoke")])),
+    "paused": with_states(safety=pb.Safety(motors="off", trust="stopped", pauses=[pb.Pause(by="ann", why="listen")])),
+    "lent": replace(
+        with_states(safety=pb.Safety(motors="off", trust="stopped", loan=pb.Loan(to="bob", by="ann"))),
+        commands=[refused("lent")],
+    ),
     "mode_contradicted": with_states(mode=pb.Mode(asked="tracking", inferred="manual", verdict="contradicted")),
     "battery_low": with_states(battery=pb.Battery(voltage_v=6.6, level="critical")),
     "leased": replace(

@@ -1,5 +1,6 @@
 """`fleet why` and `fleet plan` without a plan."""
 
+from datetime import datetime
 from pathlib import Path
 
 import zenoh
@@ -16,7 +17,7 @@ from tests.support.ports import free_endpoint
 def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
     plan, endpoint = tmp_path / "plan.yaml", free_endpoint()
     plan.write_text("roles: {line: {mode: tracking}}\n", encoding="utf-8")
-    safety = pb.Safety(car="red", hold=pb.Hold(by="ann"))
+    safety = pb.Safety(car="red", hold=pb.Hold(by="ann@lab-1", rank="lead"))
 
     def run(*words: str) -> Result:
         return CliRunner().invoke(cli, [*words, "--connect", endpoint])
@@ -28,7 +29,7 @@ def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
             return True
 
         client.bus.queryable("fleet/red/state/safety", answer)
-        commands = (("plan", "set", str(plan)), ("plan", "show"), ("plan", "stop"), ("why",), ("why", "blue"))
+        commands = (("plan", "set", str(plan)), ("plan", "show"), ("plan", "stop"), ("why", "blue"))
         for words in commands:
             done = run(*words)
             assert done.exit_code == 1
@@ -39,6 +40,19 @@ def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
         token = client.bus.token(keys.car_token("fleet", keys.SUPERVISOR))
         for words in commands:
             assert run(*words).stderr == "Error: No plan is running. Start one: `fleet plan run FILE`.\n", token
-        assert run("why", "red").stdout == "red: on hold by ann; `fleet resume red` ends it. No plan is running.\n"
+        assert (
+            run("why", "red").stdout == "red: on hold by ann (lead); `fleet resume red` ends it. No plan is running.\n"
+        )
         safety.estops.add(id="1", by="bob", why="fire")
-        assert run("why", "red").stdout.startswith("red: e-stopped by bob (fire); `fleet resume red --estops` ")
+        assert run("why", "red").stdout.startswith(
+            "red: e-stopped by bob: fire; `fleet resume red --estops` ends it; on "
+        )
+        safety.loan.CopyFrom(pb.Loan(to="eve", by="ann@lab-1", rank="lead", expires_in_s=60))
+        safety.loan.since.seconds = at = 1_790_000_000
+        safety.pauses.add(by="ann@lab-1", rank="lead", why="listen").stamp.seconds = at
+        since = f"by ann (lead) since {datetime.fromtimestamp(at).astimezone():%H:%M:%S}"
+        shown = run("why").stdout
+        assert f"paused with the whole fleet {since}: listen; `fleet unpause` ends it; " in shown
+        assert f"lent to eve {since}, for another 60 s; `fleet lend red --end` ends it. No plan" in shown
+        safety.CopyFrom(pb.Safety(car="red"))
+        assert run("why").stderr == "Error: No plan is running. Start one: `fleet plan run FILE`.\n"
