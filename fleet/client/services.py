@@ -30,13 +30,14 @@ def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
     return None
 
 
-def ask_coordinator(client: Fleet, verb: str, plan_text: str = "") -> Any:
+def ask_coordinator(client: Fleet, verb: str, plan_text: str = "", sender: str = "") -> Any:
     """Send a request to the coordinator. Return the first answer as of `send_command`, None if there is none.
 
-    verb: `plan`, with the text of the plan to set, or a PlanRequest.
+    verb: `plan`, with the text of the plan to set, or a PlanRequest. sender: if not the client.
     """
+    by = sender or client.sender
     if verb == "plan":
-        command: Any = messages.message_class("fleet.v1.Plan")(text=plan_text, set_by=client.sender)
+        command: Any = messages.message_class("fleet.v1.Plan")(text=plan_text, set_by=by)
     else:
-        command = messages.message_class("fleet.v1.PlanCommand")(sender=client.sender, kind=client.kind)
+        command = messages.message_class("fleet.v1.PlanCommand")(sender=by, kind=client.kind)
     return next(send_command(client.bus, client.name, keys.COORDINATOR, verb, command, ANSWER_TIMEOUT_S), None)

@@ -10,7 +10,7 @@ import click
 from fleet.client.client import Fleet, default_sender
 from fleet.commands.options import bus_options, json_option
 from fleet.coordinator.coordinator import SENDER, AnotherCoordinator, Coordinator
-from fleet.coordinator.observer import listed_cars
+from fleet.coordinator.observer import listed_cars, listed_people
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.policy.decision import Decision
 from fleet.policy.plan.lint import find_faults
@@ -65,7 +65,8 @@ def run(
     """Run a plan until Ctrl-C. Prints one line per decision. Cars you stopped are left alone."""
     parent = os.getppid() if with_parent else None
     plan = parse(read_text(path), str(path))
-    listed = {} if fleet_file is None else listed_cars(read_fleet(fleet_file, unbound=True))
+    file = None if fleet_file is None else read_fleet(fleet_file, unbound=True)
+    listed = {} if file is None else listed_cars(file)
     found = find_faults(plan, listed or None)
     found.raise_errors(str(path))
     for each in found.warnings:
@@ -80,7 +81,13 @@ def run(
     with Fleet(connect, fleet, sender=f"{SENDER}{default_sender()}", kind="coordinator", start_hub=True) as client:
         try:
             Coordinator(
-                client, plan, on_decided, lambda words: click.echo(f"fleet: {words}", err=True), listed, run_name
+                client,
+                plan,
+                on_decided,
+                lambda words: click.echo(f"fleet: {words}", err=True),
+                listed,
+                None if file is None else listed_people(file),
+                run_name,
             ).run(lambda: stop.is_set() or parent not in (None, os.getppid()))
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fleet.aio import Fleet
+from fleet.client.client import default_sender
 from fleet.client.commands import CommandRequest, estop_request, pause_request, stop_request, unpause_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
 from fleet.console.bus_message import message_in
@@ -34,6 +35,7 @@ from fleet.replay.colors import color
 from schemas import keys
 from schemas.bus import Handover, Latest, Sample
 from schemas.commands import STOPS
+from schemas.keys import person_of
 
 MAX_PAGES: Final = 32
 """Maximum number of connected pages."""
@@ -214,6 +216,11 @@ class Console:
     def operator_of(self, person: PagePerson | None) -> ConsoleOperator:
         """Return the operator of a request (None: from this computer)."""
         return self.operator if person is None else self._operators.of(person.name)
+
+    def sender_of(self, person: PagePerson | None) -> str:
+        """Return the name under which a request acts, also of a person without an open page."""
+        sender = self.operator_of(person).sender
+        return sender if person is None or person_of(sender) == person.name else default_sender(person.name)
 
     def management_refusal(self, person: PagePerson | None) -> str:
         """Return why this person (None: of this computer) may not start and stop the recorder and plans."""

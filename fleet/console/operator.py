@@ -158,9 +158,9 @@ class ConsoleOperator:
         finally:
             self._renewals.discard(car)
 
-    async def ask_coordinator(self, verb: str, text: str = "") -> tuple[bool, str]:
+    async def ask_coordinator(self, verb: str, text: str = "", sender: str = "") -> tuple[bool, str]:
         """Send a request to the coordinator. Return whether it was carried out, and words. text: of a plan to set."""
-        answer = await self._fleet.call(ask_coordinator, self._fleet.sync, verb, text)
+        answer = await self._fleet.call(ask_coordinator, self._fleet.sync, verb, text, sender)
         if answer is None:
             return False, f"{NO_PLAN}."
         return not isinstance(answer, Failure) and answer.status == "sent", answer.words
@@ -169,10 +169,10 @@ class ConsoleOperator:
         """Check a plan's text. Return whether it is free of faults, and the faults, one per line."""
         return await self._fleet.call(_check_plan, text)
 
-    async def set_plan(self, text: str) -> tuple[bool, str]:
-        """Put a plan in force. Return whether it is, and words, or the faults, one per line."""
+    async def set_plan(self, text: str, sender: str) -> tuple[bool, str]:
+        """Put a plan in force under this name. Return whether it is, and words, or the faults, one per line."""
         ok, words = await self.check_plan(text)
-        return await self.ask_coordinator("plan", text) if ok else (ok, words)
+        return await self.ask_coordinator("plan", text, sender) if ok else (ok, words)
 
     def spawn(self, work: Any) -> None:
         """Run a coroutine. Its errors go to the log, never to the socket that began it."""

@@ -6,6 +6,7 @@ import secrets
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -169,7 +170,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
         person = request.scope.get(PERSON)
         if words := console.management_refusal(person):
             return JSONResponse({"ok": False, "words": words}, 403)
-        return await _answer_plan(request, console.operator_of(person).set_plan)
+        return await _answer_plan(request, partial(console.operator.set_plan, sender=console.sender_of(person)))
 
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()

@@ -22,12 +22,13 @@ from fleet.client.commands import led_request, mode_request
 from fleet.client.outcome import Outcome
 from fleet.coordinator.observer import FleetObserver
 from fleet.coordinator.state_file import CoordinatorStateFile
+from fleet.policy.authority import Authority
 from fleet.policy.decide import Ask, DecisionStep, step
 from fleet.policy.decision import LEFT_ALONE, Decision
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from fleet.policy.plan.plan import Plan
-from fleet.policy.requests import EVENTS, PlanRequest, RequestRefused, on_request
+from fleet.policy.requests import EVENTS, PlanRequest, RequestRefused, check_sender, on_request
 from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
 from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to_persisted
 from schemas import keys, messages, topics
@@ -93,6 +94,8 @@ class Coordinator:
     on_decision: Callable[[Decision], None]
     on_failure: Callable[[str], None]
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
+    people: Authority | None = None
+    """The people of the fleet file, who may change the plan. None: those that the gateways know."""
     run_name: str = ""
     """Name of its `fleet up` run: in a new run the plan begins anew."""
     dropped: int = 0
@@ -245,13 +248,17 @@ class Coordinator:
         assert self._state_file is not None
         return self._state_file.save(to_persisted(self.plan, memory, time.monotonic(), time.time()))
 
-    def _on_request(self, query: zenoh.Query, request: PlanRequest) -> None:
+    def _check_sender(self, observer: FleetObserver, by: str) -> None:
+        check_sender(observer.authority if self.people is None else self.people, by)
+
+    def _on_request(self, query: zenoh.Query, request: PlanRequest, observer: FleetObserver) -> None:
         """Carry out a request for the plan in force. It is persisted and recorded before it is confirmed."""
         try:
             by = _sender(query, "fleet.v1.PlanCommand")
+            self._check_sender(observer, by)
             memory, words = on_request(request, self.plan, self._memory, by, time.monotonic())
         except RequestRefused as refused:
-            self._reply_result(query, pb.Result(status="rejected", reason=refused.reason, words=str(refused)))
+            self._reply_result(query, _rejected(refused))
             return
         except messages.BadPayload as error:
             self._reply_result(query, pb.Result(status="rejected", reason="bad_value", words=f"{error} [bad_value]"))
@@ -282,7 +289,10 @@ class Coordinator:
         result = pb.Result(status="sent")
         try:
             text, by = _plan_command(query)
+            self._check_sender(observer, by)
             plan = parse(text)
+        except RequestRefused as refused:
+            result = _rejected(refused)
         except (ValueError, messages.BadPayload) as error:  # BadPlan and UnicodeDecodeError are ValueErrors
             result = pb.Result(status="rejected", reason="bad_value", words=str(error))
         else:
@@ -407,7 +417,7 @@ class Coordinator:
             elif verb == PLAN_VERB:
                 self._on_plan(query, observer)
             else:
-                self._on_request(query, PlanRequest(verb))
+                self._on_request(query, PlanRequest(verb), observer)
             return
         for publisher, message in self._published.values():
             if query.key_expr.intersects(publisher.key):
@@ -470,6 +480,10 @@ class Coordinator:
             key = f"{self.client.name}/{topic.name}"
             self._publishers[name] = self.client.bus.publisher(key, topic, keys.COORDINATOR)
         return self._publishers[name]
+
+
+def _rejected(refused: RequestRefused) -> pb.Result:
+    return pb.Result(status="rejected", reason=refused.reason, words=str(refused))
 
 
 def _payload(query: zenoh.Query) -> tuple[bytes, str]:

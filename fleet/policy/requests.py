@@ -4,9 +4,11 @@ from dataclasses import replace
 from enum import StrEnum
 from typing import Final
 
+from fleet.policy.authority import Authority
 from fleet.policy.plan.plan import Plan
 from fleet.policy.rules import PhaseState
 from fleet.policy.state import PolicyState
+from schemas import keys
 
 GOES_ON: Final = "`fleet plan restart` or `fleet plan set` goes on"
 
@@ -33,6 +35,16 @@ class RequestRefused(Exception):
     def __init__(self, words: str, reason: str = "unsupported") -> None:
         super().__init__(f"{words} [{reason}]")
         self.reason: Final = reason
+
+
+def check_sender(people: Authority, by: str) -> None:
+    """Raise RequestRefused if the sender `by` may not set, restart and stop the plan.
+
+    The supervisor may: it sets the plan of the fleet file.
+    """
+    words = "" if by == keys.SUPERVISOR else people.refusal(keys.person_of(by))
+    if words:
+        raise RequestRefused(f"{words} Say who you are with `--as NAME` or FLEET_AS.", "not_allowed")
 
 
 def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, now: float) -> tuple[PolicyState, str]:

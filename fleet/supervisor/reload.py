@@ -70,6 +70,7 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         plan=new.plan,
         plan_text=new.plan_text,
         listed=listed,
+        people=new.people,
         warnings=new.warnings,
     )
     return SpecChange(spec, removed, tuple(restarted), tuple(words), tuple(needs_restart))

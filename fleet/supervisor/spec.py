@@ -98,6 +98,8 @@ class FleetSpec:
     world: Path | None = None
     listed: Mapping[str, CoordinatorCar] = field(default_factory=dict)
     """The coordinator's entries, by car."""
+    people: Mapping[str, FleetPerson] | None = None
+    """Who may drive, and change the plan. None: everyone."""
     console: bool = False
     console_port: int = 0
     """Port of the web page. 0: the default of `fleet console`."""
@@ -154,6 +156,7 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         recordings=options.out or (file.recordings if file else None) or RECORDINGS,
         quota=file.quota if file else "",
         groups=file.groups if file else {},
+        people=people,
         file=file.path if file else None,
         world=options.world or (file.world if file else None),
         console=options.console or options.console_port > 0 or (file is not None and file.console),
@@ -229,7 +232,10 @@ def coordinator_fleet_file(spec: FleetSpec) -> str:
         }
         for name, car in spec.listed.items()
     }
-    return json.dumps({"cars": cars}, indent=1)
+    people = (
+        {} if spec.people is None else {"people": {name: {"rank": each.rank} for name, each in spec.people.items()}}
+    )
+    return json.dumps({"cars": cars, **people}, indent=1)
 
 
 def module(name: str, *arguments: str) -> tuple[str, ...]:

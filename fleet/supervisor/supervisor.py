@@ -328,7 +328,7 @@ class Supervisor:
         is_in_force = in_force is not None and in_force.text == text
         if (
             in_force is not None
-            and old.listed == self._spec.listed
+            and (old.listed, old.people) == (self._spec.listed, self._spec.people)
             and (is_in_force or await asyncio.to_thread(service.send_plan, text))
         ):
             coordinator.command = command

@@ -3,12 +3,14 @@
 import pytest
 
 from fleet.coordinator.observer import FORGET_AFTER_S, MAX_ABSENT_CARS, REQUIRED_TOPICS, FleetObserver
+from fleet.policy.authority import Authority
 from fleet.policy.decide import step
 from fleet.policy.plan.parser import parse
 from fleet.policy.snapshot import CarSnapshot
 from fleet.policy.state import PolicyState
 from schemas import messages, topics
 from schemas.bus import Sample
+from schemas.gen import fleet_v1_pb2 as pb
 
 TURN_S = 0.1
 
@@ -102,6 +104,21 @@ def test_another_message_than_the_topics_is_ignored(topic: str, sent: str) -> No
     observer.on_sample(Sample(f"fleet/red/{topic}", b"", messages.encoding_of(sent), 0, 1), 101.0, None)
     assert set(observer.readings["red"]) == set(REQUIRED_TOPICS)
     assert observer.unconfirmed == set()
+
+
+def test_the_people_are_those_that_any_gateway_knows() -> None:
+    observer = FleetObserver()
+    come(observer, "red", 100.0)
+    assert observer.authority == Authority()
+    observer.on_token("blue", 100.0, alive=True)
+    people = pb.CarPeople(leads=["teacher"], drivers=["ann"], others=["bob"])
+    safety = pb.Safety(car="blue", seq=1, people=people).SerializeToString()
+    observer.on_sample(
+        Sample("fleet/blue/state/safety", safety, messages.encoding_of("fleet.v1.Safety"), 0, 1), 101.0, None
+    )
+    assert observer.authority == Authority(("teacher",), frozenset({"teacher", "ann", "bob"}))
+    observer.on_token("blue", 102.0, alive=False)
+    assert observer.authority == Authority()
 
 
 def test_a_token_that_names_no_car_is_ignored() -> None:

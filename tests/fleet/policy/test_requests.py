@@ -4,8 +4,9 @@ from typing import Any
 
 import pytest
 
+from fleet.policy.authority import Authority, merge_authority
 from fleet.policy.plan.parser import parse
-from fleet.policy.requests import PlanRequest, RequestRefused, on_request
+from fleet.policy.requests import PlanRequest, RequestRefused, check_sender, on_request
 from fleet.policy.snapshot import FleetSnapshot, Refusal
 from fleet.policy.state import PersistedPolicy, carry_over, restore, to_persisted
 from tests.fleet.policy.cars import PolicyRun
@@ -156,3 +157,36 @@ def test_restart_and_set_go_on(how: str) -> None:
     run.until(8.0)
     assert {(car, mode) for _, car, mode in run.asked} == {("red", "tracking"), ("blue", "tracking")}
     assert to_persisted(run.plan, run.memory, run.now, 0.0).stopped_by == PersistedPolicy().stopped_by
+
+
+SAY = "Say who you are with `--as NAME` or FLEET_AS. [not_allowed]"
+ONLY_A_LEAD, UNLISTED = "Only a lead may (teacher).", "{} watches and stops: the fleet file does not list {}."
+EVERYONE = Authority()
+NO_LEADS = Authority((), frozenset({"ann", "bob"}))
+LEADS = Authority(("teacher",), frozenset({"teacher", "ann", "bob"}))
+
+
+@pytest.mark.parametrize(
+    ("people", "by", "words"),
+    [
+        *((EVERYONE, by, None) for by in ("teacher@lab-1", "ann@lab-2", "zed", "anonymous", "@supervisor")),
+        *((NO_LEADS, by, None) for by in ("ann@lab-2", "bob", "@supervisor")),
+        *((NO_LEADS, by, UNLISTED) for by in ("teacher@lab-1", "zed@x", "anonymous", "@lead")),
+        *((LEADS, by, None) for by in ("teacher", "teacher@lab-1", "@supervisor")),
+        *((LEADS, by, ONLY_A_LEAD) for by in ("ann@lab-2", "zed@x", "anonymous", "ann@teacher", "teacher2")),
+        (merge_authority([EVERYONE, LEADS]), "ann", ONLY_A_LEAD),
+        (merge_authority([EVERYONE, NO_LEADS]), "ann", None),
+        (merge_authority([NO_LEADS, LEADS]), "zed", ONLY_A_LEAD),
+        (merge_authority([EVERYONE, EVERYONE]), "zed", None),
+        (merge_authority([]), "zed", None),
+    ],
+)
+def test_where_there_are_leads_only_they_change_the_plan(people: Authority, by: str, words: str | None) -> None:
+    if words is None:
+        check_sender(people, by)
+        return
+    with pytest.raises(RequestRefused) as refused:
+        check_sender(people, by)
+    person = by.partition("@")[0]
+    assert str(refused.value) == f"{words.format(person, person)} {SAY}"
+    assert refused.value.reason == "not_allowed"

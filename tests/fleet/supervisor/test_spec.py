@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from fleet.commands import record
+from fleet.coordinator.observer import listed_people
 from fleet.fleetfile.fleet_file import parse_fleet
+from fleet.policy.authority import Authority
 from fleet.supervisor.reload import compare
 from fleet.supervisor.spec import (
     SIMULATED,
@@ -17,6 +19,7 @@ from fleet.supervisor.spec import (
     UpOptions,
     build_spec,
     coordinator_command,
+    coordinator_fleet_file,
     gateway_command,
     recorder_command,
     simulator_command,
@@ -71,6 +74,14 @@ def test_each_gateway_gets_the_people_who_may_drive_its_car(tmp_path: Path) -> N
     assert _people(nobody.cars["ann"].arguments) == ["--people-only"]
     everyone = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions())
     assert _people(everyone.cars["ann"].arguments) == []
+    # The coordinator knows the same people from its copy of the file.
+    known = [
+        listed_people(parse_fleet(coordinator_fleet_file(each), tmp_path / "copy.yaml", unbound=True))
+        for each in (spec, nobody, everyone)
+    ]
+    people = frozenset({"lee", "ana", "kim", "teacher"})
+    assert known == [Authority(("teacher",), people), Authority((), frozenset()), Authority()]
+    assert compare(everyone, spec).spec.people == spec.people
 
 
 def listed(*people: str) -> list[str]:
