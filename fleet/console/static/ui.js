@@ -20,10 +20,22 @@ export const Verdict = ({ table, name, detail = "" }) => {
 // Why an action is refused, before it is tried.
 export const Refused = ({ words }) => words.map((each) => html`<p class="cannot refused" key=${each}>${each}</p>`);
 
-// Draws again only if its data has changed.
+// Draws again only if its data has changed, one in each task: a press of STOP waits for one card, not for all.
+const outdated = new Set();
+function drawNext() {
+  const [next] = outdated;
+  outdated.delete(next);
+  if (outdated.size > 0) setTimeout(drawNext);
+  next?.forceUpdate();
+}
+
 export class Memo extends Component {
   shouldComponentUpdate(next) {
-    return next.data !== this.props.data;
+    if (next.data !== this.props.data && outdated.add(this).size === 1) setTimeout(drawNext);
+    return false;
+  }
+  componentWillUnmount() {
+    outdated.delete(this);
   }
   render({ draw }) {
     return draw();
