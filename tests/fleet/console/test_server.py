@@ -9,10 +9,12 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import psutil
 import pytest
+import zenoh
 from click.testing import CliRunner
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
@@ -23,6 +25,8 @@ from fleet.client.client import Fleet as Client
 from fleet.client.commands import drive_request
 from fleet.console.people_file import PeopleFile, people_path
 from fleet.console.server import MAX_MESSAGE_BYTES
+from schemas.bus import reply_message
+from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.console import ConsoleProcess
 from tests.support.judge import Judge
 from tests.support.network_client import NetworkDevice, network_port, untrusting
@@ -31,6 +35,9 @@ from tests.support.processes import FleetProcesses, wait_for
 
 PEOPLE = ("teacher:lead", "mia", "thief")
 """Who may drive red."""
+WARM_UP = 2000
+"""Connections until TLS and the allocator have what they keep: 17 MB with the first thousand, then about 1."""
+MAX_GROWTH_MB_PER_THOUSAND = 2.0
 
 
 class ServerStage:
@@ -194,6 +201,27 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
     assert driver.ask("GET", "/sessions")[0] == 200
 
 
+def test_a_plan_is_set_under_the_persons_name_also_without_an_open_page(stage: ServerStage) -> None:
+    teacher = stage.device("teacher", "--rank", "lead")
+    by: list[str] = []
+
+    def take(query: zenoh.Query) -> bool:
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        by.append(pb.Plan.FromString(payload).set_by)
+        reply_message(query, str(query.key_expr), pb.Result(status="sent", words="it is in force"), as_json=False)
+        return True
+
+    declared: Any = stage.fleet.bus.queryable("fleet/@coordinator/@cmd/plan", take)
+    for open_page in (False, True):
+        with teacher.socket() if open_page else contextlib.nullcontext() as page:
+            if page is not None:
+                page.recv()  # it has joined
+            status, text = teacher.ask("POST", "/plan/set", "roles:\n  guide: {mode: tracking}\n")
+        assert (status, json.loads(text)) == (200, {"ok": True, "words": "it is in force"})
+    declared.undeclare()
+    assert [name.partition("@")[0] for name in by] == ["teacher", "teacher"]
+
+
 def next_message(page: ClientConnection, kind: str) -> Any:
     """The next message of this kind that a page gets."""
     while (found := json.loads(page.recv(timeout=30)))["t"] != kind:
@@ -345,11 +373,10 @@ def loopback_socket(stage: ServerStage) -> ClientConnection:
 def test_floods_and_half_open_connections_stop_no_stop(stage: ServerStage) -> None:
     device = stage.device("calm")
     server = psutil.Process(stage.console.process.popen.pid)
+    settled_fds = server.num_fds()
     with device.socket() as page:
-        connect_and_leave(stage, 200)  # caches fill
-        before_fds, before_threads = server.num_fds(), server.num_threads()
-        before_mb = server.memory_info().rss / 1e6
-        connect_and_leave(stage, 1000)
+        connect_and_leave(stage, WARM_UP)
+        before_threads = server.num_threads()
         half_open = [
             socket.create_connection(("127.0.0.1", port), source_address=("127.0.0.7", 0))
             for port in (stage.lan_port, stage.console.port)
@@ -371,9 +398,17 @@ def test_floods_and_half_open_connections_stop_no_stop(stage: ServerStage) -> No
                 assert each.recv(1) == b""
         for each in half_open:
             each.close()
-        wait_for(lambda: server.num_fds() <= before_fds + 5, "all are closed")
+        sizes_mb = []
+        for number in range(40):
+            # Memory follows the connections that are open at once. So each hundred waits for the last one.
+            wait_for(lambda: server.num_fds() <= settled_fds + 5, "all are closed")
+            if number % 10 == 9:
+                sizes_mb.append(server.memory_info().rss / 1e6)
+            connect_and_leave(stage, 100)
         assert server.num_threads() <= before_threads + 8
-        assert server.memory_info().rss / 1e6 < before_mb + 20
+    grown_mb = [after - before for before, after in pairwise(sizes_mb)]
+    print(f"\n{settled_fds} descriptors; MB after the warm-up {sizes_mb[0]:.1f}, more after each thousand {grown_mb}")
+    assert max(grown_mb) < MAX_GROWTH_MB_PER_THOUSAND
     assert "Traceback" not in stage.log()
 
 
