@@ -3,10 +3,15 @@
 `from fleet import Fleet` is the SDK, `from fleet.aio import Fleet` its asyncio twin. `Session` is a recording.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Final
+# `fleet` handles Ctrl-C only after this module is imported, and `typing` would take longer than all the rest.
+from __future__ import annotations
 
+from importlib import import_module
+
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Final
+
     from fleet.client.client import Fleet as Fleet
     from fleet.client.outcome import LeaseLost as LeaseLost
     from fleet.client.outcome import NotCarriedOut as NotCarriedOut

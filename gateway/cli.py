@@ -6,12 +6,15 @@ import argparse
 import importlib
 import os
 import sys
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio
 from schemas.suggestion import did_you_mean
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 COMMANDS: Final = {
     "sim": ("gateway.sim.cli", "simulated cars that behave like real ones, hazards included"),
@@ -33,9 +36,7 @@ Ctrl-C stops the car before the process ends."""
 def main() -> None:
     """Run the command line. Exit codes: 1 failure, 2 wrong use."""
     stdio.complete()
-    parser = argparse.ArgumentParser(
-        prog="gateway", description="Connects one robot car to the Zenoh bus.", epilog=_EPILOG
-    )
+    parser = _GatewayParser(prog="gateway", description="Connects one robot car to the Zenoh bus.", epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
@@ -45,10 +46,18 @@ def main() -> None:
         near = did_you_mean(called, ["run", *COMMANDS])
         if called != "run" and near:
             sys.exit(_failed(f'There is no command "{called}". {near}', 2))
-        sys.exit(_run(_parse_arguments(parser)))
+        sys.exit(_run(parser.parse_args()))
     command = importlib.import_module(COMMANDS[called][0])
     command.add_arguments(subparsers[called])
-    sys.exit(command.run(_parse_arguments(parser)))
+    sys.exit(command.run(parser.parse_args()))
+
+
+class _GatewayParser(argparse.ArgumentParser):
+    """A parser that does not ignore a help that cannot be written."""
+
+    def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
+        """Print the help to stdout, or to the file."""
+        super().print_help(file) if file is not None else _print(self.format_help())
 
 
 class _Version(argparse.Action):
@@ -57,24 +66,21 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib.metadata import version
 
-        sys.stdout.write(f"gateway {version('zenoh-car-fleet')}\n")
+        _print(f"gateway {version('zenoh-car-fleet')}\n")
         parser.exit()
 
 
-def _parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Parse the command line. If the help cannot be written, print an error and exit with 1."""
+def _print(text: str) -> None:
+    """Print a text to stdout. If it cannot be written, print an error and exit with 1."""
     try:
-        return parser.parse_args()
-    except SystemExit:
-        try:
-            sys.stdout.flush()
-        except OSError as error:
-            stdio.silence(sys.stdout)
-            sys.exit(_failed(f"the output cannot be written: {error.strerror}", 1))
-        raise
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except OSError as error:
+        stdio.silence(sys.stdout)
+        sys.exit(_failed(f"the output cannot be written: {error.strerror}", 1))
 
 
-def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run = commands.add_parser(
         "run",
         help="connect one car to the bus",

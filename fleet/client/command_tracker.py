@@ -184,7 +184,7 @@ class PendingCommand:
         try:
             answer: Any = messages.parse(topics.RESULT, item.payload, item.encoding)
         except messages.BadPayload as error:
-            progress.on_unusable_answer(f"another program answered for {progress.car}: {error}", at)
+            progress.on_foreign_answer(f"another program answered for {progress.car}: {error}")
             return
         progress.on_answer(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
 

@@ -123,6 +123,7 @@ class Progress:
         self._sent_event = False
         self._gone_at: float | None = None
         self._is_supervised = False
+        self._foreign = ""
 
     @property
     def is_awaited(self) -> bool:
@@ -190,17 +191,21 @@ class Progress:
         if not present:
             self.on_presence(at, alive=False)
 
+    def on_foreign_answer(self, words: str) -> None:
+        """Note that another program answered. The gateway may still answer."""
+        self._foreign = words
+
     def on_query_failed(self, words: str, at: float) -> None:
         """Give up if the query has ended without an answer. Where a supervisor starts a new gateway, wait for that."""
         if self._is_supervised and not self.answered:
             self.on_presence(at, alive=False)
         else:
-            self.on_unusable_answer(words, at)
+            self._give_up_unanswered(words, at)
 
-    def on_unusable_answer(self, words: str, at: float) -> None:
+    def _give_up_unanswered(self, words: str, at: float) -> None:
         """Give up, unless the gateway has answered or sent an event."""
         if not self.answered:
-            self._end(NO_ANSWER, "", words, at, ok=False)
+            self._end(NO_ANSWER, "", self._foreign or words, at, ok=False)
 
     def on_query_timeout(self, at: float) -> None:
         """Give up if the query has timed out without an answer."""
@@ -211,7 +216,7 @@ class Progress:
             else f"{self.car} may be moving: its gateway is gone ({late}). Look at the car."
         )
         if self._gone_at is None or not self._is_supervised:
-            self.on_unusable_answer(words, at)
+            self._give_up_unanswered(words, at)
 
     def on_presence(self, at: float, *, alive: bool) -> None:
         """Note that the gateway's token came back, or disappeared: the gateway was killed or lost its bus."""

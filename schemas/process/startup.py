@@ -1,9 +1,15 @@
 """The first steps of a process, before its imports, which take 0.1 s and more."""
 
+# What is imported here is imported before Ctrl-C is handled. `typing` would take longer than all the rest.
+from __future__ import annotations
+
 import os
 import signal
-from types import FrameType
-from typing import Final
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from types import FrameType
+    from typing import Final
 
 INTERRUPTED: Final = 130
 """Exit code after Ctrl-C, as shells have it: 128 + SIGINT."""

@@ -28,13 +28,15 @@ BENCHMARKS = {
 }
 
 
-def _row(one: Measured) -> str:
+def row_of(one: Measured) -> str:
+    """Return one line of the table."""
     verdict = ""
     if one.goal is not None:
         slack = f" + {one.slack:g} {one.unit}" if one.slack else ""
         goal = f"{one.goal:g} x{slack}" if one.goal else f"{one.slack:g} {one.unit}"
         verdict = f"{goal:13} {'met' if one.met else 'MISSED'}"
-    numbers = f"{one.ours_median:8.2f} {one.floor_median:8.2f} {one.unit:3} {one.ratio:6.2f} x"
+    ratio = f"{one.ratio:6.2f} x" if one.ratio is not None else f"{'-':>8}"
+    numbers = f"{one.ours_median:8.2f} {one.floor_median:8.2f} {one.unit:3} {ratio}"
     return f"{one.name:54} {numbers}   {verdict}".rstrip()
 
 
@@ -54,7 +56,7 @@ def main() -> int:
         print(f"{'':54} {'ours':>8} {'floor':>8} {'':3} {'ratio':>8}   {'goal':13}", flush=True)
     for name in arguments.names or BENCHMARKS:
         for one in importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run(scale):
-            print(json.dumps(one.to_dict()) if arguments.json else _row(one), flush=True)
+            print(json.dumps(one.to_dict()) if arguments.json else row_of(one), flush=True)
     return 0
 
 

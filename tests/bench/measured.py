@@ -1,6 +1,5 @@
 """A measured cost and the floor under it; runs of each take turns, so that both see the same machine."""
 
-import math
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,8 +53,9 @@ class Measured:
         return statistics.median(self.floor)
 
     @property
-    def ratio(self) -> float:
-        return self.ours_median / self.floor_median if self.floor_median else math.inf
+    def ratio(self) -> float | None:
+        """Ours to the floor; None if there is no floor."""
+        return self.ours_median / self.floor_median if self.floor_median > 0 else None
 
     @property
     def met(self) -> bool:
@@ -68,7 +68,7 @@ class Measured:
             "ours": self.ours_median,
             "floor": self.floor_median,
             "unit": self.unit,
-            "ratio": self.ratio if self.floor_median else None,  # JSON has no infinity
+            "ratio": self.ratio,
             "goal": self.goal,
             "slack": self.slack,
             "met": self.met,

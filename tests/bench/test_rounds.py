@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench.__main__ import BENCHMARKS
+from tests.bench.__main__ import BENCHMARKS, row_of
 from tests.bench.measured import SMALL, Measured
+from tests.bench.stops import measured
+from tests.support.stops import LONGEST_S, StopRow
 
 BENCH = Path(__file__).parent
 PARTS = {"__init__", "__main__", "measured", "record_ours", "stage", "test_rounds"}
@@ -30,3 +32,11 @@ def test_a_small_round(name: str) -> None:
 
 def test_the_command_knows_each_benchmark() -> None:
     assert {path.stem for path in BENCH.glob("*.py")} - PARTS == {*BENCHMARKS.values()}
+
+
+@pytest.mark.parametrize(("announced_s", "met"), [(LONGEST_S, True), (LONGEST_S + 0.1, False)])
+def test_a_stop_without_a_floor_has_an_absolute_goal(announced_s: float, met: bool) -> None:
+    row = measured(StopRow("at rest", 9, 0.0, 0.0, 0.0, announced_s, math.inf, 0.0, 0, math.inf, math.inf, ""))
+    assert (row.ratio, row.to_dict()["ratio"], row.met) == (None, None, met)
+    assert "inf" not in row_of(row)
+    assert f"{LONGEST_S:g} s" in row_of(row)

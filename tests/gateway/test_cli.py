@@ -1,11 +1,13 @@
 """The `gateway` command as a whole: help, wrong use, and what `gateway run` does not pay for."""
 
+import io
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from gateway.cli import COMMANDS
+from gateway.cli import COMMANDS, main
 from tests.gateway.conftest import Command
 
 
@@ -14,6 +16,24 @@ def test_the_help_names_every_command(command: Command) -> None:
     assert done.returncode == 0
     for name, (_, words) in COMMANDS.items():
         assert f"    {name:<10}{words}" in done.stdout
+
+
+@pytest.mark.parametrize("unbuffered", [False, True])
+@pytest.mark.parametrize("words", ["--help", "run --help", "scan --help", "--version"])
+def test_a_help_that_cannot_be_written_fails(
+    words: str, unbuffered: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a buffer the writing fails at the end, without one (`python -u`) at once and once only."""
+    with (
+        Path("/dev/full").open("wb", buffering=0 if unbuffered else -1) as raw,
+        io.TextIOWrapper(raw, write_through=unbuffered) as full,
+    ):
+        monkeypatch.setattr(sys, "stdout", full)
+        monkeypatch.setattr(sys, "argv", ["gateway", *words.split()])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == "gateway: the output cannot be written: No space left on device\n"
 
 
 @pytest.mark.parametrize("name", ["run", *COMMANDS])

@@ -294,6 +294,34 @@ def test_an_answer_that_nobody_can_read_costs_no_other_car_its_outcome(cars: Car
         assert outcome.words.startswith(f"another program answered for {outcome.car}: the payload is")
 
 
+@pytest.mark.parametrize("kind", ["another message", "an error"])
+def test_a_foreign_answer_that_comes_first_does_not_end_a_stop(cars: Cars, gateway: Bus, kind: str) -> None:
+    foreign_answered = threading.Event()
+
+    def answer_foreign(query: zenoh.Query) -> None:
+        with query:
+            if kind == "an error":
+                query.reply_err("no such thing", encoding="text/plain")
+            else:
+                other = messages.encoding_of("fleet.v1.Range")
+                reply(query, "odd/twice/@cmd/stop", pb.Range(range_m=1.0).SerializeToString(), other)
+        foreign_answered.set()
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            foreign_answered.wait(5.0)
+            result = pb.Result(car="twice", status="sent")
+            reply(query, "odd/twice/@cmd/stop", result.SerializeToString(), messages.encoding_of(topics.RESULT))
+
+    gateway.queryable("odd/twice/@cmd/*", answer)
+    gateway.token(keys.car_token("odd", "twice"))
+    with Bus.open(cars.endpoint) as other, Fleet(cars.endpoint, "odd", sender="ann") as client:
+        other.queryable("odd/*/@cmd/*", answer_foreign)
+        wait_for(lambda: client.cars() == ["twice"], "it is there")
+        (outcome,) = client.stop()
+    assert (outcome.car, outcome.ok, outcome.phase) == ("twice", True, "sent")
+
+
 def test_a_gateway_that_ends_a_query_without_a_word_does_not_hang(cars: Cars, gateway: Bus) -> None:
     gateway.queryable("odd/brief/@cmd/*", lambda query: query.drop())  # type: ignore[no-untyped-call]
     gateway.token(keys.car_token("odd", "brief"))

@@ -1,5 +1,7 @@
 """What a command's answer and events, in any order, say became of it."""
 
+from collections.abc import Callable
+
 import pytest
 
 from fleet.client.effects import EFFECTS, STOP_VERBS
@@ -217,3 +219,24 @@ def test_the_first_last_word_stays() -> None:
     progress.on_query_failed("nothing", 105.0)
     assert progress.outcome is not None
     assert (progress.outcome.phase, progress.outcome.reason) == ("rejected", "held")
+
+
+def test_a_foreign_answer_does_not_replace_that_of_the_gateway() -> None:
+    progress = Progress("red", Until.STOPPED, 100.0)
+    progress.on_foreign_answer("another program answered for red: no result")
+    assert progress.outcome is None
+    progress.on_answer("queued", "", "", 1.0, 101.0)
+    progress.on_query_failed("its gateway ended without an answer", 101.1)
+    progress.on_event("complete", "", "", 0.0, 103.0, "shown")
+    assert progress.outcome is not None
+    assert (progress.outcome.phase, progress.outcome.ok) == ("complete", True)
+
+
+@pytest.mark.parametrize("ends", [lambda p: p.on_query_failed("it ended", 101.0), lambda p: p.on_query_timeout(110.0)])
+def test_a_foreign_answer_explains_why_no_other_came(ends: Callable[[Progress], None]) -> None:
+    progress = Progress("red", Until.STOPPED, 100.0)
+    progress.on_foreign_answer("another program answered for red: no result")
+    ends(progress)
+    assert progress.outcome is not None
+    assert progress.outcome.code == "no_answer"
+    assert progress.outcome.words == "another program answered for red: no result"
