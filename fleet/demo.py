@@ -26,6 +26,7 @@ from fleet.client.reading import Reading
 from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
+from schemas.process.parent import parent_option
 from schemas.suggestion import how_to_install
 
 DEFAULT_OUT: Final = Path("sessions")
@@ -163,7 +164,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
                 "recorder",
                 "fleet.cli",
                 "record",
-                *("--connect", run.endpoint, "--sessions", str(run.folder), "--json", "--with-parent"),
+                *("--connect", run.endpoint, "--sessions", str(run.folder), "--json", *parent_option()),
             ),
         )
         session = Path(_line(recorder, "recorder")["session"])
@@ -232,7 +233,7 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
             "coordinator",
             "fleet.cli",
             "plan",
-            *("run", str(plan), "--connect", run.endpoint, "--with-parent"),
+            *("run", str(plan), "--connect", run.endpoint, *parent_option()),
         ),
     )
     for car, mode in (("red", "tracking"), ("green", "obstacle_avoidance")):
@@ -416,14 +417,14 @@ def _started(stack: ExitStack, process: "AbstractContextManager[subprocess.Popen
 def _simulator(run: Demo, stack: ExitStack, session: Path) -> "tuple[subprocess.Popen[str], dict[str, str]]":
     links = {"red": f"pty:{session / 'red.tty'}", "green": "pty", "blue": "tcp://127.0.0.1:0"}
     cars = [part for car, platform in DEMO_CARS.items() for part in ("--car", f"{car}:{platform}:{links[car]}")]
-    where = ("--connect", run.endpoint, "--with-parent")
+    where = ("--connect", run.endpoint, *parent_option())
     process = _started(stack, _process(run, "simulator", "gateway.cli", "sim", *cars, "--seed", "7", *where))
     lines = [_line(process, "simulator") for _ in DEMO_CARS]
     return process, {each["car"]: each["link"] for each in lines}
 
 
 def _gateway(run: Demo, car: str, link: str) -> Any:
-    options = ("--car", car, "--link", link, "--platform", DEMO_CARS[car], "--connect", run.endpoint, "--with-parent")
+    options = ("--car", car, "--link", link, "--platform", DEMO_CARS[car], "--connect", run.endpoint, *parent_option())
     return _process(run, f"gateway of {car}", "gateway.cli", "run", *options)
 
 

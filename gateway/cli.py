@@ -4,13 +4,13 @@
 
 import argparse
 import importlib
-import os
 import sys
 from typing import TYPE_CHECKING, Any, Final
 
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
 from schemas.process import startup, stdio
+from schemas.process.parent import watched_pid
 from schemas.suggestion import did_you_mean
 
 if TYPE_CHECKING:
@@ -136,14 +136,15 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
         )
     run.add_argument("--retry", action="store_true", help="keep trying when the link cannot be opened at the start")
     run.add_argument(
-        "--with-parent",
-        action="store_true",
-        help=argparse.SUPPRESS,  # end with the process that started this
+        "--parent",
+        metavar="PID",
+        type=int,
+        help=argparse.SUPPRESS,  # end with this process, which started this one
     )
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    parent = os.getppid() if arguments.with_parent else None
+    parent = watched_pid(arguments.parent)
     from gateway.bus.service import AlreadyServed, CarService
     from gateway.link import BadUrl, LinkError, parse_url
     from gateway.protocol.platforms import parse_platform_option

@@ -29,6 +29,7 @@ from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys
 from schemas.bus import resolve_endpoint
+from schemas.process.parent import watched_pid
 
 if TYPE_CHECKING:
     from fleet.console.lan import Lan
@@ -122,10 +123,11 @@ examples:
     show_default=True,
     help="The file that the page Set up writes links into.",
 )
-@click.option("--with-parent", is_flag=True, hidden=True, help="End when the process that started this ends.")
+@click.option("--parent", "starter", type=int, hidden=True, help="End with this process, which started this one.")
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @bus_options
 def serve_console(
+    starter: int | None,
     *,
     port: int,
     opens: bool,
@@ -133,12 +135,11 @@ def serve_console(
     lan_port: int,
     sessions: Path | None,
     fleet_file: Path,
-    with_parent: bool,
     connect: str | None,
     fleet: str,
 ) -> None:
     """Serve the page on this computer, until Ctrl-C. STOP is Escape on every page."""
-    parent = os.getppid() if with_parent else None
+    parent = watched_pid(starter)
     listener = listen_or_fail(port, "fleet console --port 0")
     address = f"http://{LOOPBACK}:{listener.getsockname()[1]}"
 

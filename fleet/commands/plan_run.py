@@ -16,6 +16,7 @@ from fleet.policy.decision import Decision
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from schemas.process import signals
+from schemas.process.parent import watched_pid
 from schemas.yaml_document.document import read_text
 
 
@@ -49,7 +50,7 @@ a plan:
     metavar="NAME",
     help="Phase and rules outlive the coordinator within one run (of fleet up).",
 )
-@click.option("--with-parent", is_flag=True, hidden=True, help="End when the process that started this ends.")
+@click.option("--parent", "starter", type=int, hidden=True, help="End with this process, which started this one.")
 @json_option
 @bus_options
 def run(
@@ -58,12 +59,12 @@ def run(
     run_name: str,
     connect: str | None,
     fleet: str,
+    starter: int | None,
     *,
-    with_parent: bool,
     as_json: bool,
 ) -> None:
     """Run a plan until Ctrl-C. Prints one line per decision. Cars you stopped are left alone."""
-    parent = os.getppid() if with_parent else None
+    parent = watched_pid(starter)
     plan = parse(read_text(path), str(path))
     file = None if fleet_file is None else read_fleet(fleet_file, unbound=True)
     listed = {} if file is None else listed_cars(file)

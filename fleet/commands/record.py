@@ -19,6 +19,7 @@ from fleet.recording.session_lookup import DEFAULT_SESSIONS
 from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
+from schemas.process.parent import watched_pid
 
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
@@ -117,7 +118,7 @@ The quota does not remove marked sessions."""
 @click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
 @connect_option()
 @fleet_option()
-@click.option("--with-parent", is_flag=True, hidden=True, help="End when the process that started this ends.")
+@click.option("--parent", "starter", type=int, hidden=True, help="End with this process, which started this one.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object per line: when ready, and at the end.")
 def run(
     place: Path,
@@ -131,8 +132,8 @@ def run(
     plan: Path | None,
     connect: str | None,
     fleet: str,
+    starter: int | None,
     *,
-    with_parent: bool,
     as_json: bool,
 ) -> None:
     """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
@@ -155,7 +156,7 @@ def run(
         keep_free_bytes=keep_free,
         copied={name: path for name, path in copied.items() if path is not None},
     )
-    parent = os.getppid() if with_parent else None
+    parent = watched_pid(starter)
     stop = threading.Event()
     signals.calls(stop.set)
     try:

@@ -16,6 +16,7 @@ from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, profile
 from fleet.fleetfile.models import PersonRank
 from fleet.supervisor.restart_policy import Patience
 from schemas.keys import DEFAULT_FLEET
+from schemas.process.parent import parent_option
 
 SIMULATED: Final = "sim"
 """The link of a car that the supervisor's simulator simulates."""
@@ -251,7 +252,7 @@ def hub_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
 
 def gateway_command(spec: FleetSpec, car: CarProcessSpec, link: str, endpoint: str) -> tuple[str, ...]:
     """Return the command of a car's gateway."""
-    where = ("--fleet", spec.fleet, "--connect", endpoint, "--retry", "--with-parent")
+    where = ("--fleet", spec.fleet, "--connect", endpoint, "--retry", *parent_option())
     options = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
     return module("gateway.cli", "run", *options, *where)
 
@@ -262,7 +263,9 @@ def simulator_command(spec: FleetSpec, directory: Path, endpoint: str) -> tuple[
     cars = [f"{car.name}:{car.platform}:{_terminal(directory, car.name)}" for car in spec.simulated]
     world = () if spec.world is None else ("--world", str(spec.world))
     options = [word for car in cars for word in ("--car", car)]
-    return module("gateway.cli", "sim", *options, *world, "--fleet", spec.fleet, "--connect", endpoint, "--with-parent")
+    return module(
+        "gateway.cli", "sim", *options, *world, "--fleet", spec.fleet, "--connect", endpoint, *parent_option()
+    )
 
 
 def _terminal(directory: Path, car: str) -> str:
@@ -271,7 +274,7 @@ def _terminal(directory: Path, car: str) -> str:
 
 def recorder_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
     """Return the command of the recorder."""
-    where = ("--fleet", spec.fleet, "--connect", endpoint, "--with-parent")
+    where = ("--fleet", spec.fleet, "--connect", endpoint, *parent_option())
     files = {"--fleet-file": spec.file, "--plan": spec.plan}
     copies = [word for option, path in files.items() if path is not None for word in (option, str(path))]
     quota = ("--quota", spec.quota) if spec.quota else ()
@@ -280,13 +283,13 @@ def recorder_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
 
 def coordinator_command(spec: FleetSpec, plan: Path, listed: Path, endpoint: str) -> tuple[str, ...]:
     """Return the command of the coordinator, with its copies of the plan and the fleet file in the run directory."""
-    where = ("--fleet", spec.fleet, "--connect", endpoint, "--with-parent", "--run", plan.parent.name)
+    where = ("--fleet", spec.fleet, "--connect", endpoint, *parent_option(), "--run", plan.parent.name)
     return module("fleet.cli", "plan", "run", str(plan), "--fleet-file", str(listed), "--json", *where)
 
 
 def console_command(spec: FleetSpec, endpoint: str) -> tuple[str, ...]:
     """Return the command of the web page."""
     port = ("--port", str(spec.console_port)) if spec.console_port else ()
-    where = ("--fleet", spec.fleet, "--connect", endpoint, "--sessions", str(spec.recordings), "--with-parent")
+    where = ("--fleet", spec.fleet, "--connect", endpoint, "--sessions", str(spec.recordings), *parent_option())
     file = () if spec.file is None else ("--fleet-file", str(spec.file))
     return module("fleet.cli", "console", "serve", *port, *file, *where)

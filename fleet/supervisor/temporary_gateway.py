@@ -11,6 +11,7 @@ from typing import Final
 
 from fleet.client.client import Fleet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from schemas.process.parent import parent_option
 
 _READY_S: Final = 15.0
 """Timeout for a gateway. It starts in 1 s, and brings a car of an unknown platform to a known state within 6 s."""
@@ -21,7 +22,7 @@ _READY_POLL_S: Final = 0.1
 def temporary_gateway(client: Fleet, name: str, link: str, on_error: Callable[[str], object]) -> Iterator[str | None]:
     """Run a gateway for this link. Yield its car's name, or None if the gateway did not come up. No car moves."""
     with tempfile.TemporaryDirectory() as directory, (Path(directory) / "log").open("w+", encoding="utf-8") as log:
-        command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, "--with-parent"]
+        command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, *parent_option()]
         command += ["--fleet", client.name, "--connect", client.bus.endpoint, "--state-dir", directory]
         # In its own session, so that Ctrl-C at the terminal reaches only us. We let the gateway stop its car.
         gateway = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)

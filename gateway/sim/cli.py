@@ -22,6 +22,7 @@ from gateway.sim.model.world import World
 from gateway.sim.simulation import SimCar, Simulation
 from schemas import keys
 from schemas.process import signals
+from schemas.process.parent import watched_pid
 
 WORLDS: Final = {"room": World.room, "open": World.open_field}
 PARENT_CHECK_INTERVAL_S: Final = 0.1
@@ -113,7 +114,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--connect", metavar="ENDPOINT", help="hub for the true state (default: FLEET_ENDPOINT, else loopback)"
     )
     parser.add_argument("--no-truth", action="store_true", help="publish nothing, use no bus")
-    parser.add_argument("--with-parent", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--parent", metavar="PID", type=int, help=argparse.SUPPRESS)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -209,7 +210,7 @@ async def _serve(
     endpoint: str | None,
 ) -> None:
     loop = asyncio.get_running_loop()
-    parent = os.getppid()
+    parent = watched_pid(args.parent)
     ended = asyncio.Event()
     signals.calls_in(loop, lambda _: ended.set())
     simulation = Simulation(specs, seed=args.seed, world=world, replays=replays)
@@ -221,7 +222,7 @@ async def _serve(
         from gateway.sim.truth_publisher import TruthPublisher
 
         tasks.append(loop.create_task(TruthPublisher(simulation, endpoint, args.fleet, _print_error).run()))
-    if args.with_parent:
+    if parent is not None:
         tasks.append(loop.create_task(_watch_parent(parent, ended)))
 
     def end(done: "asyncio.Task[None]") -> None:

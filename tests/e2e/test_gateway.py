@@ -660,10 +660,11 @@ def test_it_imports_nothing_that_it_does_not_need(fleet: FleetProcesses, tcp_car
 def test_a_gateway_ends_with_its_starter(fleet: FleetProcesses) -> None:
     """Killed without a word, a supervisor leaves gateways that stop their cars and end."""
     sim, (link,) = fleet.simulate("red:arduino:pty")
-    arguments = ["-m", "gateway.cli", "run", "--car", "red", "--link", link, "--platform", "arduino", "--with-parent"]
+    arguments = ["-m", "gateway.cli", "run", "--car", "red", "--link", link, "--platform", "arduino"]
     starter = fleet.start(
         "-c",
-        f"import subprocess, sys; child = subprocess.Popen([sys.executable, *{arguments!r}]); "
+        "import os, subprocess, sys; "
+        f"child = subprocess.Popen([sys.executable, *{arguments!r}, '--parent', str(os.getpid())]); "
         "print(child.pid, flush=True); child.wait()",
     )
     gateway = starter.line()

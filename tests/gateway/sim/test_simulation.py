@@ -447,8 +447,8 @@ def test_faults_of_the_command_line_come_at_their_time(started: list[SimProcess]
 
 def test_it_ends_with_its_parent(started: list[SimProcess], tmp_path: Path) -> None:
     path = tmp_path / "red"
-    child = [sys.executable, "-m", "gateway.sim", "--car", f"red:arduino:pty:{path}", "--no-truth", "--with-parent"]
-    script = f"import subprocess, sys; subprocess.Popen({child!r}); sys.stdin.read()"
+    child = [sys.executable, "-m", "gateway.sim", "--car", f"red:arduino:pty:{path}", "--no-truth", "--parent"]
+    script = f"import os, subprocess, sys; subprocess.Popen([*{child!r}, str(os.getpid())]); sys.stdin.read()"
     parent = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
         assert parent.stdout is not None
@@ -464,6 +464,14 @@ def test_it_ends_with_its_parent(started: list[SimProcess], tmp_path: Path) -> N
         assert time.monotonic() < end
         time.sleep(0.01)
     parent.stdout.close()
+
+
+def test_it_ends_if_its_parent_ended_before_it_looked() -> None:
+    """A supervisor that was killed while its processes started left them behind for ever."""
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    command = [sys.executable, "-m", "gateway.sim", "--car", "red:arduino:tcp", "--no-truth"]
+    subprocess.run([*command, "--parent", str(ended.pid)], check=True, stdout=subprocess.DEVNULL, timeout=PATIENCE)
 
 
 BAD = [

@@ -1,0 +1,17 @@
+"""Tells a process whether the one that started it still runs."""
+
+import os
+
+
+def parent_option() -> tuple[str, str]:
+    """Return the option for a new process that ends with this one."""
+    return ("--parent", str(os.getpid()))
+
+
+def watched_pid(starter: int | None) -> int | None:
+    """Return the process id that `os.getppid` reports while the starter runs. None: nothing is to be watched.
+
+    The starter passes its own id: it may end before the new process could ask for it. On Windows `os.getppid` never
+    changes, and reports the launcher of the virtual environment.
+    """
+    return starter if starter is None or os.name == "posix" else os.getppid()
