@@ -1,4 +1,4 @@
-"""Names of colors, and the reader of `red` and `#ff0000`, for LEDs and for cars in pictures. Pure."""
+"""Colors: their names, the reader of `red` and `#ff0000`, and the colors of cars in every view. Pure."""
 
 import re
 from collections.abc import Mapping
@@ -16,6 +16,15 @@ COLORS: Final[Mapping[str, Rgb]] = {
 }  # fmt: skip
 COLOR_PATTERN: Final = f"^({'|'.join(COLORS)}|#[0-9a-fA-F]{{6}})$"
 
+_CAR_COLORS: Final[Mapping[str, Rgb]] = {
+    "red": (235, 80, 80), "green": (90, 200, 110), "blue": (90, 150, 250), "yellow": (235, 205, 70),
+    "orange": (245, 150, 60), "white": (230, 230, 230), "black": (130, 130, 130), "pink": (245, 130, 190),
+    "violet": (150, 110, 240),
+}  # fmt: skip
+_OTHER_CAR_COLORS: Final[tuple[Rgb, ...]] = (
+    (80, 200, 200), (190, 130, 240), (245, 150, 60), (160, 200, 80), (230, 120, 160), (120, 160, 200),
+)  # fmt: skip
+
 
 def parse_color(text: str) -> Rgb:
     """Return the color of a name or of `#rrggbb`; raises ValueError."""
@@ -31,4 +40,14 @@ def parse_color(text: str) -> Rgb:
 def format_color(color: Rgb) -> str:
     """Return a color's name, or `#rrggbb` if it has none."""
     named = (name for name, rgb in COLORS.items() if rgb == color)
-    return next(named, f"#{color[0]:02x}{color[1]:02x}{color[2]:02x}")
+    return next(named, hex_color(color))
+
+
+def hex_color(color: Rgb) -> str:
+    """Return a color as `#rrggbb`."""
+    return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+def car_color(car: str, index: int) -> Rgb:
+    """Return the color of a car in every view: the one it is named after, else one by its index."""
+    return _CAR_COLORS.get(car, _OTHER_CAR_COLORS[index % len(_OTHER_CAR_COLORS)])

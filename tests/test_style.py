@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.message_length import MAX_LINES, count_lines
+
 ROOT = Path(__file__).resolve().parents[1]
 PRODUCT = ("gateway", "fleet", "schemas")
 PACKAGES = (*PRODUCT, "tests")
@@ -138,12 +140,39 @@ def test_no_more_imports_are_lazy() -> None:
     assert len(lazy) <= LAZY_IMPORTS, "\n".join(lazy)
 
 
+def messages_with_lines(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield all texts of a module but docstrings and help, with their lines. A value counts as a name of 12 letters."""
+    no_message: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) or (isinstance(node, ast.keyword) and node.arg in ("epilog", "help")):
+            no_message |= {
+                id(each) for each in ast.walk(node.value) if isinstance(node, ast.keyword) or each is node.value
+            }
+        elif isinstance(node, ast.JoinedStr):
+            no_message |= {id(each) for each in node.values}
+            if id(node) not in no_message:
+                yield (
+                    node.lineno,
+                    "".join(
+                        getattr(each, "value", "") if isinstance(each, ast.Constant) else "X" * 12
+                        for each in node.values
+                    ),
+                )
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in no_message:
+            yield node.lineno, node.value
+
+
 def test_a_message_to_users_has_at_most_two_lines() -> None:
     """Faults of a file and changes are lists: their lines are in no constant."""
     raised = ("ClickException", "UsageError", "BadParameter", ".fail", ".echo", "stderr.write")
+    faults = []
     for path in source_files(*PRODUCT):
+        for line, text in messages_with_lines(parsed(path)):
+            if "\n" not in text and count_lines(text) > MAX_LINES:
+                faults.append(f"{path}:{line}: {text}")
         for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(raised):
                 strings = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
                 words = "".join(each for each in strings if isinstance(each, str) and each.strip())
                 assert words.strip().count("\n") < 2, f"{path}:{node.lineno}"
+    assert faults == []

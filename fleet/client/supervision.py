@@ -4,12 +4,21 @@ from typing import Any, Final
 
 from schemas import keys, topics
 from schemas.bus import Bus, messages_of
+from schemas.colors import Rgb, parse_color
 from schemas.topics import Qos
 
 SUPERVISOR_STATUS: Final = topics.TOPICS[f"{keys.SUPERVISOR}/status"]
+COLORS_TIMEOUT_S: Final = 0.5
+"""Timeout for the colors of the cars: a supervisor that hangs must not delay a table."""
 
 
 def ask_status(bus: Bus, fleet: str, timeout_s: float = 2.0) -> list[Any]:
     """Return the fleet.v1.Supervision of every supervisor that answers."""
     answers = bus.query(f"{fleet}/{SUPERVISOR_STATUS.name}", timeout_s=timeout_s, qos=Qos.STATE)
     return list(messages_of(answers))
+
+
+def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
+    """Return the colors of the cars of a running fleet. Empty if no supervisor answers."""
+    found = ask_status(bus, fleet, COLORS_TIMEOUT_S)
+    return {car: parse_color(color) for each in found for car, color in each.colors.items()}

@@ -13,6 +13,7 @@ from fleet.client.client import Fleet
 from fleet.client.condition import KeyCondition, check_key, topics_under
 from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySurvey, event_keys
 from fleet.client.reading import Reading, Watch
+from fleet.client.supervision import ask_colors
 from fleet.client.wait import NotInTime
 from fleet.commands.options import bus_options, json_option, open_client, with_client
 from fleet.commands.output import json_text, line, show_table
@@ -32,6 +33,7 @@ from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
 from schemas.bus import Sample, intersects
+from schemas.colors import car_color, hex_color
 from schemas.suggestion import did_you_mean
 
 CAR_COLUMNS: Final = ("car", "platform", "link", "mode", "verdict", "motion", "driver", "hold", "battery")
@@ -66,12 +68,14 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
             latest.setdefault(key.car, {})[key.topic] = reading
     if not latest:
         raise no_cars(client)
+    colors = ask_colors(client.bus, client.name)
+    colors = {car: colors.get(car) or car_color(car, index) for index, car in enumerate(sorted(latest))}
     if missing := [car for car in only if car not in latest]:
         there = f"Connected: {', '.join(sorted(latest))}."
         raise click.ClickException(f"{', '.join(missing)}: not connected. {did_you_mean(missing[0], latest) or there}")
     if only:
         latest = {car: latest[car] for car in only}
-    rows = [row_of(car, values) for car, values in sorted(latest.items())]
+    rows = [{**row_of(car, values), "color": hex_color(colors[car])} for car, values in sorted(latest.items())]
     for token in client.bus.tokens(f"{client.name}/{keys.REPLAY}/*"):
         session = token.rpartition("/")[2]
         click.echo(f"fleet: {client.name} is a replay of {session}: ages are those of the recording", err=True)
@@ -81,7 +85,7 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
             click.echo(json.dumps(row))
         return
     table = [{name: shown(name, row) for name in CAR_COLUMNS} for row in rows]
-    show_table(CAR_COLUMNS, table, optional=OPTIONAL_CAR_COLUMNS)
+    show_table(CAR_COLUMNS, table, optional=OPTIONAL_CAR_COLUMNS, colors=[row["color"] for row in rows])
     for row in rows:
         for words in row["platform_contradictions"]:
             click.echo(f"fleet: {row['car']} may be no {row['platform']} car: {words}", err=True)

@@ -15,6 +15,7 @@ from fleet.client.reading import Reading
 from fleet.recording.tools.csv_table import iso
 from fleet.supervisor.car_status import fit
 from schemas import topics
+from schemas.colors import parse_color
 
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
@@ -40,15 +41,34 @@ def line(reading: Reading, width: int = 0, *, past: bool = False) -> str:
     return f"{reading.key:<{width}}  {'  '.join(fields)}  {age}"
 
 
-def show_table(columns: Sequence[str], rows: Sequence[Mapping[str, str]], *, optional: Sequence[str] = ()) -> None:
-    """Print a table with aligned columns and a bold header. On a terminal it is no wider than that."""
+def show_table(
+    columns: Sequence[str],
+    rows: Sequence[Mapping[str, str]],
+    *,
+    optional: Sequence[str] = (),
+    colors: Sequence[str] = (),
+) -> None:
+    """Print a table with aligned columns and a bold header. On a terminal it is no wider than that.
+
+    colors: of each row, as #rrggbb. On a terminal a dot of this color begins the row.
+    """
+    plain = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
+    dots = [f"{_dot(color)} " for color in colors] if sys.stdout.isatty() and not plain else []
+    dots = dots or [""] * len(rows)
     widths = {name: max(len(row[name]) for row in ({name: name}, *rows)) for name in columns}
     if sys.stdout.isatty() or "COLUMNS" in os.environ:  # a pipe gets every column
-        widths = fit(widths, shutil.get_terminal_size().columns, optional)
+        widths = fit(widths, shutil.get_terminal_size().columns - 2 * any(dots), optional)
     header = "  ".join(name.upper().ljust(width) for name, width in widths.items()).rstrip()
-    click.echo(click.style(header, bold=True))
-    for row in rows:
-        click.echo("  ".join(_shortened(row[name], width) for name, width in widths.items()).rstrip())
+    click.echo(f"{'  ' * any(dots)}{click.style(header, bold=True)}")
+    for row, dot in zip(rows, dots, strict=True):
+        cells = "  ".join(_shortened(row[name], width) for name, width in widths.items())
+        click.echo(f"{dot}{cells.rstrip()}")
+
+
+def _dot(color: str) -> str:
+    """Return a colored dot. Not each terminal has 24-bit colors, so it has one of the 6 x 6 x 6 that all have."""
+    red, green, blue = (round(part / 51) for part in parse_color(color))
+    return click.style("●", fg=16 + 36 * red + 6 * green + blue)
 
 
 def _shortened(text: str, width: int) -> str:

@@ -4,7 +4,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +14,7 @@ from fleet.aio import Fleet
 from fleet.client.client import default_sender
 from fleet.client.commands import CommandRequest, estop_request, pause_request, stop_request, unpause_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
+from fleet.client.supervision import ask_colors
 from fleet.console.bus_message import message_in
 from fleet.console.car_view import FleetView
 from fleet.console.inspections import Inspections
@@ -31,9 +32,9 @@ from fleet.console.sessions_api import SessionsApi
 from fleet.console.setup_api import SetupApi
 from fleet.console.stop_report import StopReport
 from fleet.policy.requests import PlanRequest
-from fleet.replay.colors import color
 from schemas import keys
 from schemas.bus import Handover, Latest, Sample
+from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS
 from schemas.keys import person_of
 
@@ -60,7 +61,9 @@ class Console:
         self.sessions = SessionsApi(fleet, place, self.management_refusal)
         self.setup = SetupApi(fleet, file)
         self._presses = PressBook()
-        self._view = FleetView(_hex_color)
+        self._view = FleetView(self._color_of)
+        self._colors: Mapping[str, Rgb] = {}
+        """The colors of the cars, as the running fleet says."""
         self._operators = Operators(fleet)
         self._report: StopReport | None = None
         """The course of the last STOP."""
@@ -98,10 +101,14 @@ class Console:
                 loop.call_soon_threadsafe(change, token)
 
         await self._fleet.call(bus.watch_tokens, f"{name}/{keys.COORDINATOR}", on_token)
+        self._colors = await self._fleet.call(ask_colors, bus, name)
         self.operator.spawn(self._read_plan())
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tick())
             tasks.create_task(self._renew_leases())
+
+    def _color_of(self, car: str, index: int) -> str:
+        return hex_color(self._colors.get(car) or car_color(car, index))
 
     async def _renew_leases(self) -> None:
         while True:
@@ -367,7 +374,3 @@ class Console:
             self._pages[press.client].operator.end_press(press)
         await self._operators.close()
         await self.sessions.close()
-
-
-def _hex_color(car: str, index: int) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*color(car, index))

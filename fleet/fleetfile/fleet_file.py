@@ -25,13 +25,11 @@ from fleet.fleetfile.models import (
 )
 from fleet.links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
 from gateway.protocol.platforms import AUTO, Platform, parse_platform, parse_platform_option
-from schemas.colors import COLORS, parse_color
+from schemas.colors import Rgb, car_color, hex_color, parse_color
 from schemas.links import BadLink
 from schemas.yaml_document.document import BadFile, Document, read_text
 from schemas.yaml_document.messages import Where, quote_value, suggest
 
-PALETTE: Final = ("#e01b24", "#33d17a", "#3584e4", "#f6d32d", "#9141ac", "#ff7800", "#2ec7c0", "#986a44")
-"""Colors of cars without one, in the order of the file."""
 PATHS: Final = ("plan", "world")
 
 
@@ -87,7 +85,7 @@ class FleetFile:
 
     endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: none.
     console_port: of the web page; 0: the default.
-    groups: the cars of each. people: who may drive; None: everyone. colors: of cars that have one in the file.
+    groups: the cars of each. people: who may drive; None: everyone.
     unlinked: cars without a link, if allowed.
     """
 
@@ -105,7 +103,6 @@ class FleetFile:
     path: Path
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     people: Mapping[str, FleetPerson] | None = None
-    colors: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
     unlinked: Mapping[str, FleetCar] = field(default_factory=dict)
 
     @property
@@ -123,12 +120,13 @@ def read_fleet(path: Path | str, *, unbound: bool = False, moved: bool = False) 
     return parse_fleet(read_text(path), path, unbound=unbound, moved=moved)
 
 
-def read_colors(path: Path) -> Mapping[str, tuple[int, int, int]]:
-    """Return the colors that a fleet file gives to cars. Empty if it cannot be read."""
+def read_colors(path: Path) -> Mapping[str, Rgb]:
+    """Return the colors of the cars of a fleet file. Empty if it cannot be read."""
     try:
-        return read_fleet(path, unbound=True, moved=True).colors
+        file = read_fleet(path, unbound=True, moved=True)
     except BadFile:
         return {}
+    return {name: parse_color(car.color) for name, car in {**file.cars, **file.unlinked}.items()}
 
 
 def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = False) -> FleetFile:
@@ -155,7 +153,6 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
         quota=record.quota if record else "",
         groups=MappingProxyType({name: tuple(cars) for name, cars in file.groups.items()}),
         people=_resolve_people(file) if "people" in tree else None,
-        colors=MappingProxyType({name: parse_color(car["color"]) for name, car in merged.items() if "color" in car}),
         text=text,
         path=path.absolute(),
         unlinked=MappingProxyType({name: car for name, car in cars.items() if not car.link}),
@@ -179,7 +176,7 @@ def _resolve_car(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
         name=name,
         link=car.get("link", ""),
         platform=platform,
-        color=_color_code(car["color"]) if "color" in car else default_color(name, index),
+        color=hex_color(parse_color(car["color"])) if "color" in car else default_color(name, index),
         capabilities=frozenset(word for word in profile_capabilities(platform) if not _is_listed(word, car)),
         limits=Limits(**dict(limits)),
         roles=tuple(car["roles"]) if "roles" in car else None,
@@ -205,13 +202,8 @@ def _is_listed(word: str, car: Mapping[str, Any]) -> bool:
 
 
 def default_color(name: str, index: int) -> str:
-    """Return the color of a car without one, as #rrggbb: that of its name, or one of the palette."""
-    return _color_code(name) if name in COLORS else PALETTE[index % len(PALETTE)]
-
-
-def _color_code(text: str) -> str:
-    red, green, blue = parse_color(text)
-    return f"#{red:02x}{green:02x}{blue:02x}"
+    """Return the color of a car without one, as #rrggbb."""
+    return hex_color(car_color(name, index))
 
 
 def _merge_layers(tree: Mapping[str, Any], car: Mapping[str, Any]) -> dict[str, Any]:

@@ -144,7 +144,7 @@ class CommonEntry(Entry):
     platform: _Platform = Field(default=AUTO, description="its program, with +arm, +imu; auto: its gateway finds out")
     color: _Color = Field(
         default_factory=str,
-        description='in pictures: red, or "#e01b24" in quotes; left out: the color that is the car\'s name',
+        description='in tables and pictures: red, or "#e01b24" in quotes; left out: the color that is the car\'s name',
     )
     without: list[Capability] = Field(
         default_factory=list,

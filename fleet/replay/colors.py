@@ -1,4 +1,4 @@
-"""Colors of cars, states and LEDs: one meaning has one color in every view. Pure."""
+"""Colors of states and LEDs: one meaning has one color in every view. Pure."""
 
 from collections.abc import Iterable, Mapping
 from typing import Final
@@ -9,13 +9,6 @@ from schemas.commands import COMMANDS
 OFF: Final[Rgb] = (70, 74, 82)
 """Color of a lamp or LED that is off."""
 
-_CAR_COLORS: Final[Mapping[str, Rgb]] = {
-    "red": (235, 80, 80), "green": (90, 200, 110), "blue": (90, 150, 250), "yellow": (235, 205, 70),
-    "orange": (245, 150, 60), "white": (230, 230, 230), "black": (130, 130, 130), "pink": (245, 130, 190),
-}  # fmt: skip
-_OTHER_COLORS: Final[tuple[Rgb, ...]] = (
-    (80, 200, 200), (190, 130, 240), (245, 150, 60), (160, 200, 80), (230, 120, 160), (120, 160, 200),
-)  # fmt: skip
 
 STATE_COLORS: Final[Mapping[str, int]] = {
     "true": 0x4FB477FF, "false": 0x30343BFF,
@@ -41,11 +34,6 @@ MARK_COLORS: Final[Mapping[str, int]] = {
     f"{verb} {phase}": tint for verb in COMMANDS for phase, tint in _PHASE_COLORS.items()
 }
 """Colors of the marks of commands, by phase."""
-
-
-def color(car: str, index: int) -> Rgb:
-    """Return the color of a car: the one it is named after, else one by its index."""
-    return _CAR_COLORS.get(car, _OTHER_COLORS[index % len(_OTHER_COLORS)])
 
 
 def rgb(led: str) -> Rgb:

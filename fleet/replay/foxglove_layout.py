@@ -13,9 +13,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 from fleet.replay import panels
-from fleet.replay.colors import color
 from fleet.replay.panels import Curve, Derivation, Panel, StateTrack
 from schemas import keys
+from schemas.colors import car_color, hex_color
 from schemas.topics import TOPICS
 
 DEMO_CARS: Final = ("red", "green", "blue")
@@ -28,8 +28,9 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9_/]+")
 class _FoxgloveLayout:
     """Builder of a layout. `panels` collects its panels by id."""
 
-    def __init__(self, fleet: str) -> None:
+    def __init__(self, fleet: str, cars: Sequence[str]) -> None:
         self._fleet = fleet
+        self._tints = {car: {"color": hex_color(car_color(car, index))} for index, car in enumerate(cars)}
         self.panels: dict[str, Any] = {}
 
     def add(self, kind: str, name: str, config: dict[str, Any]) -> str:
@@ -54,7 +55,8 @@ class _FoxgloveLayout:
         # With one curve per car, each has the color of its car. Else Foxglove picks the colors.
         tinted = len({car for car, _, _ in every}) == len(every)
         paths = [
-            {**_series(self.path(car, curve), label), **(_tint(car) if tinted else {})} for car, curve, label in every
+            {**_series(self.path(car, curve), label), **(self._tints.get(car, {}) if tinted else {})}
+            for car, curve, label in every
         ]
         return self.add("Plot", name, {"paths": paths, "showLegend": True, "isSynced": True, "xAxisVal": "timestamp"})
 
@@ -86,7 +88,7 @@ class _FoxgloveLayout:
 
 def layout(cars: Sequence[str] = DEMO_CARS, fleet: str = keys.DEFAULT_FLEET) -> dict[str, Any]:
     """Return the layout of a fleet: a tab for the fleet, one for each car, one for the services."""
-    builder = _FoxgloveLayout(fleet)
+    builder = _FoxgloveLayout(fleet, cars)
     glance = [
         builder.states(name, [(car, track, f"{car} {track.name}") for car in cars for track in tracks if plain(track)])
         for name, tracks in panels.FLEET_TRACKS
@@ -115,11 +117,6 @@ def plain(part: Curve | StateTrack) -> bool:
 
 def _series(path: str, label: str) -> dict[str, Any]:
     return {"value": path, "label": label, "enabled": True, "timestampMethod": "receiveTime"}
-
-
-def _tint(car: str) -> dict[str, str]:
-    """Return the color setting of a car of the demo; empty for other cars."""
-    return {"color": "#{:02x}{:02x}{:02x}".format(*color(car, DEMO_CARS.index(car)))} if car in DEMO_CARS else {}
 
 
 def _grid(names: Sequence[str]) -> Any:

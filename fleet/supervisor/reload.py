@@ -67,6 +67,7 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         old,
         cars=cars,
         groups=new.groups,
+        colors=new.colors,
         plan=new.plan,
         plan_text=new.plan_text,
         listed=listed,

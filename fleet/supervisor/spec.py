@@ -12,7 +12,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, profile_capabilities
+from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, default_color, profile_capabilities
 from fleet.fleetfile.models import PersonRank
 from fleet.supervisor.restart_policy import Patience
 from schemas.keys import DEFAULT_FLEET
@@ -94,6 +94,8 @@ class FleetSpec:
     """Maximum size of all sessions, as 20GB; empty: none."""
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """The cars of each group."""
+    colors: Mapping[str, str] = field(default_factory=dict)
+    """The color of each car, as #rrggbb."""
     file: Path | None = None
     """The fleet file. The recorder stores a copy of it."""
     world: Path | None = None
@@ -158,6 +160,9 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         quota=file.quota if file else "",
         groups=file.groups if file else {},
         people=people,
+        colors={
+            name: specs[name].color if name in specs else default_color(name, index) for index, name in enumerate(cars)
+        },
         file=file.path if file else None,
         world=options.world or (file.world if file else None),
         console=options.console or options.console_port > 0 or (file is not None and file.console),

@@ -65,11 +65,12 @@ class Table:
         """Return the table, with the states of the services below it."""
         grid = Grid(box=None, pad_edge=False, header_style="bold", expand=True)
         rows = []
+        colors = self._supervisor.colors
         for name, status in self._supervisor.rows.items():
             process = self._supervisor.processes.get(name)
             running = process is not None and process.status.state is RunState.RUNNING
             state = "" if running else "starting" if process is None else str(process.status.state)
-            rows.append(dict(zip(_TABLE_COLUMNS, _cells(status, state), strict=True)))
+            rows.append(dict(zip(_TABLE_COLUMNS, _cells(status, state, colors.get(name, "")), strict=True)))
         widths = {each: max([len(each), *(row[each].cell_len for row in rows)]) for each in _TABLE_COLUMNS}
         widths[_EVENT] = _MIN_EVENT_WIDTH
         widths = fit(widths, self._console.width, _OPTIONAL_COLUMNS)
@@ -98,12 +99,12 @@ class Table:
             self._broken = True
 
 
-def _cells(row: CarStatus, process: str) -> list[Text]:
+def _cells(row: CarStatus, process: str, color: str) -> list[Text]:
     link = process if process or not row.link else row.link
     held = f"e-stop {row.estop}" if row.estop else f"hold {row.hold}" if row.hold else ""
     rate = "" if row.rate_hz is None else f"{row.rate_hz:.1f}"
     return [
-        Text(row.car, "bold"),
+        Text.assemble(("● " if color else "", color), (row.car, "bold")),
         Text(link, _LINK.get(link, "yellow")),
         Text.assemble(row.mode, " ", (row.verdict, _VERDICT.get(row.verdict, ""))),
         Text(row.motion),

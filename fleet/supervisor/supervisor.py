@@ -508,6 +508,11 @@ class Supervisor:
 
     # ------------------------------------------------------------------ commands
 
+    @property
+    def colors(self) -> Mapping[str, str]:
+        """The color of each car, as #rrggbb."""
+        return self._spec.colors
+
     def status(self) -> pb.Supervision:
         """Return the status of the supervisor and its processes."""
         now = self.processes.now
@@ -522,6 +527,7 @@ class Supervisor:
             missing=self.missing(),
             session=self._session,
             groups={name: ",".join(cars) for name, cars in self._spec.groups.items()},
+            colors=self._spec.colors,
         )
         for process in self.processes:
             life = process.status

@@ -730,7 +730,7 @@ class Supervised(_message.Message):
     def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., since_s: _Optional[float] = ..., words: _Optional[str] = ...) -> None: ...
 
 class Supervision(_message.Message):
-    __slots__ = ("stamp", "car", "seq", "boot_id", "state", "host", "pid", "uptime_s", "fleet_file", "directory", "processes", "became", "missing", "session", "groups")
+    __slots__ = ("stamp", "car", "seq", "boot_id", "state", "host", "pid", "uptime_s", "fleet_file", "directory", "processes", "became", "missing", "session", "groups", "colors")
     class BecameEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -752,6 +752,13 @@ class Supervision(_message.Message):
         key: str
         value: str
         def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    class ColorsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     STAMP_FIELD_NUMBER: _ClassVar[int]
     CAR_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -767,6 +774,7 @@ class Supervision(_message.Message):
     MISSING_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     GROUPS_FIELD_NUMBER: _ClassVar[int]
+    COLORS_FIELD_NUMBER: _ClassVar[int]
     stamp: _timestamp_pb2.Timestamp
     car: str
     seq: int
@@ -782,7 +790,8 @@ class Supervision(_message.Message):
     missing: _containers.ScalarMap[str, str]
     session: str
     groups: _containers.ScalarMap[str, str]
-    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., state: _Optional[str] = ..., host: _Optional[str] = ..., pid: _Optional[int] = ..., uptime_s: _Optional[float] = ..., fleet_file: _Optional[str] = ..., directory: _Optional[str] = ..., processes: _Optional[_Iterable[_Union[Supervised, _Mapping]]] = ..., became: _Optional[_Mapping[str, str]] = ..., missing: _Optional[_Mapping[str, str]] = ..., session: _Optional[str] = ..., groups: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    colors: _containers.ScalarMap[str, str]
+    def __init__(self, stamp: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., car: _Optional[str] = ..., seq: _Optional[int] = ..., boot_id: _Optional[str] = ..., state: _Optional[str] = ..., host: _Optional[str] = ..., pid: _Optional[int] = ..., uptime_s: _Optional[float] = ..., fleet_file: _Optional[str] = ..., directory: _Optional[str] = ..., processes: _Optional[_Iterable[_Union[Supervised, _Mapping]]] = ..., became: _Optional[_Mapping[str, str]] = ..., missing: _Optional[_Mapping[str, str]] = ..., session: _Optional[str] = ..., groups: _Optional[_Mapping[str, str]] = ..., colors: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class DownCommand(_message.Message):
     __slots__ = ("sender", "kind", "id")

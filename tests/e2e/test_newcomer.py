@@ -15,6 +15,7 @@ from typing import Final
 import pytest
 
 from tests.e2e.test_wheel import Environment
+from tests.support.message_length import too_long
 from tests.support.processes import wait_for
 
 ROOT: Final = Path(__file__).parents[2]
@@ -82,6 +83,7 @@ class Newcomer:
         done = self._run(command)
         assert done.returncode in (0, DIFFERENCES.get(command)), (command, done.stdout, done.stderr)
         assert "Traceback" not in done.stderr, done.stderr
+        assert too_long(done.stderr) == [], command
         return done.stdout
 
     def succeeds(self, command: str) -> bool:

@@ -18,6 +18,7 @@ from click.testing import CliRunner, Result
 
 from fleet import cli
 from tests.fleet.conftest import Cars, running
+from tests.support.message_length import too_long
 from tests.support.ports import free_endpoint
 from tests.support.processes import LONG_S, driving, wait_for
 
@@ -134,6 +135,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     assert told in said.err
     assert said.err.startswith(("fleet: ", "no/such.yaml: error: "))
     assert said.err.count("\n") == 1
+    assert too_long(said.err) == []
     assert said.out == ""
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 from fleet.cli import main
+from tests.support.message_length import too_long
 
 
 def fleet(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -23,5 +24,6 @@ def fleet(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedPr
         try:
             main()
         except SystemExit as ended:
+            assert too_long(err.getvalue()) == [], words
             return subprocess.CompletedProcess(words, int(ended.code or 0), out.getvalue(), err.getvalue())
     raise AssertionError("it ends without an exit code")

@@ -17,6 +17,7 @@ from fleet import cli
 from fleet.client.supervision import ask_status
 from schemas import messages
 from schemas.bus import Bus, BusError, Sample
+from tests.support.message_length import too_long
 from tests.support.processes import GatewayProcess, wait_for
 
 
@@ -38,6 +39,7 @@ def fleet_command(*arguments: str, environment: dict[str, str]) -> "subprocess.C
         except SystemExit as ended:
             code = ended.code
     assert code is None or isinstance(code, int), code
+    assert too_long(stderr.getvalue()) == [], arguments
     stdout.seek(0)
     return subprocess.CompletedProcess(arguments, code or 0, stdout.read(), stderr.getvalue())
 

@@ -28,10 +28,11 @@ from rich.terminal_theme import MONOKAI
 
 import fleet.examples
 from fleet import Reading, Session
-from fleet.replay.colors import color, rgb
+from fleet.replay.colors import rgb
 from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.restart_policy import RunState
 from fleet.supervisor.status_table import Table
+from schemas.colors import car_color, hex_color
 from tests.support.ports import free_endpoint
 
 WIDTH: Final = 960
@@ -101,7 +102,8 @@ class State:
         rows = {car: replace(row) for car, row in sorted(self.rows.items())}
         for row in rows.values():
             row.hold, row.lease = (name.replace(HOST, "laptop") for name in (row.hold, row.lease))
-        supervisor: Any = SimpleNamespace(rows=rows, processes=processes)
+        colors = {car: hex_color(car_color(car, 0)) for car in rows}
+        supervisor: Any = SimpleNamespace(rows=rows, processes=processes, colors=colors)
         return Table(supervisor, Console(file=io.StringIO(), width=COLUMNS)).rendered()
 
 
@@ -161,7 +163,7 @@ class Painter:
         top += 5 * LINE_HEIGHT
         draw.text((left, top), "what the plan decides", DIM, self._bold)
         for number, (car, line) in enumerate(sorted(state.decisions.items()), 1):
-            draw.text((left, top + number * LINE_HEIGHT), line, _mixed(color(car, 0), 0.8, INK), self._bold)
+            draw.text((left, top + number * LINE_HEIGHT), line, _mixed(car_color(car, 0), 0.8, INK), self._bold)
         self._terminal(draw, state, WORLD_HEIGHT + 2 * MARGIN)
         return image
 
@@ -186,9 +188,9 @@ class Painter:
             points = [place(x, y) for _, x, y in trail]
             for number, (one, other) in enumerate(pairwise(points)):
                 share = (number + 1) / len(points)
-                draw.line([one, other], _mixed(color(car, 0), share * 0.8), 6)
+                draw.line([one, other], _mixed(car_color(car, 0), share * 0.8), 6)
         for car, truth in state.truths.items():
-            self._car(draw, place(truth.x_m, truth.y_m), truth, color(car, 0), 0.13 * scale)
+            self._car(draw, place(truth.x_m, truth.y_m), truth, car_color(car, 0), 0.13 * scale)
         small = canvas.resize((size[0] // 2, size[1] // 2), Image.Resampling.LANCZOS)
         image.paste(small, (MARGIN, MARGIN))
         return MARGIN + small.width

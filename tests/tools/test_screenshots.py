@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from fleet.replay import colors, panels
+from schemas.colors import car_color
 from tests.fleet.replay.make_session import make
 from tests.tools.screenshots import NoPicture, Shown, pictures, software_driver
 
@@ -62,7 +63,7 @@ def _is_the_fleet(image: np.ndarray, shown: Shown) -> None:
         assert share(image[:, middle:], lane(colors.STATE_COLORS[state])) > 0.002, state
     for car in ("red", "green", "blue"):
         for half in (image[:, :middle], image[:, middle:]):
-            assert share(half, colors.color(car, 0)) > 0.0001, car
+            assert share(half, car_color(car, 0)) > 0.0001, car
 
 
 def _is_a_car(image: np.ndarray, shown: Shown) -> None:
@@ -73,7 +74,7 @@ def _is_a_car(image: np.ndarray, shown: Shown) -> None:
         assert share(left, lane(colors.STATE_COLORS[state])) > 0.002, state
     assert share(left, lane(0xFF0010FF)) > 0.002, "the LED's lanes are in its colour"
     # 0.00065 seen, less as lines are smoothed.
-    assert share(right, colors.color("blue", 0)) > 0.0002, "distance and battery"
+    assert share(right, car_color("blue", 0)) > 0.0002, "distance and battery"
     assert share(right, (217, 83, 79)) > 0.00005, "the critical threshold"
 
 
@@ -85,7 +86,7 @@ def _is_the_world(image: np.ndarray) -> None:
     ):
         assert share(image, colour) > least, what
     for car in ("red", "green", "blue"):
-        assert share(image, colors.color(car, 0)) > 0.0005, car
+        assert share(image, car_color(car, 0)) > 0.0005, car
 
 
 def test_without_a_driver_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,11 +16,11 @@ import rerun as rr
 import rerun.chunk as rrc
 
 from fleet.replay import panels
-from fleet.replay.colors import OFF, color, rgb
+from fleet.replay.colors import OFF, rgb
 from fleet.replay.rerun.lenses import component, numbers, triples
 from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
 from schemas import keys, messages
-from schemas.colors import Rgb
+from schemas.colors import Rgb, car_color
 from schemas.commands import COMMANDS
 
 TIMELINES: Final = (LOG_TIMELINE, PUBLISH_TIMELINE)
@@ -101,7 +101,7 @@ class Drawing:
 
     def color(self, car: str, index: int) -> Rgb:
         """Return the color of a car."""
-        return self._car_colors.get(car) or color(car, index)
+        return self._car_colors.get(car) or car_color(car, index)
 
     def contents(self) -> panels.Contents:
         """Return the contents of the session so far."""

@@ -17,8 +17,7 @@ import rerun as rr
 import rerun.chunk as rrc
 from mcap.writer import CompressionType, Writer
 
-from fleet.client.supervision import ask_status
-from fleet.fleetfile.fleet_file import read_colors
+from fleet.client.supervision import ask_colors
 from fleet.replay.rerun import blueprint
 from fleet.replay.rerun.drawings import Drawing
 from fleet.replay.rerun.export import APPLICATION
@@ -51,8 +50,7 @@ class Live:
     ) -> None:
         self._bus = bus
         self._fleet = keys.check_name(fleet, "fleet name")
-        files = [Path(each.fleet_file) for each in ask_status(bus, fleet) if each.fleet_file]
-        self._drawing = Drawing(MAX_PATH_POINTS, read_colors(files[0]) if files else None)
+        self._drawing = Drawing(MAX_PATH_POINTS, ask_colors(bus, self._fleet))
         self._last_s = last_s
         self._layout_contents: frozenset[object] = frozenset()
         self._lock = threading.Lock()

@@ -7,6 +7,7 @@ import pytest
 from fleet.client.effects import EFFECTS, STOP_VERBS
 from fleet.client.outcome import STOP_EVIDENCE_S, Progress, Until
 from schemas.commands import COMMANDS
+from tests.support.message_length import MAX_LINES, count_lines
 
 # Each step: ("answer" | "event", phase, worst case); at 1, 2, 3 ... s after asking at 100.
 Steps = list[tuple[str, str, float]]
@@ -180,6 +181,7 @@ def test_the_text_of_each_outcome(verb: str, detail: str, event: tuple[str, str,
         progress = Progress("red", Until.STOPPED, 100.0, verb=verb)
         progress.on_answer(phase, reason, words, 0.0, 101.0)
     assert str(progress.outcome) == f"red: {text}"
+    assert count_lines(str(progress.outcome)) <= MAX_LINES
 
 
 def test_each_verb_has_a_text() -> None:

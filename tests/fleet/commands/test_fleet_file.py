@@ -317,7 +317,7 @@ def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: An
     init.type("arduno")
     init.until('Unknown platform "arduno". Did you mean arduino?')
     init.type("stm32+arm")
-    init.until("its color [#e01b24]: ")
+    init.until("its color [#50c8c8]: ")
     init.type("#FF00aa")
     init.until("silent")
     init.until("its name (- to leave it out) [-]: ")

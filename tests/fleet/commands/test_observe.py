@@ -1,5 +1,6 @@
 """What `fleet list` shows of a car that is not heard, or whose bytes are not those of its platform."""
 
+import sys
 from datetime import UTC, datetime
 from typing import Any
 
@@ -62,3 +63,17 @@ def test_the_table_of_cars_fits_a_terminal(
     assert max(len(header), len(line)) <= int(columns)
     assert {name.upper() for name in CAR_COLUMNS} - set(header.split()) >= left_out
     assert "stale (silent for" in line
+
+
+@pytest.mark.parametrize(("no_color", "dot"), [("", "\x1b[38;5;16m●\x1b[0m "), ("1", "")])
+def test_the_row_of_a_car_has_its_color_on_a_terminal(
+    no_color: str, dot: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NO_COLOR", no_color)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "80")
+    show_table(("car",), [{"car": "red"}], colors=["#010203"])
+    assert capsys.readouterr().out.splitlines()[1] == "red", "a pipe gets no color"
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    show_table(("car",), [{"car": "red"}], colors=["#010203"])
+    assert capsys.readouterr().out.splitlines()[1] == f"{dot}red"

@@ -16,6 +16,7 @@ from fleet.links import FleetLink, SimLink, may_be_same, parse_fleet_link, share
 from gateway.bus import requests
 from gateway.control.estimate import battery
 from gateway.link import BadUrl, parse_url
+from schemas.colors import car_color, hex_color
 from schemas.links import BadLink, parse_link
 from schemas.yaml_document.document import BadFile, schema_of
 
@@ -56,7 +57,7 @@ def test_a_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> Non
     assert list(fleet.cars) == ["red", "green", "blue"]
     red, green, blue = fleet.cars.values()
     assert red.limits == Limits(longest_drive_s=5, battery_low_v=7.2)
-    assert (red.roles, red.color) == (("patrol", "guard"), "#ff0000")
+    assert (red.roles, red.color) == (("patrol", "guard"), hex_color(car_color("red", 0)))
     assert red.capabilities == profile_capabilities("arduino")
     slow = Limits(longest_drive_s=3, battery_low_v=7.2, speed_max=0.5, on_battery_low=BatteryAction.STOP)
     assert green == FleetCar(

@@ -149,7 +149,7 @@ def test_the_rate_is_what_came_over_some_seconds() -> None:
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
 def test_the_table_fits_and_names_every_car(width: int) -> None:
-    spec = FleetSpec(endpoint="tcp/127.0.0.1:7999")
+    spec = FleetSpec(endpoint="tcp/127.0.0.1:7999", colors={"red": "#010203", "green": "#030201"})
     supervisor = Supervisor(spec, "", lambda: spec, lambda event: None)
     for name, kind in (("@hub", ProcessKind.HUB), ("red", ProcessKind.GATEWAY), ("green", ProcessKind.GATEWAY)):
         supervisor.processes.add(name, kind, ())
@@ -165,7 +165,7 @@ def test_the_table_fits_and_names_every_car(width: int) -> None:
     assert all(word in shown for word in ("red", "green", "online", "@hub"))
     assert all(len(line) <= width for line in shown.splitlines())
     header, red, green, *_ = shown.splitlines()
-    assert (red.split()[0], green.split()[0]) == ("red", "green"), "no line is wrapped"
+    assert (red.split()[:2], green.split()[:2]) == (["●", "red"], ["●", "green"]), "no line is wrapped"
     assert ("last event" in header, "Hz" in header) == (width > 80, width > 80)
     assert "battery" in header
     assert "obstacle_av" in green

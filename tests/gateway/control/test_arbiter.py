@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.control.arbiter import MAX_QUEUED_COMMANDS, TABLE, CommandContext, needs, refuse
+from gateway.control.arbiter import MAX_QUEUED_COMMANDS, TABLE, CommandContext, Refusal, needs, refuse
 from gateway.control.commands import (
     Action,
     ChangeSpeed,
@@ -33,6 +33,7 @@ from gateway.control.safety import Estop, Hold, LeaseState
 from gateway.protocol.enums import Light, Mode, Motion, ServoAction, SpeedStep
 from gateway.protocol.frames import ArmSet, ColorLed, General, Ptz
 from gateway.protocol.platforms import parse_platform
+from tests.support.message_length import MAX_LINES, count_lines
 
 NOW = 100.0
 WHATS: list[Action] = [
@@ -133,15 +134,18 @@ PROFILES = {name: parse_platform(name) for name in ("arduino", "raspberry_pi", "
 @pytest.mark.parametrize("sender", SENDERS, ids=lambda sender: sender.kind)
 @pytest.mark.parametrize("what", WHATS, ids=repr)
 def test_every_command_in_every_state(what: Action, sender: Sender) -> None:
-    seen: set[Reason | None] = set()
+    found: set[Refusal | None] = set()
     for take in (False, True):
         command = Command("c", "verb", sender, what, take=take)
         for at in situations():
             refusal = refuse(command, at)
-            seen.add(refusal and refusal[0])
+            found.add(refusal)
             if refusal is not None:
                 assert at.car in refusal[1] or refusal[0] in (Reason.UNSUPPORTED, Reason.HELD, Reason.BATTERY_LOW)
             _check(command, at, None if refusal is None else refusal[0])
+    printed = ["fleet: red: refused: {1} [{0}]".format(*each) for each in found if each]
+    assert [text for text in printed if count_lines(text) > MAX_LINES] == []
+    seen = {each and each[0] for each in found}
     if isinstance(what, Drive) and what.motion is not Motion.STOP:
         every = {None, *(Reason.ESTOPPED, Reason.LEASED, Reason.BATTERY_LOW, Reason.LINK_DOWN, Reason.WRONG_MODE)}
         assert seen == (every | {Reason.HELD} if sender.kind is SenderKind.COORDINATOR else every)

@@ -33,6 +33,7 @@ from gateway.protocol.enums import Mode, Motion
 from gateway.protocol.frames import ColorLed
 from gateway.protocol.platforms import parse_platform
 from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench
+from tests.support.message_length import MAX_LINES, count_lines
 
 LEAD, PERSON, SCRIPT, COORDINATOR = SenderKind
 NOW = 100.0
@@ -128,6 +129,7 @@ def test_every_rank_every_action_every_state(who: str, table: str) -> None:
     people = NO_PEOPLE if listed is None else People.parse(":".join(filter(None, each)) for each in listed.items())
     sender = people.ranked(SENDERS[who])
     seen: set[Reason | None] = set()
+    texts: set[str] = set()
     for estops, hold, pauses, lease, loan in itertools.product(ESTOPS, HOLDS, PAUSES, LEASES, LOANS):
         if sum(map(bool, (estops, hold, pauses, lease, loan))) > 3:
             continue
@@ -139,7 +141,10 @@ def test_every_rank_every_action_every_state(who: str, table: str) -> None:
             assert reason == expected(action, sender, listed, at), (action, sender, at)
             assert reason in (None, Reason.BAD_VALUE, Reason.LEASED) or words[-1] == "."
             seen.add(reason)
+            texts.add(words)
     assert seen >= {None, Reason.ESTOPPED, Reason.HELD if who == "plan" else None}
+    printed = [f"fleet: red: refused: {each} [{Reason.NOT_ALLOWED}]" for each in texts]
+    assert [text for text in printed if count_lines(text) > MAX_LINES] == []
 
 
 def expected(action: str, sender: Sender, listed: dict[str, str] | None, at: CommandContext) -> Reason | None:

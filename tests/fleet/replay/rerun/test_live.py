@@ -77,12 +77,11 @@ def viewers(process: GatewayProcess) -> list[psutil.Process]:
     return [each for each in below if each.name().startswith("rerun")]
 
 
-def test_cars_have_the_colors_of_the_running_fleets_file(tmp_path: Path) -> None:
-    file, key = tmp_path / "fleet.yaml", "fleet/@supervisor/status"
-    file.write_text("cars: {red: {link: COM1, color: '#010203'}}\n", encoding="utf-8")
+def test_cars_have_the_colors_of_the_running_fleet(tmp_path: Path) -> None:
+    key = "fleet/@supervisor/status"
 
     def answer(query: zenoh.Query) -> bool:
-        reply_message(query, key, pb.Supervision(fleet_file=str(file)), as_json=False)
+        reply_message(query, key, pb.Supervision(colors={"red": "#010203"}), as_json=False)
         return True
 
     endpoint = free_endpoint()

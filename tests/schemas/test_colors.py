@@ -1,0 +1,12 @@
+"""A color has a name or #rrggbb, and a car has one color in every view."""
+
+from schemas.colors import car_color, format_color, hex_color, parse_color
+
+
+def test_a_color_is_read_as_it_is_written() -> None:
+    assert [format_color(parse_color(text)) for text in ("red", "#ff8000", "ff8000")] == ["red", "#ff8000", "#ff8000"]
+
+
+def test_a_car_has_the_color_of_its_name_or_one_by_its_place() -> None:
+    assert car_color("red", 0) == car_color("red", 5)
+    assert len({hex_color(car_color(f"car{index}", index)) for index in range(6)}) == 6
