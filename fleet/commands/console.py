@@ -123,7 +123,9 @@ examples:
     show_default=True,
     help="The file that the page Set up writes links into.",
 )
-@click.option("--parent", "starter", type=int, hidden=True, help="End with this process, which started this one.")
+@click.option(
+    "--parent", "starter", metavar="PID", type=int, hidden=True, help="End with this process, which started this one."
+)
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @bus_options
 def serve_console(

@@ -50,7 +50,9 @@ a plan:
     metavar="NAME",
     help="Phase and rules outlive the coordinator within one run (of fleet up).",
 )
-@click.option("--parent", "starter", type=int, hidden=True, help="End with this process, which started this one.")
+@click.option(
+    "--parent", "starter", metavar="PID", type=int, hidden=True, help="End with this process, which started this one."
+)
 @json_option
 @bus_options
 def run(

@@ -118,7 +118,9 @@ The quota does not remove marked sessions."""
 @click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
 @connect_option()
 @fleet_option()
-@click.option("--parent", "starter", type=int, hidden=True, help="End with this process, which started this one.")
+@click.option(
+    "--parent", "starter", metavar="PID", type=int, hidden=True, help="End with this process, which started this one."
+)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object per line: when ready, and at the end.")
 def run(
     place: Path,

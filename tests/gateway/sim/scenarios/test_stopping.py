@@ -14,7 +14,7 @@ from gateway.sim.model.objects import Lamp
 from gateway.sim.model.world import World
 from tests.gateway.sim.strangers import FAN, MODE00, RUN, STOP, VirtualStranger, opening, opening_s, virtual
 
-MOMENTS = 200
+MOMENTS = 100
 WIRE = 0.02
 REPORT = 0.04
 NO_ECHO = 1.0
@@ -164,16 +164,26 @@ async def stop(car: VirtualStranger, recipe: tuple[tuple[float, bytes], ...]) ->
     return off_at - begun
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-async def test_a_stop_begun_at_a_random_moment(case: Case) -> None:
+async def stops_begun_at_random_moments(case: Case, count: int) -> None:
     moments = random.Random(str(case))
     worst = 0.0
-    for seed in range(MOMENTS):
+    for seed in range(count):
         car = virtual(case.platform, world=case.world(), tcp=case.tcp, seed=seed)
         await case.load(car, moments)
         worst = max(worst, await stop(car, RECIPES[case.recipe]))
     print(f"{case}: {worst:.2f} s")
     assert case.worst_at_least <= worst <= case.bound
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+async def test_a_stop_begun_at_a_random_moment(case: Case) -> None:
+    await stops_begun_at_random_moments(case, MOMENTS)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("case", CASES, ids=str)
+async def test_a_stop_begun_at_many_random_moments(case: Case) -> None:
+    await stops_begun_at_random_moments(case, 4 * MOMENTS)
 
 
 async def test_a_stop_and_mode00_every_1_1_s_keep_a_car_that_opens_a_mode_driving() -> None:
