@@ -8,11 +8,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from schemas.bus import Sample
 from tests.support.ports import free_endpoint
+from tests.support.processes import wait_for
 from tests.support.up import Up
 
 CARS = 100
@@ -46,23 +48,44 @@ def hundred(directory: Path, seconds: float) -> Iterator[Up]:
         yield up
 
 
-def moving(up: Up) -> list[str]:
+def moving(up: Up) -> dict[str, str]:
     """The cars that are not known to stand, and what is known of each."""
     states = {
         each.key.split("/")[1]: each.message()
         for each in up.bus.query("fleet/*/state/safety", timeout_s=5.0)
         if isinstance(each, Sample)
     }
-    missing = [f"{CARS - len(states)} cars did not answer"] if len(states) < CARS else []
-    return missing + [str(state) for state in states.values() if state.motors != "off"]  # type: ignore[attr-defined]
+    missing = {"": f"{CARS - len(states)} cars did not answer"} if len(states) < CARS else {}
+    return missing | {car: str(state) for car, state in states.items() if state.motors != "off"}  # type: ignore[attr-defined]
 
 
-def wait_until_at_rest(up: Up, seconds: float) -> None:
-    """Look once a second: to answer costs a hundred gateways what they need to start."""
+def wait_until_at_rest(up: Up, seconds: float, wedged: int = 0) -> None:
+    """Look once a second: to answer costs a hundred gateways what they need to start.
+
+    wedged: number of cars that may show no stop, if they stand and their gateways say so.
+    """
     deadline = time.monotonic() + seconds
     while left := moving(up):
-        assert time.monotonic() < deadline, f"{len(left)} are not at rest:\n" + "\n".join(left)
+        if time.monotonic() > deadline:
+            words = f"{len(left)} are not at rest:\n" + "\n".join(left.values())
+            assert len(left) <= wedged, words
+            assert all('trust: "unproven"' in state and stands(up, car) for car, state in left.items()), words
+            print("wedged:", *left)
+            return
         time.sleep(1.0)
+
+
+def stands(up: Up, car: str) -> bool:
+    """Whether the car stands in truth."""
+    truths: list[bool] = []
+
+    def on_truth(sample: Sample) -> None:
+        truth: Any = sample.message()
+        truths.append(truth.motor_left == truth.motor_right == 0)
+
+    with up.bus.subscribe(f"fleet/{car}/sim/truth", on_truth):
+        wait_for(lambda: len(truths) > 5, f"the truth of {car}")
+    return all(truths)
 
 
 def restarts(up: Up) -> dict[str, str]:
@@ -93,7 +116,9 @@ def test_a_hundred_cars_come_to_rest_and_none_is_restarted_when_the_hub_or_the_m
         for what, pids in (("hub", [up.hub()]), ("machine", [up.process.pid, *up.left()])):
             stand(pids)
             time.sleep(SETTLED_S)
-            wait_until_at_rest(up, BUSY_S)
+            # One of 300 cars showed no stop from then on: likely it lost half a frame while the simulator was late, and
+            # was wedged (docs/reference/protocol.md#hazards). No gateway can mend this.
+            wait_until_at_rest(up, BUSY_S, wedged=2)
             print(f"{what} stood for {STANDS_S:g} s, restarts: {restarts(up)}")
             assert restarts(up) == {}
         assert up.fleet("down").returncode == 0
