@@ -98,12 +98,7 @@ class Demo:
         return self.wait_until(lambda: getattr(self.truth[car], field_name) == value)
 
 
-@click.command(
-    epilog="""\b
-examples:
-  fleet demo
-  fleet demo --json --no-view"""
-)
+@click.command(epilog="\b\nexamples:\n  fleet demo\n  fleet demo --json --no-view")
 @click.option(
     "--sessions",
     "out",

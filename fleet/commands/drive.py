@@ -55,12 +55,7 @@ def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, 
     end_with(outcomes, as_json=as_json)
 
 
-@click.command(
-    epilog="""\b
-example:
-  fleet mode red tracking
-  fleet mode red,blue manual"""
-)
+@click.command(epilog="\b\nexample:\n  fleet mode red tracking\n  fleet mode red,blue manual")
 @cars_argument
 @click.argument("mode", type=Choice("mode", Mode))
 @take_option
@@ -74,12 +69,7 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
     carry_out(client, mode_request(mode), cars, take=take, as_json=as_json)
 
 
-@click.command(
-    epilog="""\b
-examples:
-  fleet stop
-  fleet stop red blue"""
-)
+@click.command(epilog="\b\nexamples:\n  fleet stop\n  fleet stop red blue")
 @any_cars_argument
 @json_option
 @with_client
@@ -91,12 +81,7 @@ def stop(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
     end_with_any(client.ask(stop_request(), _named(client, cars)), as_json=as_json)
 
 
-@click.command(
-    epilog="""\b
-examples:
-  fleet estop
-  fleet estop red --why 'someone is on the track'"""
-)
+@click.command(epilog="\b\nexamples:\n  fleet estop\n  fleet estop red --why 'someone is on the track'")
 @any_cars_argument
 @click.option("--why", default="", metavar="WORDS", help="What happened, for the record.")
 @json_option

@@ -174,12 +174,7 @@ def _fields(each: "ReadingDifference", start_ns: int) -> dict[str, Any]:
     }
 
 
-@click.command(
-    epilog="""\b
-example:
-  fleet sessions vector --car red --from 10s --to 20s --out tracking.jsonl
-""",
-)
+@click.command(epilog="\b\nexample:\n  fleet sessions vector --car red --from 10s --to 20s --out tracking.jsonl\n")
 @session_argument
 @click.option(
     "--car",

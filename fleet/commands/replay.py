@@ -21,12 +21,7 @@ if TYPE_CHECKING:
     from fleet.replay.rerun.export import Part
 
 
-@click.command(
-    epilog="""\b
-examples:
-  fleet replay
-  fleet replay latest~1 --car red --from=-60s --save red.rrd"""
-)
+@click.command(epilog="\b\nexamples:\n  fleet replay\n  fleet replay latest~1 --car red --from=-60s --save red.rrd")
 @session_argument
 @car_option
 @from_option

@@ -89,11 +89,7 @@ def watched(label: str, total: int | None) -> Callable[[Iterable[T]], Iterator[T
 
 @sessions.command(
     "list",
-    epilog="""\b
-examples:
-  fleet sessions list
-  fleet sessions list /media/disk/sessions --json
-""",
+    epilog="\b\nexamples:\n  fleet sessions list\n  fleet sessions list /media/disk/sessions --json\n",
 )
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
@@ -140,12 +136,7 @@ def _size(count: int) -> str:
     return f"{size:.1f} GB"
 
 
-@sessions.command(
-    epilog="""\b
-example:
-  fleet sessions info
-""",
-)
+@sessions.command(epilog="\b\nexample:\n  fleet sessions info\n")
 @session_argument
 @json_option
 def info(session: Path, *, as_json: bool) -> None:
@@ -190,12 +181,7 @@ def _say_contents(about: "SessionSummary") -> None:
         click.echo(f"  {key.ljust(width)}  {count:8}{rate}")
 
 
-@sessions.command(
-    epilog="""\b
-example:
-  fleet sessions verify
-""",
-)
+@sessions.command(epilog="\b\nexample:\n  fleet sessions verify\n")
 @session_argument
 @json_option
 def verify(session: Path, *, as_json: bool) -> None:
@@ -217,12 +203,7 @@ def verify(session: Path, *, as_json: bool) -> None:
     raise SystemExit(0 if verdict.whole else 1)
 
 
-@sessions.command(
-    epilog="""\b
-example:
-  fleet sessions recover --out rescued
-""",
-)
+@sessions.command(epilog="\b\nexample:\n  fleet sessions recover --out rescued\n")
 @session_argument
 @out_option
 def recover(session: Path, out: Path | None) -> None:
@@ -296,11 +277,7 @@ def part_of(session: "Session", start: str | None, end: str | None, cars: Iterab
 
 
 @sessions.command(
-    epilog="""\b
-examples:
-  fleet sessions export --csv tables
-  fleet sessions export --parquet tables
-""",
+    epilog="\b\nexamples:\n  fleet sessions export --csv tables\n  fleet sessions export --parquet tables\n",
 )
 @session_argument
 @click.option("--csv", "csv", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Write CSV here.")

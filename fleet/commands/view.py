@@ -26,13 +26,7 @@ LAYOUT_DELAY_S: Final = 1.5
 """Delay of the first layout, so that the tabs do not change while the user clicks on them."""
 
 
-@click.command(
-    epilog="""\b
-examples:
-  fleet view
-  fleet view --web
-  fleet view --save now.rrd --for 30s"""
-)
+@click.command(epilog="\b\nexamples:\n  fleet view\n  fleet view --web\n  fleet view --save now.rrd --for 30s")
 @click.option("--web", is_flag=True, help="Serve the viewer as a web page on this machine only, and print its address.")
 @click.option(
     "--save",
