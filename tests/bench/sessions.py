@@ -6,7 +6,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import rerun.chunk as rrc
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -15,7 +14,7 @@ from fleet.recording.tools.export import export
 from fleet.recording.tools.table_formats import FORMATS
 from schemas import messages
 from tests.bench.measured import Measured, Scale, in_turns
-from tests.bench.replaying import SECONDS, SHORTEST_S, write_session
+from tests.bench.replaying import SECONDS, SHORTEST_S, import_s, write_session
 from tests.bench.stage import scratch
 from tests.fleet.replay.make_session import START_NS
 
@@ -86,13 +85,7 @@ def _tables(directory: Path, name: str, source: Path, count: int, scale: Scale) 
         assert sum(done.rows.values()) == count
         return took / count * 1e6
 
-    def floor() -> float:
-        began = perf_counter()
-        stream = rrc.McapReader(source).stream()
-        stream.write_rrd(directory / "floor.rrd", application_id="floor", recording_id="floor")
-        return (perf_counter() - began) / count * 1e6
-
-    mine, least = in_turns(scale, ours, floor)
+    mine, least = in_turns(scale, ours, lambda: import_s(source, directory) / count * 1e6)
     # The goal of twice the importer is the .rrd's (replaying.py); what a table costs beside it is only told.
     return Measured(f"export a message to {name}", tuple(mine), tuple(least), "us", None)
 

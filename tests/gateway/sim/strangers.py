@@ -2,8 +2,9 @@
 
 import asyncio
 import random
+import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import serial
 
@@ -22,6 +23,14 @@ WHISTLE = b"$0,0,1,0,0,0,0,0,0#"
 FAN = b"$0,0,0,0,0,0,0,1,0#"
 PTZ90 = b"$4WD,PTZ90#"
 MODE00 = b"$4WD,MODE00#"
+PATIENCE = 40.0
+
+
+async def until(so: Any, what: str) -> None:
+    end = time.monotonic() + PATIENCE
+    while not so():
+        assert time.monotonic() < end, f"never: {what}"
+        await asyncio.sleep(0.005)
 
 
 def opening(mode: int) -> bytes:

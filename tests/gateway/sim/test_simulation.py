@@ -26,17 +26,8 @@ from gateway.sim.model.faulty_link import Direction
 from gateway.sim.simulation import Simulation
 from gateway.sim.truth_publisher import HUB_RETRY_DELAY_S, TruthPublisher
 from schemas.bus import Bus, Sample
-from tests.gateway.sim.strangers import FAN, MODE00, RUN, STOP, opening
+from tests.gateway.sim.strangers import FAN, MODE00, PATIENCE, RUN, STOP, opening, until
 from tests.support.ports import free_endpoint
-
-PATIENCE = 40.0
-
-
-async def until(so: Any, what: str) -> None:
-    end = time.monotonic() + PATIENCE
-    while not so():
-        assert time.monotonic() < end, f"never: {what}"
-        await asyncio.sleep(0.005)
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import socket
 import time
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import serial
@@ -16,16 +15,7 @@ from gateway.sim.faults import Fault, FaultKind, Press
 from gateway.sim.model.faulty_link import Direction, Flood
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.simulation import Simulation
-from tests.gateway.sim.strangers import RUN, STOP, opening
-
-PATIENCE = 40.0
-
-
-async def until(so: Any, what: str) -> None:
-    end = time.monotonic() + PATIENCE
-    while not so():
-        assert time.monotonic() < end, f"never: {what}"
-        await asyncio.sleep(0.005)
+from tests.gateway.sim.strangers import PATIENCE, RUN, STOP, opening, until
 
 
 @pytest.fixture
