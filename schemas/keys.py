@@ -84,16 +84,17 @@ def operator_token(fleet: str, sender: str) -> str:
     return f"{fleet}/{OPERATOR}/{sender}"
 
 
-def recorded(fleet: str) -> tuple[str, ...]:
+def recorded_keys(fleet: str) -> tuple[str, ...]:
     """Return the key expressions of a recorder's subscriptions. `**` does not match chunks that begin with @."""
     services = (f"{fleet}/{service}/**" for service in (COORDINATOR, RECORDER, SUPERVISOR, SIMULATOR))
     return (f"{fleet}/**", *services, f"{fleet}/*/@cmd/drive")
 
 
 def expand(expression: str, fleet: str = DEFAULT_FLEET) -> str:
-    """Expand a short form: `red` is every reading of red; `red/sensor/range`, `*/sensor/battery` get the fleet.
+    """Return the whole key expression of a short form. Raises BadKey.
 
-    An expression that begins with the fleet's name (or with `**`) stays as it is. Raises BadKey.
+    `red` stands for every reading of red. The fleet's name is put before `red/sensor/range` and `*/sensor/battery`. An
+    expression that begins with the fleet's name or with `**` stays as it is.
     """
     text = expression.strip("/")
     if not text or "//" in text or set(text) & set("#? \t\n"):

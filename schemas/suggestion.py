@@ -27,13 +27,10 @@ def near_names(wrong: str, names: Iterable[str]) -> list[str]:
     """Return the names that are likely meant, the likeliest first."""
     known, word = list(names), wrong.lower()
     begun = [name for name in known if len(word) > 1 and name.lower().startswith(word)]
-    part = [name for name in known if len(word) >= _MIN_PART_LENGTH and _begins_part(word, name.lower())]
+    parts = {name: _NO_WORD.split(name.lower()) for name in known if len(word) >= _MIN_PART_LENGTH}
+    part = [name for name, words in parts.items() if any(each.startswith(word) for each in words)]
     longer = [name for name in known if name.lower() == _NO_WORD.split(word)[0]]
     return list(dict.fromkeys([*misspelled(wrong, known), *begun, *part, *longer]))
-
-
-def _begins_part(word: str, name: str) -> bool:
-    return any(part.startswith(word) for part in _NO_WORD.split(name))
 
 
 def _faults(word: str, name: str) -> int:

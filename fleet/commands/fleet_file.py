@@ -166,12 +166,8 @@ def write(path: Path, text: str) -> None:
         raise click.ClickException(f"{path} cannot be written: {error.strerror}") from None
 
 
-def _default_name(index: int) -> str:
-    return DEFAULT_CAR_NAMES[index] if index < len(DEFAULT_CAR_NAMES) else f"car{index + 1}"
-
-
 def _new_car(index: int, link: str, platform: str, words: str = "") -> NewCar:
-    name = _default_name(index)
+    name = DEFAULT_CAR_NAMES[index] if index < len(DEFAULT_CAR_NAMES) else f"car{index + 1}"
     return NewCar(name, link, platform, default_color(name, index), words)
 
 

@@ -106,16 +106,5 @@ def line(decision: Decision) -> str:
 
 
 def _json(decision: Decision) -> str:
-    return json.dumps(
-        {
-            "subject": decision.subject,
-            "kind": decision.kind,
-            "decided": decision.decided,
-            "car": decision.car,
-            "role": decision.role,
-            "mode": decision.mode,
-            "why": decision.why,
-            "readings": decision.readings,
-            "would_change": decision.would_change,
-        }
-    )
+    names = ("subject", "kind", "decided", "car", "role", "mode", "why", "readings", "would_change")
+    return json.dumps({name: getattr(decision, name) for name in names})

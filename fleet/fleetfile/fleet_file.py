@@ -1,7 +1,7 @@
 """Reads a fleet file: the cars, their platforms, capabilities and limits. All faults are reported at once.
 
-A car overrides its type, a type overrides the defaults; lists replace, `limits` merge. link_check.py checks whether the
-cars are there; only the file itself is opened here.
+The fields of a car override those of its type, which override the defaults. A list replaces the list below it;
+`limits` are merged field by field. This module opens no link: link_check.py checks whether the cars are there.
 """
 
 from collections.abc import Iterator, Mapping
@@ -54,8 +54,8 @@ class FleetCar:
     """One car with its type and the defaults resolved.
 
     link, platform: values for `gateway run --link` and `--platform`. color: #rrggbb. capabilities: words for modes and
-    parts; for platform `auto` by default those of all platforms, until its gateway detects the platform. roles: the
-    roles that it may take; None: any.
+    parts. A car of platform `auto` has those of all platforms until its gateway detects the platform. roles: the roles
+    that it may take; None: any.
     """
 
     name: str
@@ -83,10 +83,9 @@ class FleetPerson:
 class FleetFile:
     """A fleet file with resolved cars and absolute paths.
 
-    endpoint: of the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: none.
-    console_port: of the web page; 0: the default.
-    groups: the cars of each. people: who may drive; None: everyone.
-    unlinked: cars without a link, if allowed.
+    endpoint: the bus; None: FLEET_ENDPOINT, or loopback. quota: maximum size of all sessions, as 20GB; empty: no limit.
+    console_port: the port of the web page; 0: the default. groups: cars by group. people: the only ones who may drive;
+    None: everyone may. unlinked: cars without a link, if they are allowed.
     """
 
     name: str
@@ -177,7 +176,7 @@ def _resolve_car(name: str, car: Mapping[str, Any], index: int) -> FleetCar:
         link=car.get("link", ""),
         platform=platform,
         color=hex_color(parse_color(car["color"])) if "color" in car else default_color(name, index),
-        capabilities=frozenset(word for word in profile_capabilities(platform) if not _is_listed(word, car)),
+        capabilities=frozenset(word for word in profile_capabilities(platform) if not _is_without(word, car)),
         limits=Limits(**dict(limits)),
         roles=tuple(car["roles"]) if "roles" in car else None,
     )
@@ -195,7 +194,7 @@ def _resolve_people(file: FileEntry) -> Mapping[str, FleetPerson]:
     return MappingProxyType({name: FleetPerson(person.rank, cars(person)) for name, person in file.people.items()})
 
 
-def _is_listed(word: str, car: Mapping[str, Any]) -> bool:
+def _is_without(word: str, car: Mapping[str, Any]) -> bool:
     """Return True if the car is without this mode or part. `servo` stands for all servos."""
     without = car.get("without", ())
     return word in without or ("servo" in without and word.startswith("servo_"))

@@ -243,19 +243,11 @@ def _drive(message: Any, longest_s: float, car: str) -> Action:
     return Drive(_word("motion", message.motion, Motion), duration_s)
 
 
-def _mode(message: Any) -> Action:
-    return SetMode(_word("mode", message.mode, Mode))
-
-
 def _led(message: Any) -> Action:
     missing = [name for name in "rgb" if not message.HasField(name)]
     if missing:
         raise ValueError(f"{', '.join(missing)} is missing: r, g and b are needed, 0..255 each")
     return _checked(ColorLed(message.r, message.g, message.b))
-
-
-def _light(message: Any) -> Action:
-    return OneShot(General(Motion.STOP, light=_word("light", message.light, Light)))
 
 
 _SERVO_ACTIONS: Final = {
@@ -281,10 +273,6 @@ def _servo(message: Any) -> Action:
     return OneShot(General(Motion.STOP, servo=ServoAction(f"{servo}_{message.action}")))
 
 
-def _arm(message: Any) -> Action:
-    return _checked(ArmSet(tuple(message.joint_deg)))
-
-
 def _fan(message: Any) -> Action:
     if message.state not in ("", "on", "off"):
         raise ValueError(f"state {message.state!r}: allowed are on, off, or none to toggle")
@@ -307,11 +295,11 @@ def _checked(frame: ColorLed | Ptz | ArmSet) -> OneShot:
 
 
 _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
-    "mode": _mode,
+    "mode": lambda message: SetMode(_word("mode", message.mode, Mode)),
     "led": _led,
-    "light": _light,
+    "light": lambda message: OneShot(General(Motion.STOP, light=_word("light", message.light, Light))),
     "servo": _servo,
-    "arm": _arm,
+    "arm": lambda message: _checked(ArmSet(tuple(message.joint_deg))),
     "whistle": lambda _: OneShot(General(Motion.STOP, whistle=True)),
     "speed": lambda message: ChangeSpeed(_word("step", message.step, SpeedStep)),
     "fan": _fan,

@@ -19,7 +19,7 @@ from bleak.backends.device import BLEDevice
 from bleak.backends.scanner import AdvertisementData
 from bleak.backends.service import BleakGATTService
 
-from gateway.link.base import MAX_BUFFERED_BYTES, Busy, CannotOpen, Link, LinkLost
+from gateway.link.base import MAX_BUFFERED_BYTES, BufferedLink, Busy, CannotOpen, Link, LinkLost
 from schemas.links import BleUrl
 from schemas.process.stdio import printable
 
@@ -55,20 +55,18 @@ preference."""
 UART_SERVICES: Final = tuple(service for services, _ in _UARTS for service in services)
 
 
-class BleLink(Link):
+class BleLink(BufferedLink):
     """One connection, created by `open_ble`."""
 
     def __init__(self, url: BleUrl) -> None:
+        super().__init__()
         self._url = url
         self._client: BleakClient | None = None
         self._to_car: BleakGATTCharacteristic | None = None
         self._claim: socket.socket | None = None
-        self._data = bytearray()
-        self._came = asyncio.Event()
         self._writing = asyncio.Lock()
         self._pieces: asyncio.Task[None] | None = None
         self._closing: asyncio.Task[None] | None = None
-        self._lost: str | None = None
         self._stage = "Bluetooth does not answer: is its service running?"
 
     # ------------------------------------------------------------------ opening
@@ -162,18 +160,7 @@ class BleLink(Link):
         if self._lost is not None:
             raise CannotOpen(f"{self._lost}, while it was opened")
 
-    # ------------------------------------------------------------------ reading and writing
-
-    async def read(self) -> bytes:
-        """Return the next bytes as they arrived; raise LinkLost."""
-        while not self._data:
-            if self._lost is not None:
-                raise LinkLost(self._lost)
-            self._came.clear()
-            await self._came.wait()
-        data = bytes(self._data)
-        self._data.clear()
-        return data
+    # ------------------------------------------------------------------ writing
 
     async def write(self, data: bytes) -> None:
         """Send the frame in pieces, with nothing between them; raise LinkLost, after which some may have been sent.
@@ -308,14 +295,11 @@ def _claim(url: BleUrl, address: str) -> socket.socket | None:
 
 
 def _not_found(url: BleUrl, others: Mapping[str, str]) -> str:
-    hint = " (macOS has no addresses: use the UUID of `fleet scan`, or ble://name=)" if _is_mac_without(url) else ""
+    no_addresses = sys.platform == "darwin" and url.address is not None and ":" in url.address
+    hint = " (macOS has no addresses: use the UUID of `fleet scan`, or ble://name=)" if no_addresses else ""
     there = _listed(f"{address} ({name})" for address, name in others.items())
     found = f"Found: {there}." if there else "No other car module was found."
     return f"no such device found{hint}. Is it on, in range, and no phone connected to it? {found}"
-
-
-def _is_mac_without(url: BleUrl) -> bool:
-    return sys.platform == "darwin" and url.address is not None and ":" in url.address
 
 
 def _listed(items: Iterable[str]) -> str:

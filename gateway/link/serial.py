@@ -227,9 +227,10 @@ class SerialLink(Link):
             path = found.device
         check_same_device(self._url, path, first, found)
         try:
-            # `exclusive` locks the port against a second gateway.
+            # `exclusive` locks the port against a second gateway. Windows always does, and pyserial refuses it there.
+            exclusive = os.name == "posix" or None
             port = serial.Serial(
-                path, self._url.baud, timeout=None, write_timeout=SERIAL_WRITE_TIMEOUT_S, exclusive=_exclusive()
+                path, self._url.baud, timeout=None, write_timeout=SERIAL_WRITE_TIMEOUT_S, exclusive=exclusive
             )
         except _NOT_OPENED as error:
             kind = Busy if getattr(error, "errno", None) in _BUSY else CannotOpen
@@ -353,8 +354,3 @@ def _group(path: str) -> str:
     except (ImportError, OSError, KeyError):
         return "Ask the administrator for access to the port."
     return f"It belongs to group {group}: `sudo usermod -aG {group} $USER`, then log in again"
-
-
-def _exclusive() -> bool | None:
-    # Ports are always exclusive on Windows, where pyserial refuses the argument.
-    return True if os.name == "posix" else None

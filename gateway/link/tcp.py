@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from typing import Any, Final
 
-from gateway.link.base import CLOSE_S, MAX_BUFFERED_BYTES, CannotOpen, Link, LinkLost
+from gateway.link.base import CLOSE_S, MAX_BUFFERED_BYTES, BufferedLink, CannotOpen, Link, LinkLost
 from schemas.links import TcpUrl
 
 # A vanished peer is noticed within about five seconds, where the system has these options.
@@ -21,28 +21,20 @@ _lookups: Final[dict[TcpUrl, "Future[_Addresses]"]] = {}
 """The last name lookup for each link."""
 
 
-class TcpLink(asyncio.Protocol, Link):
+class TcpLink(asyncio.Protocol, BufferedLink):
     """One connection, created by `open_tcp`."""
 
     def __init__(self, url: TcpUrl) -> None:
+        super().__init__()
         self._url = url
         self._transport: asyncio.Transport | None = None
-        self._data = bytearray()
-        self._came = asyncio.Event()
         self._ended = asyncio.Event()
-        self._lost: str | None = None
         self._has_received = False
         self._paused = False
 
     async def read(self) -> bytes:
         """Return the next bytes as they arrived; raise LinkLost."""
-        while not self._data:
-            if self._lost is not None:
-                raise LinkLost(self._lost)
-            self._came.clear()
-            await self._came.wait()
-        data = bytes(self._data)
-        self._data.clear()
+        data = await super().read()
         if self._paused and self._transport is not None and not self._transport.is_closing():
             self._paused = False
             self._transport.resume_reading()

@@ -234,7 +234,8 @@ async def _serve(
     try:
         for car in simulation.cars.values():
             _print_link(car)
-            car.on_renamed, car.on_ended = _print_link, _print_ended
+            car.on_renamed = _print_link
+            car.on_ended = lambda car: print_json({"car": car.spec.name, "replay": "ended"})
         tasks.append(loop.create_task(serve_commands(simulation)))
         tasks[-1].add_done_callback(end)
         await ended.wait()
@@ -253,10 +254,6 @@ def _print_link(car: SimCar) -> None:
         print_json({"car": car.spec.name, "platform": car.spec.platform_words, "link": car.url})
     else:
         print_json({"car": car.spec.name, "replay": car.spec.path, "link": car.url})
-
-
-def _print_ended(car: SimCar) -> None:
-    print_json({"car": car.spec.name, "replay": "ended"})
 
 
 async def _run_scheduled(simulation: Simulation, scheduled: Scheduled) -> None:

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+from dataclasses import asdict
 from typing import Final
 
 from gateway.sim.car_spec import BadSpec
@@ -94,31 +95,11 @@ def _truth(simulation: Simulation, name: object) -> dict[str, object]:
     if car is None:
         raise BadSpec(f"car {name!r} is not simulated here: use {', '.join(simulation.cars)}")
     truth, pose = car.truth, car.pose
+    fields: dict[str, object]
     if truth is None or pose is None:
-        assert isinstance(car.firmware, CaptureCar)
-        sent, ignored, rounds = car.firmware.sent_bytes, car.firmware.ignored_bytes, car.firmware.rounds
-        return {
-            "ok": True,
-            "car": name,
-            "sent_bytes": sent,
-            "ignored_bytes": ignored,
-            "rounds": rounds,
-            "lost_bytes": car.lost_bytes,
-        }
-    return {
-        "ok": True,
-        "car": name,
-        "mode": truth.mode.value,
-        "motor_left": truth.motor_left,
-        "motor_right": truth.motor_right,
-        "blocked": truth.blocked,
-        "fan": truth.fan,
-        "led": truth.led,
-        "servo": truth.servo,
-        "speed": truth.speed,
-        "alive": truth.alive,
-        "x_m": pose.x_m,
-        "y_m": pose.y_m,
-        "heading_rad": pose.heading_rad,
-        "lost_bytes": car.lost_bytes,
-    }
+        played = car.firmware
+        assert isinstance(played, CaptureCar)
+        fields = {"sent_bytes": played.sent_bytes, "ignored_bytes": played.ignored_bytes, "rounds": played.rounds}
+    else:
+        fields = {**asdict(truth), **pose._asdict()}
+    return {"ok": True, "car": name, **fields, "lost_bytes": car.lost_bytes}

@@ -130,9 +130,7 @@ class TruthPublisher:
         if truth is None or pose is None:
             return
         message = fleet_v1_pb2.Truth(
-            x_m=pose.x_m,
-            y_m=pose.y_m,
-            heading_rad=pose.heading_rad,
+            **pose._asdict(),
             mode=truth.mode.value,
             motor_left=truth.motor_left,
             motor_right=truth.motor_right,

@@ -1,7 +1,7 @@
 """Reads YAML 1.2 text into a pydantic model and reports all faults at once, each with line and column.
 
-Limits size, depth and aliases, and records the place of each value. messages.py puts faults into words; fleet files and
-plans check their meaning themselves.
+It limits size, depth and aliases. messages.py puts faults into words. What a fleet file or a plan means is checked by
+its own package.
 """
 
 import json
@@ -94,10 +94,10 @@ def _without_titles(part: Any) -> Any:
 def read_yaml(text: str, source: str, model: type[_Model]) -> _Model:
     """Read a model from a text; raises BadFile. `source` is its name in errors, usually the path as typed."""
     document = Document(text, source)
-    errors = document.validate(model)
+    found = document.validate(model)
     document.raise_faults()
-    assert errors is not None  # else there was a problem
-    return errors
+    assert found is not None  # else there was a fault
+    return found
 
 
 def name_special_file(path: Path) -> str:
@@ -167,7 +167,8 @@ class Document:
             root = self._loader.get_single_node()
         except yaml.reader.ReaderError as error:
             line, column = text.count("\n", 0, error.position) + 1, error.position - text.rfind("\n", 0, error.position)
-            words = f"character U+{_code_point(error.character):04X} is not allowed in YAML"
+            code = error.character if isinstance(error.character, int) else ord(error.character)
+            words = f"character U+{code:04X} is not allowed in YAML"
             raise _bad_file(source, words, line, column) from None
         except yaml.MarkedYAMLError as error:
             raise BadFile(source, [_syntax_problem(error)]) from None
@@ -281,7 +282,7 @@ class Document:
         return Problem(mark.line + 1, mark.column + 1, format_place(where, self.tree), words)
 
     def _construct(self, where: Where, key: yaml.Mark | None, node: yaml.Node) -> Any:
-        """Return plain data with all aliases expanded; raises BadFile if there is too much."""
+        """Return plain data with all aliases expanded; raises BadFile if it has too many values or levels."""
         self._places[where] = (key, node)
         self._values += 1
         if self._values > MAX_YAML_VALUES or len(where) > MAX_YAML_DEPTH:
@@ -368,11 +369,6 @@ def _syntax_problem(error: yaml.MarkedYAMLError) -> Problem:
     elif "single document" in (error.context or ""):
         problem = "a second document (`---`). A file has one"
     return Problem(line, column, "", f"this is not YAML: {problem}")
-
-
-def _code_point(character: str | int) -> int:
-    """Return the code point in PyYAML's error, which is a number although its stub says a character."""
-    return character if isinstance(character, int) else ord(character)
 
 
 def _can_encode(text: str) -> bool:

@@ -103,7 +103,9 @@ class Session:
         """Readable segments, in order."""
         if whole:
             numbered = {session_dir.segment(path, number + 1) for number in range(int(there[-1].stem))}
-            if missing := sorted((numbered | _closed_segments(path)) - set(there)):
+            # Only index.json shows that the last segment is missing.
+            closed = {path / one["file"] for one in _indexed_segments(path)}
+            if missing := sorted((numbered | closed) - set(there)):
                 self.damage[path] = f"lacks {len(missing)} of its files, the first is {missing[0].name}"
             given = _json(path / session_dir.SESSION_FILE).get("format")
             if isinstance(given, int) and given > session_dir.FORMAT_VERSION:
@@ -297,11 +299,6 @@ def _recorded(row: Row) -> Recorded:
     return Recorded(
         info.channel.topic, data, message_of(info), info.channel.message_encoding, publish_ns, log_ns, sequence
     )
-
-
-def _closed_segments(path: Path) -> set[Path]:
-    """Return the segments listed in index.json, which alone shows that the last one is missing."""
-    return {path / one["file"] for one in _indexed_segments(path)}
 
 
 def _indexed_segments(path: Path) -> list[dict[str, Any]]:

@@ -130,7 +130,7 @@ class Recorder:
         Raises AnotherRecorder, and OSError if the session cannot be created. A full disk does not raise.
         """
         self._refuse_a_second()
-        for expression in keys.recorded(self._fleet):
+        for expression in keys.recorded_keys(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, SUBSCRIBER_QUEUE_SIZE))
         self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
         self._drops = self._session.drops
@@ -141,7 +141,7 @@ class Recorder:
         self._marks = self._bus.publisher(marks, MARK_TOPIC, keys.RECORDER)
         self._last = self._status()
         self._backfill = Backfill(
-            self._bus, keys.recorded(self._fleet), resumes=bool(self._session.description.continues)
+            self._bus, keys.recorded_keys(self._fleet), resumes=bool(self._session.description.continues)
         )
         self._reader = threading.Thread(target=self._read, name="bus-reader")
         self._writer = threading.Thread(target=self._write, name="mcap-writer")

@@ -3,7 +3,6 @@
 import contextlib
 import shutil
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -37,7 +36,7 @@ def make_room(root: Path, limit_bytes: int, keep: Path) -> tuple[list[Path], int
 
     Spare `keep`, marked sessions, directories of other programs and sessions that cannot be removed.
     """
-    sizes = {session: size(session) for session in _sessions(root)}
+    sizes = {path.parent: size(path.parent) for path in root.glob(f"*/{SESSION_FILE}")}
     over = sum(sizes.values()) - limit_bytes
     removed = []
     for session in sorted(sizes, key=lambda session: session.name):
@@ -51,10 +50,6 @@ def make_room(root: Path, limit_bytes: int, keep: Path) -> tuple[list[Path], int
             removed.append(session)
             over -= sizes[session]
     return removed, max(0, over)
-
-
-def _sessions(root: Path) -> Iterator[Path]:
-    return (path.parent for path in root.glob(f"*/{SESSION_FILE}"))
 
 
 def _may_go(session: Path) -> bool:

@@ -51,7 +51,6 @@ class Drawing:
     def __init__(self, limit: int | None = None, car_colors: Mapping[str, Rgb] | None = None) -> None:
         self._limit = limit
         self._car_colors = car_colors or {}
-        self._paths: dict[str, Any] = {}
         self._parts: dict[str, list[Any]] = {}
         self._static: dict[str, Any] = {}
         self._ends = StaleStates()

@@ -70,7 +70,7 @@ class Live:
 
     def start(self) -> None:
         """Subscribe, and query the topics that are published only on change."""
-        for expression in keys.recorded(self._fleet):
+        for expression in keys.recorded_keys(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, VIEW_QUEUE_SIZE))
         self._reader.start()
         for topic in _ON_CHANGE_TOPICS:

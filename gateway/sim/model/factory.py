@@ -23,8 +23,8 @@ def build(
 ) -> Firmware:
     """Return car number `index` of the world, at rest on its start pose, with its program just started.
 
-    `name`: its name in the world file, for its place and the things that it carries. `transport` matters only to a
-    Raspberry Pi: an Arduino behind a Wi-Fi bridge still has its UART.
+    `name`: its name in the world file, which gives its place and the things that it carries. `transport` is used for a
+    Raspberry Pi only: an Arduino behind a Wi-Fi bridge still has its UART.
     """
     body = CarBody(world, world.start_pose(index, name), rng, now, name)
     car: Firmware

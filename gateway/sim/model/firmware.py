@@ -76,15 +76,15 @@ class CarBodyState(Protocol):
         ...
 
     def line(self, now: float) -> tuple[bool, bool, bool, bool]:
-        """Return for left-outer, left-inner, right-inner, right-outer whether the sensor sees the line."""
+        """Return whether each sensor sees the line: left-outer, left-inner, right-inner, right-outer."""
         ...
 
     def obstacle(self, now: float) -> tuple[bool, bool]:
-        """Return for left and right whether the infrared sensor sees an obstacle."""
+        """Return whether the left and the right infrared sensor see an obstacle."""
         ...
 
     def light(self, now: float) -> tuple[bool, bool]:
-        """Return for left and right whether the sensor sees light."""
+        """Return whether the left and the right sensor see light."""
         ...
 
     def grayscale(self, now: float) -> int:
@@ -255,7 +255,7 @@ class Firmware:
         self._arrivals.clear()
 
     def brown_out(self, now: float) -> None:
-        """Let the battery sag: motors off, the frame being sent is truncated, the RAM is lost, the program reboots."""
+        """Let the battery sag. The motors stop, the frame being sent is truncated, and the program reboots."""
         self._run(now)
         self._cut_outgoing(now)
         self._arrivals.clear()

@@ -258,5 +258,5 @@ def test_topics_that_are_recorded_match_the_subscriptions() -> None:
         key = keys.topic_key(
             "fleet", *(topic.name.split("/", 1) if topic.name.startswith("@") else ("red", topic.name))
         )
-        matching = [e for e in keys.recorded("fleet") if zenoh.KeyExpr(e).includes(zenoh.KeyExpr(key))]
+        matching = [e for e in keys.recorded_keys("fleet") if zenoh.KeyExpr(e).includes(zenoh.KeyExpr(key))]
         assert len(matching) == int(topic.recorded), key
