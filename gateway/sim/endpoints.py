@@ -33,55 +33,57 @@ class Owner(Protocol):
 
     def received(self, data: bytes) -> None:
         """Accept bytes from the host."""
-        ...
 
     def connected(self) -> None:
         """Note that a host has connected (TCP only)."""
-        ...
 
     def disconnected(self) -> None:
         """Note that the host has disconnected (TCP only)."""
-        ...
 
 
 class SimEndpoint(Protocol):
-    """The interface of both kinds of links."""
+    """The common part of both kinds of links."""
+
+    _held: bool = False
+    _stuck: bool = False
 
     @property
     def url(self) -> str:
         """The URL that a gateway opens."""
-        ...
 
     async def up(self) -> None:
         """Open the link for a host; raise EndpointError."""
-        ...
 
     async def down(self) -> None:
         """Close the link, as an unplugged cable or a lost network does; `up` opens it again."""
-        ...
 
     def send(self, data: bytes) -> None:
         """Send bytes to the host, if there is one."""
-        ...
 
     def hold(self, *, on: bool) -> None:
         """Pause or resume reading. The host can write until the system's buffers are full."""
-        ...
+        self._held = on
+        self._update_reading()
 
     def stick(self, *, on: bool) -> None:
-        """Stop or resume reading, as a stuck device does. The host's writes block where the system allows."""
-        ...
+        """Stop or resume reading, as a stuck device does.
+
+        The next write to a PTY blocks at once. For TCP, both systems buffer some hundred kilobytes, which arrive later.
+        """
+        self._stuck = on
+        self._update_reading()
+
+    def _update_reading(self) -> None:
+        """Read unless the link is held or stuck."""
 
     def rename(self, path: str | None) -> None:
         """Become another device at the next `up`, at another path if one is given; raise EndpointError."""
-        ...
 
     async def close(self) -> None:
         """Close the link for good and remove its traces."""
-        ...
 
 
-class PtyEndpoint:
+class PtyEndpoint(SimEndpoint):
     """A pseudo terminal; POSIX only."""
 
     def __init__(self, owner: Owner, path: str | None) -> None:
@@ -102,7 +104,7 @@ class PtyEndpoint:
         self._master = self._slave = -1
         self._next: tuple[int, int] | None = None
         self._name = ""
-        self._reading = self._held = self._stuck = False
+        self._reading = False
 
     @property
     def url(self) -> str:
@@ -170,15 +172,9 @@ class PtyEndpoint:
             return
         self._owner.received(data)
 
-    def hold(self, *, on: bool) -> None:
-        """Pause or resume reading. A host that goes on writing blocks after some kilobytes."""
-        self._held = on
-        self._update_reading()
-
     def stick(self, *, on: bool) -> None:
-        """Stop or resume the flow: the host's next write blocks at once."""
-        self._stuck = on
-        self._update_reading()
+        """Stop or resume reading and the flow."""
+        super().stick(on=on)
         if self._master >= 0:
             self._tcflow(self._slave, self._flow_off if on else self._flow_on)
 
@@ -235,7 +231,7 @@ class PtyEndpoint:
         self._next = None
 
 
-class TcpEndpoint:
+class TcpEndpoint(SimEndpoint):
     """A listening port with one host at a time."""
 
     def __init__(self, owner: Owner, host: str, port: int) -> None:
@@ -244,7 +240,6 @@ class TcpEndpoint:
         self._port = port
         self._server: asyncio.Server | None = None
         self._next: socket.socket | None = None
-        self._held = self._stuck = False
         self._transport: asyncio.Transport | None = None
 
     @property
@@ -312,16 +307,6 @@ class TcpEndpoint:
         """Send bytes. They are lost if the host does not read."""
         if self._transport is not None and self._transport.get_write_buffer_size() < 65536:
             self._transport.write(data)
-
-    def hold(self, *, on: bool) -> None:
-        """Pause or resume reading."""
-        self._held = on
-        self._update_reading()
-
-    def stick(self, *, on: bool) -> None:
-        """Stop or resume reading. The systems at both ends buffer some hundred kilobytes, which arrive later."""
-        self._stuck = on
-        self._update_reading()
 
     def _update_reading(self) -> None:
         if self._transport is not None:

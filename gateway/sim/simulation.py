@@ -33,36 +33,28 @@ class Machine(Protocol):
     @property
     def alive(self) -> bool:
         """False once a program has died."""
-        ...
 
     @property
     def truth(self) -> Truth | None:
         """The true state; None if unknown."""
-        ...
 
     def pose(self, now: float) -> Pose | None:
         """Return the pose; None if unknown."""
-        ...
 
     def feed(self, data: bytes, now: float) -> None:
         """Accept bytes from the host."""
-        ...
 
     def advance(self, now: float) -> list[tuple[float, bytes]]:
         """Run up to `now`; return the pieces sent since the last call."""
-        ...
 
     def next_event(self) -> float:
         """Return the time of the next event."""
-        ...
 
     def backlog(self, now: float) -> int:
         """Return the number of bytes still on the wire."""
-        ...
 
     def drop_link(self, now: float) -> None:
         """Cut the link."""
-        ...
 
 
 class SimCar:

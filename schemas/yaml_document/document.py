@@ -91,15 +91,6 @@ def _without_titles(part: Any) -> Any:
     return {name: _without_titles(each) for name, each in part.items() if name != "title" or not isinstance(each, str)}
 
 
-def read_yaml(text: str, source: str, model: type[_Model]) -> _Model:
-    """Read a model from a text; raises BadFile. `source` is its name in errors, usually the path as typed."""
-    document = Document(text, source)
-    found = document.validate(model)
-    document.raise_faults()
-    assert found is not None  # else there was a fault
-    return found
-
-
 def name_special_file(path: Path) -> str:
     """Name the type of a path that is no regular file (`directory`, `FIFO`, ...); empty if it is one. Raises OSError.
 

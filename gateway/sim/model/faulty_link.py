@@ -36,11 +36,9 @@ class Noise(Protocol):
 
     def random(self) -> float:
         """Return the next number in 0..1."""
-        ...
 
     def randbytes(self, n: int) -> bytes:
         """Return the next `n` bytes."""
-        ...
 
 
 class _ByteQueue:

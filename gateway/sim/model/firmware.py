@@ -49,7 +49,6 @@ class Rng(Protocol):
 
     def random(self) -> float:
         """Return the next number in 0..1."""
-        ...
 
 
 class Pose(NamedTuple):
@@ -65,39 +64,30 @@ class CarBodyState(Protocol):
 
     def drive(self, now: float, left: int, right: int) -> None:
         """Set the PWM values of the motors from `now` on, -255..255."""
-        ...
 
     def pose(self, now: float) -> Pose:
         """Return the true pose."""
-        ...
 
     def range_cm(self, now: float, bearing_deg: float) -> float | None:
         """Return the ultrasonic distance at a bearing from straight ahead, left positive. None without echo."""
-        ...
 
     def line(self, now: float) -> tuple[bool, bool, bool, bool]:
         """Return whether each sensor sees the line: left-outer, left-inner, right-inner, right-outer."""
-        ...
 
     def obstacle(self, now: float) -> tuple[bool, bool]:
         """Return whether the left and the right infrared sensor see an obstacle."""
-        ...
 
     def light(self, now: float) -> tuple[bool, bool]:
         """Return whether the left and the right sensor see light."""
-        ...
 
     def grayscale(self, now: float) -> int:
         """Return the raw ADC value of the floor, 0..1023."""
-        ...
 
     def battery_v(self, now: float) -> float:
         """Return the battery voltage."""
-        ...
 
     def yaw_rate_deg_s(self, now: float) -> float:
         """Return the yaw rate, left positive."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,9 @@ class Member(Protocol):
 
     def due(self) -> float:
         """Return the time at which the program next runs; inf if it never does."""
-        ...
 
     def run_alone(self, now: float) -> None:
         """Run this program up to `now`."""
-        ...
 
 
 class EventScheduler:

@@ -48,21 +48,17 @@ class WorldBody(Protocol):
     @property
     def name(self) -> str:
         """The name of the car."""
-        ...
 
     @property
     def place(self) -> Pose:
         """The pose after the last move."""
-        ...
 
     @property
     def driving(self) -> bool:
         """True if a motor is on."""
-        ...
 
     def glide(self, now: float) -> None:
         """Move on to `now`, at most one tick."""
-        ...
 
 
 class World:

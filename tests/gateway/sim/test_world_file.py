@@ -19,7 +19,8 @@ from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import RADIUS_M, World
 from gateway.sim.world_file import MIN_SIZE_M, WorldSpec, read_world
 from schemas.world import WorldEntry
-from schemas.yaml_document.document import MAX_YAML_BYTES, BadFile, read_yaml
+from schemas.yaml_document.document import MAX_YAML_BYTES, BadFile
+from tests.support.yaml_text import read_yaml
 
 WORLDS = EXAMPLES / "worlds"
 EVERYTHING = """\

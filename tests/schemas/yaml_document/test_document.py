@@ -7,7 +7,8 @@ from typing import Literal
 import pytest
 from pydantic import Field
 
-from schemas.yaml_document.document import MAX_YAML_BYTES, BadFile, Entry, read_text, read_yaml
+from schemas.yaml_document.document import MAX_YAML_BYTES, BadFile, Entry, read_text
+from tests.support.yaml_text import read_yaml
 
 
 class Wheel(Entry):

@@ -1,0 +1,18 @@
+"""A YAML text as a model, for the tests of models and of the document."""
+
+from typing import TypeVar
+
+from pydantic import BaseModel
+
+from schemas.yaml_document.document import Document
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_yaml(text: str, source: str, model: type[Model]) -> Model:
+    """Read a model from a text; raise BadFile."""
+    document = Document(text, source)
+    found = document.validate(model)
+    document.raise_faults()
+    assert found is not None
+    return found
