@@ -11,7 +11,7 @@ from typing import Final
 
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Sensors
-from gateway.protocol.timing import MODE_CLOSE_S
+from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
 
 # A reporting mode sends 20 frames a second. A corrupted frame of such a mode can look like mode 0, because there is no
 # checksum. But no silence comes before it.
@@ -43,6 +43,10 @@ PAUSE_MAX_S: Final = 2.6
 NORMAL_MIN_S: Final = 0.8
 NORMAL_MAX_S: Final = 1.4
 """Range of the normal interval of two reports. The link has delayed closer ones, so their times show nothing."""
+# A damaged MODE frame may open mode 0 with the motors on, which blocks for 2.0 to 2.3 s. If the link holds the report
+# before, both gaps look like pauses: held for 0.85 to 1.4 s. No such hold makes both match the interval of this car.
+MATCH_S: Final = 0.12
+"""Maximum difference of a pause from the last normal interval and the 1.0 s that `MODE00` takes."""
 # A link that loses both `MODE00` and the report after it leaves the same gap as a pause. Half of all outages of 0.6 s
 # around a stop do that, so one pause is not enough.
 PAUSES: Final = 2
@@ -96,7 +100,8 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     ),
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
-        "two pauses of 1.9 s between reports, each around a `MODE00`, and no reading for 0.25 s after the second",
+        "two pauses of 1.9 s between reports, each around a `MODE00` and 1.0 s longer than a normal interval, and no "
+        "reading for 0.25 s after the second",
         "the stop goes on",
     ),
     StopCase.NO_ECHO: EvidenceRow(
@@ -177,6 +182,10 @@ class StopEvidence:
     _pending: float | None = None
     """When the last `MODE00` without a result was written."""
     _pauses: int = 0
+    _interval_s: float | None = None
+    """The last normal interval of two reports, without a frame that blocks in between."""
+    _blocked_s: float = 0.0
+    """For how long the frames since the last report block the car."""
     _window_s: float = CLOSED_S
     _shapes: int = 0
     _shape_at: float | None = None
@@ -194,7 +203,7 @@ class StopEvidence:
 
     def begin_link(self) -> None:
         """Forget everything: the link is new."""
-        self.obeyed_at = None
+        self.obeyed_at = self._interval_s = None
         self._last_at = self._foreign_at = float("-inf")
         self._window_s = CLOSED_S
         self.reset_times()
@@ -217,6 +226,11 @@ class StopEvidence:
         """Record a frame that neither moves the car nor closes a mode."""
         if self._closed_at is None:
             self._plain = False
+
+    def blocked(self, block_s: float) -> None:
+        """Record a frame that blocks the car for so long: the next report comes later."""
+        if block_s > FRAME_S:
+            self._blocked_s += block_s
 
     def closed(self, now: float, *, awake: bool) -> None:
         """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly 1.0 s."""
@@ -266,6 +280,7 @@ class StopEvidence:
             self._before = None
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
+        blocked_s, self._blocked_s = self._blocked_s, 0.0
         self.without_echo = 0 if event.range_cm else self.without_echo + 1
         if self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S):
             return self._obeyed(at)
@@ -273,13 +288,15 @@ class StopEvidence:
         if not event.range_cm:
             return Finding.NO_ECHO
         if pending is None:
+            if before is not None and not blocked_s and at - before < NORMAL_MAX_S:
+                self._interval_s = at - before
             return Finding.REPORT
         if before is None:
             if at <= pending + CLOSED_S:
                 return Finding.NOTHING
             self._pending = None
             return Finding.REPORT
-        return self._compare(at - before, at - pending, at)
+        return self._compare(at - before, at - pending, at, blocked_s)
 
     def settle(self, now: float) -> bool:
         """Return True if the pauses count from now on: no reading came just after them."""
@@ -289,11 +306,13 @@ class StopEvidence:
         self._obeyed(self._last_at)
         return True
 
-    def _compare(self, gap_s: float, after_s: float, at: float) -> Finding:
+    def _compare(self, gap_s: float, after_s: float, at: float, blocked_s: float) -> Finding:
         """Judge the interval of two reports. The later one came `after_s` after `MODE00`."""
         if after_s <= CLOSED_S:
             return Finding.NOTHING
-        if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S:
+        longer_s = gap_s - MODE_CLOSE_S - self._interval_s if self._interval_s is not None else 0.0
+        matches = -MATCH_S <= longer_s <= blocked_s + MATCH_S
+        if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S and matches:
             self._pending = None
             self._pauses += 1
             self.obeyed_at = at
@@ -304,7 +323,7 @@ class StopEvidence:
             return Finding.SETTLING
         if after_s <= self._window_s and gap_s <= NORMAL_MAX_S:
             return Finding.NOTHING
-        self._pending = None
+        self._pending = self._interval_s = None
         self._pauses = 0
         return Finding.LOST if NORMAL_MIN_S < gap_s < NORMAL_MAX_S else Finding.REPORT
 
