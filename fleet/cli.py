@@ -4,6 +4,7 @@ Subcommands are imported when they are called, so that `fleet --help` is fast.
 """
 
 import importlib
+import re
 import sys
 from typing import Final
 
@@ -213,7 +214,16 @@ def _command_path(error: click.UsageError) -> str:
     """Return the command that the error is about. Errors of click's parser do not carry it."""
     if error.ctx is not None:
         return error.ctx.command_path
-    return " ".join(["fleet", *[word for word in sys.argv[1:] if word in _FUNCTIONS][:1]])
+    path: list[str] = ["fleet"]
+    command: click.Group = cli
+    for word in sys.argv[1:]:
+        found = command.get_command(click.Context(command), word)
+        if found is not None:
+            path.append(word)
+            if not isinstance(found, click.Group):
+                break
+            command = found
+    return " ".join(path)
 
 
 def _one_line(error: click.ClickException) -> str:
@@ -221,7 +231,11 @@ def _one_line(error: click.ClickException) -> str:
     if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
         option = f"{error.param.opts[-1]}: " if isinstance(error.param, click.Option) else ""
         return " ".join(f"{option}{error.message}".split())
-    return " ".join(error.format_message().split())
+    words = " ".join(error.format_message().split())
+    extra = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", words)
+    if extra is None or not isinstance(error, click.UsageError):
+        return words
+    return f'{_command_path(error)} takes no "{extra[1]}".'
 
 
 if __name__ == "__main__":

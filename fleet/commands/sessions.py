@@ -101,7 +101,8 @@ def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     try:
         found = list(overviews(place)) if directory is not None or place.exists() else []
     except OSError as error:
-        raise click.ClickException(f"{place} cannot be listed: {error.strerror}.") from None
+        why = f"{place} cannot be listed: {error.strerror}." if place.exists() else f"There is no directory {place}."
+        raise click.ClickException(f"{why} `fleet sessions` without a name lists those here.") from None
     if as_json:
         for one in found:
             click.echo(json.dumps(one.to_dict()))

@@ -126,7 +126,7 @@ class _Parser:
             self._fail(token, f"the word that begins with {rest[0]} has no end")
         number = re.match(r"[+-]?[0-9][0-9.]*", rest)
         if number is not None:
-            self._fail(token, f"{rest.split()[0]} is no number; units are not written: they are the field's")
+            self._fail(token, f"{rest.split()[0]} is not a number. Write it without a unit: a field has its own.")
         wrong = next((wrong for wrong in sorted(_INSTEAD, key=len, reverse=True) if rest.startswith(wrong)), None)
         if wrong is not None:
             self._fail(token, f"{wrong} is not known: write {_INSTEAD[wrong]}")

@@ -85,7 +85,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("schema plna", '"plna" is not a kind of file. Did you mean plan?'),
         ("mode red track", '"track" is not a mode. Did you mean tracking?'),
         ("led red blu", '"blu" is not a color. Did you mean blue?'),
-        ("led red #ff00", '"#ff00" is not a color. Choose from: red, green, '),
+        ("led red #ff00", '"#ff00" is not a color. Write # and six of 0-9 and a-f'),
         ("light red pnik", '"pnik" is not a color. Did you mean pink?'),
         ("servo red middle left", '"middle" is not a servo. Choose from: front, vertical, horizontal.'),
         ("servo red front 181", "deg 181 is not allowed: a whole number, 0 to 180"),
@@ -120,6 +120,8 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("list --connect tcp/localhost", "endpoint 'tcp/localhost' is not allowed"),
         ("list --fleet A", "fleet name 'A' is not allowed"),
         ("plan run", "Missing argument 'FILE'"),
+        ("sessions export latest --csv", "Option '--csv' requires an argument. (see fleet sessions export --help)"),
+        ("pause red", 'fleet: fleet pause takes no "red". (see fleet pause --help)'),
         ("plan run no/such.yaml", "no/such.yaml: error: there is no such file"),
     ],
 )
@@ -191,8 +193,8 @@ def test_every_help_has_an_example_and_words_for_each_option(context: click.Cont
     command, shown = context.command, context.get_help()
     assert context.help_option_names == ["-h", "--help"]
     assert f"  {context.command_path}" in shown[shown.index("example") :]
-    for param in command.params:
-        if isinstance(param, click.Option) and not param.hidden:
+    for param in (each for each in command.params if not getattr(each, "hidden", False)):
+        if isinstance(param, click.Option):
             assert param.help, param.opts
             assert param.help.endswith((".", ")")), param.opts
         words = " ".join(param.get_help_record(context) or (param.make_metavar(context),))

@@ -9,9 +9,9 @@ from fleet import Session
 
 
 def main(session: str, car: str, picture: str) -> None:
-    """Save the picture. A point is a reading; the line has a gap where there was no echo."""
+    """Save the picture. Each dot is a reading. A reading without an echo has none."""
     frame = Session(session).to_pandas(f"{car}/sensor/range")
-    plot = frame.plot(x="publish_time", y="range_m", marker=".", xlabel="time (UTC)", ylabel="distance (m)")
+    plot = frame.plot(x="publish_time", y="range_m", style=".", xlabel="time (UTC)", ylabel="distance (m)")
     plot.figure.savefig(picture)
 
 
