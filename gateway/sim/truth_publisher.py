@@ -91,7 +91,7 @@ class TruthPublisher:
 
     async def _open(self, loop: asyncio.AbstractEventLoop) -> Bus:
         """Open the bus, with retries."""
-        # Opening blocks, so it runs in a thread: a daemon, so that a missing hub does not delay our end.
+        # Opening blocks, so it runs in a thread: a daemon, so that a hub that hangs does not prevent our end.
         warn_at = loop.time() + HUB_WARNING_DELAY_S
         while True:
             if loop.time() >= warn_at:
@@ -101,8 +101,14 @@ class TruthPublisher:
                     "`gateway run` and `fleet up` start a hub; --no-truth needs none."
                 )
             opened: asyncio.Future[Bus | None] = loop.create_future()
-            threading.Thread(target=self._try, args=(loop, opened), daemon=True).start()
-            bus = await opened
+            thread = threading.Thread(target=self._try, args=(loop, opened), daemon=True)
+            thread.start()
+            try:
+                bus = await opened
+            except asyncio.CancelledError:
+                # A daemon thread that is still in Zenoh's code when the interpreter ends would abort the process.
+                thread.join(5 * HUB_OPEN_TIMEOUT_S)
+                raise
             if bus is not None:
                 return bus
             await asyncio.sleep(HUB_RETRY_DELAY_S)

@@ -6,9 +6,11 @@ not run, with the reason. tests/test_documented.py parses all of it.
 
 import contextlib
 import io
+import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -198,6 +200,65 @@ def test_each_command_of_the_pages_on_one_simulated_fleet(prompt: Prompt) -> Non
         assert (prompt.place / "range.csv").read_text(encoding="utf-8").startswith("time,key")
     finally:
         prompt.type("fleet down")
+
+
+STAYS: Final = r"fleet (logs .*--follow|watch (?!.*--count).*|record( --.*| run.*)?|play.*|plan run.*|sim .*)"
+CTRL_C_S: Final = 10.0
+"""Timeout for the end after Ctrl-C."""
+
+
+def interrupted(command: str, prompt: Prompt) -> tuple[int, str]:
+    """Run a command that stays, press Ctrl-C after its first line; its exit code, and all that it printed."""
+    words = [sys.executable, "-u", "-m", "fleet.cli", *shlex.split(command)[1:]]
+    with subprocess.Popen(
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=prompt.place,
+        env=os.environ | prompt.environment,
+    ) as process:
+        assert process.stdout is not None
+        try:
+            first = process.stdout.readline()
+            process.send_signal(signal.SIGINT)
+            rest, _ = process.communicate(timeout=CTRL_C_S)
+        finally:
+            process.kill()
+    return process.returncode, first + rest
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+def test_each_command_that_stays_ends_with_ctrl_c(prompt: Prompt) -> None:
+    """Its exit code is 130, or 0 where Ctrl-C is the usual end. Pages say both."""
+    stays = [
+        command
+        for command in LINES
+        if re.fullmatch(STAYS, command) and not re.search(r"/media/disk|fleet-replay|event/command", command)
+    ]
+    of_recorder = [command for command in stays if command.startswith("fleet record")]
+    others = [command for command in stays if command.startswith(("fleet play", "fleet sim", "fleet plan run"))]
+    ended = {}
+    prompt.type("fleet up --detach")
+    try:
+        for command in stays:
+            if command not in (*of_recorder, *others):
+                ended[command] = interrupted(command, prompt)
+    finally:
+        prompt.type("fleet down")
+    for command in others:
+        ended[command] = interrupted(command, prompt)
+    prompt.type("fleet up --no-record --detach")
+    try:
+        for command in of_recorder:
+            ended[command] = interrupted(command, prompt)
+    finally:
+        prompt.type("fleet down")
+    for command, (code, printed) in ended.items():
+        assert "Traceback" not in printed, (command, printed)
+        assert code == (130 if command.startswith(("fleet logs", "fleet watch")) else 0), (command, printed)
+    assert len(ended) > 15
 
 
 def test_each_command_of_the_pages_on_made_sessions(prompt: Prompt) -> None:
