@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
+from click.testing import CliRunner
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
+from fleet.cli import cli
 from tests.support.console import DESKTOP, ConsoleProcess, find_chromium
 from tests.support.judge import Judge
 from tests.support.network_client import network_port
@@ -89,6 +91,102 @@ def test_a_phone_pairs_by_keyboard_drives_and_is_revoked(browser: Browser, tmp_p
         phone.mouse.up()
         phone.get_by_role("link", name="Pair it again").click()
         expect(phone.get_by_role("heading", name="Pair this device")).to_be_visible()
+        assert console.process.end() == 0
+    finally:
+        fleet.close()
+
+
+FORWARD = "[data-motion=forward]"
+
+
+def paired_page(browser: Browser, fleet: FleetProcesses, port: int, *person: str) -> Page:
+    """The drive page of a device that pairs as this person by the address of a QR code."""
+    done = CliRunner().invoke(cli, ["console", "pair", *person], env=fleet.environment)
+    code = done.output.split(" type ")[1][:9]
+    page = browser.new_context(ignore_https_errors=True, **DESKTOP).new_page()
+    page.goto(f"https://127.0.0.1:{port}/pair#{code}")
+    expect(page.locator(".person")).to_contain_text(f"You are {person[0]}")
+    page.goto(f"https://127.0.0.1:{port}/#/drive")
+    return page
+
+
+def hold_until_driving(page: Page, judge: Judge) -> None:
+    """Hold the button of the pad until the car drives. After a stop a person pauses, and presses again."""
+    for _ in range(10):
+        page.locator(FORWARD).hover()
+        page.mouse.down()
+        try:
+            wait_for(lambda: judge.driving, "it drives", 2.0)
+        except AssertionError:
+            page.mouse.up()
+            page.wait_for_timeout(700)
+        else:
+            return
+    raise AssertionError(page.locator(".results").inner_text())
+
+
+def test_a_group_and_a_teacher_share_one_console(browser: Browser, tmp_path: Path) -> None:
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    try:
+        _, links = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp", truth=True)
+        for car, link, own, other in zip(("red", "blue"), links, "ab", "ba", strict=True):
+            people = ("teacher:lead", f"group_{own}", f"group_{other}:other")
+            fleet.gateway(link, *(word for name in people for word in ("--person", name)), car=car)
+        judges = {car: Judge.follow(fleet.bus, car) for car in ("red", "blue")}
+        console = ConsoleProcess(fleet, "--lan", "--lan-port", "0")
+        for car in judges:
+            fleet.ready(car)
+        port = network_port(console)
+        ours = paired_page(browser, fleet, port, "group_a")
+        teacher = paired_page(browser, fleet, port, "teacher", "--rank", "lead")
+        red, blue = (f"input[name=select-{car}]" for car in judges)
+        refused = ours.locator("[data-control=drive] .refused")
+
+        def press_for_nothing() -> None:
+            """Hold the button of the pad for a second: no command reaches the car."""
+            frames = len(judges["red"].frames)
+            ours.locator(FORWARD).hover()
+            ours.mouse.down()
+            ours.wait_for_timeout(1000)
+            ours.mouse.up()
+            assert not judges["red"].driving
+            assert [why for _, why, _ in judges["red"].frames[frames:] if why == "command"] == []
+
+        # The group drives its own car, and not the other one.
+        ours.locator(blue).check()
+        expect(refused).to_have_text("group_a drives other cars, not blue.")
+        ours.locator(FORWARD).click(force=True)
+        assert not judges["blue"].driving
+        ours.locator(blue).uncheck()
+        ours.locator(red).check()
+        hold_until_driving(ours, judges["red"])
+
+        # The teacher pauses while the group holds its button.
+        teacher.locator("#pause").click()
+        teacher.locator("input[name=why]").fill("look here")
+        teacher.locator("[data-asking=pause] .danger").click()
+        wait_for(lambda: not judges["red"].driving, "the pause stops it")
+        expect(ours.locator("[data-paused]")).to_contain_text("Paused by teacher: look here")
+        expect(ours.locator("[data-paused] button")).to_be_disabled()
+        ours.mouse.up()
+        press_for_nothing()
+        teacher.locator("[data-paused] button").click()
+        expect(ours.locator("[data-paused]")).to_have_count(0)
+
+        # The teacher takes the car over without driving it, and gives it back.
+        teacher.locator(red).check()
+        teacher.get_by_role("button", name="Take over red").click()
+        expect(refused).to_contain_text("teacher drives red.")
+        press_for_nothing()
+        hold_until_driving(teacher, judges["red"])
+        teacher.mouse.up()
+        wait_for(lambda: not judges["red"].driving, "red stands")
+        teacher.get_by_role("button", name="Give back red").click()
+        expect(refused).to_have_count(0)
+        hold_until_driving(ours, judges["red"])
+        ours.mouse.up()
+        wait_for(lambda: not judges["red"].driving, "red stands")
+        assert not judges["blue"].motors or not any(on for _, on in judges["blue"].motors), "nobody drove it"
         assert console.process.end() == 0
     finally:
         fleet.close()

@@ -64,6 +64,12 @@ def test_the_page_records_marks_and_closes_what_it_started(stage: ConsoleStage, 
         row.get_by_role("link", name="Download the tables").click()
     with zipfile.ZipFile(exported.value.path()) as archive:
         assert any(name.endswith("/fleet.v1.Range.csv") for name in archive.namelist())
+    row.get_by_role("button", name="Export Parquet").click()
+    with page.expect_download() as exported:
+        row.get_by_role("link", name="Download the tables").and_(page.locator("[href*=parquet]")).click()
+    with zipfile.ZipFile(exported.value.path()) as archive:
+        (table,) = [name for name in archive.namelist() if name.endswith("/fleet.v1.Range.parquet")]
+        assert archive.read(table)[:4] == b"PAR1"
     page.locator("[data-record=start]").click()
     page.locator("[data-recorder=recording]").wait_for()
     wait_for(lambda: page.locator("[data-session]").count() == 2, "the new session is listed")

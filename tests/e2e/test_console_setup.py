@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.test_console import serious
+from tests.e2e.test_console import serious, unreachable
 from tests.support.console import ConsoleProcess, ConsoleStage
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
@@ -32,19 +32,27 @@ def test_a_car_is_found_blinks_and_is_written_with_the_comments_kept(stage: Cons
     sim, (link,) = stage.fleet.simulate("new:arduino:pty")
     page = stage.page("#/setup")
     page.get_by_text("no link yet").wait_for()
-    page.locator("input[name=links]").fill(link)
-    page.locator("[data-setup=scan]").click()
+    # By keyboard alone.
+    page.locator("input[name=links]").focus()
+    page.keyboard.type(link)
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
     card = page.locator("[data-link]")
     card.wait_for()
     blinks: list[bytes] = []
     stage.fleet.bus.subscribe("fleet/setup-1/frame/tx", lambda sample: blinks.append(sample.payload))
-    card.locator("[data-setup=blink]").click()
+    assert [each for each in unreachable(page) if "disabled" not in each] == []
+    card.locator("[data-setup=blink]").focus()
+    page.keyboard.press("Enter")
     card.get_by_text("It blinks and beeps now.").wait_for()
     wait_for(lambda: len(blinks) > 3, "its gateway has sent lights")
     truth = sim.say({"car": "new", "ask": "truth"})
     assert (truth["motor_left"], truth["motor_right"]) == (0, 0)
-    card.locator("input[name=car]").fill("ann")
-    page.locator("[data-setup=write]").click()
+    card.locator("input[name=car]").focus()
+    page.keyboard.type("ann")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.dataset.setup") == "write"
+    page.keyboard.press("Enter")
     page.get_by_text("fleet.yaml has ann.").wait_for()
     text = file.read_text()
     assert text.startswith("# the cars of our lab\n")

@@ -1,52 +1,118 @@
 """Pictures of every page of the console, of simulated cars: `python -m tests.tools.console_pictures DIRECTORY`.
 
-Each page comes in light on a desktop, and in dark on a phone.
+Each page comes in light on a desktop. The pages that one drives with come in dark on a phone, too.
 """
 
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
+from click.testing import CliRunner
 from PIL import Image
+from playwright.sync_api import Page
 
+from fleet.cli import cli
 from fleet.client.commands import mode_request
-from tests.support.console import ConsoleStage
+from tests.support.console import ConsoleProcess, ConsoleStage
+from tests.support.network_client import NetworkDevice, find_line, network_port
 from tests.support.ports import free_endpoint
-from tests.support.processes import FleetProcesses
+from tests.support.processes import FleetProcesses, wait_for
 
 PLAN = "roles:\n  guide: {mode: tracking}\n  rest: {mode: manual, count: all, priority: -1}\n"
+FLEET_FILE = "cars:\n  red: {platform: arduino}\n  blue: {platform: stm32+arm}\n  green: {}\n"
+ON_PHONES = ("fleet", "drive", "plan", "plots", "inspect", "pair")
 COLORS = 64
 SETTLE_S = 4.0
 """Time for some readings of each car."""
+REPLACE = """(texts) => {
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (walk.nextNode())
+    for (const [from, to] of texts) walk.currentNode.data = walk.currentNode.data.replaceAll(from, to);
+  for (const input of document.querySelectorAll("input"))
+    for (const [from, to] of texts) input.value = input.value.replaceAll(from, to);
+}"""
 
 
 def main(directory: Path) -> None:
-    """Write console-PAGE.png and console-PAGE-phone.png."""
+    """Write console-PAGE.png, and console-PAGE-phone.png of some pages."""
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         stage = ConsoleStage(FleetProcesses(free_endpoint(), Path(scratch)))
         try:
-            plan = Path(scratch) / "plan.yaml"
-            plan.write_text(PLAN)
-            stage.fleet.start("-m", "fleet.cli", "plan", "run", str(plan))
-            stage.person.ask(mode_request("light_seeking"), ["blue"])
-            time.sleep(SETTLE_S)
-            phone = stage.playwright.devices["Pixel 7"] | {"color_scheme": "dark", "device_scale_factor": 1.5}
-            links = stage.page().locator("nav a").all()
-            pages = [link.get_attribute("href") or "" for link in links]
-            for path in pages:
-                name = path.removeprefix("#/") or "fleet"
-                for suffix, options in (("", {}), ("-phone", phone)):
-                    page = stage.page(path, **options)
-                    if name == "drive":
-                        page.locator("input[name=select-red]").check()
-                    time.sleep(1.0)
-                    file = directory / f"console-{name}{suffix}.png"
-                    page.screenshot(path=file)
-                    Image.open(file).quantize(COLORS).save(file, optimize=True)
+            take_pictures(stage, Path(scratch), directory)
         finally:
             stage.close()
+
+
+def take_pictures(stage: ConsoleStage, scratch: Path, directory: Path) -> None:
+    """Bring cars, console, recordings and a paired device into a state worth a picture, and take the pictures."""
+    (scratch / "fleet.yaml").write_text(FLEET_FILE)
+    (scratch / "plan.yaml").write_text(PLAN)
+    sessions = ("--sessions", str(scratch / "recordings"))
+    lan = ("--lan", "--lan-port", "0", "--as", "teacher")
+    stage.console = ConsoleProcess(stage.fleet, *lan, *sessions, "--fleet-file", str(scratch / "fleet.yaml"))
+    port = network_port(stage.console)
+    stage.fleet.start("-m", "fleet.cli", "record", "run", *sessions, "--json").line()
+    stage.fleet.start("-m", "fleet.cli", "plan", "run", str(scratch / "plan.yaml"))
+    _, (link,) = stage.fleet.simulate("new:arduino:pty")
+    stage.person.ask(mode_request("light_seeking"), ["blue"])
+    pairing = CliRunner().invoke(cli, ["console", "pair", "group_a"], env=stage.fleet.environment)
+    assert NetworkDevice(port).pair(pairing.output.split(" type ")[1][:9])["ok"]
+    # Nothing of the computer that takes the pictures is in them.
+    address = find_line(stage.console, r"On the network: (https://.*)")
+    texts = [(str(scratch), "/home/mia/my-cars"), (address, "https://192.168.1.5:7443"), (link, "/dev/ttyUSB0")]
+    time.sleep(SETTLE_S)
+    phone = stage.playwright.devices["Pixel 7"] | {"color_scheme": "dark", "device_scale_factor": 1.5}
+    paths = [each.get_attribute("href") or "" for each in stage.page().locator("nav a").all()]
+    for path in [*paths, "pair"]:
+        name = path.removeprefix("#/") or "fleet"
+        for suffix, options in (("", {}), ("-phone", phone)):
+            if suffix and name not in ON_PHONES:
+                continue
+            page = pair_page(stage, port, options) if name == "pair" else stage.page(path, **options)
+            prepare(page, name, link)
+            time.sleep(1.0)
+            page.evaluate(REPLACE, texts)
+            file = directory / f"console-{name}{suffix}.png"
+            page.screenshot(path=file)
+            Image.open(file).quantize(COLORS).save(file, optimize=True)
+
+
+def pair_page(stage: ConsoleStage, port: int, options: dict[str, Any]) -> Page:
+    """Open the only page that a device sees that is not paired."""
+    shown = options or {"viewport": {"width": 640, "height": 400}}
+    page = stage.browser.new_context(ignore_https_errors=True, **shown).new_page()
+    page.goto(f"https://127.0.0.1:{port}/pair")
+    return page
+
+
+def prepare(page: Page, name: str, link: str) -> None:
+    """Do what a person does first on a page."""
+    match name:
+        case "drive":
+            page.locator("input[name=select-red]").check()
+        case "people":
+            page.locator("[data-device]").wait_for()
+        case "sessions":
+            row = page.locator("[data-session]")
+            row.first.wait_for()
+            page.locator("[data-recorder=recording]").wait_for()
+            page.locator("input[name=mark]").fill("blue lost the line")
+            page.locator("[data-record=mark]").click()
+            page.locator("[data-record=stop]").click()
+            page.locator("[data-recorder=stopped]").wait_for()
+            page.locator("[data-record=start]").click()
+            page.locator("[data-recorder=recording]").wait_for()
+            wait_for(lambda: row.count() == 2, "both sessions are listed")
+            row.last.get_by_role("button", name="Verify").click()
+            row.last.get_by_text("whole,").wait_for()
+        case "setup":
+            page.locator("input[name=links]").fill(link)
+            page.locator("[data-setup=scan]").click()
+            page.locator("[data-link]").wait_for()
+            page.locator("[data-link] input[name=car]").fill("green")
 
 
 if __name__ == "__main__":
