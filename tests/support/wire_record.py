@@ -72,6 +72,10 @@ class WireRecord:
         index = bisect_left(times, moment_ns)
         return times[index] if index < len(times) else None
 
+    def is_blocked(self, car: str) -> bool:
+        """Return True if the last line about the car's program says that it is blocked."""
+        return self._blocks.get(car, [(0, False)])[-1][1]
+
     def was_blocked(self, car: str, begin_ns: int, end_ns: int) -> bool:
         """Return True if a block of the car's program ran at any time in between."""
         blocks = self._blocks.get(car, [(0, False)])

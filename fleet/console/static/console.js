@@ -4,6 +4,8 @@ const RECONNECT_MS = 500;
 const UNPAIRED_MS = 5000;
 const LOST_MS = 1500;
 const MAX_RESULTS = 6;
+const DRAWING_SHARE = 3; // the page rests three times as long as a drawing took
+const MAX_DRAWING_MS = 150;
 const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
 
 const listeners = new Set();
@@ -41,8 +43,31 @@ export function changed() {
   drawing = true;
   requestAnimationFrame(() => {
     drawing = false;
+    const began = performance.now();
     for (const listener of listeners) listener();
+    // After the frame: on a slow phone its layout and paint take longest.
+    setTimeout(() => {
+      const now = performance.now();
+      freeAt = now + DRAWING_SHARE * Math.min(now - began, MAX_DRAWING_MS);
+    });
   });
+}
+
+// A new state is drawn when the page is free for it: a slow phone must stay free for the finger.
+let freeAt = 0;
+let drawsLater = false;
+function stateChanged() {
+  const wait = freeAt - performance.now();
+  if (drawsLater) return;
+  if (wait <= 0) {
+    changed();
+    return;
+  }
+  drawsLater = true;
+  setTimeout(() => {
+    drawsLater = false;
+    changed();
+  }, wait);
 }
 
 function send(message) {
@@ -215,7 +240,8 @@ function onMessage(text) {
       return;
     case "state":
       store.state = message;
-      break;
+      stateChanged();
+      return;
     case "rights":
       store.rights = message;
       break;

@@ -20,25 +20,47 @@ export const Verdict = ({ table, name, detail = "" }) => {
 // Why an action is refused, before it is tried.
 export const Refused = ({ words }) => words.map((each) => html`<p class="cannot refused" key=${each}>${each}</p>`);
 
-// Draws again only if its data has changed, one in each task: a press of STOP waits for one card, not for all.
+// Draws again only if its data has changed: some in each task, so that a press of STOP does not wait for all.
+// Layout and paint of twenty cards keep a phone busy, so what is out of view is drawn once a second.
+const OUT_OF_VIEW_MS = 1000;
+const CARDS_IN_A_TASK = 4;
 const outdated = new Set();
 function drawNext() {
-  const [next] = outdated;
-  outdated.delete(next);
+  const some = [...outdated].slice(0, CARDS_IN_A_TASK);
+  for (const each of some) outdated.delete(each);
   if (outdated.size > 0) setTimeout(drawNext);
-  next?.forceUpdate();
+  for (const each of some) each.forceUpdate();
 }
+function drawSoon(memo) {
+  clearTimeout(memo.later);
+  memo.later = undefined;
+  if (outdated.add(memo).size === 1) setTimeout(drawNext);
+}
+const view = new IntersectionObserver((entries) => {
+  for (const { target, isIntersecting } of entries) {
+    target.memo.inView = isIntersecting;
+    if (isIntersecting && target.memo.later !== undefined) drawSoon(target.memo);
+  }
+});
 
 export class Memo extends Component {
+  componentDidMount() {
+    this.cell.memo = this;
+    view.observe(this.cell);
+  }
   shouldComponentUpdate(next) {
-    if (next.data !== this.props.data && outdated.add(this).size === 1) setTimeout(drawNext);
+    if (next.data === this.props.data) return false;
+    if (this.inView) drawSoon(this);
+    else this.later ??= setTimeout(() => drawSoon(this), OUT_OF_VIEW_MS);
     return false;
   }
   componentWillUnmount() {
+    view.unobserve(this.cell);
+    clearTimeout(this.later);
     outdated.delete(this);
   }
   render({ draw }) {
-    return draw();
+    return html`<div class="cell" ref=${(cell) => (this.cell = cell ?? this.cell)}>${draw()}</div>`;
   }
 }
 
