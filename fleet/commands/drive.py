@@ -28,7 +28,8 @@ _MOTIONS: Final = tuple(each for each in Motion if each is not Motion.STOP)
 examples:
   fleet drive red forward --for 2s
   fleet drive red blue spin_left --for 500ms
-  fleet drive all forward"""
+  fleet drive all forward
+  fleet drive red forward --take   # another person drives it: take it over"""
 )
 @cars_argument
 @click.argument("motion", type=Choice("motion", _MOTIONS, {"stop": "To stop cars, write: fleet stop red"}))

@@ -12,6 +12,7 @@ import click
 examples:
   fleet scan
   fleet scan --link /dev/ttyUSB0
+  fleet scan --probe             # also ask silent ports: every car there stops
   fleet scan --json > report.json
 
 Opening a USB port can reset an Arduino. TCP cars are not searched: closing the connection ends their program."""

@@ -31,6 +31,7 @@ examples:
   fleet play
   fleet play --as rehearsal --rate 4 --loop
   fleet play --car red --from=-60s
+  fleet play latest --skip-gaps 5s   # pauses of the recording take 5 s at most
 
 Look at it with `fleet list --fleet fleet-replay`, or run your own program on it."""
 )

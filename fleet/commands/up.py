@@ -39,7 +39,7 @@ _Write = Callable[[SupervisorEvent], None]
 examples:
   fleet up
   fleet up lab.yaml --plan plan.yaml
-  fleet up --sim 8
+  fleet up --sim 8 --console     # with the web page
   fleet up --detach && fleet drive red forward --for 1s; fleet down
 
 Without FILE and --sim it takes ./fleet.yaml. The start ends with one line: all cars are ready, or who is missing and
