@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 
 from tests.support.ports import free_endpoint
@@ -96,6 +97,7 @@ class Environment:
         return found
 
 
+@pytest.mark.timeout(240)
 def test_the_first_minutes_from_the_wheel(tmp_path: Path) -> None:
     here = Environment(tmp_path)
     extras = ("rerun", "pyarrow", "numpy", "PIL", "bleak", "uvicorn", "starlette")

@@ -7,9 +7,10 @@ LINE: Final = 160
 """Characters of a line."""
 MAX_LINES: Final = 2
 _PART_OF_A_LIST: Final = re.compile(
+    r"\S+ is (?:added|removed|restarted)$|"
     r"\S+: (?:error|warning): |\S+:\d+(?::\d+)?: |(?:fleet: )?(?!fleet: )@?[a-z0-9][a-z0-9_-]*: |\d\d:\d\d:\d\d "
 )
-"""Faults of a file, outcomes of cars, and events: each is a message of its own."""
+"""Changes of a fleet, faults of a file, outcomes of cars, and events: each is a message of its own."""
 
 
 def count_lines(text: str) -> int:

@@ -39,7 +39,7 @@ def fleet_command(*arguments: str, environment: dict[str, str]) -> "subprocess.C
         except SystemExit as ended:
             code = ended.code
     assert code is None or isinstance(code, int), code
-    assert too_long(stderr.getvalue()) == [], arguments
+    assert too_long(stderr.getvalue()) == [], (arguments, stderr.getvalue())
     stdout.seek(0)
     return subprocess.CompletedProcess(arguments, code or 0, stdout.read(), stderr.getvalue())
 
