@@ -11,6 +11,8 @@ import pytest
 
 from tests.support.message_length import MAX_LINES, count_lines
 
+pytestmark = pytest.mark.xdist_group("sources")  # on one worker, which parses each file once
+
 ROOT = Path(__file__).resolve().parents[1]
 PRODUCT = ("gateway", "fleet", "schemas")
 PACKAGES = (*PRODUCT, "tests")

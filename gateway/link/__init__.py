@@ -1,7 +1,7 @@
 """Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.protocol` gives the bytes their meaning.
 
-`base` has the interface and its errors. `serial`, `tcp` and `ble` implement it. `usb` finds the port of a USB device,
-`url` accepts a link from the command line.
+`base` has the interface and its errors. `serial`, `tcp` and `ble` implement it, two of them with the buffer of
+`buffered_link`. `usb` finds the port of a USB device, `url` accepts a link from the command line.
 """
 
 from gateway.link.base import BadUrl, Busy, CannotOpen, Link, LinkError, LinkLost

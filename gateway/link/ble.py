@@ -19,7 +19,8 @@ from bleak.backends.device import BLEDevice
 from bleak.backends.scanner import AdvertisementData
 from bleak.backends.service import BleakGATTService
 
-from gateway.link.base import MAX_BUFFERED_BYTES, BufferedLink, Busy, CannotOpen, Link, LinkLost
+from gateway.link.base import Busy, CannotOpen, Link, LinkLost
+from gateway.link.buffered_link import MAX_BUFFERED_BYTES, BufferedLink
 from schemas.links import BleUrl
 from schemas.process.stdio import printable
 

@@ -9,7 +9,8 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from typing import Any, Final
 
-from gateway.link.base import CLOSE_S, MAX_BUFFERED_BYTES, BufferedLink, CannotOpen, Link, LinkLost
+from gateway.link.base import CLOSE_S, CannotOpen, Link, LinkLost
+from gateway.link.buffered_link import MAX_BUFFERED_BYTES, BufferedLink
 from schemas.links import TcpUrl
 
 # A vanished peer is noticed within about five seconds, where the system has these options.

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from gateway.link import Busy, CannotOpen, Link, LinkLost, ble, open_link
-from gateway.link.base import MAX_BUFFERED_BYTES
+from gateway.link.buffered_link import MAX_BUFFERED_BYTES
 from schemas.links import BleUrl
 from tests.gateway.link.peers import BlePeer, open_descriptors, settled
 

@@ -22,7 +22,7 @@ from gateway.sim.model.world import World
 from tests.support.stops import AVOIDANCE, CASES, ENDS_S, LONGEST_S, OPENS_S, RESTORED, Seen, StopTestCase, inside, play
 from tests.support.virtual import Pair
 
-MOMENTS = 6
+MOMENTS = 4
 
 
 def judge(seen: Seen) -> None:

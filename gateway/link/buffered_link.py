@@ -1,0 +1,33 @@
+"""The links whose callbacks buffer bytes: TCP and Bluetooth."""
+
+# Not in `base`: `gateway run` imports asyncio only if the link's URL is one.
+import asyncio
+from typing import Final
+
+from gateway.link.base import Link, LinkLost
+
+# Over a minute of a car's 960 bytes/s.
+MAX_BUFFERED_BYTES: Final = 64 * 1024
+"""Maximum of unread bytes. Above it, TCP stops reading the socket; Bluetooth, without flow control, ends the link."""
+
+
+class BufferedLink(Link):
+    """A link whose callbacks buffer the bytes for `read`."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._came = asyncio.Event()
+        """Set if there are bytes, or if the link is lost."""
+        self._lost: str | None = None
+        """Why the link is lost; None if it is not."""
+
+    async def read(self) -> bytes:
+        """Return the next bytes as they arrived; raise LinkLost."""
+        while not self._data:
+            if self._lost is not None:
+                raise LinkLost(self._lost)
+            self._came.clear()
+            await self._came.wait()
+        data = bytes(self._data)
+        self._data.clear()
+        return data
