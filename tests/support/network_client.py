@@ -65,6 +65,7 @@ class NetworkDevice:
             additional_headers=sent,
             ssl=untrusting(),
             proxy=None,
+            open_timeout=30,
             source_address=self._source,
         )
 

@@ -152,6 +152,7 @@ def test_a_topic_without_messages_is_an_empty_table() -> None:
 
 @pytest.mark.parametrize("package", ["pyarrow", "pandas"])
 def test_without_the_extra_the_error_says_what_to_type(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(Session(OLD).to_pandas("sensor/range")), "pyarrow has looked for pandas, and never looks again"
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(FormatMissing, match=rf"{package} is not installed.*'zenoh-car-fleet\[analysis\]'") as error:
         Session(OLD).to_pandas("sensor/range")
