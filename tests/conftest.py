@@ -26,11 +26,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Return five times the processors: most tests wait, for processes, cars and seconds.
+    """Return four times the processors: most tests wait, for processes, cars and seconds.
 
     With two workers for each processor the suite took 9.8 min on two, and used one.
     """
-    return 5 * (os.cpu_count() or 1)
+    return 4 * (os.cpu_count() or 1)
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups

@@ -42,6 +42,11 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(parsed(path)))
+
+
 def module_name(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
@@ -49,7 +54,7 @@ def module_name(path: Path) -> str:
 def test_a_class_name_stands_for_one_class() -> None:
     places: dict[str, list[str]] = defaultdict(list)
     for path in source_files(*PACKAGES):
-        for node in ast.walk(parsed(path)):
+        for node in nodes(path):
             if isinstance(node, ast.ClassDef):
                 places[node.name].append(module_name(path))
     for name in TWINS:
@@ -172,7 +177,7 @@ def test_a_message_to_users_has_at_most_two_lines() -> None:
         for line, text in messages_with_lines(parsed(path)):
             if "\n" not in text and count_lines(text) > MAX_LINES:
                 faults.append(f"{path}:{line}: {text}")
-        for node in ast.walk(parsed(path)):
+        for node in nodes(path):
             if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(raised):
                 strings = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
                 words = "".join(each for each in strings if isinstance(each, str) and each.strip())

@@ -55,7 +55,7 @@ def cut_it_shows_every_whole_chunk(original: Original, lengths: Iterable[int], p
 
 
 def test_cut_anywhere_it_shows_every_whole_chunk(original: Original, tmp_path: Path) -> None:
-    cut_it_shows_every_whole_chunk(original, sampled(original), tmp_path / "x.mcap")
+    cut_it_shows_every_whole_chunk(original, sampled(original)[::2], tmp_path / "x.mcap")
 
 
 @pytest.mark.soak
@@ -74,7 +74,7 @@ def report(path: Path) -> str:
 
 
 def test_a_flipped_bit_anywhere_is_said_and_loses_its_own_chunk_at_most(original: Original, tmp_path: Path) -> None:
-    for at in sampled(original):
+    for at in sampled(original)[::2]:
         flipped_it_loses_its_own_chunk_at_most(original, at, [at % 8], tmp_path)
 
 
