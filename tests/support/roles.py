@@ -18,7 +18,6 @@ from gateway.protocol.frames import ModeOpen, encode
 from schemas import messages
 from schemas.bus import Bus, Sample, sample_of
 from tests.support.judge import stamp_ns
-from tests.support.kills import BUSY_S
 from tests.support.processes import TAKEN, wait_for
 from tests.support.up import Up
 
@@ -221,16 +220,15 @@ class RoleStage:
         self.up.kill(pid)
         wait_for(lambda: not self.up.exists(pid), f"{name} is gone")
 
-    def judge(self, *, slack_s: float = 0.0) -> None:
+    def judge(self) -> None:
         """Raise for what must never be."""
         watcher = self.watcher
         assert not watcher.twice, f"two roles: {watcher.twice}"
-        # A gateway that stands stops nothing meanwhile: the machine's part of it.
-        strays = {car: stray_s for car, stray_s in watcher.strays.items() if stray_s > STRAY_S + min(slack_s, BUSY_S)}
+        strays = {car: stray_s for car, stray_s in watcher.strays.items() if stray_s > STRAY_S}
         assert not strays, f"motors on in mode 0 with nobody driving: {strays}"
         moved = [car for at, car in watcher.moved if car == HELD and at > self.held_ns]
         assert not moved, f"{HELD} was held and moved"
-        late = [fault for fault in self.faults if fault.late and (fault.filled_s or 0) > fault.limit_s + slack_s]
+        late = [fault for fault in self.faults if fault.late and (fault.filled_s or 0) > fault.limit_s]
         assert not late, late
 
 
