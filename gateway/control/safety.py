@@ -195,7 +195,12 @@ class Safety:
         """Merge the fleet-wide e-stops of another gateway. Return (latched, ended). An ended e-stop stays ended."""
         removed = self.end(each for each in ended if each in self._estops and self._estops[each].fleet_wide)
         known = {*self._estops, *self._ended}
-        latched = [self.latch(each) for each in estops if each.fleet_wide and each.id not in known]
+        shared = [each for each in estops if each.fleet_wide]
+        latched = [self.latch(each) for each in shared if each.id not in known]
+        for each in shared:  # a gateway without people latches the e-stop of a lead as that of a person
+            first = self._estops.get(each.id)
+            if first is not None and _SENDER_RANK[each.rank] > _SENDER_RANK[first.rank]:
+                self.latch(each)
         return [each for each in latched if each.id in self._estops], removed
 
     # ------------------------------------------------------------------ pauses

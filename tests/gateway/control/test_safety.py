@@ -101,6 +101,21 @@ def test_only_fleet_wide_ids_are_united_and_ended_wins() -> None:
     assert blue.merge((estop("fleet"),), ()) == ([], []), "ended wins over one who has not heard of it"
 
 
+def test_a_gateway_without_people_learns_that_a_lead_did_an_e_stop() -> None:
+    """The e-stop of a lead reaches each gateway directly. One without people latches it as that of a person."""
+    own = estop("a")
+    lead = replace(own, rank=SenderKind.LEAD)
+    safety = Safety()
+    safety.latch(own)
+    assert safety.merge([lead], ()) == ([], []), "nothing new: the car is not stopped once more"
+    assert (safety.estops, safety.hold) == ((lead,), Hold("eve", 7, SenderKind.LEAD))
+    assert safety.merge([own], ()) == ([], [])
+    assert safety.estops == (lead,), "no other gateway lowers the rank"
+    safety.end(["a"])
+    assert safety.merge([lead], ()) == ([], [])
+    assert safety.estops == ()
+
+
 @given(st.lists(st.tuples(st.integers(0, 2), st.sampled_from("abcd"), st.booleans()), max_size=30))
 def test_gateways_that_see_each_other_agree(steps: list[tuple[int, str, bool]]) -> None:
     cars = [Safety(), Safety(), Safety()]
