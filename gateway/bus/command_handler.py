@@ -14,7 +14,7 @@ import zenoh
 from gateway.bus import requests
 from gateway.bus.estop_sync import EstopSync
 from gateway.bus.publisher import CarPublisher
-from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Phase, Unpause
+from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Phase, Reason, Resume, Unpause
 from gateway.control.controller import Controller
 from gateway.control.events import Level, LogRecord
 from gateway.control.safety import PersistedSafety
@@ -97,8 +97,10 @@ class CommandHandler:
         command, answer = self._carry_out(request)
         if not request.by_wildcard:
             self._estop_sync.forward(command, before, self._control.safety.persisted)
-        elif isinstance(command.what, Pause | Unpause) or (
-            isinstance(command.what, EmergencyStop) and command.what.fleet_wide
+        elif (
+            isinstance(command.what, Pause | Unpause)
+            or (isinstance(command.what, EmergencyStop) and command.what.fleet_wide)
+            or (isinstance(command.what, Resume) and answer.reason is Reason.ESTOPPED)
         ):
             self._estop_sync.sync_soon()  # this gateway may have missed an e-stop or a pause, or its end
         key = keys.command_key(self._fleet, self._car, verb)

@@ -62,7 +62,8 @@ class People:
         if rank is not SenderKind.LEAD or sender.kind is SenderKind.LEAD:
             return True
         if self.roles is None:
-            # A gateway without a table knows one lead: who began it. All others must end it at the other gateways.
+            # A gateway without a table knows one lead: who began it. If another lead ends a pause or a fleet-wide
+            # e-stop at the other gateways, this one learns the end from them.
             return sender.kind is SenderKind.PERSON and sender.person == person_of(by)
         # After a restart with another table there may be no lead: then the car must not stay stopped for ever.
         return not self.leads

@@ -2,6 +2,8 @@
 
 import time
 
+import pytest
+
 from fleet.client.client import Fleet as Client
 from tests.support.processes import TAKEN, FleetProcesses, driving, wait_for
 
@@ -146,3 +148,25 @@ def test_a_lead_pauses_the_fleet_and_lends_a_car(fleet: FleetProcesses) -> None:
         assert 500 < safety.loan.expires_in_s < 600
         assert bob.car("blue").end_loan().ok
         assert bob.car("blue").drive("forward").reason == "not_allowed"
+
+
+@pytest.mark.soak
+def test_a_gateway_without_people_learns_that_a_lead_ended_an_e_stop(fleet: FleetProcesses) -> None:
+    _, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
+    fleet.gateway(red, "--person", "teacher:lead", "--person", "head:lead", "--person", "ann")
+    fleet.gateway(blue, car="blue")
+    for car in ("red", "blue"):
+        fleet.ready(car)
+    with (
+        Client(fleet.endpoint, person="teacher", kind="person") as teacher,
+        Client(fleet.endpoint, person="head", kind="person") as head,
+        Client(fleet.endpoint, person="ann", kind="person") as ann,
+    ):
+        teacher.estop(why="smoke")
+        wait_for(
+            lambda: [each.rank for each in fleet.state("safety", "blue").estops] == ["lead"], "blue knows the rank"
+        )
+        assert [outcome.reason for outcome in ann.resume(None, everything=True)] == ["estopped"] * 2
+        assert estops(fleet, "red") == estops(fleet, "blue") != []
+        assert head.resume(["red"], estops(fleet, "red"))[0].ok
+        wait_for(lambda: estops(fleet, "blue") == [], "blue learns the end from red")
