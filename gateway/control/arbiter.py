@@ -311,7 +311,8 @@ def _only_leads(context: CommandContext) -> str:
     rule, leads = "only a lead ends what a lead began", context.people.leads
     if leads:
         return f"{rule} ({', '.join(leads)})."
-    return f"{rule}. The gateway of {context.car} knows no leads: start it by `fleet up`, or with `--person NAME:lead`."
+    where = "`people:` of the fleet file, or with `--person NAME:lead`"
+    return f"{rule}. The gateway of {context.car} knows no leads: name them in {where}."
 
 
 def _not_allowed(sender: Sender, context: CommandContext) -> Refusal | None:
@@ -327,7 +328,9 @@ def _not_allowed(sender: Sender, context: CommandContext) -> Refusal | None:
         return refusal
     last = context.pauses[-1]
     why = f': "{last.why}"' if last.why else ""
-    who = "A lead" if context.people.leads or last.rank is SenderKind.LEAD else "A person"
+    people = context.people
+    by_lead = people.roles is None and any(pause.rank is SenderKind.LEAD for pause in context.pauses)
+    who = "A lead" if people.leads or by_lead else "A person"
     return Reason.PAUSED, f"{car} is paused with the whole fleet ({last.by}{why}). {who} ends it with `fleet unpause`."
 
 

@@ -220,6 +220,25 @@ def resumed(
     return estopped
 
 
+@pytest.mark.parametrize(
+    ("people", "ranks", "who"),
+    [
+        (PEOPLE, (PERSON,), "A lead"),
+        (NO_PEOPLE, (PERSON,), "A person"),
+        (NO_PEOPLE, (LEAD, PERSON), "A lead"),
+        (People.parse(["ann"]), (LEAD,), "A person"),  # there is no lead who could
+    ],
+)
+def test_a_paused_car_says_who_ends_the_pause(people: People, ranks: tuple[SenderKind, ...], who: str) -> None:
+    pauses = tuple(FleetPause(f"p{at_ns}", "teacher@lab", "", at_ns, rank) for at_ns, rank in enumerate(ranks))
+    at = replace(FREE, people=people, pauses=pauses)
+    reason, words = refused(Drive(Motion.FORWARD), SENDERS["person"], at)
+    assert reason is Reason.PAUSED
+    assert words.endswith(f". {who} ends it with `fleet unpause`.")
+    may_end = refused(Unpause(), SENDERS["person"], at)[0] is None
+    assert may_end is (who == "A person")
+
+
 # ---------------------------------------------------------------------- through control
 
 FORWARD = Drive(Motion.FORWARD, 10.0)
