@@ -1,5 +1,6 @@
 """Queries the supervisor of a fleet for its status."""
 
+from contextlib import suppress
 from typing import Any, Final
 
 from schemas import keys, topics
@@ -19,6 +20,10 @@ def ask_status(bus: Bus, fleet: str, timeout_s: float = 2.0) -> list[Any]:
 
 
 def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
-    """Return the colors of the cars of a running fleet. Empty if no supervisor answers."""
-    found = ask_status(bus, fleet, COLORS_TIMEOUT_S)
-    return {car: parse_color(color) for each in found for car, color in each.colors.items()}
+    """Return the colors of the cars of a running fleet. Empty if no supervisor answers. Skip what is no color."""
+    colors: dict[str, Rgb] = {}
+    for status in ask_status(bus, fleet, COLORS_TIMEOUT_S):
+        for car, color in status.colors.items():
+            with suppress(ValueError):  # anybody may answer
+                colors[car] = parse_color(color)
+    return colors

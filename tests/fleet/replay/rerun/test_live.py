@@ -23,6 +23,7 @@ from fleet.replay.rerun import export, live
 from fleet.replay.rerun.live import Live
 from fleet.replay.rerun.viewer import Viewer, free_port
 from schemas.bus import Bus, reply_message, router_config
+from schemas.colors import car_color
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint
@@ -81,7 +82,7 @@ def test_cars_have_the_colors_of_the_running_fleet(tmp_path: Path) -> None:
     key = "fleet/@supervisor/status"
 
     def answer(query: zenoh.Query) -> bool:
-        reply_message(query, key, pb.Supervision(colors={"red": "#010203"}), as_json=False)
+        reply_message(query, key, pb.Supervision(colors={"red": "#010203", "blue": "no color"}), as_json=False)
         return True
 
     endpoint = free_endpoint()
@@ -89,6 +90,7 @@ def test_cars_have_the_colors_of_the_running_fleet(tmp_path: Path) -> None:
         bus.queryable(key, answer)
         with following_of(bus, lambda recording: recording.save(tmp_path / "out.rrd")) as following:
             assert following._drawing.color("red", 0) == (1, 2, 3)
+            assert following._drawing.color("blue", 0) == car_color("blue", 0), "what is no color changes nothing"
 
 
 def test_what_is_on_the_bus_is_in_the_file(fleet: FleetProcesses, tmp_path: Path) -> None:
