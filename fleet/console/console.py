@@ -89,6 +89,8 @@ class Console:
     async def run(self) -> None:
         """Serve the pages until the task is cancelled."""
         bus, name = self._fleet.sync.bus, self._fleet.sync.name
+        # Before any message comes: a car keeps the color that it has first.
+        self._colors = await self._fleet.call(ask_colors, bus, name)
         for family in ("sensor", "state"):
             bus.subscribe(f"{name}/*/{family}/*", self._on_reading)
         bus.subscribe(f"{name}/*/event/*", self._events)
@@ -101,7 +103,6 @@ class Console:
                 loop.call_soon_threadsafe(change, token)
 
         await self._fleet.call(bus.watch_tokens, f"{name}/{keys.COORDINATOR}", on_token)
-        self._colors = await self._fleet.call(ask_colors, bus, name)
         self.operator.spawn(self._read_plan())
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tick())
