@@ -205,7 +205,8 @@ class Progress:
     def _give_up_unanswered(self, words: str, at: float) -> None:
         """Give up, unless the gateway has answered or sent an event."""
         if not self.answered:
-            self._end(NO_ANSWER, "", self._foreign or words, at, ok=False)
+            words = f"{self._foreign}. {words}" if self._foreign else words
+            self._end(NO_ANSWER, "", words, at, ok=False)
 
     def on_query_timeout(self, at: float) -> None:
         """Give up if the query has timed out without an answer."""

@@ -234,11 +234,15 @@ def test_a_foreign_answer_does_not_replace_that_of_the_gateway() -> None:
     assert (progress.outcome.phase, progress.outcome.ok) == ("complete", True)
 
 
-@pytest.mark.parametrize("ends", [lambda p: p.on_query_failed("it ended", 101.0), lambda p: p.on_query_timeout(110.0)])
+@pytest.mark.parametrize(
+    "ends",
+    [lambda p: p.on_query_failed("It ended. Look at the car.", 101.0), lambda p: p.on_query_timeout(110.0)],
+)
 def test_a_foreign_answer_explains_why_no_other_came(ends: Callable[[Progress], None]) -> None:
     progress = Progress("red", Until.STOPPED, 100.0)
     progress.on_foreign_answer("another program answered for red: no result")
     ends(progress)
     assert progress.outcome is not None
     assert progress.outcome.code == "no_answer"
-    assert progress.outcome.words == "another program answered for red: no result"
+    assert progress.outcome.words.startswith("another program answered for red: no result. It ")
+    assert progress.outcome.words.endswith("Look at the car.")
