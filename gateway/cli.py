@@ -53,7 +53,7 @@ def main() -> None:
 
 
 class _GatewayParser(argparse.ArgumentParser):
-    """A parser that does not ignore a help that cannot be written."""
+    """A parser that fails if its help cannot be written."""
 
     def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
         """Print the help to stdout, or to the file."""
@@ -71,13 +71,12 @@ class _Version(argparse.Action):
 
 
 def _print(text: str) -> None:
-    """Print a text to stdout. If it cannot be written, print an error and exit with 1."""
+    """Print a text to stdout. If it cannot be written, exit with 1."""
     try:
         sys.stdout.write(text)
         sys.stdout.flush()
     except OSError as error:
-        stdio.silence(sys.stdout)
-        sys.exit(_failed(f"the output cannot be written: {error.strerror}", 1))
+        sys.exit(stdio.silence_broken(error, "gateway"))
 
 
 def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
