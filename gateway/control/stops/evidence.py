@@ -43,7 +43,7 @@ PAUSE_MAX_S: Final = 2.6
 NORMAL_MIN_S: Final = 0.8
 NORMAL_MAX_S: Final = 1.4
 """Range of the normal interval of two reports. The link has delayed closer ones, so their times show nothing."""
-# A damaged MODE frame may open mode 0 with the motors on, which blocks for 2.0 to 2.3 s. If the link holds the report
+# A damaged MODE frame may open mode 0 with the motors on, which blocks for 2.1 to 2.3 s. If the link holds the report
 # before, both gaps look like pauses: held for 0.85 to 1.4 s. No such hold makes both match the interval of this car.
 MATCH_S: Final = 0.12
 """Maximum difference of a pause from the last normal interval and the 1.0 s that `MODE00` takes."""
@@ -100,8 +100,8 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     ),
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
-        "two pauses of 1.9 s between reports, each around a `MODE00` and 1.0 s longer than a normal interval, and no "
-        "reading for 0.25 s after the second",
+        "two pauses of 1.9 s between reports, each around a `MODE00` and 1.0 s longer than the last normal interval "
+        "(if there was one), and no reading for 0.25 s after the second",
         "the stop goes on",
     ),
     StopCase.NO_ECHO: EvidenceRow(
@@ -185,7 +185,7 @@ class StopEvidence:
     _interval_s: float | None = None
     """The last normal interval of two reports, without a frame that blocks in between."""
     _blocked_s: float = 0.0
-    """For how long the frames since the last report block the car."""
+    """Time for which the frames since the last report block the car."""
     _window_s: float = CLOSED_S
     _shapes: int = 0
     _shape_at: float | None = None
@@ -228,7 +228,7 @@ class StopEvidence:
             self._plain = False
 
     def blocked(self, block_s: float) -> None:
-        """Record a frame that blocks the car for so long: the next report comes later."""
+        """Record a frame that blocks the car. The next report comes up to this time later."""
         if block_s > FRAME_S:
             self._blocked_s += block_s
 
