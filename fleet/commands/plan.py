@@ -40,7 +40,7 @@ examples:
 def why(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> None:
     """Explain why a car does what it does: what the plan decided, from which readings, and what would change it.
 
-    Also who stopped, paused, borrowed or drives it, since when, and what ends that.
+    Also say who stopped, paused, borrowed or drives the car, since when, and what ends that.
     """
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}

@@ -87,7 +87,8 @@ def refusals(rules: CarRules, sender: str) -> dict[str, Refusal]:
 def management_refusal(cars: Iterable[CarRules], sender: str) -> str:
     """Return why this person may not start and stop the recorder and plans. Empty if allowed.
 
-    Both are of the whole fleet. The coordinator decides by the same rule. The console holds its own pages to it.
+    Both are of the whole fleet. The coordinator decides about the plan by the same rule. The recorder refuses nobody,
+    so the console holds its own pages to the rule.
     """
     return merge_authority(rules.authority for rules in cars).refusal(person_of(sender))
 

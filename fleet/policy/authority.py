@@ -1,4 +1,4 @@
-"""Who may act on the whole fleet: set, start and stop its plan and its recorder. Pure."""
+"""Decides who may act on the whole fleet: change its plan, and start and stop its recorder. Pure."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Authority:
         return self.names is None or person in self.names
 
     def refusal(self, person: str) -> str:
-        """Return why this person may not; empty if allowed. Where there are leads, only they may."""
+        """Return why this person may not act on the fleet; empty if allowed. If there are leads, only they may."""
         if person in self.leads:
             return ""
         if self.leads:
@@ -41,5 +41,5 @@ def merge_authority(parts: Iterable[Authority]) -> Authority:
 
 
 def unlisted_words(person: str) -> str:
-    """Say what a person may do whom the fleet file does not list."""
+    """Return what a person may do whom the fleet file does not list, in words."""
     return f"{person} watches and stops: the fleet file does not list {person}."

@@ -97,11 +97,9 @@ def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
 
 
 def longest_hub_silence_s(sign: Sign) -> float:
-    """Return the allowed silence of a hub if it is longer than the hub's own patience, else 0.
-
-    A hub that works is no hung one: a hundred sessions come back at once after it stood still. It has several threads,
-    so a whole CPU is work too.
-    """
+    """Return the allowed silence of a hub if it is longer than the hub's own patience, else 0."""
+    # A hub that works is not hung: after it stood still, a hundred sessions come back at once. Its threads then use a
+    # whole CPU or more. A hub of which only the main thread still polls may look the same.
     return SLOW_SILENT_S if sign in (Sign.SLOW, Sign.SPINNING) else 0.0
 
 

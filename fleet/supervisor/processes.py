@@ -35,7 +35,7 @@ CPU_CHECK_SILENCE_S: Final = 1.0
 """Silence after which a process's CPU time is sampled."""
 
 
-# The hub is judged by the link to it alone: its main thread shows nothing of Zenoh's routing threads.
+# The link to the hub is its heartbeat: its main thread shows nothing of Zenoh's routing threads.
 _HEARTBEAT_KINDS: Final = tuple(kind for kind in ProcessKind if kind is not ProcessKind.HUB)
 
 

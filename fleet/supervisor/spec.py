@@ -102,7 +102,7 @@ class FleetSpec:
     listed: Mapping[str, CoordinatorCar] = field(default_factory=dict)
     """The coordinator's entries, by car."""
     people: Mapping[str, FleetPerson] | None = None
-    """Who may drive, and change the plan. None: everyone."""
+    """The people who may drive, and change the plan. None: everyone may."""
     console: bool = False
     console_port: int = 0
     """Port of the web page. 0: the default of `fleet console`."""

@@ -1,6 +1,6 @@
 """The links whose callbacks buffer bytes: TCP and Bluetooth."""
 
-# Not in `base`: `gateway run` imports asyncio only if the link's URL is one.
+# Not in `base`, which `gateway run` imports before it is on the bus: the import of asyncio takes long.
 import asyncio
 from typing import Final
 

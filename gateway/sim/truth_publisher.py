@@ -91,7 +91,7 @@ class TruthPublisher:
 
     async def _open(self, loop: asyncio.AbstractEventLoop) -> Bus:
         """Open the bus, with retries."""
-        # Opening blocks, so it runs in a thread: a daemon, so that a hub that hangs does not prevent our end.
+        # Opening blocks, so it runs in a thread. The thread is a daemon: a hub that hangs must not prevent our end.
         warn_at = loop.time() + HUB_WARNING_DELAY_S
         while True:
             if loop.time() >= warn_at:

@@ -5,7 +5,7 @@ const UNPAIRED_MS = 5000;
 const LOST_MS = 1500;
 const MAX_RESULTS = 6;
 const DRAWING_SHARE = 3; // the page rests three times as long as a drawing took
-const MAX_DRAWING_MS = 150;
+const MAX_DRAWING_MS = 150; // the longest time that counts, so that the page rests 450 ms at most
 const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
 
 const listeners = new Set();

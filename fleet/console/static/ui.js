@@ -20,7 +20,7 @@ export const Verdict = ({ table, name, detail = "" }) => {
 // Why an action is refused, before it is tried.
 export const Refused = ({ words }) => words.map((each) => html`<p class="cannot refused" key=${each}>${each}</p>`);
 
-// Draws again only if its data has changed: some in each task, so that a press of STOP does not wait for all.
+// Cards are drawn some in each task, so that a press of STOP does not wait for all.
 // Layout and paint of twenty cards keep a phone busy, so what is out of view is drawn once a second.
 const OUT_OF_VIEW_MS = 1000;
 const CARDS_IN_A_TASK = 4;
@@ -43,6 +43,7 @@ const view = new IntersectionObserver((entries) => {
   }
 });
 
+// Draws again only if its data has changed.
 export class Memo extends Component {
   componentDidMount() {
     this.cell.memo = this;

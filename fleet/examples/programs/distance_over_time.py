@@ -9,7 +9,7 @@ from fleet import Session
 
 
 def main(session: str, car: str, picture: str) -> None:
-    """Save the picture. Each dot is a reading. A reading without an echo has none."""
+    """Save the picture. Each dot is a reading. A reading without an echo has no dot."""
     frame = Session(session).to_pandas(f"{car}/sensor/range")
     plot = frame.plot(x="publish_time", y="range_m", style=".", xlabel="time (UTC)", ylabel="distance (m)")
     plot.figure.savefig(picture)
