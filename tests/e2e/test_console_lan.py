@@ -100,7 +100,7 @@ FORWARD = "[data-motion=forward]"
 
 
 def paired_page(browser: Browser, fleet: FleetProcesses, port: int, *person: str) -> Page:
-    """The drive page of a device that pairs as this person by the address of a QR code."""
+    """Open the drive page on a device that pairs as this person by the address of a QR code."""
     done = CliRunner().invoke(cli, ["console", "pair", *person], env=fleet.environment)
     code = done.output.split(" type ")[1][:9]
     page = browser.new_context(ignore_https_errors=True, **DESKTOP).new_page()

@@ -208,7 +208,7 @@ CTRL_C_S: Final = 10.0
 
 
 def interrupted(command: str, prompt: Prompt) -> tuple[int, str]:
-    """Run a command that stays, press Ctrl-C after its first line; its exit code, and all that it printed."""
+    """Press Ctrl-C after the first line of a command that stays. Return its exit code, and all that it printed."""
     words = [sys.executable, "-u", "-m", "fleet.cli", *shlex.split(command)[1:]]
     with subprocess.Popen(
         words,

@@ -19,7 +19,7 @@ def test_no_stop_is_claimed_and_false(part: int) -> None:
 
 
 def play_held(seed: int, load_s: float, held_at_s: float, held_s: float, report_every_s: float) -> Report:
-    """The link holds a report for about a second, which looks like a pause. It damages a stop, which blocks for 2 s."""
+    """Play a link that holds a report for about a second, as a pause does, and damages a stop, which blocks for 2 s."""
     held = LinkFault(Kind.STUCK, Way.TO_HOST, held_at_s, held_s)
     lossy = LinkFault(Kind.LOSSY, Way.TO_CAR, -0.5, 8.0, share=0.2 if seed == 1352 else 0.3)
     plan = EpisodePlan(

@@ -110,7 +110,7 @@ class TwentyCars:
         self._newest[sample.key.split("/")[1]].append(time.monotonic())
 
     def _streams(self, car: str) -> bool:
-        """True if a car has just sent some readings at the rate of its mode."""
+        """Return True if a car has just sent some readings at the rate of its mode."""
         times = list(self._newest[car])
         lasts_s = STREAM_READINGS / MIN_RATE_HZ
         return len(times) == STREAM_READINGS and time.monotonic() - times[0] < lasts_s

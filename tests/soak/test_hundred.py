@@ -76,7 +76,7 @@ def wait_until_at_rest(up: Up, seconds: float, wedged: int = 0) -> None:
 
 
 def stands(up: Up, car: str) -> bool:
-    """Whether the car stands in truth."""
+    """Return True if the car stands in truth."""
     truths: list[bool] = []
 
     def on_truth(sample: Sample) -> None:

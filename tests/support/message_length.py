@@ -1,4 +1,4 @@
-"""How long a message to a person may be: two lines. Faults of a file, cars and changes are lists: a message each."""
+"""The maximum length of a message to a person: two lines. Each fault of a file, car or change is a message."""
 
 from typing import Final
 
