@@ -323,9 +323,12 @@ class StopEvidence:
             return Finding.SETTLING
         if after_s <= self._window_s and gap_s <= NORMAL_MAX_S:
             return Finding.NOTHING
-        self._pending = self._interval_s = None
+        self._pending = None
         self._pauses = 0
-        return Finding.LOST if NORMAL_MIN_S < gap_s < NORMAL_MAX_S else Finding.REPORT
+        if NORMAL_MIN_S < gap_s < NORMAL_MAX_S:
+            return Finding.LOST
+        self._interval_s = None
+        return Finding.REPORT
 
     def _other_mode(self, at: float) -> None:
         self._shapes += 1

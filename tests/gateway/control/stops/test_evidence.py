@@ -143,6 +143,18 @@ def test_a_held_report_and_a_damaged_frame_that_blocks_for_longer_make_no_two_pa
     assert watch.reports(7.73) == [PAUSE], "the next ones count again"
 
 
+def test_after_a_lost_mode00_the_interval_is_still_known() -> None:
+    """The stop is sent again at once. Then a report is held for 0.9 s, and a damaged frame opens mode 0 for 2.3 s."""
+    watch = EvidenceWatch()
+    watch.reports(9.0, 10.0)
+    watch.closed(10.1)
+    assert watch.reports(11.0, 12.0) == [NOTHING, LOST]
+    watch.closed(12.05)
+    assert watch.reports(13.92) == [PAUSE]
+    watch.closed(13.93)
+    assert watch.reports(16.33) == [REPORT]
+
+
 def test_after_a_shown_stop_one_more_pause_shows_the_next_until_a_motion_is_sent() -> None:
     watch = EvidenceWatch()
     watch.pause(10.0)
