@@ -5,7 +5,8 @@ The car acknowledges nothing (docs/reference/protocol.md#evidence-of-a-stop). A 
 pause. The docs print `EVIDENCE` (docs/reference/stop-evidence.md).
 """
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
@@ -46,7 +47,10 @@ NORMAL_MAX_S: Final = 1.4
 # A damaged MODE frame may open mode 0 with the motors on, which blocks for 2.1 to 2.3 s. If the link holds the report
 # before, both gaps look like pauses: held for 0.85 to 1.4 s. No such hold makes both match the interval of this car.
 MATCH_S: Final = 0.12
-"""Maximum difference of a pause from the last normal interval and the 1.0 s that `MODE00` takes."""
+"""Maximum difference of a pause from the last normal intervals and the 1.0 s that `MODE00` takes."""
+# A busy machine or a radio delays reports by more than MATCH_S. Then the normal intervals differ by as much.
+INTERVALS: Final = 5
+"""Number of normal intervals that a pause is compared with."""
 # A link that loses both `MODE00` and the report after it leaves the same gap as a pause. Half of all outages of 0.6 s
 # around a stop do that, so one pause is not enough.
 PAUSES: Final = 2
@@ -182,8 +186,8 @@ class StopEvidence:
     _pending: float | None = None
     """When the last `MODE00` without a result was written."""
     _pauses: int = 0
-    _interval_s: float | None = None
-    """The last normal interval of two reports, without a frame that blocks in between."""
+    _intervals: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
+    """The last normal intervals of two reports, without a frame that blocks in between."""
     _blocked_s: float = 0.0
     """Time for which the frames since the last report block the car."""
     _window_s: float = CLOSED_S
@@ -203,7 +207,8 @@ class StopEvidence:
 
     def begin_link(self) -> None:
         """Forget everything: the link is new."""
-        self.obeyed_at = self._interval_s = None
+        self.obeyed_at = None
+        self._intervals.clear()
         self._last_at = self._foreign_at = float("-inf")
         self._window_s = CLOSED_S
         self.reset_times()
@@ -289,7 +294,7 @@ class StopEvidence:
             return Finding.NO_ECHO
         if pending is None:
             if before is not None and not blocked_s and at - before < NORMAL_MAX_S:
-                self._interval_s = at - before
+                self._intervals.append(at - before)
             return Finding.REPORT
         if before is None:
             if at <= pending + CLOSED_S:
@@ -310,9 +315,7 @@ class StopEvidence:
         """Judge the interval of two reports. The later one came `after_s` after `MODE00`."""
         if after_s <= CLOSED_S:
             return Finding.NOTHING
-        longer_s = gap_s - MODE_CLOSE_S - self._interval_s if self._interval_s is not None else 0.0
-        matches = -MATCH_S <= longer_s <= blocked_s + MATCH_S
-        if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S and matches:
+        if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S and self._matches(gap_s, blocked_s):
             self._pending = None
             self._pauses += 1
             self.obeyed_at = at
@@ -326,9 +329,18 @@ class StopEvidence:
         self._pending = None
         self._pauses = 0
         if NORMAL_MIN_S < gap_s < NORMAL_MAX_S:
+            if not blocked_s:
+                self._intervals.append(gap_s)
             return Finding.LOST
-        self._interval_s = None
+        self._intervals.clear()
         return Finding.REPORT
+
+    def _matches(self, gap_s: float, blocked_s: float) -> bool:
+        """Return True if this pause is a normal interval and `MODE00`, or if no normal interval is known."""
+        if not self._intervals:
+            return True
+        normal_s = gap_s - MODE_CLOSE_S
+        return min(self._intervals) - MATCH_S <= normal_s <= max(self._intervals) + blocked_s + MATCH_S
 
     def _other_mode(self, at: float) -> None:
         self._shapes += 1
