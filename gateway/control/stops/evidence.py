@@ -104,8 +104,8 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     ),
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
-        "two pauses of 1.9 s between reports, each around a `MODE00` and 1.0 s longer than the last normal interval "
-        "(if there was one), and no reading for 0.25 s after the second",
+        "two pauses of 1.9 s between reports, each around a `MODE00`; no reading for 0.25 s after the second. A pause "
+        "is 1.0 s longer than the last normal intervals, if there were some",
         "the stop goes on",
     ),
     StopCase.NO_ECHO: EvidenceRow(
