@@ -227,7 +227,7 @@ class Fleet:
     # ------------------------------------------------------------------ commands
 
     def stop(self, cars: Iterable[str] | None = None) -> list[Outcome]:
-        """Stop these cars. Without an argument, stop every car with one query."""
+        """Stop these cars, or the car with this name. Without an argument, stop every car with one query."""
         return self.ask(stop_request(), cars)
 
     def estop(self, cars: Iterable[str] | None = None, why: str = "") -> list[Outcome]:
@@ -266,6 +266,7 @@ class Fleet:
 
     def send(self, request: CommandRequest, cars: Iterable[str] | None = None) -> PendingCommand:
         """Send a command and return at once. Pass the result to `outcomes`."""
+        cars = [cars] if isinstance(cars, str) else cars  # a str is an iterable of letters
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._filled(request)
         payload = message.SerializeToString()

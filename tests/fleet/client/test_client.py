@@ -67,6 +67,12 @@ def test_one_stop_reaches_every_car(client: Fleet) -> None:
     ]
 
 
+def test_a_name_in_place_of_a_list_is_one_car(client: Fleet) -> None:
+    """A str is an iterable of letters. `stop("red")` must not ask the cars r, e and d, and leave red driving."""
+    (outcome,) = client.stop("red")
+    assert (outcome.car, outcome.ok) == ("red", True)
+
+
 def test_a_missing_car_keeps_no_other_from_its_command(client: Fleet) -> None:
     outcomes = client.ask(led_request(1, 2, 3), ["red", "purple", "blue"])
     assert [(each.car, each.ok, each.phase) for each in outcomes] == [
