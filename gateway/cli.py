@@ -5,7 +5,7 @@
 import argparse
 import importlib
 import sys
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
@@ -53,7 +53,30 @@ def main() -> None:
 
 
 class _GatewayParser(argparse.ArgumentParser):
-    """A parser that fails if its help cannot be written."""
+    """A parser with errors of one line, which fails if its help cannot be written."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse the words. A subcommand rejects words that it does not know, because it can name the likely option."""
+        if self._subparsers is not None:
+            return super().parse_known_args(args, namespace)
+        for word in args:
+            name = word.partition("=")[0]
+            if name[:2] == "--" and name[2:] and not any(each.startswith(name) for each in self._option_string_actions):
+                self.error(f"No such option '{name}'. {did_you_mean(name, self._option_string_actions)}".rstrip())
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f'{self.prog} takes no "{unknown[0]}".')
+        return parsed, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        near = did_you_mean(str(value), map(str, action.choices or ()))
+        if near and value not in (action.choices or ()):
+            raise argparse.ArgumentError(action, f'"{value}" is not allowed. {near}')
+        super()._check_value(action, value)
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and where the help is, and exit with 2. The usage has up to eight lines: it is left out."""
+        sys.exit(_failed(f"{message} (see {self.prog} --help)", 2))
 
     def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
         """Print the help to stdout, or to the file."""

@@ -48,8 +48,25 @@ def test_every_command_has_examples(command: Command, name: str) -> None:
 def test_wrong_use_is_told(command: Command, arguments: list[str]) -> None:
     done = command(*arguments)
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith("gateway")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("gateway: ")
+    assert line.endswith(" --help)")
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("run --cra red", "No such option '--cra'. Did you mean --car? (see gateway run --help)"),
+        ("scan --proeb", "No such option '--proeb'. Did you mean --probe? (see gateway scan --help)"),
+        ("sim 3", 'gateway sim takes no "3". (see gateway sim --help)'),
+        ("run --on-battery-low wran", '"wran" is not allowed. Did you mean warn? (see gateway run --help)'),
+    ],
+)
+def test_wrong_words_name_the_likely_one(command: Command, arguments: str, words: str) -> None:
+    done = command(*arguments.split(" "))
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert words in done.stderr
 
 
 @pytest.mark.parametrize(
