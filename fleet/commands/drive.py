@@ -6,7 +6,16 @@ from typing import Final
 import click
 
 from fleet.client.client import Fleet
-from fleet.client.commands import MAX_DRIVE_S, drive_request, estop_request, mode_request, resume_request, stop_request
+from fleet.client.commands import (
+    MAX_DRIVE_S,
+    CommandRequest,
+    drive_request,
+    estop_request,
+    mode_request,
+    resume_request,
+    stop_request,
+)
+from fleet.client.outcome import Outcome
 from fleet.commands.options import (
     carry_out,
     end_with,
@@ -79,7 +88,8 @@ def stop(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
 
     `fleet estop` also makes cars refuse every command. `fleet mode CAR manual` stops without a hold.
     """
-    end_with_any(client.ask(stop_request(), _named(client, cars)), as_json=as_json)
+    request = stop_request()
+    end_with_any([*client.ask(request, _named(client, cars)), *_strangers(client, request, cars)], as_json=as_json)
 
 
 @click.command(epilog="\b\nexamples:\n  fleet estop\n  fleet estop red --why 'someone is on the track'")
@@ -94,7 +104,7 @@ def estop(client: Fleet, cars: tuple[str, ...], why: str, *, as_json: bool) -> N
     """
     named = _named(client, cars)
     request = estop_request(why, "fleet" if named is None else "car")
-    end_with_any(client.ask(request, named), as_json=as_json)
+    end_with_any([*client.ask(request, named), *_strangers(client, request, cars)], as_json=as_json)
 
 
 @click.command(
@@ -165,3 +175,10 @@ def _complete_id(car: str, prefix: str, in_force: list[str]) -> str:
 def _named(client: Fleet, cars: tuple[str, ...]) -> list[str] | None:
     """Return the cars. None for all: one query reaches them at once, also cars that have just connected."""
     return resolve_cars(client, cars) if cars and ALL_CARS not in cars else None
+
+
+def _strangers(client: Fleet, request: CommandRequest, cars: tuple[str, ...]) -> list[Outcome]:
+    """Ask the cars that are named beside `all` and are not connected. The outcome names the likely car."""
+    wrong = [each for each in cars if each != ALL_CARS and not each.startswith("@")] if ALL_CARS in cars else []
+    wrong = [each for each in wrong if each not in client.cars()]
+    return client.ask(request, wrong) if wrong else []

@@ -391,6 +391,14 @@ def test_stop_stops_all_and_is_complete_when_it_ends(cars: Cars) -> None:
     assert resumed.returncode == 0
 
 
+def test_a_wrong_name_beside_all_is_named_and_all_are_stopped(cars: Cars) -> None:
+    done = run(cars.endpoint, "stop", "all", "gren")
+    assert done.returncode == 1
+    assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["blue", "green", "red"]
+    assert done.stderr.startswith('gren: NOT STOPPED: No car named "gren". Did you mean green?')
+    assert run(cars.endpoint, "resume").returncode == 0
+
+
 def test_ending_its_e_stops_does_not_end_a_cars_hold(cars: Cars) -> None:
     estopped = run(cars.endpoint, "estop", "blue", "--why", "wall")
     assert estopped.stdout.endswith(". Release it with `fleet resume blue --estops`\n")
