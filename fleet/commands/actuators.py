@@ -20,9 +20,11 @@ from fleet.client.commands import (
 from fleet.commands.options import carry_out, json_option, take_option, with_client
 from fleet.commands.params import CarNames, Choice, Color, cars_argument, missing_words
 from gateway.protocol.enums import Light, SpeedStep
+from schemas.suggestion import misspelled
 
 _NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings with which -1 is a wrong value and not an unknown option."""
+_FAN_STATES: Final = ("on", "off")
 _ARM_EXAMPLE: Final = "fleet arm red 90 90 45 120 90 30"
 
 
@@ -73,7 +75,7 @@ def _arm(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tupl
 
 def _fan(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tuple[tuple[str, ...], CommandRequest]:
     """Split the words into cars and the state, if there is one. Return the cars and the request."""
-    state = words[-1] if len(words) > 1 and words[-1] in ("on", "off") else None
+    state = words[-1] if len(words) > 1 and words[-1] in _FAN_STATES else None
     cars = words[:-1] if state else words
     if not cars:
         raise click.UsageError(missing_words(ctx), ctx)
@@ -169,6 +171,8 @@ def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_jso
 def fan(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest], *, take: bool, as_json: bool) -> None:
     """Switch the fan. Cars only know "toggle", so `on` and `off` work only if its state is known."""
     cars, request = cars_and_request
+    if cars[1:] and cars[-1] not in client.cars() and (near := misspelled(cars[-1], _FAN_STATES)):
+        raise click.UsageError(f'"{cars[-1]}" is neither a connected car nor on or off. Did you mean {near[0]}?')
     carry_out(client, request, cars, take=take, as_json=as_json)
 
 

@@ -251,6 +251,12 @@ def test_no_fleet_running_is_a_failure_that_says_what_to_do() -> None:
     assert done.stderr.count("\n") == 1
 
 
+def test_a_misspelled_state_of_the_fan_toggles_nothing(cars: Cars) -> None:
+    done = run(cars.endpoint, "fan", "blue", "onn")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith('fleet: "onn" is neither a connected car nor on or off. Did you mean on?')
+
+
 def test_a_fleet_without_cars(cars: Cars) -> None:
     for command in (["list"], ["stop"], ["get", "red"]):
         done = run(cars.endpoint, *command, "--fleet", "empty")
