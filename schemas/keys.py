@@ -29,7 +29,9 @@ def is_name(name: str) -> bool:
 def check_name(name: str, what: str = "car name") -> str:
     """Return `name` if it is a valid name of a car or fleet. Raises BadKey."""
     if not is_name(name):
-        raise BadKey(f"{what} {name!r} is not allowed: use {NAME_RULE}")
+        likely = name.strip().lower().replace(" ", "_")
+        near = f". Did you mean {likely}?" if is_name(likely) else ""
+        raise BadKey(f"{what} {name!r} is not allowed: use {NAME_RULE}{near}")
     return name
 
 

@@ -16,6 +16,12 @@ def test_refused_names_say_the_rule(name: str) -> None:
         keys.check_name(name)
 
 
+@pytest.mark.parametrize(("name", "likely"), [("Red", "red"), ("my car", "my_car"), ("red ", "red")])
+def test_a_refused_name_names_the_likely_one(name: str, likely: str) -> None:
+    with pytest.raises(keys.BadKey, match=rf"digit\. Did you mean {likely}\?$"):
+        keys.check_name(name)
+
+
 @pytest.mark.parametrize(
     ("short", "long"),
     [
