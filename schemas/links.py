@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from typing import Final
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
+from schemas.suggestion import nearest
+
 CAR_TCP_PORT: Final = 8888
 """The port on which the program of a Raspberry Pi car listens (docs/reference/protocol.md#platforms)."""
 BAUD: Final = 9600  # docs/reference/protocol.md#framing: UART 9600 8N1
 _BAUDS: Final = range(300, 4_000_001)
+_SCHEMES: Final = ("ble", "serial", "tcp")
 WINDOWS_PORT: Final = re.compile(r"COM\d{1,3}", re.IGNORECASE)
 _USB_ID: Final = re.compile(r"(?:0[xX])?([0-9a-fA-F]{4})")
 _USB_FIELDS: Final = ("vid", "pid", "serial")
@@ -112,6 +115,9 @@ def parse_link(text: str) -> LinkUrl:
 
 def _likely_link(text: str) -> str:
     """Return the link that a text without a scheme probably means, as a question; empty if unknown."""
+    scheme, colon, rest = text.partition("://")
+    if colon and rest and (near := nearest(scheme, _SCHEMES)):
+        return f"Did you mean {near}://{rest}? "
     if re.fullmatch(r"(tty|cu\.|rfcomm)[\w.-]*", text):
         return f"Did you mean /dev/{text}? "
     if _BLE_ADDRESS.fullmatch(text.upper()):

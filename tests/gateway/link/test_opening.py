@@ -62,6 +62,7 @@ def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written
         ("", "this is not a link"),
         ("ttyUSB0", "this is not a link. Did you mean /dev/ttyUSB0? `fleet scan` lists"),
         ("COM", "this is not a link"),
+        ("bel://A4:C1:38:00:00:01", "this is not a link. Did you mean ble://A4:C1:38:00:00:01? `fleet scan` lists"),
         ("serial://", "it names no device"),
         ("serial:///", "it names no device"),
         ("serial://dev/ttyUSB0", "three slashes come before a device path"),
