@@ -107,6 +107,9 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
     allowed_here = [words for words in map(_describe_allowed, here) if words and words != "nothing"]
     kinds = ("_type", "_than", "_equal", "_parsing", "int_from_float", "enum", "literal_error")
     if allowed_here and kind.endswith(kinds):
+        words = [str(word) for each in here for word in each.get("enum", ())]
+        if isinstance(value, str) and (near := did_you_mean(value, words)):
+            return head, near
         quotes = " in quotes" if kind == "string_type" and isinstance(value, bool | int | float) else ""
         return head, f"Write {' or '.join(dict.fromkeys(allowed_here))}{quotes}."
     message = str(error["msg"])

@@ -71,6 +71,10 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
             "'two' is not allowed. Write a whole number, at least 1 and at most 1000 or the word all.",
         ),
         (
+            "roles: {a: {mode: tracking}}\nrules: [{when: line.left_inner, then: {who: this_car, mode: trakcing}}]",
+            "rule 1, then.mode: 'trakcing' is not allowed. Did you mean tracking?",
+        ),
+        (
             "fixed: {Red: {mode: manual}}",
             "fixed.Red: name 'Red' is not allowed: use 1 to 32 of a-z, 0-9, _ and -, beginning",
         ),
