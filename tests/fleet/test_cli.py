@@ -80,6 +80,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("drive red forward --for 3601s", "fleet: --for: 3601s is too long: at most 1h."),
         ("drive red forward --for 0", "--for: 0 is too short: more than 0."),
         ("drive red forward --for 1d", '--for: "1d" is not a duration: write it as 500ms, 2s, 1m30s or 1h.'),
+        ("drive red forward --for 2sec", '--for: "2sec" is not a duration: write 2s.'),
         ("drive red forward --for nan", '"nan" is not a duration'),
         ("mode red fast", '"fast" is not a mode. Choose from: manual, remote_control, '),
         ("schema plna", '"plna" is not a kind of file. Did you mean plan?'),

@@ -34,6 +34,14 @@ def test_anything_else_is_not(text: str) -> None:
         parse_duration(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "likely"), [("2sec", "2s"), ("1.5 Minutes", "1.5m"), ("1hour", "1h"), ("200 msec", "200ms"), ("1 s", "1s")]
+)
+def test_a_duration_in_other_words_names_the_likely_one(text: str, likely: str) -> None:
+    with pytest.raises(ValueError, match=f"is not a duration: write {likely}$"):
+        parse_duration(text)
+
+
 def test_a_duration_outside_its_range_names_the_range() -> None:
     with pytest.raises(click.BadParameter, match=r"2h is too long: at most 1h\."):
         Duration(3600.0).convert("2h", None, None)
