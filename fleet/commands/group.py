@@ -31,7 +31,10 @@ class CommandGroup(click.Group):
 
 
 class DefaultCommandGroup(CommandGroup):
-    """A group with a command that may be left out: `fleet sessions DIR` is `fleet sessions list DIR`."""
+    """A group with a command that may be left out: `fleet sessions DIR` is `fleet sessions list DIR`.
+
+    A first word with another word behind it is a command, because a default command takes one word at most.
+    """
 
     def __init__(self, *arguments: Any, default_command: str, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
@@ -44,7 +47,8 @@ class DefaultCommandGroup(CommandGroup):
         if first.startswith("-") and args[-1:] and args[-1] in self.commands:
             raise click.UsageError(f"Write the command first: {ctx.command_path} {args[-1]}", ctx)
         is_command = first in {*self.commands, *ctx.help_option_names}
-        if not is_command and (first.startswith("-") or not did_you_mean(first, self.commands) or Path(first).exists()):
+        is_misspelled = bool(did_you_mean(first, self.commands)) or (bool(args[1:]) and not args[1].startswith("-"))
+        if not is_command and (first.startswith("-") or not is_misspelled or Path(first).exists()):
             args = [self._default_command, *args]
         return super().parse_args(ctx, args)
 

@@ -64,6 +64,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("frob", 'There is no command "frob". (see fleet --help)'),
         ("drvie red forward", 'There is no command "drvie". Did you mean drive? (see fleet --help)'),
         ("sessions vrify", 'There is no command "vrify". Did you mean verify? (see fleet sessions --help)'),
+        ("sessions show latest", 'There is no command "show". (see fleet sessions --help)'),
         (
             "drive",
             "Write: fleet drive CAR... MOTION, such as: fleet drive red forward --for 2s (see fleet drive --help)",
