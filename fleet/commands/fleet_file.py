@@ -118,7 +118,8 @@ def init(
     for path in (out, plan) if simulated else (out,):
         if path.exists() and not force:
             if yes or simulated:
-                raise click.UsageError(f"{path} exists already: give --force to overwrite it, or --out for another")
+                other = "--out for another" if path == out else f"--out in a directory without {path.name}"
+                raise click.UsageError(f"{path} exists already: give --force to overwrite it, or {other}")
             click.confirm(f"{path} exists already. Overwrite it?", abort=True)
     if not out.absolute().parent.is_dir():
         raise click.UsageError(f"{out}: there is no such directory")

@@ -283,6 +283,9 @@ def test_simulated_cars_overwrite_nothing(command: Command, tmp_path: Path, name
     assert done.returncode == 2
     assert done.stderr.startswith(f"fleet: {name} exists already: give --force")
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine\n")]
+    other = command("init", "--sim", "3", "--out", "other.yaml")
+    assert other.returncode == (2 if name == "plan.yaml" else 0)
+    assert other.stderr.count("--out in a directory without plan.yaml") == (name == "plan.yaml")
     assert command("init", "--sim", "3", "--force").returncode == 0
     assert len(read_fleet(tmp_path / "fleet.yaml").cars) == 3
     assert parse_plan((tmp_path / "plan.yaml").read_text()).roles
