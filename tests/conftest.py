@@ -1,6 +1,5 @@
 """How many tests run at once and where, how long an example of Hypothesis may take, and what a Ctrl-C is."""
 
-import hashlib
 import os
 import signal
 
@@ -16,9 +15,6 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("patient")
-
-LONG_S = 200.0
-"""A test with a time-out from here on begins first."""
 
 # In the background of a script SIGINT comes ignored, and is in every process that a test starts and would end by it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -38,7 +34,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep tests that share a fixture of their module on one worker.
 
     Without a group every worker gets some of them, and starts the fleet or records the session once more.
-    Mix the others: in the order of the files, all those that wait for processes come first and leave a processor idle.
     """
     for item in items:
         if isinstance(item, pytest.Function) and item.get_closest_marker("xdist_group") is None:
@@ -46,14 +41,3 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             used = (each for several in definitions for each in several if each.baseid.startswith("tests"))
             if any(each.scope == "module" for each in used):
                 item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        items.sort(key=mixed)
-
-
-def mixed(item: pytest.Item) -> tuple[bool, str]:
-    """Return the place of a test: what may take minutes comes first, a group stays together, the rest is shuffled."""
-    limit = item.get_closest_marker("timeout")
-    takes_long = limit is not None and limit.args[0] >= LONG_S
-    group = item.get_closest_marker("xdist_group")
-    name = item.nodeid if group is None else str(group.args[0])
-    return not takes_long, hashlib.sha256(name.encode()).hexdigest()
