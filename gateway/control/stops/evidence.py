@@ -5,14 +5,13 @@ The car acknowledges nothing (docs/reference/protocol.md#evidence-of-a-stop). A 
 pause. The docs print `EVIDENCE` (docs/reference/stop-evidence.md).
 """
 
-from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Sensors
-from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
+from gateway.protocol.timing import MODE_CLOSE_S
 
 # A reporting mode sends 20 frames a second. A corrupted frame of such a mode can look like mode 0, because there is no
 # checksum. But no silence comes before it.
@@ -44,13 +43,6 @@ PAUSE_MAX_S: Final = 2.6
 NORMAL_MIN_S: Final = 0.8
 NORMAL_MAX_S: Final = 1.4
 """Range of the normal interval of two reports. The link has delayed closer ones, so their times show nothing."""
-# A damaged MODE frame may open mode 0 with the motors on, which blocks for 2.1 to 2.3 s. If the link holds the report
-# before, both gaps look like pauses: held for 0.85 to 1.4 s. No such hold makes both match the interval of this car.
-MATCH_S: Final = 0.12
-"""Maximum difference of a pause from the last normal intervals and the 1.0 s that `MODE00` takes."""
-# A busy machine or a radio delays reports by more than MATCH_S. Then the normal intervals differ by as much.
-INTERVALS: Final = 5
-"""Number of normal intervals that a pause is compared with."""
 # A link that loses both `MODE00` and the report after it leaves the same gap as a pause. Half of all outages of 0.6 s
 # around a stop do that, so one pause is not enough.
 PAUSES: Final = 2
@@ -104,8 +96,7 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     ),
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
-        "two pauses of 1.9 s between reports, each around a `MODE00`; no reading for 0.25 s after the second. A pause "
-        "is 1.0 s longer than the last normal intervals, if there were some",
+        "two pauses of 1.9 s between reports, each around a `MODE00`, and no reading for 0.25 s after the second",
         "the stop goes on",
     ),
     StopCase.NO_ECHO: EvidenceRow(
@@ -186,10 +177,6 @@ class StopEvidence:
     _pending: float | None = None
     """When the last `MODE00` without a result was written."""
     _pauses: int = 0
-    _intervals: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
-    """The last normal intervals of two reports, without a frame that blocks in between."""
-    _blocked_s: float = 0.0
-    """Time for which the frames since the last report block the car."""
     _window_s: float = CLOSED_S
     _shapes: int = 0
     _shape_at: float | None = None
@@ -208,7 +195,6 @@ class StopEvidence:
     def begin_link(self) -> None:
         """Forget everything: the link is new."""
         self.obeyed_at = None
-        self._intervals.clear()
         self._last_at = self._foreign_at = float("-inf")
         self._window_s = CLOSED_S
         self.reset_times()
@@ -231,11 +217,6 @@ class StopEvidence:
         """Record a frame that neither moves the car nor closes a mode."""
         if self._closed_at is None:
             self._plain = False
-
-    def blocked(self, block_s: float) -> None:
-        """Record a frame that blocks the car. The next report comes up to this time later."""
-        if block_s > FRAME_S:
-            self._blocked_s += block_s
 
     def closed(self, now: float, *, awake: bool) -> None:
         """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly 1.0 s."""
@@ -285,7 +266,6 @@ class StopEvidence:
             self._before = None
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
-        blocked_s, self._blocked_s = self._blocked_s, 0.0
         self.without_echo = 0 if event.range_cm else self.without_echo + 1
         if self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S):
             return self._obeyed(at)
@@ -293,15 +273,13 @@ class StopEvidence:
         if not event.range_cm:
             return Finding.NO_ECHO
         if pending is None:
-            if before is not None and not blocked_s and at - before < NORMAL_MAX_S:
-                self._intervals.append(at - before)
             return Finding.REPORT
         if before is None:
             if at <= pending + CLOSED_S:
                 return Finding.NOTHING
             self._pending = None
             return Finding.REPORT
-        return self._compare(at - before, at - pending, at, blocked_s)
+        return self._compare(at - before, at - pending, at)
 
     def settle(self, now: float) -> bool:
         """Return True if the pauses count from now on: no reading came just after them."""
@@ -311,11 +289,11 @@ class StopEvidence:
         self._obeyed(self._last_at)
         return True
 
-    def _compare(self, gap_s: float, after_s: float, at: float, blocked_s: float) -> Finding:
+    def _compare(self, gap_s: float, after_s: float, at: float) -> Finding:
         """Judge the interval of two reports. The later one came `after_s` after `MODE00`."""
         if after_s <= CLOSED_S:
             return Finding.NOTHING
-        if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S and self._matches(gap_s, blocked_s):
+        if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S:
             self._pending = None
             self._pauses += 1
             self.obeyed_at = at
@@ -328,19 +306,7 @@ class StopEvidence:
             return Finding.NOTHING
         self._pending = None
         self._pauses = 0
-        if NORMAL_MIN_S < gap_s < NORMAL_MAX_S:
-            if not blocked_s:
-                self._intervals.append(gap_s)
-            return Finding.LOST
-        self._intervals.clear()
-        return Finding.REPORT
-
-    def _matches(self, gap_s: float, blocked_s: float) -> bool:
-        """Return True if this pause is a normal interval and `MODE00`, or if no normal interval is known."""
-        if not self._intervals:
-            return True
-        normal_s = gap_s - MODE_CLOSE_S
-        return min(self._intervals) - MATCH_S <= normal_s <= max(self._intervals) + blocked_s + MATCH_S
+        return Finding.LOST if NORMAL_MIN_S < gap_s < NORMAL_MAX_S else Finding.REPORT
 
     def _other_mode(self, at: float) -> None:
         self._shapes += 1

@@ -13,7 +13,6 @@ from gateway.control.stops.evidence import (
     CLOSED_S,
     EVIDENCE,
     LEFT_S,
-    MATCH_S,
     NORMAL_MAX_S,
     OPENING_SILENCE_S,
     PAUSE_MAX_S,
@@ -105,54 +104,6 @@ def test_two_pauses_show_a_stop_and_one_does_not() -> None:
     assert watch.pause(12.95) is SHOWN
     assert watch.evidence.words == "2 pauses in its reports, each after MODE00"
     assert PAUSES == 2
-
-
-@pytest.mark.parametrize(
-    ("reports", "acts", "found"),
-    [
-        ((9.0, 10.0, 12.0), (), PAUSE),
-        ((9.0, 10.0, 12.0 + MATCH_S - 0.01), (), PAUSE),
-        ((9.0, 10.0, 12.0 + MATCH_S + 0.01), (), REPORT),
-        ((9.0, 10.0, 12.0 - MATCH_S - 0.01), (), REPORT),
-        ((10.0, 12.0 + MATCH_S + 0.01), (), PAUSE),  # of the interval of this car nothing is known
-        ((9.0, 10.3, 12.3), (9.5,), PAUSE),  # a whistle makes an interval longer, so that one does not count
-        ((8.0, 9.0, 10.3, 12.3), (9.5,), PAUSE),
-        ((9.0, 10.0, 12.3), (10.2,), PAUSE),
-        ((9.0, 10.0, 12.3 + MATCH_S + 0.01), (10.2,), REPORT),
-    ],
-)
-def test_a_pause_is_longer_than_a_normal_interval_by_the_time_of_a_mode00(
-    reports: tuple[float, ...], acts: tuple[float, ...], found: Finding
-) -> None:
-    watch, last = EvidenceWatch(), reports[-1]
-    for at in sorted({*reports, *acts} - {last}):
-        watch.evidence.blocked(0.3) if at in acts else watch.reports(at)
-    watch.closed(10.5)
-    assert watch.reports(last) == [found]
-
-
-def test_a_held_report_and_a_damaged_frame_that_blocks_for_longer_make_no_two_pauses() -> None:
-    """Seed 1096 of a search: the link held a report for 0.9 s. A damaged frame then opened mode 0 for 2.3 s."""
-    watch = EvidenceWatch()
-    watch.reports(0.38, 1.39)
-    watch.closed(1.72)
-    watch.reports(3.31)
-    watch.closed(3.32)
-    assert watch.reports(5.72)[-1] is not Finding.SETTLING
-    watch.closed(5.73)
-    assert watch.reports(7.73) == [PAUSE], "the next ones count again"
-
-
-def test_after_a_lost_mode00_the_interval_is_still_known() -> None:
-    """The stop is sent again at once. Then a report is held for 0.9 s, and a damaged frame opens mode 0 for 2.3 s."""
-    watch = EvidenceWatch()
-    watch.reports(9.0, 10.0)
-    watch.closed(10.1)
-    assert watch.reports(11.0, 12.0) == [NOTHING, LOST]
-    watch.closed(12.05)
-    assert watch.reports(13.92) == [PAUSE]
-    watch.closed(13.93)
-    assert watch.reports(16.33) == [REPORT]
 
 
 def test_after_a_shown_stop_one_more_pause_shows_the_next_until_a_motion_is_sent() -> None:
