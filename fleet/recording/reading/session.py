@@ -112,7 +112,7 @@ class Session:
                 raise NoSession(
                     f"{path} has format {given}, this version reads up to {session_dir.FORMAT_VERSION}: "
                     "update zenoh-car-fleet; "
-                    f"its files can be read one by one, such as {there[0]}"
+                    f"its files can be read one by one, such as {there[0].name} in there"
                 )
         self.description = session_dir.SessionInfo.read(path) if whole else None
 
