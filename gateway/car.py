@@ -8,7 +8,6 @@ to control, and answers after control could write. Only `_write_due` writes to t
 import asyncio
 import gc
 import logging
-import os
 import random
 import time
 from collections.abc import Mapping
@@ -38,6 +37,7 @@ from gateway.protocol.platforms import Profile
 from gateway.state_file import SafetyStateFile
 from schemas import bus
 from schemas.process import signals
+from schemas.process.parent import has_ended
 
 CHECK_INTERVAL_S: Final = 0.2
 """Interval of the checks for silence, changed states, and a stalled loop."""
@@ -408,7 +408,7 @@ class CarGateway:
             self._alive_at = now
             if self._attempts.check_proven(now, has_reading=False):
                 self._log_open()
-            if self._settings.parent not in (None, os.getppid()) and not self._ending:
+            if has_ended(self._settings.parent) and not self._ending:
                 self._commands.log(
                     Level.WARNING,
                     "parent_gone",

@@ -171,7 +171,7 @@ def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_jso
 def fan(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest], *, take: bool, as_json: bool) -> None:
     """Switch the fan. Cars only know "toggle", so `on` and `off` work only if its state is known."""
     cars, request = cars_and_request
-    if cars[1:] and cars[-1] not in client.cars() and (near := misspelled(cars[-1], _FAN_STATES)):
+    if cars[1:] and (near := misspelled(cars[-1], _FAN_STATES)) and cars[-1] not in client.cars():
         raise click.UsageError(f'"{cars[-1]}" is neither a connected car nor on or off. Did you mean {near[0]}?')
     carry_out(client, request, cars, take=take, as_json=as_json)
 

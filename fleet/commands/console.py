@@ -19,7 +19,7 @@ import click
 
 from fleet.aio import Fleet
 from fleet.client.client import default_sender
-from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option
+from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, starter_option
 from fleet.commands.options import bus_options, cli_errors, json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number
@@ -29,7 +29,7 @@ from fleet.console.server import DEFAULT_PORT, HELLO, LOOPBACK, listen, serve
 from fleet.recording.session_lookup import sessions_place
 from schemas import keys
 from schemas.bus import resolve_endpoint
-from schemas.process.parent import watched_pid
+from schemas.process.parent import has_ended, watched_pid
 
 if TYPE_CHECKING:
     from fleet.console.lan import Lan
@@ -66,7 +66,7 @@ def listen_or_fail(port: int | None, other: str) -> socket.socket:
 async def _send_heartbeats(parent: int, address: str) -> None:
     """Print the address each second for `fleet up`, and end with it."""
     with suppress(OSError):  # nobody reads any more
-        while os.getppid() == parent:
+        while not has_ended(parent):
             click.echo(json.dumps({"console": address}))
             await asyncio.sleep(HEARTBEAT_INTERVAL_S)
     os.kill(os.getpid(), signal.SIGTERM)
@@ -123,14 +123,12 @@ examples:
     show_default=True,
     help="The file that the page Set up writes links into.",
 )
-@click.option(
-    "--parent", "starter", metavar="PID", type=int, hidden=True, help="End with this process, which started this one."
-)
+@starter_option()
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @bus_options
 def serve_console(
-    starter: int | None,
     *,
+    starter: int | None,
     port: int,
     opens: bool,
     on_lan: bool,

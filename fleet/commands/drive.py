@@ -180,5 +180,6 @@ def _named(client: Fleet, cars: tuple[str, ...]) -> list[str] | None:
 def _strangers(client: Fleet, request: CommandRequest, cars: tuple[str, ...]) -> list[Outcome]:
     """Ask the cars that are named beside `all` and are not connected. The outcome names the likely car."""
     wrong = [each for each in cars if each != ALL_CARS and not each.startswith("@")] if ALL_CARS in cars else []
-    wrong = [each for each in wrong if each not in client.cars()]
+    connected = client.cars() if wrong else ()
+    wrong = [each for each in wrong if each not in connected]
     return client.ask(request, wrong) if wrong else []

@@ -73,6 +73,12 @@ def fleet_option(default: str | None = DEFAULT_FLEET) -> _Decorator:
     return click.option("--fleet", metavar="NAME", default=default, show_default=True, callback=_from_group, help=words)
 
 
+def starter_option() -> _Decorator:
+    """Return the hidden option of `schemas.process.parent.parent_option`."""
+    words = "End with this process, which started this one."
+    return click.option("--parent", "starter", metavar="PID", type=int, hidden=True, help=words)
+
+
 def as_option(complete: Callable[..., list[str]] | None = None) -> _Decorator:
     """Return the option --as. `chosen_person` has its value, before the command and after it."""
     return click.option(

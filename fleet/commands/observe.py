@@ -68,11 +68,11 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
             latest.setdefault(key.car, {})[key.topic] = reading
     if not latest:
         raise no_cars(client)
-    colors = ask_colors(client.bus, client.name)
-    colors = {car: colors.get(car) or car_color(car, index) for index, car in enumerate(sorted(latest))}
     if missing := [car for car in only if car not in latest]:
         there = f"Connected: {', '.join(sorted(latest))}."
         raise click.ClickException(f"{', '.join(missing)}: not connected. {did_you_mean(missing[0], latest) or there}")
+    colors = ask_colors(client.bus, client.name)
+    colors = {car: colors.get(car) or car_color(car, index) for index, car in enumerate(sorted(latest))}
     if only:
         latest = {car: latest[car] for car in only}
     rows = [{**row_of(car, values), "color": hex_color(colors[car])} for car, values in sorted(latest.items())]

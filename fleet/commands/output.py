@@ -16,6 +16,7 @@ from fleet.recording.tools.csv_table import iso
 from fleet.supervisor.car_status import fit
 from schemas import topics
 from schemas.colors import parse_color
+from schemas.process import stdio
 
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
@@ -52,8 +53,7 @@ def show_table(
 
     colors: of each row, as #rrggbb. On a terminal a dot of this color begins the row.
     """
-    plain = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
-    dots = [f"{_dot(color)} " for color in colors] if sys.stdout.isatty() and not plain else []
+    dots = [f"{_dot(color)} " for color in colors] if stdio.shows_colors(sys.stdout) else []
     dots = dots or [""] * len(rows)
     widths = {name: max(len(row[name]) for row in ({name: name}, *rows)) for name in columns}
     if sys.stdout.isatty() or "COLUMNS" in os.environ:  # a pipe gets every column

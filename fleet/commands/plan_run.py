@@ -1,13 +1,13 @@
 """`fleet plan run`: runs the coordinator as a process."""
 
 import json
-import os
 import threading
 from pathlib import Path
 
 import click
 
 from fleet.client.client import Fleet, default_sender
+from fleet.commands.group import starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.coordinator.coordinator import SENDER, AnotherCoordinator, Coordinator
 from fleet.coordinator.observer import listed_cars, listed_people
@@ -16,7 +16,7 @@ from fleet.policy.decision import Decision
 from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse
 from schemas.process import signals
-from schemas.process.parent import watched_pid
+from schemas.process.parent import has_ended, watched_pid
 from schemas.yaml_document.document import read_text
 
 
@@ -50,9 +50,7 @@ a plan:
     metavar="NAME",
     help="Phase and rules outlive the coordinator within one run (of fleet up).",
 )
-@click.option(
-    "--parent", "starter", metavar="PID", type=int, hidden=True, help="End with this process, which started this one."
-)
+@starter_option()
 @json_option
 @bus_options
 def run(
@@ -61,8 +59,8 @@ def run(
     run_name: str,
     connect: str | None,
     fleet: str,
-    starter: int | None,
     *,
+    starter: int | None,
     as_json: bool,
 ) -> None:
     """Run a plan until Ctrl-C. Prints one line per decision. Cars you stopped are left alone."""
@@ -91,7 +89,7 @@ def run(
                 listed,
                 None if file is None else listed_people(file),
                 run_name,
-            ).run(lambda: stop.is_set() or parent not in (None, os.getppid()))
+            ).run(lambda: stop.is_set() or has_ended(parent))
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None
 

@@ -1,7 +1,6 @@
 """`fleet record` and `fleet mark`: runs the recorder as a process, and sends commands to a running recorder."""
 
 import json
-import os
 import re
 import threading
 from collections.abc import Mapping
@@ -12,14 +11,14 @@ import click
 
 from fleet.client.client import default_sender
 from fleet.client.services import ask_recorder
-from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option
+from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.params import Choice, Duration
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
 from schemas import keys
 from schemas.bus import BadEndpoint, Bus, BusError, Failure, HubKeeper
 from schemas.process import signals
-from schemas.process.parent import watched_pid
+from schemas.process.parent import has_ended, watched_pid
 
 POLL_INTERVAL_S: Final = 0.25
 HUB_RESTART_DELAY_S: Final = 0.5
@@ -118,9 +117,7 @@ The quota does not remove marked sessions."""
 @click.option("--plan", type=_FILE, help="Copy this file into the session as plan.yaml.")
 @connect_option()
 @fleet_option()
-@click.option(
-    "--parent", "starter", metavar="PID", type=int, hidden=True, help="End with this process, which started this one."
-)
+@starter_option()
 @click.option("--json", "as_json", is_flag=True, help="One JSON object per line: when ready, and at the end.")
 def run(
     place: Path,
@@ -134,8 +131,8 @@ def run(
     plan: Path | None,
     connect: str | None,
     fleet: str,
-    starter: int | None,
     *,
+    starter: int | None,
     as_json: bool,
 ) -> None:
     """Record everything of a fleet until Ctrl-C. Print the session's directory when the recorder is ready."""
@@ -202,7 +199,7 @@ def run(
 def _wait(bus: Bus, stop: threading.Event, ended: threading.Event, parent: int | None) -> None:
     """Wait until a signal, a failure of the recorder or the end of the parent. Restart a lost hub meanwhile."""
     hub_keeper = HubKeeper(bus.endpoint, HUB_RESTART_DELAY_S, _warn)
-    while not stop.wait(POLL_INTERVAL_S) and not ended.is_set() and parent in (None, os.getppid()):
+    while not stop.wait(POLL_INTERVAL_S) and not ended.is_set() and not has_ended(parent):
         hub_keeper.check(connected=bus.connected)
 
 

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Literal, Self
 
 from schemas import keys
+from schemas.process.stdio import printable
 
 CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """Letters and digits that nobody confuses."""
@@ -111,7 +112,7 @@ class PeopleBook:
         matching = [each for each in self.codes if hmac.compare_digest(each.digest, wanted) & each.is_open(now)]
         if not matching:
             return None
-        words = "".join(letter for letter in device if letter.isprintable())[:MAX_DEVICE_NAME_LENGTH].strip()
+        words = printable(device)[:MAX_DEVICE_NAME_LENGTH].strip()
         added = PairedDevice(device_id, matching[0].person, words, digest(cookie), now)
         codes = tuple(each for each in self.codes if each is not matching[0])
         devices = [each for each in self.devices if each.state(now) != "unknown"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Self
 
-from fleet.policy.authority import Authority, merge_authority, unlisted_words
+from fleet.policy.authority import Authority, authority_of, merge_authority, unlisted_words
 from schemas.keys import person_of
 
 ACTIONS: Final = ("move", "act", "take", "resume", "end_estops", "pause", "unpause", "lend", "end_loan")
@@ -74,7 +74,7 @@ class CarRules:
     @property
     def authority(self) -> Authority:
         """The people of the fleet, as the gateway of this car knows them."""
-        return Authority(self.leads, frozenset((*self.leads, *self.drivers, *self.others)) if self.listed else None)
+        return authority_of(self if self.listed else None)
 
 
 def refusals(rules: CarRules, sender: str) -> dict[str, Refusal]:

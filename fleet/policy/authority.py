@@ -26,7 +26,7 @@ class Authority:
 
 
 def authority_of(people: Any) -> Authority:
-    """Return the people of a fleet.v1.CarPeople. None: its gateway knows nobody."""
+    """Return the people of a fleet.v1.CarPeople, or of what has its fields. None: its gateway knows nobody."""
     if people is None:
         return Authority()
     return Authority(tuple(people.leads), frozenset((*people.leads, *people.drivers, *people.others)))

@@ -268,9 +268,8 @@ def simulator_command(spec: FleetSpec, directory: Path, endpoint: str) -> tuple[
     cars = [f"{car.name}:{car.platform}:{_terminal(directory, car.name)}" for car in spec.simulated]
     world = () if spec.world is None else ("--world", str(spec.world))
     options = [word for car in cars for word in ("--car", car)]
-    return module(
-        "gateway.cli", "sim", *options, *world, "--fleet", spec.fleet, "--connect", endpoint, *parent_option()
-    )
+    where = ("--fleet", spec.fleet, "--connect", endpoint, *parent_option())
+    return module("gateway.cli", "sim", *options, *world, *where)
 
 
 def _terminal(directory: Path, car: str) -> str:

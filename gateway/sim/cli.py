@@ -6,7 +6,6 @@
 import argparse
 import asyncio
 import math
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from gateway.sim.model.world import World
 from gateway.sim.simulation import SimCar, Simulation
 from schemas import keys
 from schemas.process import signals
-from schemas.process.parent import watched_pid
+from schemas.process.parent import has_ended, watched_pid
 
 WORLDS: Final = {"room": World.room, "open": World.open_field}
 PARENT_CHECK_INTERVAL_S: Final = 0.1
@@ -268,6 +267,6 @@ async def _run_scheduled(simulation: Simulation, scheduled: Scheduled) -> None:
 
 
 async def _watch_parent(parent: int, ended: asyncio.Event) -> None:
-    while os.getppid() == parent:  # noqa: ASYNC110 - no portable notification exists
+    while not has_ended(parent):  # noqa: ASYNC110 - no portable notification exists
         await asyncio.sleep(PARENT_CHECK_INTERVAL_S)
     ended.set()

@@ -1,7 +1,6 @@
 """Shared parts of the bench commands `scan`, `monitor` and `send`: help, color, exit codes."""
 
 import argparse
-import os
 import re
 import signal
 import sys
@@ -108,8 +107,7 @@ class Paint:
     """Colors text for a terminal. Leaves it plain in a pipe, with NO_COLOR, and on a terminal without colors."""
 
     def __init__(self, stream: IO[str]) -> None:
-        plain = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
-        self._on = stream.isatty() and not plain
+        self._on = stdio.shows_colors(stream)
 
     def __call__(self, color: str, text: str) -> str:
         """Return the text in this color."""

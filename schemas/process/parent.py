@@ -15,3 +15,8 @@ def watched_pid(starter: int | None) -> int | None:
     changes, and reports the launcher of the virtual environment.
     """
     return starter if starter is None or os.name == "posix" else os.getppid()
+
+
+def has_ended(watched: int | None) -> bool:
+    """Return True if the process of this `watched_pid` has ended. Without one, return False."""
+    return watched not in (None, os.getppid())

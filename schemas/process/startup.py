@@ -1,6 +1,6 @@
 """The first steps of a process, before its imports, which take 0.1 s and more."""
 
-# What is imported here is imported before Ctrl-C is handled. `typing` would take longer than all the rest.
+# These imports run before Ctrl-C is handled. `typing` would take longer than all others together.
 from __future__ import annotations
 
 import os

@@ -36,6 +36,11 @@ def silence_broken(error: OSError, program: str) -> int:
     return 1
 
 
+def shows_colors(stream: IO[str]) -> bool:
+    """Return False for a pipe, with NO_COLOR, and for a terminal without colors."""
+    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
 def printable(text: str | None, instead: str = "") -> str:
     """Return a text that somebody else has chosen for one line of a terminal or a file, without control characters."""
     return "".join(each if each.isprintable() else instead for each in text or "")

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from fleet.cli import cli
-from tests.support.console import DESKTOP, ConsoleProcess, find_chromium
+from tests.support.console import DESKTOP, ConsoleProcess, find_chromium, hold_until_driving
 from tests.support.judge import Judge
 from tests.support.network_client import network_port
 from tests.support.ports import free_endpoint
@@ -66,7 +66,7 @@ def test_a_phone_pairs_by_keyboard_drives_and_is_revoked(browser: Browser, tmp_p
         phone.keyboard.press("Enter")
         expect(phone.get_by_text("You are group_a.")).to_be_visible()
 
-        # What is for leads is refused there, with its reason.
+        # The page refuses the actions of leads, and says why.
         for page, allowed in ((phone, False), (teacher, True)):
             page.goto(page.url.partition("#")[0] + "#/plan")
             expect(page.locator("[data-plan=set]")).to_be_enabled(enabled=allowed)
@@ -108,21 +108,6 @@ def paired_page(browser: Browser, fleet: FleetProcesses, port: int, *person: str
     expect(page.locator(".person")).to_contain_text(f"You are {person[0]}")
     page.goto(f"https://127.0.0.1:{port}/#/drive")
     return page
-
-
-def hold_until_driving(page: Page, judge: Judge) -> None:
-    """Hold the button of the pad until the car drives. After a stop a person pauses, and presses again."""
-    for _ in range(10):
-        page.locator(FORWARD).hover()
-        page.mouse.down()
-        try:
-            wait_for(lambda: judge.driving, "it drives", 2.0)
-        except AssertionError:
-            page.mouse.up()
-            page.wait_for_timeout(700)
-        else:
-            return
-    raise AssertionError(page.locator(".results").inner_text())
 
 
 def test_a_group_and_a_teacher_share_one_console(browser: Browser, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect, sync_playwright
 
-from tests.support.console import DESKTOP, ConsoleProcess, find_chromium
+from tests.support.console import DESKTOP, ConsoleProcess, find_chromium, hold_until_driving
 from tests.support.judge import Judge
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
@@ -49,21 +49,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
     opened.close()
 
 
-def hold(room: Room, page: Page) -> None:
-    """Hold the button of the pad until the car drives. After a stop a person pauses, and presses again."""
-    for _ in range(10):
-        page.locator("[data-motion=forward]").hover()
-        page.mouse.down()
-        try:
-            wait_for(lambda: room.judge.driving, "red drives", 2.0)
-        except AssertionError:
-            page.mouse.up()
-            page.wait_for_timeout(700)
-        else:
-            return
-    raise AssertionError(page.locator(".results").inner_text())
-
-
 def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     expect.set_options(timeout=PATIENCE_S * 1000)
     teacher, ours, theirs = (room.page(person) for person in room.consoles)
@@ -76,7 +61,7 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     expect(theirs.locator("[data-do=led]")).to_be_disabled()
     assert theirs.locator(forward).get_attribute("aria-disabled") == "true"
     theirs.locator(forward).click(force=True)
-    hold(room, ours)
+    hold_until_driving(ours, room.judge)
     theirs.keyboard.press("Escape")
     wait_for(lambda: not room.judge.driving, "anybody stops")
     ours.mouse.up()
@@ -85,7 +70,7 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     ours.locator("#pause").click()
     expect(ours.locator("[data-asking=pause] .danger")).to_be_disabled()
     expect(ours.locator("[data-asking=pause] .refused")).to_have_text("Only a lead may (teacher).")
-    hold(room, ours)
+    hold_until_driving(ours, room.judge)
     teacher.locator("#pause").click()
     teacher.locator("input[name=why]").fill("look here")
     teacher.locator("[data-asking=pause] .danger").click()
@@ -102,12 +87,12 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     ours.mouse.up()
 
     # The lead takes the car and gives it back.
-    hold(room, teacher)
+    hold_until_driving(teacher, room.judge)
     expect(ours.locator("[data-control=drive] .refused")).to_contain_text("teacher drives red.")
     teacher.mouse.up()
     wait_for(lambda: not room.judge.driving, "red stands")
     expect(ours.locator("[data-control=drive] .refused")).to_have_count(0)
-    hold(room, ours)
+    hold_until_driving(ours, room.judge)
     ours.mouse.up()
 
     # The car is lent to the other group, and comes back.
@@ -115,11 +100,11 @@ def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     teacher.locator("[data-do=lend]").click()
     expect(ours.locator("[data-control=drive] .refused")).to_have_text("red is lent to group_b (by teacher).")
     expect(theirs.locator("[data-control=drive] .refused")).to_have_count(0)
-    hold(room, theirs)
+    hold_until_driving(theirs, room.judge)
     teacher.goto(f"{room.consoles['teacher'].address}/#/")
     teacher.get_by_role("button", name="End the loan red").click()
     wait_for(lambda: not room.judge.driving, "the end of the loan stops it")
     theirs.mouse.up()
     expect(ours.locator("[data-control=drive] .refused")).to_have_count(0)
-    hold(room, ours)
+    hold_until_driving(ours, room.judge)
     ours.mouse.up()

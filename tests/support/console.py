@@ -32,6 +32,21 @@ def find_chromium(playwright: Playwright) -> str:
     return found
 
 
+def hold_until_driving(page: Page, judge: Judge) -> None:
+    """Hold the button of the pad until the car drives. After a stop a person pauses, and presses again."""
+    for _ in range(10):
+        page.locator("[data-motion=forward]").hover()
+        page.mouse.down()
+        try:
+            wait_for(lambda: judge.driving, "it drives", 2.0)
+        except AssertionError:
+            page.mouse.up()
+            page.wait_for_timeout(700)
+        else:
+            return
+    raise AssertionError(page.locator(".results").inner_text())
+
+
 class StallProxy:
     """A TCP wire to a port of loopback. Cut, it passes nothing and closes nothing, as lost Wi-Fi does."""
 

@@ -377,7 +377,7 @@ def test_a_gateway_without_a_table_frees_nothing_that_a_lead_began() -> None:
     assert rule in desk.ask(Unpause(), ANN).words
     assert [pause.id for pause in desk.control.safety.pauses] == ["p1"]
     assert desk.control.safety.ended_pauses == (), "no other gateway would follow"
-    # Who began it is the one lead that the state names.
+    # The state names one lead: the person who began it.
     teacher = Sender("teacher@phone", PERSON)
     assert desk.ask(Unpause(), teacher).words == "the pause has ended"
     assert desk.ask(Resume(all=True), teacher).reason is None
