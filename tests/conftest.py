@@ -1,10 +1,12 @@
 """How many tests run at once and where, how long an example of Hypothesis may take, and what a Ctrl-C is."""
 
-import os
 import signal
 
 import pytest
 from hypothesis import HealthCheck, settings
+from xdist.remote import Producer
+
+from tests.support import scheduling
 
 # By default an example that takes 200 ms fails, and so do examples that take a second to make: a machine that stalls
 # for as long says nothing of the product. What never ends is pytest's time-out's.
@@ -22,11 +24,18 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Return three times the processors: most tests wait, for processes, cars and seconds.
+    """Return the number of workers for `-n auto`."""
+    return scheduling.WORKERS
 
-    With four, simulated cars and gateways were late at times, and tests of stops failed.
-    """
-    return 3 * (os.cpu_count() or 1)
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> scheduling.Scheduling:
+    """Use `--dist loadgroup` with workers in the background."""
+    return scheduling.Scheduling(config, log)
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Lower the priority of a worker in the background."""
+    scheduling.lower_priority(session.config, len(session.items))
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups

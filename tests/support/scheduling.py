@@ -1,0 +1,72 @@
+"""Which worker of pytest-xdist runs which test: tests that compute have workers of their own, of low priority."""
+
+import os
+from typing import Final
+
+import pytest
+from xdist.scheduler.loadgroup import LoadGroupScheduling
+from xdist.workermanage import WorkerController
+
+FOREGROUND_PER_PROCESSOR: Final = 3
+"""Workers for tests of processes, for each processor. With four, simulated cars were late and tests of stops failed."""
+_PROCESSORS: Final = os.cpu_count() or 1
+WORKERS: Final = (FOREGROUND_PER_PROCESSOR + 1) * _PROCESSORS
+"""One more for each processor is in the background."""
+_MIN_TESTS: Final = 1000
+"""With fewer tests no worker is in the background."""
+_LOWEST_PRIORITY: Final = 19
+
+_COMPUTING: Final = (
+    "tests/deploy/",
+    "tests/fleet/conditions/",
+    "tests/fleet/fleetfile/",
+    "tests/fleet/policy/",
+    "tests/fleet/recording/reading/",
+    "tests/fleet/recording/tools/",
+    "tests/fleet/replay/analysis/",
+    "tests/fleet/replay/rerun/",
+    "tests/fuzz/",
+    "tests/gateway/control/",
+    "tests/gateway/protocol/",
+    "tests/gateway/sim/model/",
+    "tests/gateway/sim/scenarios/",
+    "tests/schemas/",
+    "tests/test_",
+)
+"""Rooms of tests that compute on virtual time, or read files. The other tests wait for processes, cars and seconds."""
+
+
+def in_background(worker: str, workers: int, tests: int) -> bool:
+    """Return True if this worker (`gw7`) of so many has low priority, and runs tests that compute only."""
+    return tests >= _MIN_TESTS and workers == WORKERS and int(worker.removeprefix("gw")) >= workers - _PROCESSORS
+
+
+def lower_priority(config: pytest.Config, tests: int) -> None:
+    """Lower the priority of this process if it is a worker in the background."""
+    given = getattr(config, "workerinput", None)
+    if given is not None and hasattr(os, "nice") and in_background(given["workerid"], given["workercount"], tests):
+        os.nice(_LOWEST_PRIORITY)
+
+
+class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has no types
+    """`--dist loadgroup` with workers in the background.
+
+    These use what the others leave of the processors. So both processors are busy and no simulated car is late.
+    """
+
+    def _assign_work_unit(self, node: WorkerController) -> None:
+        scope = self._next(node)
+        if scope is None:
+            node.shutdown()
+            return
+        self.workqueue.move_to_end(scope, last=False)
+        super()._assign_work_unit(node)
+
+    def _next(self, node: WorkerController) -> str | None:
+        """Return the next unit of work for a worker; None if there is none for it."""
+        background = in_background(node.gateway.id, self.numnodes, len(self.collection or ()))
+        for scope, unit in self.workqueue.items():
+            if next(iter(unit)).startswith(_COMPUTING) is background:
+                return scope
+        # Processes that a worker in the background started would be of low priority too.
+        return None if background else next(iter(self.workqueue), None)
