@@ -35,6 +35,7 @@ def parse_color(text: str) -> Rgb:
     if match is not None:
         return int(match[1], 16), int(match[2], 16), int(match[3], 16)
     hint = "Write # and six of 0-9 and a-f, as '#ff8000'." if text.startswith("#") else ""
+    hint = hint or ("Write red, green and blue as one color: '#ff8000' is 255, 128, 0." if text.isdecimal() else "")
     hint = hint or did_you_mean(text, COLORS) or f"Choose from: {', '.join(COLORS)}, or write '#ff8000'."
     raise ValueError(f'"{text[:40]}" is not a color. {hint}')
 

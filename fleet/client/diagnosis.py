@@ -276,7 +276,7 @@ CHECKS: Final = (
     DoctorCheck("paused", _paused, "fleet unpause"),
     DoctorCheck("mode_contradicted", _other_mode, "fleet stop {car}"),
     DoctorCheck("battery_low", _weak, "fleet get {car}/sensor/battery"),
-    DoctorCheck("leased", _leased, "fleet drive {car} forward --take"),
+    DoctorCheck("leased", _leased, "fleet stop {car}"),
     DoctorCheck("lent", _lent, "fleet lend {car} --end"),
     DoctorCheck("link_breaks", _breaks, "fleet logs {car}"),
     DoctorCheck("gateway_restarted", _restarted, "fleet logs {car}"),
@@ -347,7 +347,8 @@ def describe_people(car: str, safety: Any) -> Iterator[tuple[str, str]]:
         left = f"for another {loan.expires_in_s:.0f} s"
         yield f"lent to {loan.to} by {_who(loan, loan.since)}, {left}", f"fleet lend {car} --end"
     if safety.HasField("lease"):
-        yield f"driven by {safety.lease.holder} ({safety.lease.kind})", f"fleet drive {car} forward --take"
+        # `--take` would move the car, and takes nothing from a lead. A stop is everybody's, and ends the lease in 2 s.
+        yield f"driven by {safety.lease.holder} ({safety.lease.kind})", f"fleet stop {car}"
 
 
 def _who(deed: Any, stamp: Any) -> str:

@@ -169,7 +169,7 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: b
     if path is None:
         there = _logged(directory)
         near = did_you_mean(name, there) or f"There are: {', '.join(there) or 'none'}."
-        raise click.UsageError(f'There is no log of "{name}" in {directory}. {near}')
+        raise click.UsageError(f'There is no log of "{name}". {near}')
     with signals.sigterm_interrupts():
         try:
             for line in _lines(path, follow=follow):

@@ -228,13 +228,14 @@ def _resolve_path(path: Path, given: str | None) -> Path | None:
 def _find_contradictions(
     tree: Mapping[str, Any], path: Path, *, unbound: bool, moved: bool
 ) -> Iterator[tuple[Where, str]]:
-    cars = {name: _as_mapping(car) for name, car in _as_mapping(tree.get("cars")).items()}
+    entries = _as_mapping(tree.get("cars"))
+    cars = {name: _as_mapping(car) for name, car in entries.items()}
     types = _as_mapping(tree.get("types"))
     for name, car in cars.items():
         kind = car.get("type")
         if isinstance(kind, str) and kind not in types:
             yield ("cars", name, "type"), f"there is no type {quote_value(kind)}. {suggest(kind, types)}"
-        if "link" not in car and not unbound:
+        if "link" not in car and not unbound and isinstance(entries[name], Mapping):
             words = "is missing. `fleet scan` lists links, `fleet bind` finds out which car is which."
             yield ("cars", name, "link"), words
         yield from _find_car_contradictions(tree, name, car)

@@ -1,5 +1,6 @@
 """Parses times within a session as users type them: an offset from its start or end, or a date. Pure."""
 
+import re
 from datetime import UTC, datetime
 from typing import Final
 
@@ -16,7 +17,9 @@ def at_ns(text: str, start_ns: int, end_ns: int) -> int:
     try:
         when = datetime.fromisoformat(text)
     except ValueError:
-        raise ValueError(f"{text!r} is not a time: write {RULE}") from None
+        clock = re.fullmatch(r"(\d+):(\d+)", text)
+        near = f"Minutes and seconds are written as {clock[1]}m{clock[2]}s. " if clock else ""
+        raise ValueError(f"{text!r} is not a time. {near}Write {RULE}.") from None
     if when.tzinfo is None:
         when = when.replace(tzinfo=UTC)
     whole = int(when.replace(microsecond=0).timestamp())

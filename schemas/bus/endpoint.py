@@ -22,9 +22,17 @@ _LOOPBACK: Final = re.compile(r"localhost|127\.\d+\.\d+\.\d+|\[::1\]")
 
 def resolve_endpoint(argument: str | None = None) -> str:
     """Return the endpoint: the argument, else FLEET_ENDPOINT, else loopback port 7447. Raises BadEndpoint."""
-    endpoint = argument or os.environ.get(ENDPOINT_VARIABLE) or DEFAULT_ENDPOINT
-    _host_and_port(endpoint)
-    return endpoint
+    if argument:
+        _host_and_port(argument)
+        return argument
+    given = os.environ.get(ENDPOINT_VARIABLE)
+    if not given:
+        return DEFAULT_ENDPOINT
+    try:
+        _host_and_port(given)
+    except BadEndpoint as error:
+        raise BadEndpoint(f"{ENDPOINT_VARIABLE}: {error}") from None
+    return given
 
 
 def _host_and_port(endpoint: str) -> tuple[str, int]:

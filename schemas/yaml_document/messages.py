@@ -122,13 +122,14 @@ def _sentence(words: str) -> str:
 
 def _example(schema: Mapping[str, Any], value: object, definitions: Mapping[str, Any]) -> str:
     """Return an example of a mapping with the fields that it needs; `value`: what stands there."""
-    names = schema.get("required") or [*schema["properties"]][:1]
+    properties = schema["properties"]
+    shown = [name for name, each in properties.items() if "examples" in each]
+    names = schema.get("required") or shown or [*properties][:1]
     parts = []
     for name in names:
-        words = [
-            word for each in _resolve_members(schema["properties"][name], definitions) for word in each.get("enum", ())
-        ]
-        parts.append(f"{name}: {value if value in words else words[0] if words else '…'}")
+        words = [word for each in _resolve_members(properties[name], definitions) for word in each.get("enum", ())]
+        likely = value in words or (name in shown and isinstance(value, str))
+        parts.append(f"{name}: {value if likely else words[0] if words else '…'}")
     return f"{{{', '.join(parts)}}}"
 
 

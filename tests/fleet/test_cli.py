@@ -104,7 +104,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("arm red -1 2 3 4 5 6", 'joint 1 is "-1": 6 are needed, 0 to 180 degrees each'),
         ("arm red 1 2 3 4 x 6", 'joint 5 is "x": '),
         ("arm", "Write: fleet arm CAR... J1 J2 J3 J4 J5 J6, such as: fleet arm red"),
-        ("led red 300 0 0", '"0" is not a color.'),
+        ("led red 300 0 0", '"0" is not a color. Write red, green and blue as one color'),
         ("led red", "Write: fleet led CAR... COLOR, such as: fleet led red '#ff0010'"),
         ("speed red faster", '"faster" is not a speed step. Choose from: up, down.'),
         ("fan", "Write: fleet fan CAR... [on|off], such as: fleet fan red"),

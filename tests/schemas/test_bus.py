@@ -195,6 +195,9 @@ def test_the_endpoint_is_the_argument_then_the_variable_then_loopback(monkeypatc
     monkeypatch.setenv("FLEET_ENDPOINT", "tcp/[::1]:7000")
     assert bus.resolve_endpoint() == "tcp/[::1]:7000"
     assert bus.resolve_endpoint("tls/box:7447") == "tls/box:7447"
+    monkeypatch.setenv("FLEET_ENDPOINT", "box:7447")
+    with pytest.raises(bus.BadEndpoint, match=r"^FLEET_ENDPOINT: endpoint 'box:7447' is not allowed"):
+        bus.resolve_endpoint()
 
 
 async def turns() -> None:

@@ -154,6 +154,13 @@ cars:
     assert "fleet bind" in found[11]
 
 
+@pytest.mark.parametrize(("value", "example"), [("tcp://h:9", "{link: tcp://h:9}"), ("3", "{link: …}")])
+def test_a_car_without_fields_is_shown_how_a_link_is_written(value: str, example: str) -> None:
+    assert _faults(f"cars:\n  red: {value}\n") == [
+        f"/nowhere/f.yaml:2:8: error: cars.red: needs fields. Write: `red: {example}`"
+    ]
+
+
 def test_no_car_is_called_all() -> None:
     (found,) = _faults("cars:\n  all: {link: COM1}\n")
     assert found.startswith("/nowhere/f.yaml:2:3: error: cars.all: no car can be called all")

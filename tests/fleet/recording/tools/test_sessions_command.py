@@ -115,6 +115,7 @@ def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
         (("--from", "1h"), "The time range is empty"),
         (("--from", "2s", "--to", "1s"), "is not before"),
         (("--from", "soon"), "is not a time"),
+        (("--from", "12:34"), "are written as 12m34s"),
         (("--car", "pink"), "pink is not in"),
         (("--to", "2026-09-21T14:13:19Z"), "The time range is empty"),
     ):
