@@ -26,8 +26,11 @@ from schemas.suggestion import did_you_mean
 
 FLEET_DOWN_TIMEOUT_S: Final = 120.0
 """Timeout for the shutdown: the longest stop of a car, and a recorder that writes its buffers."""
-SUPERVISOR_LOST_S: Final = 3.0
-"""Time without a status after which a missing token means that the supervisor has ended."""
+SUPERVISOR_LOST_S: Final = 10.0
+"""Time without a status and without a token after which the supervisor has ended.
+
+On a machine that stalls, Zenoh ends a session after 2 s, and its tokens are gone until it is open again.
+"""
 FLEET_DOWN_POLL_S: Final = 0.2
 LOG_POLL_S: Final = 0.2
 
@@ -85,7 +88,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
             raise not_running(fleet)
         if answer.status == "rejected":
             raise click.ClickException(answer.words)
-        last = _until_ended(bus, fleet, received)
+        last, gone = _until_ended(bus, fleet, received)
     results = dict(last.became) if last is not None else {}
     ended = last is not None and last.state == "ended"
     bad = sorted(car for car, words in results.items() if words.startswith(NOT_STOPPED))
@@ -95,26 +98,27 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         for car, words in sorted(results.items()):
             click.echo(f"{car}: {words}", err=car in bad)
     if not ended:
+        what = "ended without reporting" if gone else f"has not ended after {FLEET_DOWN_TIMEOUT_S:g} s"
         raise click.ClickException(
-            "`fleet up` ended without reporting. Cars may still be moving: check them. "
-            "Then `fleet status` and `fleet logs supervisor`."
+            f"`fleet up` {what}. Cars may still be moving: check them. Then `fleet status` and `fleet logs supervisor`."
         )
     raise SystemExit(1 if bad else 0)
 
 
-def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> Any:
-    """Wait for the end of the shutdown. Return the last status that was received."""
-    deadline, at = time.monotonic() + FLEET_DOWN_TIMEOUT_S, time.monotonic()
-    count = 0
-    while time.monotonic() < deadline:
+def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> tuple[Any, bool]:
+    """Wait for the end of the shutdown. Return the last status, and whether the supervisor is gone."""
+    deadline, seen = time.monotonic() + FLEET_DOWN_TIMEOUT_S, time.monotonic()
+    count, gone = 0, False
+    while time.monotonic() < deadline and not gone:
         if len(received) != count:
-            count, at = len(received), time.monotonic()
+            count, seen = len(received), time.monotonic()
             if received[-1].state == "ended":
                 break
-        elif time.monotonic() - at > SUPERVISOR_LOST_S and not bus.tokens(keys.car_token(fleet, keys.SUPERVISOR)):
-            break
+        elif bus.tokens(keys.car_token(fleet, keys.SUPERVISOR)):
+            seen = time.monotonic()
+        gone = time.monotonic() - seen > SUPERVISOR_LOST_S
         time.sleep(FLEET_DOWN_POLL_S)
-    return received[-1] if received else None
+    return received[-1] if received else None, gone
 
 
 @click.command(
