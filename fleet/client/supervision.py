@@ -20,10 +20,15 @@ def ask_status(bus: Bus, fleet: str, timeout_s: float = 2.0) -> list[Any]:
 
 
 def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
-    """Return the colors of the cars of a running fleet. Empty if no supervisor answers. Skip what is no color."""
+    """Return the colors of the cars of a running fleet. Empty if no supervisor answers."""
+    answers = ask_status(bus, fleet, COLORS_TIMEOUT_S)
+    return {car: color for status in answers for car, color in colors_of(status).items()}
+
+
+def colors_of(status: Any) -> dict[str, Rgb]:
+    """Return the colors of the cars in a fleet.v1.Supervision. Skip what is no color."""
     colors: dict[str, Rgb] = {}
-    for status in ask_status(bus, fleet, COLORS_TIMEOUT_S):
-        for car, color in status.colors.items():
-            with suppress(ValueError):  # anybody may answer
-                colors[car] = parse_color(color)
+    for car, color in status.colors.items():
+        with suppress(ValueError):  # anybody may answer
+            colors[car] = parse_color(color)
     return colors

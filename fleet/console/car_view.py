@@ -255,6 +255,11 @@ class FleetView:
             self._cars[name] = CarView(name, self._color_of(name, len(self._cars)))
         return self._cars[name]
 
+    def update_colors(self) -> None:
+        """Ask for the color of each car again."""
+        for index, (name, car) in enumerate(self._cars.items()):
+            car.color = self._color_of(name, index)
+
     @property
     def names(self) -> list[str]:
         """The names of all cars."""

@@ -14,7 +14,7 @@ from fleet.aio import Fleet
 from fleet.client.client import default_sender
 from fleet.client.commands import CommandRequest, estop_request, pause_request, stop_request, unpause_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
-from fleet.client.supervision import ask_colors
+from fleet.client.supervision import SUPERVISOR_STATUS, ask_colors, colors_of
 from fleet.console.bus_message import message_in
 from fleet.console.car_view import FleetView
 from fleet.console.inspections import Inspections
@@ -63,7 +63,7 @@ class Console:
         self._presses = PressBook()
         self._view = FleetView(self._color_of)
         self._colors: Mapping[str, Rgb] = {}
-        """The colors of the cars, as the running fleet says."""
+        """The colors of the cars, as the running fleet says. `fleet reload` changes them."""
         self._operators = Operators(fleet)
         self._report: StopReport | None = None
         """The course of the last STOP."""
@@ -80,6 +80,9 @@ class Console:
         self._plan_samples: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_plan_sample, limit=_MAX_EVENTS, newest=True
         )
+        self._statuses: Handover[Sample] = Handover(
+            asyncio.get_running_loop(), self._on_status, limit=_MAX_EVENTS, newest=True
+        )
         self._events: Handover[Sample] = Handover(
             asyncio.get_running_loop(), self._on_event, limit=_MAX_EVENTS, newest=True
         )
@@ -95,6 +98,7 @@ class Console:
             bus.subscribe(f"{name}/*/{family}/*", self._on_reading)
         bus.subscribe(f"{name}/*/event/*", self._events)
         bus.subscribe(f"{name}/{keys.COORDINATOR}/*", self._plan_samples)
+        bus.subscribe(f"{name}/{SUPERVISOR_STATUS.name}", self._statuses)
         loop = asyncio.get_running_loop()
 
         def on_token(token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
@@ -110,6 +114,11 @@ class Console:
 
     def _color_of(self, car: str, index: int) -> str:
         return hex_color(self._colors.get(car) or car_color(car, index))
+
+    def _on_status(self, sample: Sample) -> None:
+        if (found := message_in(sample, logging.WARNING)) is not None and (colors := colors_of(found[1])):
+            self._colors = colors
+            self._view.update_colors()
 
     async def _renew_leases(self) -> None:
         while True:

@@ -11,6 +11,7 @@ import zenoh
 from fleet.aio import Fleet
 from fleet.client import supervision
 from fleet.console.console import Console
+from schemas import keys
 from schemas.bus import reply_message
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
@@ -20,13 +21,14 @@ from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 KEY = "fleet/@supervisor/status"
 
 
-async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet(
+async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet_also_after_a_reload(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervision, "COLORS_TIMEOUT_S", PATIENCE_S)
     hub = FleetProcesses(free_endpoint(), tmp_path)
     asked: list[zenoh.Query] = []
     hub.bus.queryable(KEY, asked.append)
+    statuses = hub.bus.publisher(KEY, supervision.SUPERVISOR_STATUS, keys.SUPERVISOR)
     events = hub.bus.publisher("fleet/red/event/command", TOPICS["event/command"], "red")
     try:
         async with Fleet(hub.endpoint, person="teacher", kind="person") as fleet:
@@ -40,6 +42,10 @@ async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet(
                 events.put(pb.CommandEvent(id="1", verb="led", phase="sent", sender="ann"), time.time_ns())
                 return [each["color"] for each in console._view.as_list(0.0)]
 
+            def reloaded() -> bool:
+                statuses.put(pb.Supervision(colors={"red": "#040506"}), time.time_ns())
+                return colors() == ["#040506"]
+
             await asyncio.to_thread(wait_for, reaches_the_supervisor, "the hub knows who has the status")
             while asked:
                 asked.pop().drop()  # type: ignore[no-untyped-call]
@@ -50,6 +56,7 @@ async def test_a_car_whose_event_comes_first_has_the_color_of_the_fleet(
             with query:
                 reply_message(query, KEY, pb.Supervision(colors={"red": "#010203"}), as_json=False)
             assert await asyncio.to_thread(wait_for, colors, "red is there") == ["#010203"]
+            assert await asyncio.to_thread(wait_for, reloaded, "the color changes")
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
             await console.close()
