@@ -1,7 +1,11 @@
 """Reads what comes over the bus, where anyone may publish."""
 
 import logging
+import math
+from collections.abc import Iterable, Mapping
 from typing import Any
+
+from google.protobuf.message import Message
 
 from schemas import keys, messages, topics
 from schemas.bus import Sample
@@ -15,7 +19,27 @@ def message_in(sample: Sample, level: int = logging.DEBUG) -> tuple[keys.Key, An
     if topic is None or key is None:
         return None
     try:
-        return key, messages.parse(topic.message, sample.payload, sample.encoding)
+        message = messages.parse(topic.message, sample.payload, sample.encoding)
     except messages.BadPayload as error:
         log.log(level, "%s: %s", sample.key, error)
         return None
+    if not is_finite(message):
+        log.log(level, "%s: a number in it is infinite or none", sample.key)
+        return None
+    return key, message
+
+
+def is_finite(message: Any) -> bool:
+    """Return True if all numbers of a message are finite. Others are no JSON, and no page could read its state."""
+    return all(_is_finite(value) for _, value in message.ListFields())
+
+
+def _is_finite(value: Any) -> bool:
+    if isinstance(value, float):
+        return math.isfinite(value)
+    if isinstance(value, Message):
+        return is_finite(value)
+    if isinstance(value, str | bytes | int) or not isinstance(value, Iterable):
+        return True
+    values = value.values() if isinstance(value, Mapping) else value
+    return all(_is_finite(each) for each in values)
