@@ -302,7 +302,7 @@ class Fleet:
         message = type(request.message)()
         message.CopyFrom(request.message)
         message.id = uuid.uuid4().hex
-        message.sender = self.sender
+        message.sender = request.sender or self.sender
         message.kind = self.kind
         message.take = request.take
         message.asked.seconds, message.asked.nanos = divmod(time.time_ns(), 1_000_000_000)

@@ -25,7 +25,7 @@ STOP_TTL_S: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class CommandRequest:
-    """One command without a sender, an id and a time."""
+    """One command without an id and a time."""
 
     verb: str
     message: Any
@@ -35,6 +35,8 @@ class CommandRequest:
     """Duration of a drive, s."""
     take: bool = False
     """True if a person takes the car over from another person."""
+    sender: str = ""
+    """Who sends it, if not the client."""
 
     @property
     def effect_verb(self) -> str:

@@ -282,11 +282,14 @@ class Console:
     ) -> None:
         """Stop every car, once for each id: a page sends each STOP twice, over its socket and by fetch.
 
+        Without an id, every call counts.
+
         operator: of the page (None: of this computer). request: an e-stop or a pause (None: a stop).
         """
         if stop_id in self._stop_ids:
             return
-        self._stop_ids[stop_id] = None
+        if stop_id:
+            self._stop_ids[stop_id] = None
         if len(self._stop_ids) > _MAX_STOP_IDS:
             del self._stop_ids[next(iter(self._stop_ids))]
         now, operator, request = time.monotonic(), operator or self.operator, request or stop_request()
@@ -294,8 +297,8 @@ class Console:
             self._end(press, "All cars were stopped.")
         self._stops += 1
         present = {*self._fleet.sync.cars(), *self._view.names}
-        at_ms = time.time_ns() // 1_000_000
-        self._report = StopReport(self._stops, request.verb, operator.sender, present, now, at_ms)
+        at_ms, sender = time.time_ns() // 1_000_000, request.sender or operator.sender
+        self._report = StopReport(self._stops, request.verb, sender, present, now, at_ms)
         operator.stop(request, self._report)
 
     def _on_message(self, page: PageLink, message: PageMessage) -> None:

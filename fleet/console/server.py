@@ -6,6 +6,7 @@ import secrets
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -19,6 +20,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fleet.aio import Fleet
+from fleet.client.commands import stop_request
 from fleet.console.console import Console, TooManyPages
 from fleet.console.guard import PERSON, STOP_PATH, App, Guard, NetworkGuard
 from fleet.console.people_routes import pair_routes, people_routes
@@ -160,7 +162,10 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
 
     async def stop(request: Request) -> Response:
         stop_id = request.query_params.get("id", "")[:_MAX_STOP_ID_LENGTH]
-        console.stop_all(stop_id or secrets.token_hex(8), console.operator_of(request.scope.get(PERSON)))
+        person = request.scope.get(PERSON)
+        # A lead's name on the stop of a person without an open page would keep the cars from this person.
+        named = replace(stop_request(), sender=console.sender_of(person))
+        console.stop_all(stop_id, console.operator_of(person), named)
         return Response(status_code=204)
 
     async def check_plan(request: Request) -> Response:

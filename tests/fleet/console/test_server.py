@@ -222,6 +222,19 @@ def test_a_plan_is_set_under_the_persons_name_also_without_an_open_page(stage: S
     assert [name.partition("@")[0] for name in by] == ["teacher", "teacher"]
 
 
+def test_a_stop_has_its_persons_name_also_without_an_open_page(stage: ServerStage) -> None:
+    device = stage.device("eva")
+
+    def holder() -> str:
+        (safety,) = stage.person.get("red/state/safety")
+        return str(safety.value.hold.by.partition("@")[0])
+
+    stage.drive()
+    assert device.ask("POST", "/stop")[0] == 204
+    wait_for(holder, "red is on hold")
+    assert holder() == "eva", "a lead's name would keep red from all others"
+
+
 def next_message(page: ClientConnection, kind: str) -> Any:
     """The next message of this kind that a page gets."""
     while (found := json.loads(page.recv(timeout=30)))["t"] != kind:
