@@ -52,6 +52,10 @@ class PageMessage:
         value = self.fields.get(name, "")
         if not isinstance(value, str) or len(value) > longest:
             raise BadPageMessage(f"{name} is not a text of at most {longest} characters")
+        try:
+            value.encode()
+        except UnicodeEncodeError:  # half of a pair of surrogates
+            raise BadPageMessage(f"{name} has characters that are none") from None
         return value
 
     def number(self, name: str) -> int:
