@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
@@ -234,7 +235,7 @@ class SessionsApi:
 
 def _stream(data: Iterator[bytes], name: str) -> Response:
     """Answer with a file. Its parts are read on a thread."""
-    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(name, safe='')}"}  # RFC 6266
     return StreamingResponse(data, media_type="application/octet-stream", headers=headers)
 
 

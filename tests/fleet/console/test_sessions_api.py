@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 
@@ -47,7 +48,8 @@ def test_recordings_are_listed_verified_downloaded_and_exported_and_no_path_lead
 ) -> None:
     place = tmp_path / "sessions"
     secret = tmp_path / "20260101T000000Z-secret"
-    for path in (place / "20260921T141320Z-fleet", secret):
+    foreign = place / "20260920T141320Z-\u0443\u0440\u043e\u043a"
+    for path in (place / "20260921T141320Z-fleet", foreign, secret):
         path.mkdir(parents=True)
         written(path / "0001.mcap")
     (place / "link").symlink_to(secret)
@@ -59,7 +61,8 @@ def test_recordings_are_listed_verified_downloaded_and_exported_and_no_path_lead
         return json.loads(data) if status == 200 else status
 
     listed = json.loads(answer(console.port, "GET", "/sessions")[1])
-    assert [each["name"] for each in listed["sessions"]] == ["20260921T141320Z-fleet"]
+    assert [each["name"] for each in listed["sessions"]] == ["20260921T141320Z-fleet", foreign.name]
+    assert answer(console.port, "GET", f"/sessions/{quote(foreign.name)}/download")[0] == 200, "its name is no Latin-1"
     name = listed["sessions"][0]["name"]
     verdict = ask(f"/sessions/{name}/verify")
     assert "session.json is missing" in verdict["words"]
