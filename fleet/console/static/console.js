@@ -110,7 +110,7 @@ async function postStop(id, until) {
 }
 
 export function estopAll(why) {
-  if (!store.connected) stopAll();
+  if (!store.connected || store.lost) stopAll(); // by fetch, again and again; an e-stop has only the socket
   send({ t: "estop", id: newId(), why });
   store.press = null;
   changed();
