@@ -10,6 +10,7 @@ from fleet.console.abilities import UNKNOWN_ABILITIES, abilities_of
 from fleet.console.command_ledger import CommandLedger
 from fleet.console.frame_log import describe_gateway
 from fleet.console.permissions import CarRules
+from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
 from schemas import messages, topics
 
 TREND_WINDOW_S: Final = 240.0
@@ -255,6 +256,10 @@ class FleetView:
             self._cars[name] = CarView(name, self._color_of(name, len(self._cars)))
         return self._cars[name]
 
+    def look_up(self, name: str) -> CarView:
+        """Return the view of a car, an empty one if there is no such car. None is added: a page may name any car."""
+        return self._cars.get(name) or CarView(name, "")
+
     def update_colors(self) -> None:
         """Ask for the color of each car again."""
         for index, (name, car) in enumerate(self._cars.items()):
@@ -270,6 +275,8 @@ class FleetView:
         there = set(present)
         for name in there | set(self._cars):
             self.car(name).on_presence(now, present=name in there)
+        for name in [each for each in self._cars if each.startswith(TEMPORARY_PREFIX) and each not in there]:
+            del self._cars[name]  # nobody misses it: its car blinked, and got a name of its own
 
     def as_list(self, now: float) -> list[dict[str, Any]]:
         """Return what a page shows of each car, by name."""

@@ -74,7 +74,7 @@ class Console:
         self._coordinators: set[str] = set()
         """Tokens of the coordinator."""
         self._readings: Latest[Sample] = Latest()
-        self._inspections = Inspections(fleet, self._view.car)
+        self._inspections = Inspections(fleet, self._view.look_up)
         self._plots = PlotFeed(fleet)
         self._plan = PlanView()
         self._plan_samples: Handover[Sample] = Handover(

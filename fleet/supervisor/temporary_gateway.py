@@ -13,6 +13,8 @@ from fleet.client.client import Fleet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
 from schemas.process.parent import parent_option
 
+TEMPORARY_PREFIX: Final = "temporary-"
+"""How the names of cars begin that exist for a moment only."""
 _READY_S: Final = 15.0
 """Timeout for a gateway. It starts in 1 s, and brings a car of an unknown platform to a known state within 6 s."""
 _READY_POLL_S: Final = 0.1

@@ -40,7 +40,7 @@ def test_a_car_is_found_blinks_and_is_written_with_the_comments_kept(stage: Cons
     card = page.locator("[data-link]")
     card.wait_for()
     blinks: list[bytes] = []
-    stage.fleet.bus.subscribe("fleet/setup-1/frame/tx", lambda sample: blinks.append(sample.payload))
+    stage.fleet.bus.subscribe("fleet/temporary-setup-1/frame/tx", lambda sample: blinks.append(sample.payload))
     assert [each for each in unreachable(page) if "disabled" not in each] == []
     card.locator("[data-setup=blink]").focus()
     page.keyboard.press("Enter")

@@ -92,3 +92,13 @@ def test_the_last_event_and_the_ledger() -> None:
     assert view.as_list(1.0)[0]["event"]["words"] == "drive rejected: no 99 (mia)"
     assert view.as_list(1.0)[0]["event"]["level"] == "warning"
     assert len(car.ledger) == 60
+
+
+def test_a_car_that_a_page_names_is_not_added_and_a_temporary_one_leaves_nothing() -> None:
+    view = view_of()
+    assert view.look_up("ghost").as_dict(0.0)["gateway"] is False
+    assert view.look_up("red") is view.car("red")
+    view.on_presence(["red", "temporary-setup-1"], 1.0)
+    assert view.names == ["red", "temporary-setup-1"]
+    view.on_presence([], 2.0)
+    assert view.names == ["red"], "red has gone, too, but somebody looks for it"
