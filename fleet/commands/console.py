@@ -55,12 +55,16 @@ def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
 
 
 def listen_or_fail(port: int | None, other: str) -> socket.socket:
-    """Return a listening socket. None: the default port. Raises ClickException with what to type for another one."""
+    """Return a listening socket. None: the default port. Raises ClickException with what to type for another one.
+
+    other: this command, with `{other}` for the number of a neighboring port.
+    """
     port = DEFAULT_PORT if port is None else port
     try:
         return listen(port)
     except OSError as error:
-        raise click.ClickException(f"{_port_in_use(port, error)} `{other}` takes another one.") from None
+        command = other.format(other=port + 1 if port < 65535 else port - 1)
+        raise click.ClickException(f"{_port_in_use(port, error)} `{command}` takes another one.") from None
 
 
 async def _send_heartbeats(parent: int, address: str) -> None:

@@ -116,7 +116,7 @@ def up(
         if spec.console:
             from fleet.commands.console import listen_or_fail  # needs an extra
 
-            listen_or_fail(spec.console_port or None, "fleet up --console-port 7481").close()
+            listen_or_fail(spec.console_port or None, "fleet up --console-port {other}").close()
         endpoint = resolve_endpoint(spec.endpoint)
         if not accepts(endpoint):  # the hub will be ours
             check_listening(endpoint, insecure_lan=insecure_lan)

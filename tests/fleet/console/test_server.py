@@ -448,6 +448,8 @@ def test_a_second_console_says_where_the_first_is_and_another_port_works(stage: 
     done = CliRunner().invoke(cli, ["console", "--port", port], env=stage.fleet.environment)
     assert done.exit_code == 1
     assert f"Another console is at http://127.0.0.1:{port}." in done.output
+    done = CliRunner().invoke(cli, ["up", "--sim", "1", "--console-port", port], env=stage.fleet.environment)
+    assert (done.exit_code, f"`fleet up --console-port {int(port) + 1}`" in done.output) == (1, True), done.output
     done = CliRunner().invoke(
         cli, ["console", "--port", "0", "--lan", "--lan-port", str(stage.lan_port)], env=stage.fleet.environment
     )
