@@ -97,9 +97,15 @@ class CarView:
 
     @property
     def motors(self) -> tuple[str, str]:
-        """State of the motors and what it rests on."""
+        """State of the motors and what it rests on. Without a gateway nobody knows it any more."""
         safety = self._newest.get("state/safety")
-        return ("unknown", "") if safety is None else (safety[0].motors, safety[0].motors_basis)
+        if safety is None or self._has_gone:
+            return "unknown", ""
+        return safety[0].motors, safety[0].motors_basis
+
+    @property
+    def _has_gone(self) -> bool:
+        return not self._present and self._changed_at is not None
 
     def describe_gateway(self) -> list[tuple[str, str]]:
         """Return what the car's gateway knows, as names and texts."""
@@ -120,7 +126,7 @@ class CarView:
     def as_dict(self, now: float) -> dict[str, Any]:
         """Return what a page shows of the car, as JSON values. Numbers are rounded: most are equal next time."""
         shown: dict[str, Any] = {"name": self.name, "color": self.color, "gateway": self._present}
-        if not self._present and self._changed_at is not None:
+        if self._changed_at is not None and self._has_gone:
             shown["gone_s"] = int(now - self._changed_at)
         for part in (self._link, self._mode, self._motion, self._safety, self._health, self._sensors):
             shown |= part(now)
@@ -158,7 +164,7 @@ class CarView:
             "mode": {
                 "asked": mode.asked,
                 "inferred": mode.inferred,
-                "verdict": mode.verdict,
+                "verdict": "assumed" if self._has_gone else mode.verdict,
                 "evidence": mode.evidence,
             }
         }

@@ -52,11 +52,16 @@ def test_each_sender_has_its_name() -> None:
 def test_a_gateway_that_has_gone_says_for_how_long() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
-    assert view.as_list(11.0)[0]["gateway"] is True
+    view.car("red").on_message("state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
+    view.car("red").on_message("state/mode", pb.Mode(asked="manual", verdict="confirmed"), 10.0)
+    (car,) = view.as_list(11.0)
+    assert (car["gateway"], car["motors"]["basis"], car["mode"]["verdict"]) == (True, "shown", "confirmed")
     view.on_presence([], 20.0)
     view.on_presence([], 25.0)
     (car,) = view.as_list(32.0)
     assert (car["gateway"], car["gone_s"]) == (False, 12)
+    assert car["motors"] == {"state": "unknown", "basis": ""}, "what it showed before is no news of now"
+    assert car["mode"]["verdict"] == "assumed"
 
 
 def test_a_car_is_offered_what_its_platform_and_gateway_can() -> None:
