@@ -107,7 +107,7 @@ def test_an_e_stop_is_latched_with_its_reason_until_a_deliberate_end(stage: Cons
     page = stage.page()
     page.locator("#estop").click()
     page.locator("input[name=why]").fill("smoke")
-    page.get_by_role("button", name="E-stop all cars now").click()
+    page.locator("input[name=why]").press("Enter")  # as good as the button beside it
     card = page.locator("[data-car=red]")
     card.get_by_text("E-stop of the whole fleet by you: smoke").wait_for()
     refused = stage.person.car("red").drive("forward")
@@ -432,6 +432,8 @@ def test_a_lost_car_says_what_is_known_and_what_to_do(stage: ConsoleStage) -> No
     card = page.locator("[data-car=red]")
     card.get_by_text("Whether red moves is not known").wait_for()
     card.get_by_text("Look at the car.").wait_for()
+    card.locator(".row", has_text="Motors").get_by_text("unknown").wait_for()
+    card.locator(".row", has_text="Battery").get_by_text("not known").wait_for()
     stage.gateways["red"] = stage.fleet.gateway(stage.links["red"], car="red", platform=CARS["red"])
     stage.fleet.ready("red")
     card.get_by_text("online").wait_for()

@@ -77,12 +77,14 @@ function StopBar({ report }) {
   };
   const toggle = (what) => setAsking(asking === what ? null : what);
   const refused = store.rights.pause;
+  const forbidden = asking === "pause" && refused !== "";
+  const onWhyKey = (event) => event.key === "Enter" && !event.repeat && !event.isComposing && !forbidden && act();
   return html`<section class="stopbar" aria-label="STOP">
     <${Report} report=${report} />
     ${asking &&
     html`<div class="estop" data-asking=${asking}>
-      <label>${asking === "estop" ? t.estopWhy : t.pauseWhy} <input name="why" maxlength="200" value=${why} onInput=${(event) => setWhy(event.target.value)} /></label>
-      <button class="danger" disabled=${asking === "pause" && refused !== ""} onClick=${act}>
+      <label>${asking === "estop" ? t.estopWhy : t.pauseWhy} <input name="why" maxlength="200" value=${why} onInput=${(event) => setWhy(event.target.value)} onKeyDown=${onWhyKey} /></label>
+      <button class="danger" disabled=${forbidden} onClick=${act}>
         ${asking === "estop" ? t.estopNow : t.pauseNow}</button>
       <button onClick=${() => setAsking(null)}>${t.cancel}</button>
       ${asking === "pause" && refused && html`<${Refused} words=${[refused]} />`}

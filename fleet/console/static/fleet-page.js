@@ -73,6 +73,8 @@ function Card({ car }) {
     store.selected = new Set([car.name]);
   };
   const { battery, mode, event } = car;
+  const reports = car.gateway && (car.link.state === "online" || car.link.state === "quiet");
+  const missing = reports ? t.notMeasured : t.notKnown;
   return html`<article class="card" style=${{ "--car": car.color }} aria-labelledby=${`car-${car.name}`} data-car=${car.name}>
     <header>
       <h2 id=${`car-${car.name}`}>${car.name}</h2>
@@ -97,18 +99,18 @@ function Card({ car }) {
               ${battery.v.toFixed(1)} V${battery.charge === null ? "" : ` · ${Math.round(battery.charge * 100)} %`}
               ${battery.level === "ok" ? "" : ` · ⚠ ${battery.level}`} ${trends[battery.trend] ?? ""}</span
             >`
-          : t.notMeasured}
+          : missing}
       <//>
       <${Row} name=${t.distance}>
-        ${car.range_m === undefined ? t.notMeasured : car.range_m === null ? t.noEcho : `${car.range_m.toFixed(2)} m`}
+        ${car.range_m === undefined ? missing : car.range_m === null ? t.noEcho : `${car.range_m.toFixed(2)} m`}
       <//>
       <${Row} name=${t.line}>
-        ${car.line ? html`<${Lamps} values=${car.line} words=${t.seesLine(seen(car.line, t.lineNames))} />` : t.notMeasured}
+        ${car.line ? html`<${Lamps} values=${car.line} words=${t.seesLine(seen(car.line, t.lineNames))} />` : missing}
       <//>
       <${Row} name=${t.obstacle}>
         ${car.obstacle
           ? html`<${Lamps} values=${car.obstacle} words=${t.seesObstacle(seen(car.obstacle, t.sideNames))} />`
-          : t.notMeasured}
+          : missing}
       <//>
       <${Row} name=${t.control}>${car.lease ? t.leaseOf(who(car.lease.holder), car.lease.kind) : t.nobody}<//>
       <${Row} name=${t.event}>

@@ -114,6 +114,7 @@ export const t = {
   event: "Last event",
   nobody: "nobody",
   notMeasured: "not measured in this mode",
+  notKnown: "not known",
   seesLine: (names) => (names.length ? `line under ${names.join(", ")}` : "no line"),
   seesObstacle: (names) => (names.length ? `obstacle ${names.join(" and ")}` : "clear"),
   lineNames: ["outer left", "inner left", "inner right", "outer right"],
