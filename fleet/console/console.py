@@ -321,6 +321,8 @@ class Console:
                 self.stop_all(message.text("id"), page.operator, estop_request(why, "fleet"))
             case "pause":
                 why = message.text("why", MAX_REASON_LENGTH)
+                if refused := rights_of(page.operator.sender, self._view.rules)["pause"]:
+                    raise BadPageMessage(refused)  # it stops no car, so it ends no press
                 self.stop_all(message.text("id"), page.operator, pause_request(why))
             case "unpause":
                 page.operator.command(unpause_request(), None, self._answer_to(page, message))

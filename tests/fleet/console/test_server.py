@@ -196,6 +196,8 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
         assert next_message(page, "rights")["manage"] == "Only a lead may (teacher)."
         page.send(json.dumps({"t": "plan", "id": 7, "verb": "stop"}))
         assert next_message(page, "plan_done")["words"] == "Only a lead may (teacher)."
+        page.send(json.dumps({"t": "pause", "id": "p1", "why": "x"}))  # no page may read that all cars were stopped
+        assert next_message(page, "bad")["words"] == "Only a lead may (teacher)."
     for path in ("/recording/status", "/recording/mark", "/plan/check"):
         assert driver.ask("POST", path, plan)[0] == 200, "for everyone"
     assert driver.ask("GET", "/sessions")[0] == 200
