@@ -72,11 +72,12 @@ def validate_platform(text: str) -> str:
 
 def validate_endpoint(text: str) -> str:
     """Return the bus endpoint if it is valid; raises ValueError."""
-    return bus.resolve_endpoint(text) if text else _bad_endpoint()
-
-
-def _bad_endpoint() -> str:
-    raise ValueError("'' is not allowed: write tcp/HOST:PORT, or leave it out")
+    if not text:
+        raise ValueError("'' is not allowed: write tcp/HOST:PORT, or leave it out")
+    try:
+        return bus.resolve_endpoint(text)
+    except bus.BadEndpoint as error:  # pydantic lets no other error than ValueError be one of the file
+        raise ValueError(str(error).removeprefix("endpoint ")) from None
 
 
 def validate_color(text: str) -> str:

@@ -161,6 +161,11 @@ def test_a_car_without_fields_is_shown_how_a_link_is_written(value: str, example
     ]
 
 
+def test_a_wrong_endpoint_is_a_fault_of_the_file() -> None:
+    (line,) = _faults("endpoint: localhost:7447\ncars: {red: {link: tcp://h:9}}\n")
+    assert ":1:11: error: endpoint: 'localhost:7447' is not allowed: write it as tcp/HOST:PORT" in line
+
+
 def test_no_car_is_called_all() -> None:
     (found,) = _faults("cars:\n  all: {link: COM1}\n")
     assert found.startswith("/nowhere/f.yaml:2:3: error: cars.all: no car can be called all")
