@@ -45,7 +45,7 @@ from fleet.client.reading import Reading, Watch, reading_of
 from fleet.client.supervision import ask_status
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages, topics
-from schemas.bus import Bus, Failure, Sample, canon
+from schemas.bus import Bus, BusError, Failure, Sample, canon
 from schemas.commands import COMMANDS
 from schemas.topics import Qos
 
@@ -101,6 +101,7 @@ class Fleet:
         self.kind = kind
         token = keys.operator_token(self.name, self.sender)
         self.bus = Bus.open(endpoint, start_hub=start_hub)
+        self._closed = False
         self._pending: dict[str, PendingCommand] = {}
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
@@ -124,6 +125,7 @@ class Fleet:
 
     def close(self) -> None:
         """Leave the bus. Pending commands end with an unknown outcome, and every watch ends."""
+        self._closed = True
         for watch in list(self._watches):
             watch.close()
         for command in list(self._pending.values()):
@@ -134,10 +136,16 @@ class Fleet:
         for pool in (self._pool, self._stop_pool):
             pool.shutdown()
 
+    def _check_open(self) -> None:
+        """Raise BusError if the fleet is closed."""
+        if self._closed:  # Zenoh and the pools would raise errors of their own, which name nothing that helps
+            raise BusError("this Fleet is closed: use it inside its `with`, or open another one")
+
     # ------------------------------------------------------------------ reading
 
     def cars(self) -> list[str]:
         """Return the names of the cars whose gateway is on the bus."""
+        self._check_open()
         return [token.rpartition("/")[2] for token in self.bus.tokens(keys.car_token(self.name, "*"))]
 
     def car(self, name: str) -> "Car":
@@ -174,6 +182,7 @@ class Fleet:
         if "@cmd" in written.split("/"):
             raise keys.BadKey(f"{written} is a command, not a reading: a query of it would be carried out")
         check_key(written)
+        self._check_open()
         found = []
         for answer in self.bus.query(selector, timeout_s=timeout_s, qos=Qos.STATE):
             if isinstance(answer, Failure):
@@ -193,6 +202,7 @@ class Fleet:
         """
         written = check_key(self.expression(expression))
         accept = None if when is None else KeyCondition.of(when, written).holds
+        self._check_open()
 
         def subscribe(on_sample: Callable[[Sample], None]) -> Callable[[], object]:
             return self.bus.subscribe(written, on_sample).undeclare
@@ -266,6 +276,7 @@ class Fleet:
 
     def send(self, request: CommandRequest, cars: Iterable[str] | None = None) -> PendingCommand:
         """Send a command and return at once. Pass the result to `outcomes`."""
+        self._check_open()
         cars = [cars] if isinstance(cars, str) else cars  # a str is an iterable of letters
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._filled(request)

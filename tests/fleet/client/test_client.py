@@ -3,7 +3,7 @@
 import asyncio
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from typing import Any
 
@@ -14,7 +14,7 @@ from fleet.aio import Fleet as AsyncFleet
 from fleet.client.client import Fleet
 from fleet.client.commands import led_request
 from schemas import keys, messages, topics
-from schemas.bus import BadEndpoint, Bus, NoFleet, reply
+from schemas.bus import BadEndpoint, Bus, BusError, NoFleet, reply
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars, asked
 from tests.support.ports import free_endpoint
@@ -361,6 +361,22 @@ def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
     assert time.monotonic() - began < 5.0, "the query that hangs is not waited for"
     waiting.join(20)
     assert len(outcomes) == 1
+
+
+def test_a_closed_fleet_says_that_it_is_closed(cars: Cars) -> None:
+    with Fleet(cars.endpoint, sender="ann") as client:
+        red = client.car("red")
+    uses: list[Callable[[], object]] = [
+        client.cars,
+        client.stop,
+        lambda: red.drive("forward", 0.2),
+        lambda: client.get("red"),
+        lambda: client.history("red/sensor/range", last=1),
+        lambda: client.watch("red/sensor/range"),
+    ]
+    for use in uses:
+        with pytest.raises(BusError, match="this Fleet is closed"):
+            use()
 
 
 def test_no_fleet_and_bad_names_are_told_apart() -> None:
