@@ -237,6 +237,8 @@ class Session:
         tolerance_s: maximum age of a value, s, by publish_time. The default is the time after which its topic is stale
         (3 s for readings and states); values of topics that are never stale have no limit. Raises as `to_pandas`.
         """
+        if tolerance_s is not None and not tolerance_s >= 0:
+            raise ValueError(f"tolerance_s {tolerance_s:g} is not allowed: at least 0, or None for the topic's own")
         table = self.to_arrow(of)
         for other in others:
             prefix = re.split(r"[/.]", other)[-1].lower()

@@ -84,6 +84,8 @@ def test_a_join_has_the_latest_value_of_the_same_car_while_it_is_fresh(made: Mad
     without_limit = session.joined("red/sensor/range", "state/mode", tolerance_s=float("inf"))
     assert without_limit["mode.inferred"].isna().sum() == 2
     assert session.joined("sensor/range", "sensor/arm")["arm.joint_deg"].isna().all()
+    with pytest.raises(ValueError, match="tolerance_s -1 is not allowed: at least 0"):
+        session.joined("sensor/range", "state/mode", tolerance_s=-1)
 
 
 def test_the_request_of_a_command_has_columns(made: Made, tmp_path: Path) -> None:
