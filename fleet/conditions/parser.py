@@ -233,7 +233,8 @@ class _Parser:
     def _fail_unknown(self, token: _Token) -> Never:
         if token.text in ("and", "or", "not"):
             self._fail(token, f"a field or a value is missing here, before {token.text}")
-        if self._expected_kind() is ValueKind.WORD:
+        quoted = any(each.kind == "word" for each in self._tokens[max(0, self._at - 3) : self._at + 2])
+        if self._expected_kind() is ValueKind.WORD and not quoted:
             self._fail(token, f"{token.text} is not a value. A word needs quotes: '{token.text}'")
         near = self._close_names(token.text)
         listed = self._list_names(self._fitting_names())

@@ -6,6 +6,7 @@ its own package.
 
 import json
 import math
+import re
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -31,6 +32,9 @@ _TOO_LARGE: Final = f"the file has more than {MAX_YAML_BYTES // 1024} KiB, which
 _COLLECTIONS: Final = {yaml.MappingNode: "tag:yaml.org,2002:map", yaml.SequenceNode: "tag:yaml.org,2002:seq"}
 _MAX_PROBLEMS_LISTED: Final = 50
 """Maximum faults in an error message."""
+
+_COLOR_COMMENT: Final = re.compile(r"[:,[][ \t]*(#[0-9A-Fa-f]{6})\b")
+"""A color without quotes, which YAML reads as a comment."""
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -106,7 +110,8 @@ def name_special_file(path: Path) -> str:
 def _similar_file(path: Path) -> str:
     """Return a question with the likely YAML file of the same directory. Empty if there is none."""
     with suppress(OSError):
-        return did_you_mean(path.name, sorted(each.name for each in path.parent.iterdir() if each.suffix == ".yaml"))
+        names = sorted(each.name for each in path.parent.iterdir() if each.suffix == ".yaml" and each.exists())
+        return did_you_mean(path.name, names)
     return ""
 
 
@@ -326,6 +331,9 @@ class Document:
                 self.report(where, f"{text} is not a finite number")
             elif isinstance(value, int) and abs(value) > _MAX_INTEGER:
                 self.report(where, f"{text} is too large a number")
+            elif value is None and node.end_mark.buffer is not None:
+                if color := _COLOR_COMMENT.match(node.end_mark.buffer, node.end_mark.pointer - 1):
+                    self.report(where, _quote_color(color[1]))
             else:
                 return value
         return None
@@ -352,6 +360,12 @@ class _Loader(CoreLoader):  # type: ignore[misc]  # the class has no stubs
 def _syntax_problem(error: yaml.MarkedYAMLError) -> Problem:
     mark = error.problem_mark or error.context_mark
     line, column = (1, 1) if mark is None else (mark.line + 1, mark.column + 1)
+    if mark is not None and mark.buffer is not None:
+        # A comment hides the closing bracket, and the error is at the next token, often a line below.
+        begin = max(0, min(mark.line - 1, error.context_mark.line if error.context_mark else mark.line))
+        for at, text in enumerate(mark.buffer.splitlines()[begin : mark.line + 1], begin + 1):
+            if color := _COLOR_COMMENT.search(text):
+                return Problem(at, color.start(1) + 1, "", _quote_color(color[1]))
     problem = " ".join((error.problem or error.context or "it cannot be read").split())
     if "'\\t'" in problem:
         problem = "a tab. YAML needs spaces"
@@ -360,6 +374,10 @@ def _syntax_problem(error: yaml.MarkedYAMLError) -> Problem:
     elif "single document" in (error.context or ""):
         problem = "a second document (`---`). A file has one"
     return Problem(line, column, "", f"this is not YAML: {problem}")
+
+
+def _quote_color(color: str) -> str:
+    return f"a # begins a comment. Write the color in quotes: '{color}'"
 
 
 def _can_encode(text: str) -> bool:

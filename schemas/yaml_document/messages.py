@@ -19,7 +19,7 @@ Where = tuple[str | int, ...]
 
 _MAX_VALUE_LENGTH: Final = 60
 _MAX_WORDS_LISTED: Final = 12
-_ITEMS: Final = {"boxes": "box", "line": "point", "path": "point", "then": "effect"}
+_ITEMS: Final = {"boxes": "box", "capabilities": "capability", "line": "point", "path": "point", "then": "effect"}
 """Names of a list's items, if not the list's name without its s."""
 _TYPES: Final = {
     "string": "text",
@@ -110,8 +110,10 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
         words = [str(word) for each in here for word in each.get("enum", ())]
         if isinstance(value, str) and (near := did_you_mean(value, words)):
             return head, near
-        quotes = " in quotes" if kind == "string_type" and isinstance(value, bool | int | float) else ""
-        return head, f"Write {' or '.join(dict.fromkeys(allowed_here))}{quotes}."
+        if kind.endswith("_type") and isinstance(value, bool | int | float):
+            # Each member of a union has an error of its own: the same words for all of them.
+            allowed_here = ["text in quotes" if each == "text" else each for each in allowed_here]
+        return head, f"Write {' or '.join(dict.fromkeys(allowed_here))}."
     message = str(error["msg"])
     return head, _sentence(message)
 

@@ -89,7 +89,9 @@ class _PlanParser:
         roles = {name: self._role(name, each) for name, each in entry.roles.items()}
         for car, each in entry.fixed.items():
             if (each.role is None) is (each.mode is None):
-                self._report(("fixed", car), "needs a role or a mode. Write: `{mode: manual}`", unless=("fixed", car))
+                words = "has a role and a mode. Write one of them." if each.role else ""
+                words = words or "needs a role or a mode. Write: `{mode: manual}`"
+                self._report(("fixed", car), words, unless=("fixed", car))
             elif each.role is not None:
                 self._check_role(("fixed", car, "role"), each.role)
             elif each.mode is not None:

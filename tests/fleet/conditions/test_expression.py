@@ -77,6 +77,7 @@ def test_what_a_condition_means(text: str, held: bool | None) -> None:
         ("()", 2, "a field or a value is missing here, before )"),
         ("range < 0.3", 1, "range is not a value. Did you mean range_m?"),
         ("level == low", 10, "low is not a value. A word needs quotes: 'low'"),
+        ("levl == 'low'", 1, "levl is not a value. Did you mean level?"),
         ("light.left == True", 15, "Did you mean true?"),
         ("range_m", 1, "range_m is a number, not a condition: compare it, as range_m < 0.3"),
         ("no_echo or level", 12, "level is a word, not a condition: compare it, as level == 'low'"),

@@ -71,6 +71,12 @@ def test_yaml_is_that_of_1_2() -> None:
         ("wheels: {a: {spokes: " + "9" * 5000 + "}}", "1:22", "too long a number"),
         ("wheels: {a: {spokes: " + "9" * 50 + "}}", "1:22", "too large a number"),
         ("wheels: !!python/object:os.system {a: {}}", "1:9", "the tag"),
+        ("wheels: {}\nspare: #ff8000", "2:7", "a # begins a comment. Write the color in quotes: '#ff8000'"),
+        ("wheels: {a: {size_m: #ff8000}}\nmode: fast", "1:22", "Write the color in quotes: '#ff8000'"),
+        ("wheels: {}\nnames: [#ff8000, #ff0000]", "2:9", "Write the color in quotes: '#ff8000'"),
+        ("wheels: {}\nnames: 3 #ff8000", "2:8", "3 is not allowed. Write a list"),
+        ("wheels: {}\nspare: true", "2:8", "true is not allowed. Write fields"),
+        ("wheels: {}\nnames: 7", "2:8", "7 is not allowed. Write a list"),
         ("wheels: {}\nmode: !secret x", "2:7", "the tag '!secret' is not allowed"),
         ("wheels: {}\nnames: ['\x01']", "2:10", "U+0001"),
         ('wheels: {}\nnames: ["\\ud800"]', "2:9", "half a character"),
@@ -125,3 +131,9 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
             read_text(odd)
     path.write_bytes("\ufeffmode: fast\nwheels: {}".encode())
     assert read_yaml(read_text(path), "f", Wagon).mode == "fast"
+
+
+def test_a_dangling_link_is_not_suggested_instead_of_itself(tmp_path: Path) -> None:
+    (tmp_path / "plan.yaml").symlink_to(tmp_path / "gone.yaml")
+    with pytest.raises(BadFile, match=r"plan\.yaml: error: there is no such file$"):
+        read_text(tmp_path / "plan.yaml")

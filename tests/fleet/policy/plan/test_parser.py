@@ -91,6 +91,12 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
         ("roles: {a: {mode: tracking, if_none: b}}", "roles.a.if_none: there is no role b. There is only a."),
         ("roles: {a: {mode: tracking, if_none: a}}", "these roles stand in for each other: a -> a"),
         ("roles: {a: {mode: tracking, capabilities: [wings]}}", "there is no capability wings"),
+        ("roles: {a: {mode: tracking, capabilities: [wings]}}", "roles.a, capability 1"),
+        (ROLE + "fixed: {red: {role: a, mode: manual}}", "fixed.red: has a role and a mode. Write one of them."),
+        (
+            ROLE + "rules: [{when: true, then: {who: red, mode: manual}}]",
+            "rule 1, when: true is not allowed. Write text in quotes or fields, `name: value`.",
+        ),
         ("roles: {other_cars: {mode: tracking}}", "other_cars is a word of rules"),
         ("fixed: {a: {role: b}}\n" + ROLE, "a car in `fixed` has this name"),
         (
