@@ -89,7 +89,9 @@ def stop(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
     `fleet estop` also makes cars refuse every command. `fleet mode CAR manual` stops without a hold.
     """
     request = stop_request()
-    end_with_any([*client.ask(request, _named(client, cars)), *_strangers(client, request, cars)], as_json=as_json)
+    end_with_any(
+        client, [*client.ask(request, _named(client, cars)), *_strangers(client, request, cars)], as_json=as_json
+    )
 
 
 @click.command(epilog="\b\nexamples:\n  fleet estop\n  fleet estop red --why 'someone is on the track'")
@@ -104,7 +106,7 @@ def estop(client: Fleet, cars: tuple[str, ...], why: str, *, as_json: bool) -> N
     """
     named = _named(client, cars)
     request = estop_request(why, "fleet" if named is None else "car")
-    end_with_any([*client.ask(request, named), *_strangers(client, request, cars)], as_json=as_json)
+    end_with_any(client, [*client.ask(request, named), *_strangers(client, request, cars)], as_json=as_json)
 
 
 @click.command(
@@ -143,7 +145,7 @@ def resume(
     if everything and (estops or ids):
         raise click.UsageError("--all ends everything: leave --estops and --id out")
     if everything:
-        end_with_any(client.resume(_named(client, cars), everything=True), as_json=as_json)
+        end_with_any(client, client.resume(_named(client, cars), everything=True), as_json=as_json)
     named = resolve_cars(client, cars or [ALL_CARS])
     if not estops and not ids:
         carry_out(client, resume_request(), named, as_json=as_json)

@@ -13,7 +13,7 @@ from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
 from fleet.client.outcome import Outcome
 from fleet.commands.group import as_option, chosen_person, connect_option, fleet_option
-from fleet.commands.params import complete_people, resolve_cars
+from fleet.commands.params import complete_people, no_cars, resolve_cars
 from schemas import keys
 from schemas.bus import BadEndpoint, BusError
 
@@ -93,10 +93,10 @@ def carry_out(
     end_with(client.ask(replace(request, take=take), resolve_cars(client, cars)), as_json=as_json)
 
 
-def end_with_any(outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
+def end_with_any(client: Fleet, outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
     """End as `end_with`. Fail if there is no outcome, because no car is connected."""
     if not outcomes:
-        raise click.ClickException("No car is connected.")
+        raise no_cars(client)
     end_with(outcomes, as_json=as_json)
 
 

@@ -20,7 +20,7 @@ def pause(client: Fleet, why: str, *, as_json: bool) -> None:
 
     Without leads in the fleet file any person may pause, and nobody moves a car meanwhile.
     """
-    end_with_any(client.pause(why), as_json=as_json)
+    end_with_any(client, client.pause(why), as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet unpause --as teacher")
@@ -28,7 +28,7 @@ def pause(client: Fleet, why: str, *, as_json: bool) -> None:
 @with_client
 def unpause(client: Fleet, *, as_json: bool) -> None:
     """End the pause of the fleet. No car moves by it, and a stopped car stays on hold."""
-    end_with_any(client.unpause(), as_json=as_json)
+    end_with_any(client, client.unpause(), as_json=as_json)
 
 
 @click.command(
@@ -59,4 +59,4 @@ def lend(
         outcomes = client.lend(named, to, duration_s)
     else:
         outcomes = client.end_loan(named)
-    end_with_any(outcomes, as_json=as_json)
+    end_with_any(client, outcomes, as_json=as_json)

@@ -89,6 +89,8 @@ def test_a_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
     assert "names one car, or all (*), but no group" in error("get", "@a")
     assert error("list", "@A") == 'No group "@A". Names are lower case: did you mean "@a"?'
     assert error("list", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
+    assert error("stop", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
+    assert error("pause", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
     assert len(tokens) == 2
 
 
