@@ -1,6 +1,7 @@
 """`fleet check`: checks fleet files, plans and worlds, which it recognizes by their content."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -19,16 +20,19 @@ from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import FleetFile, read_fleet
 from fleet.fleetfile.link_check import check_link
 from fleet.fleetfile.models import FileEntry
+from fleet.links import LINK_SIM
 from fleet.policy.plan.lint import Severity
 from fleet.policy.plan.lint import check as find_findings
 from fleet.policy.plan.models import PlanEntry
 from fleet.policy.plan.parser import parse as parse_plan
 from fleet.policy.snapshot import CarSnapshot
+from gateway.protocol.platforms import Platform
 from schemas import bus
 from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, read_text
 
 _CHECK_THREADS: Final = 16
+_WORLD_PROBLEM: Final = re.compile(r"(?P<line>\d+):(?P<column>\d+): error: (?P<words>.*)")
 _Cars = Mapping[str, CarSnapshot] | None
 
 
@@ -80,6 +84,8 @@ class _Checks:
         self.result = _Result.GOOD
         self._as_json = as_json
         self._cars: _Cars = None
+        self._simulated: list[str] = []
+        """Cars that can carry things of a world. Empty: any car."""
         self._done: set[Path] = set()
 
     def recognize(self, file: Path) -> FileKind | None:
@@ -113,6 +119,8 @@ class _Checks:
         fleet = read_fleet(file)
         if self._cars is None:
             self._cars = listed_cars(fleet)
+            # `fleet up --sim N` also simulates cars that have a port.
+            self._simulated = [name for name, car in fleet.cars.items() if car.link == LINK_SIM] or list(fleet.cars)
         served = _served(fleet)
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
             found = list(pool.map(lambda car: check_link(car, served), fleet.cars.values()))
@@ -138,11 +146,15 @@ class _Checks:
 
     def _check_world(self, file: Path) -> None:
         # Worlds belong to the simulator, whose code no part of the fleet imports.
-        command = [sys.executable, "-m", "gateway.cli", "sim", "--check", "--world", str(file)]
+        cars = [word for name in self._simulated for word in ("--car", f"{name}:{Platform.ARDUINO}:tcp")]
+        command = [sys.executable, "-m", "gateway.cli", "sim", "--check", *cars, "--world", str(file)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         for line in done.stderr.splitlines():
             words = line.removeprefix("gateway sim: ")
-            self._print({"file": str(file), "severity": "error", "words": words}, words, err=True)
+            found = _WORLD_PROBLEM.fullmatch(words.removeprefix(f"{file}:"))
+            place = {"line": int(found["line"]), "column": int(found["column"])} if found else {}
+            problem = {"words": found["words"] if found else words, **place}
+            self._print({"file": str(file), "severity": "error", **problem}, words, err=True)
         if done.returncode:
             self._worse(_Result.WRONG)
         else:

@@ -54,7 +54,7 @@ def print_errors(error: BadFile, *, as_json: bool = False) -> None:
     """Print every error of a file on its own line: for a person to stderr, as JSON to stdout."""
     if as_json:
         for problem in error.problems:
-            click.echo(json.dumps({"file": error.source, **asdict(problem)}))
+            click.echo(json.dumps({"file": error.source, "severity": "error", **asdict(problem)}))
     else:
         click.echo(str(error), err=True)
 

@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="room: walls and a line to track; open: nothing, so no ranging has an echo; or a file with lamps, things "
         "and cars that meet, as `fleet example show follow` prints (default: room)",
     )
-    parser.add_argument("--check", action="store_true", help="only check the world, for any cars")
+    parser.add_argument("--check", action="store_true", help="only check the world, for these cars or (no --car) any")
     parser.add_argument(
         "--fault",
         action="append",
@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     """Run until SIGINT or SIGTERM; return the exit code."""
     try:
         if args.check:
-            _world(args.world, None)
+            _world(args.world, [spec.name for spec in parse_cars(args.car)] or None)
             return 0
         specs = parse_cars(args.car)
         replays = [parse_replay(text) for text in args.replay]

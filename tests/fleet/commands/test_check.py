@@ -70,6 +70,18 @@ def test_plans_and_worlds_are_checked_by_themselves(run: object) -> None:
     )
 
 
+def test_a_world_is_checked_for_the_simulated_cars_of_the_fleet_file(run: object) -> None:
+    Path("world.yaml").write_text("room: {width_m: 4.0, depth_m: 3.0}\nlamps: {sun: {carried_by: rad}}\n")
+    assert run("world.yaml").exit_code == 0, "any car may exist"  # type: ignore[operator]
+    done = run("fleet.yaml", "--json")  # type: ignore[operator]
+    assert done.exit_code == 2
+    (found,) = [
+        each for each in map(json.loads, done.stdout.splitlines()) if each.get("file", "").endswith("/world.yaml")
+    ]
+    assert (found["severity"], found["line"], found["column"]) == ("error", 2, 27)
+    assert found["words"] == "lamps.sun.carried_by: no car or thing 'rad' is simulated here: use red"
+
+
 def test_every_wrong_file_is_named_and_the_worst_counts(run: object) -> None:
     Path("bad.yaml").write_text("roles: {a: {mde: tracking}}\n")
     Path("bad_world.yaml").write_text("room: 5\nwalls: 7\n")
@@ -77,3 +89,4 @@ def test_every_wrong_file_is_named_and_the_worst_counts(run: object) -> None:
     assert done.exit_code == 2
     found = [json.loads(line) for line in done.stdout.splitlines()]
     assert {Path(each["file"]).name for each in found} == {"never.yaml", "bad.yaml", "bad_world.yaml", "nowhere.yaml"}
+    assert all({"file", "severity", "line", "column", "words"} <= set(each) for each in found)
