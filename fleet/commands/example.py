@@ -95,6 +95,8 @@ def show(path: Path) -> None:
 @click.option("--force", is_flag=True, help="Overwrite existing files.")
 def copy(path: Path, directory: Path, *, force: bool) -> None:
     """Copy an example into DIR (default: here), with the plan and the world that a fleet file names."""
+    if directory.suffix == path.suffix:  # or a directory of the name plan.yaml would be created
+        raise click.UsageError(f"{directory} is the name of a file: give a directory, or nothing for this one")
     text = path.read_text(encoding="utf-8")
     copies = {directory / path.name: _OTHER_FILE.sub(lambda match: Path(match[1]).name, text)}
     for other in _OTHER_FILE.findall(text) if path.parent.name == "fleets" else ():

@@ -66,6 +66,8 @@ def try_plan(session: Path, path: Path | None, fleet_file: Path | None, toleranc
 
     if path is None and session.suffix in (".yaml", ".yml"):
         path, session = session, SessionPath().convert("latest", None, click.get_current_context())
+    elif path is not None and session.suffix in (".yaml", ".yml") and path.suffix not in (".yaml", ".yml"):
+        raise click.UsageError(f"Write the session first: fleet plan try {path} {session}")
     with cli_errors():
         plan = None if path is None else parse(read_text(path), str(path))
         try:

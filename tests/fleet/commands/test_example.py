@@ -57,6 +57,9 @@ def test_wrong_names_and_places(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith('fleet: There is no example "patrol". Did you mean 1-patrol?')
     assert "`fleet example list` shows all" in fleet("example", "copy", "xyz").stderr
+    done = fleet("example", "copy", "1-patrol", "plan.yaml", cwd=tmp_path)
+    assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
+    assert done.stderr.startswith("fleet: plan.yaml is the name of a file: give a directory")
     (tmp_path / "file").touch()
     done = fleet("example", "copy", "room", "file/lab", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
