@@ -13,7 +13,7 @@ from click.shell_completion import BashComplete, FishComplete, add_completion_cl
 
 from fleet.commands.group import CommandGroup, as_option, connect_option, fleet_option
 from schemas.process import startup, stdio
-from schemas.suggestion import how_to_install
+from schemas.suggestion import how_to_install, misspelled
 
 COMMANDS: Final = {
     "Start here": {
@@ -231,6 +231,11 @@ def _one_line(error: click.ClickException) -> str:
     if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
         option = f"{error.param.opts[-1]}: " if isinstance(error.param, click.Option) else ""
         return " ".join(f"{option}{error.message}".split())
+    if isinstance(error, click.NoSuchOption) and error.ctx is not None:
+        # click suggests --as for --json: names that are only somewhat like the word.
+        options = [each for param in error.ctx.command.get_params(error.ctx) for each in param.opts]
+        near = misspelled(error.option_name.lstrip("-"), [each[2:] for each in options if each.startswith("--")])
+        return f"No such option '{error.option_name}'.{f' Did you mean --{near[0]}?' if near else ''}"
     words = " ".join(error.format_message().split())
     extra = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", words)
     if extra is None or not isinstance(error, click.UsageError):

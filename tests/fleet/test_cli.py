@@ -63,6 +63,8 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
     [
         ("frob", 'There is no command "frob". (see fleet --help)'),
         ("drvie red forward", 'There is no command "drvie". Did you mean drive? (see fleet --help)'),
+        ("mark --json", "No such option '--json'. (see fleet mark --help)"),
+        ("sessions info --josn", "No such option '--josn'. Did you mean --json? (see fleet sessions info --help)"),
         ("sessions vrify", 'There is no command "vrify". Did you mean verify? (see fleet sessions --help)'),
         ("sessions show latest", 'There is no command "show". (see fleet sessions --help)'),
         (
