@@ -203,6 +203,32 @@ rules:
     assert run.of("blue").readings == ("red/sensor/range range_m=0.2 (1.0 s old)",)
 
 
+def test_a_car_that_lost_the_line_drives_on_by_itself_unless_it_was_stopped() -> None:
+    """docs/how-to/write-a-plan.md warns of it: the rule ends without `fleet resume`."""
+    plan = parse("""
+roles: {guide: {mode: tracking}}
+rules:
+  - when: {any_car: not (line.left_inner or line.right_inner), with_role: guide, for_s: 5}
+    then: {who: this_car, mode: manual}
+""")
+    run = PolicyRun(plan, "red")
+
+    def until(end: float, on_line: bool) -> None:
+        while run.now < end:
+            run.sees("red", line={"left_inner": on_line, "right_inner": on_line})
+            run.at(round(run.now + 0.1, 6))
+
+    until(12.0, on_line=False)
+    assert run.of("red").mode == "manual"
+    until(16.0, on_line=True)
+    assert run.of("red").mode == "tracking"
+    until(30.0, on_line=False)
+    run.change("red", held_by="ann")
+    until(40.0, on_line=True)
+    assert run.of("red").mode is None, "after `fleet stop red` the plan leaves it alone"
+    assert run.asked[-1][1:] == ("red", "manual")
+
+
 @pytest.mark.parametrize(
     ("back_s", "kept"), [(0.3, True), (HUB_RETURN_GRACE_S - 0.2, True), (HUB_RETURN_GRACE_S + 0.2, False)]
 )
