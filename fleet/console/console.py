@@ -7,6 +7,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +24,7 @@ from fleet.console.operators import Operators
 from fleet.console.page_link import PageLink
 from fleet.console.pairing import PagePerson
 from fleet.console.permissions import management_refusal, rights_of
+from fleet.console.plan_process import PlanProcess
 from fleet.console.plan_view import PlanView, coordinator_topic
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed
@@ -71,6 +73,7 @@ class Console:
         self._stops = 0
         self._pages: dict[int, PageLink] = {}
         self._last_page = 0
+        self._plan_process = PlanProcess(fleet, file)
         self._coordinators: set[str] = set()
         """Tokens of the coordinator."""
         self._readings: Latest[Sample] = Latest()
@@ -277,6 +280,17 @@ class Console:
             log.warning("page %d sent a bad message: %s", page.number, error)
             page.answer(t="bad", words=str(error))
 
+    async def set_plan(self, text: str, sender: str) -> tuple[bool, str]:
+        """Put a plan in force under this name. Return whether it is, and words, or the faults, one per line.
+
+        If no plan runs, the console starts a coordinator.
+        """
+        ok, words = await self.operator.check_plan(text)
+        if not ok:
+            return ok, words
+        ask = partial(self.operator.ask_coordinator, "plan", text, sender)
+        return await ask() or await self._plan_process.start(text, ask)
+
     def stop_all(
         self, stop_id: str, operator: ConsoleOperator | None = None, request: CommandRequest | None = None
     ) -> None:
@@ -353,7 +367,7 @@ class Console:
                 raise BadPageMessage(f"unknown message {kind!r}")
 
     async def _ask_coordinator(self, page: PageLink, request_id: int, verb: str) -> None:
-        ok, words = await page.operator.ask_coordinator(verb)
+        ok, words = await page.operator.ask_coordinator(verb) or (False, "No plan is running. Put one in force.")
         page.answer(t="plan_done", id=request_id, ok=ok, words=words)
 
     def _on_press(self, page: PageLink, message: PageMessage, now: float) -> None:
@@ -388,4 +402,5 @@ class Console:
         for press in self._presses.alive:
             self._pages[press.client].operator.end_press(press)
         await self._operators.close()
+        await self._plan_process.close()
         await self.sessions.close()

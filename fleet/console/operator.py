@@ -10,7 +10,7 @@ from typing import Any, Final
 from fleet.aio import Fleet
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import Outcome
-from fleet.client.services import NO_PLAN, ask_coordinator
+from fleet.client.services import ask_coordinator
 from fleet.console.presses import HeldPress
 from fleet.console.stop_report import StopReport
 from fleet.policy.plan.parser import BadPlan, parse
@@ -158,21 +158,19 @@ class ConsoleOperator:
         finally:
             self._renewals.discard(car)
 
-    async def ask_coordinator(self, verb: str, text: str = "", sender: str = "") -> tuple[bool, str]:
-        """Send a request to the coordinator. Return whether it was carried out, and words. text: of a plan to set."""
+    async def ask_coordinator(self, verb: str, text: str = "", sender: str = "") -> tuple[bool, str] | None:
+        """Send a request to the coordinator. Return whether it was carried out, and words. None: no plan is running.
+
+        text: of a plan to set.
+        """
         answer = await self._fleet.call(ask_coordinator, self._fleet.sync, verb, text, sender)
         if answer is None:
-            return False, f"{NO_PLAN}."
+            return None
         return not isinstance(answer, Failure) and answer.status == "sent", answer.words
 
     async def check_plan(self, text: str) -> tuple[bool, str]:
         """Check a plan's text. Return whether it is free of faults, and the faults, one per line."""
         return await self._fleet.call(_check_plan, text)
-
-    async def set_plan(self, text: str, sender: str) -> tuple[bool, str]:
-        """Put a plan in force under this name. Return whether it is, and words, or the faults, one per line."""
-        ok, words = await self.check_plan(text)
-        return await self.ask_coordinator("plan", text, sender) if ok else (ok, words)
 
     def spawn(self, work: Any) -> None:
         """Run a coroutine. Its errors go to the log, never to the socket that began it."""

@@ -175,7 +175,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> Sta
         person = request.scope.get(PERSON)
         if words := console.management_refusal(person):
             return JSONResponse({"ok": False, "words": words}, 403)
-        return await _answer_plan(request, partial(console.operator.set_plan, sender=console.sender_of(person)))
+        return await _answer_plan(request, partial(console.set_plan, sender=console.sender_of(person)))
 
     async def connect(socket_: WebSocket) -> None:
         await socket_.accept()

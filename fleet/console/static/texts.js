@@ -190,7 +190,7 @@ export const t = {
   commandColumns: ["Time", "Requested", "Decided", "On the wire", "Evidence"],
   freeze: "Freeze this view",
   plan: "Plan",
-  noPlan: "No plan is running. Start one: `fleet plan run FILE`.",
+  noPlan: "No plan is running. Load or write one below, and put it in force. It ends with this console.",
   coordinator: "Coordinator",
   planRuns: (version, by) => `Plan ${version}${by ? `, set by ${by}` : ""}: running.`,
   planStopped: (version, by) => `Plan ${version}: stopped by ${by}. It moves no car until you restart it.`,

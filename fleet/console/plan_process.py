@@ -1,0 +1,71 @@
+"""The coordinator that the console starts for a page, if none runs. It ends with the console."""
+
+import asyncio
+import sys
+import tempfile
+from asyncio.subprocess import DEVNULL, Process
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Final
+
+from fleet.aio import Fleet
+from schemas.process.parent import parent_option
+
+_START_S: Final = 20.0
+"""Timeout for the start of a coordinator. It starts in 1 s, on a busy machine in 10 s."""
+_END_S: Final = 5.0
+_COORDINATOR_POLL_S: Final = 0.1
+
+
+class PlanProcess:
+    """A process of `fleet plan run`, one at a time. file: the fleet file, with the abilities and roles of the cars."""
+
+    def __init__(self, fleet: Fleet, file: Path) -> None:
+        self._fleet = fleet
+        self._file = file
+        self._process: Process | None = None
+        self._starting = asyncio.Lock()
+
+    async def start(self, text: str, ask: Callable[[], Awaitable[tuple[bool, str] | None]]) -> tuple[bool, str]:
+        """Start a coordinator with this plan. Return its answer, or what went wrong.
+
+        ask: put the plan in force. None if there is no coordinator.
+        """
+        async with self._starting:
+            if (answer := await ask()) is not None:
+                return answer
+            await self.close()
+            with tempfile.TemporaryDirectory(prefix="fleet-console-") as name:
+                plan, errors = Path(name) / "plan.yaml", Path(name) / "errors"
+                await asyncio.to_thread(plan.write_text, text, "utf-8")
+                with await asyncio.to_thread(errors.open, "wb") as written:
+                    self._process = await asyncio.create_subprocess_exec(
+                        *self._command(plan), stdin=DEVNULL, stdout=DEVNULL, stderr=written
+                    )
+                for _ in range(round(_START_S / _COORDINATOR_POLL_S)):
+                    if (answer := await ask()) is not None:
+                        return answer
+                    if self._process.returncode is not None:
+                        break
+                    await asyncio.sleep(_COORDINATOR_POLL_S)
+                await self.close()
+                lines = (await asyncio.to_thread(errors.read_text, "utf-8", "replace")).splitlines()
+        return False, lines[-1].removeprefix("fleet: ") if lines else f"No coordinator started within {_START_S:g} s."
+
+    def _command(self, plan: Path) -> tuple[str, ...]:
+        client = self._fleet.sync
+        listed = ("--fleet-file", str(self._file)) if self._file.is_file() else ()
+        where = ("--connect", client.bus.endpoint, "--fleet", client.name, *parent_option())
+        return (sys.executable, "-m", "fleet.cli", "plan", "run", str(plan), *listed, *where)
+
+    async def close(self) -> None:
+        """End the coordinator. It gives its cars mode manual."""
+        process, self._process = self._process, None
+        if process is None or process.returncode is not None:
+            return
+        process.terminate()
+        try:
+            await asyncio.wait_for(process.wait(), _END_S)
+        except TimeoutError:
+            process.kill()
+            await process.wait()

@@ -1,0 +1,27 @@
+"""The coordinator that the console starts."""
+
+from pathlib import Path
+
+from fleet.aio import Fleet
+from fleet.console.plan_process import PlanProcess
+from tests.support.ports import free_endpoint
+from tests.support.processes import FleetProcesses
+
+
+async def nobody_answers() -> None:
+    """Ask a coordinator that is not there."""
+
+
+async def test_what_keeps_a_coordinator_from_starting_is_reported(tmp_path: Path) -> None:
+    hub = FleetProcesses(free_endpoint(), tmp_path)
+    file = tmp_path / "fleet.yaml"
+    file.write_text("cars: {red: {link: sim, platform: stm32, roles: [Guide]}}")
+    try:
+        async with Fleet(hub.endpoint) as fleet:
+            process = PlanProcess(fleet, file)
+            ok, words = await process.start("roles: {guide: {mode: tracking}}", nobody_answers)
+            assert not ok
+            assert words.startswith(f"{file}:1:"), words
+            await process.close()
+    finally:
+        hub.close()
