@@ -29,14 +29,16 @@ class CommandLedger:
 
     def __init__(self) -> None:
         self._commands: dict[str, LedgerCommand] = {}
+        self._early: dict[str, list[str]] = {}
+        """Frames by command, of commands without an event so far: the two come over two subscriptions, in any order."""
 
     def on_event(self, event: Any) -> None:
         """Handle a command event."""
         if event.id not in self._commands:
             requested = f"{event.verb} by {event.sender}{f' ({event.kind})' if event.kind else ''}"
-            self._commands[event.id] = LedgerCommand(messages.stamp_ms(event.stamp), requested)
-            while len(self._commands) > MAX_COMMANDS:
-                del self._commands[next(iter(self._commands))]
+            wire = self._early.pop(event.id, [])
+            self._commands[event.id] = LedgerCommand(messages.stamp_ms(event.stamp), requested, wire=wire)
+            _limit(self._commands)
         command = self._commands[event.id]
         words = event.phase + (f": {event.words or event.reason}" if event.words or event.reason else "")
         if event.HasField("took_s"):
@@ -49,10 +51,14 @@ class CommandLedger:
 
     def on_frame(self, frame: Any) -> None:
         """Handle a frame to the car (fleet.v1.TxFrame)."""
+        text = frame.data.decode("ascii", "backslashreplace")
+        text = text if frame.written else f"{text} NOT written"
         command = self._commands.get(frame.command_id)
         if command is not None:
-            text = frame.data.decode("ascii", "backslashreplace")
-            command.wire = [*command.wire, text if frame.written else f"{text} NOT written"][-MAX_WIRE_FRAMES:]
+            command.wire = [*command.wire, text][-MAX_WIRE_FRAMES:]
+        elif frame.command_id:
+            self._early[frame.command_id] = [*self._early.get(frame.command_id, ()), text][-MAX_WIRE_FRAMES:]
+            _limit(self._early)
 
     def as_list(self) -> list[dict[str, Any]]:
         """Return the commands, the newest first."""
@@ -67,3 +73,9 @@ class CommandLedger:
             }
             for each in reversed(self._commands.values())
         ]
+
+
+def _limit(by_id: dict[str, Any]) -> None:
+    """Keep the newest only."""
+    while len(by_id) > MAX_COMMANDS:
+        del by_id[next(iter(by_id))]

@@ -50,3 +50,14 @@ def test_the_panel_has_the_doctors_lines() -> None:
     assert facts["link"].startswith("lost for 4 s, 0 frames in")
     assert facts["refused"] == "stop of mia 3 s ago: rejected [link_down]"
     assert "services" not in facts
+
+
+def test_a_frame_that_comes_before_the_event_of_its_command_is_shown() -> None:
+    ledger = CommandLedger()
+    for number in range(MAX_COMMANDS):
+        ledger.on_frame(pb.TxFrame(command_id=f"no event {number}", data=b"x", written=True))
+    ledger.on_frame(pb.TxFrame(data=b"x", written=True))  # of no command
+    ledger.on_frame(pb.TxFrame(command_id="a", data=b"$0#", written=True))
+    ledger.on_event(event("asked"))
+    ledger.on_frame(pb.TxFrame(command_id="a", data=b"$1#", written=True))
+    assert [row["wire"] for row in ledger.as_list()] == ["$0# $1#"]
