@@ -19,7 +19,6 @@ from fleet.client.outcome import Outcome
 from fleet.commands.options import (
     carry_out,
     end_with,
-    end_with_any,
     json_option,
     print_outcomes,
     take_option,
@@ -62,7 +61,7 @@ def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, 
         except KeyboardInterrupt:
             print_outcomes(client.ask(drive_request("stop"), named), as_json=as_json)
             raise SystemExit(startup.INTERRUPTED) from None
-    end_with(outcomes, as_json=as_json)
+    end_with(client, outcomes, as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet mode red tracking\n  fleet mode red,blue manual")
@@ -89,9 +88,7 @@ def stop(client: Fleet, cars: tuple[str, ...], *, as_json: bool) -> None:
     `fleet estop` also makes cars refuse every command. `fleet mode CAR manual` stops without a hold.
     """
     request = stop_request()
-    end_with_any(
-        client, [*client.ask(request, _named(client, cars)), *_strangers(client, request, cars)], as_json=as_json
-    )
+    end_with(client, [*client.ask(request, _named(client, cars)), *_strangers(client, request, cars)], as_json=as_json)
 
 
 @click.command(epilog="\b\nexamples:\n  fleet estop\n  fleet estop red --why 'someone is on the track'")
@@ -106,7 +103,7 @@ def estop(client: Fleet, cars: tuple[str, ...], why: str, *, as_json: bool) -> N
     """
     named = _named(client, cars)
     request = estop_request(why, "fleet" if named is None else "car")
-    end_with_any(client, [*client.ask(request, named), *_strangers(client, request, cars)], as_json=as_json)
+    end_with(client, [*client.ask(request, named), *_strangers(client, request, cars)], as_json=as_json)
 
 
 @click.command(
@@ -145,7 +142,7 @@ def resume(
     if everything and (estops or ids):
         raise click.UsageError("--all ends everything: leave --estops and --id out")
     if everything:
-        end_with_any(client, client.resume(_named(client, cars), everything=True), as_json=as_json)
+        end_with(client, client.resume(_named(client, cars), everything=True), as_json=as_json)
     named = resolve_cars(client, cars or [ALL_CARS])
     if not estops and not ids:
         carry_out(client, resume_request(), named, as_json=as_json)
@@ -157,8 +154,10 @@ def resume(
             by_ids.setdefault(chosen, []).append(car)
         else:
             click.echo(f"{car}: no e-stop is in force", err=True)
+    if not by_ids:
+        return
     outcomes = [outcome for chosen, cars in by_ids.items() for outcome in client.ask(resume_request(chosen), cars)]
-    end_with(sorted(outcomes, key=lambda each: each.car), as_json=as_json)
+    end_with(client, sorted(outcomes, key=lambda each: each.car), as_json=as_json)
 
 
 def _in_force(client: Fleet, car: str) -> list[str]:

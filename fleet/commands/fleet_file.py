@@ -21,6 +21,7 @@ from schemas import keys
 from schemas.atomic_file import write_atomically
 from schemas.world import WorldEntry
 from schemas.yaml_document.document import BadFile, Entry, schema_of
+from schemas.yaml_document.messages import list_words
 
 SCHEMAS: Final = ("fleet", "plan", "world")
 DEFAULT_FILE: Final = Path("fleet.yaml")
@@ -141,7 +142,7 @@ def init(
         print_errors(error)
         raise click.ClickException("nothing was written: two links may be one port") from None
     write(out, text)
-    names = ", ".join(car.name for car in cars)
+    names = list_words([car.name for car in cars])
     click.echo(f"Wrote {out}{f' and {plan}' if simulated else ''} with {names}. Next, type:")
     where = "" if out == DEFAULT_FILE else f" {out}"
     click.echo(f"  fleet check{where}\n  fleet up{where}")

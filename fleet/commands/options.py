@@ -11,9 +11,9 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
-from fleet.client.outcome import Outcome
+from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.commands.group import as_option, chosen_person, connect_option, fleet_option
-from fleet.commands.params import complete_people, no_cars, resolve_cars
+from fleet.commands.params import complete_people, describe_other_fleets, no_cars, resolve_cars
 from schemas import keys
 from schemas.bus import BadEndpoint, BusError
 
@@ -90,20 +90,20 @@ def carry_out(
     client: Fleet, request: CommandRequest, cars: Sequence[str], *, as_json: bool, take: bool = False
 ) -> None:
     """Send a command to the cars, print each outcome, and exit with the code of `end_with`."""
-    end_with(client.ask(replace(request, take=take), resolve_cars(client, cars)), as_json=as_json)
+    end_with(client, client.ask(replace(request, take=take), resolve_cars(client, cars)), as_json=as_json)
 
 
-def end_with_any(client: Fleet, outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
-    """End as `end_with`. Fail if there is no outcome, because no car is connected."""
+def end_with(client: Fleet, outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
+    """Print each outcome. Exit with code 0 if all cars have carried out the command, 2 for a bad value, else 1.
+
+    Fail if there is no outcome, because no car is connected.
+    """
     if not outcomes:
         raise no_cars(client)
-    end_with(outcomes, as_json=as_json)
-
-
-def end_with(outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
-    """Print each outcome. Exit with code 0 if all cars have carried out the command, 2 for a bad value, else 1."""
     print_outcomes(outcomes, as_json=as_json)
     failed = [outcome for outcome in outcomes if not outcome.ok]
+    if all(outcome.phase == NO_ANSWER for outcome in outcomes) and (words := describe_other_fleets(client)):
+        click.echo(words, err=True)  # --fleet may be wrong
     wrong = bool(failed) and all(outcome.reason == "bad_value" for outcome in failed)
     raise SystemExit(2 if wrong else 1 if failed else 0)
 

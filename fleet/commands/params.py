@@ -307,11 +307,16 @@ def written_out(keyexpr: str, fleet: str) -> str:
 
 def no_cars(client: Fleet) -> click.ClickException:
     """Return the error that no car is connected. It names other fleets if this one is not on the bus."""
-    there = {token.partition("/")[0] for token in client.bus.tokens("*/*")} - {client.name}
-    there |= {token.partition("/")[0] for token in client.bus.tokens(f"*/{keys.SUPERVISOR}")}
+    return click.ClickException(describe_other_fleets(client) or "No car is connected.")
+
+
+def describe_other_fleets(client: Fleet) -> str:
+    """Name the fleets on the bus. Empty if this one is among them, or if there is none."""
+    cars = {token.partition("/")[0] for token in client.bus.tokens("*/*")}
+    there = cars | {token.partition("/")[0] for token in client.bus.tokens(f"*/{keys.SUPERVISOR}")}
     if not there or client.name in there:
-        return click.ClickException("No car is connected.")
-    return click.ClickException(f'No fleet "{client.name}" is on this bus. There is: {", ".join(sorted(there))}.')
+        return ""
+    return f'No fleet "{client.name}" is on this bus. There is: {", ".join(sorted(there))}.'
 
 
 def describe_missing(client: Fleet, written: str, what: str) -> str:

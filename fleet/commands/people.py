@@ -5,7 +5,7 @@ from typing import Final
 import click
 
 from fleet.client.client import Fleet
-from fleet.commands.options import end_with_any, json_option, with_client
+from fleet.commands.options import end_with, json_option, with_client
 from fleet.commands.params import Duration, cars_argument, complete_people, resolve_cars
 
 _DAY_S: Final = 86_400.0
@@ -20,7 +20,7 @@ def pause(client: Fleet, why: str, *, as_json: bool) -> None:
 
     Without leads in the fleet file any person may pause, and nobody moves a car meanwhile.
     """
-    end_with_any(client, client.pause(why), as_json=as_json)
+    end_with(client, client.pause(why), as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet unpause --as teacher")
@@ -28,7 +28,7 @@ def pause(client: Fleet, why: str, *, as_json: bool) -> None:
 @with_client
 def unpause(client: Fleet, *, as_json: bool) -> None:
     """End the pause of the fleet. No car moves by it, and a stopped car stays on hold."""
-    end_with_any(client, client.unpause(), as_json=as_json)
+    end_with(client, client.unpause(), as_json=as_json)
 
 
 @click.command(
@@ -59,4 +59,4 @@ def lend(
         outcomes = client.lend(named, to, duration_s)
     else:
         outcomes = client.end_loan(named)
-    end_with_any(client, outcomes, as_json=as_json)
+    end_with(client, outcomes, as_json=as_json)

@@ -52,7 +52,9 @@ def people_routes(lan: "Lan | None") -> list[Route]:
         return JSONResponse({"may_pair": may_pair, "lan": lan.as_dict() if lan is not None and may_pair else None})
 
     async def change(request: Request) -> Response:
-        if lan is None or not _may_pair(request.scope):
+        if lan is None:
+            return _failure("This console serves its own computer only. Start it with --lan.", 409)
+        if not _may_pair(request.scope):
             return _failure("Only the console's own computer or a lead may do this.", 403)
         text = await read_text(request, _MAX_BODY_BYTES)
         try:

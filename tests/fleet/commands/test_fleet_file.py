@@ -23,6 +23,7 @@ from fleet.policy.plan.lint import find_faults
 from fleet.policy.plan.parser import parse as parse_plan
 from schemas.yaml_document.document import BadFile
 from tests.support import in_process
+from tests.support.message_length import LINE
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, GatewayProcess, TcpCar, wait_for
 from tests.support.terminal import Terminal
@@ -256,11 +257,12 @@ def test_each_link_is_written_as_it_is(link: str) -> None:
     assert written.cars["red"].link == direct.cars["red"].link
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 9])
+@pytest.mark.parametrize("count", [1, 2, 3, 9, 40])
 def test_simulated_cars_are_written_with_a_plan_that_uses_all(command: Command, tmp_path: Path, count: int) -> None:
     done = command("init", "--sim", str(count))
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Wrote fleet.yaml and plan.yaml with red")
+    assert max(map(len, done.stdout.splitlines())) <= LINE
     assert done.stdout.splitlines()[1:] == [
         "  fleet check",
         "  fleet up",

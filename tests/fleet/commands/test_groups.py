@@ -91,6 +91,10 @@ def test_a_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
     assert error("list", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
     assert error("stop", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
     assert error("pause", "--fleet", "flet") == 'No fleet "flet" is on this bus. There is: fleet.'
+    named = CliRunner().invoke(cli, ["stop", "red", "--fleet", "flet", "--connect", client.bus.endpoint])
+    assert named.exit_code == 1
+    assert named.output.startswith("red: NOT STOPPED")
+    assert named.output.endswith('No fleet "flet" is on this bus. There is: fleet.\n')
     assert len(tokens) == 2
 
 
