@@ -20,7 +20,7 @@ from fleet.recording.reading.mcap_reader import McapReader, NotMcap, Row
 from fleet.recording.reading.message_decoder import MessageDecoder, message_of
 from fleet.recording.selection import EVERYTHING, Selection, key_expressions
 from fleet.recording.session_lookup import NoLatest, find_session, sessions_place
-from fleet.recording.tools.analysis import arrow_table, data_frame, join_as_of
+from fleet.recording.tools.analysis import arrow_table, data_frame, is_known, join_as_of, no_messages
 from fleet.recording.writing.mcap_copy import McapCopy
 from schemas.keys import DEFAULT_FLEET
 from schemas.suggestion import did_you_mean
@@ -199,9 +199,19 @@ class Session:
         no longer than a minute's messages.
         decode: True to yield readings, as `Fleet.watch` does, and to leave out what is not protobuf. False to yield
         payloads as they were on the bus.
+        Raises NoTable if `keys` is one name without wildcards that neither we nor this session have.
         """
-        rows = self.rows(self.selection(keys, start_ns, end_ns))
+        selection = self.selection(keys, start_ns, end_ns)
+        if isinstance(keys, str) and not is_known(keys) and self._lacks(selection):
+            raise no_messages(keys, self.name)
+        rows = self.rows(selection)
         return self._readings(rows) if decode else map(_recorded, rows)
+
+    def _lacks(self, selection: Selection) -> bool:
+        """Return True if the indexes of all segments show that no key is selected."""
+        indexes = [index for index in self.indexes().values() if index is not None and index.has_all_channels]
+        recorded = {channel.topic for index in indexes for channel in index.channels.values()}
+        return len(indexes) == len(self.segments) and not any(map(selection.has_key, recorded))
 
     def _readings(self, rows: Iterable[Row]) -> Iterator[Reading]:
         decoder = MessageDecoder()

@@ -24,7 +24,7 @@ _NOT_JOINED: Final = frozenset({"key", "car", "log_time", "sequence", "seq", "bo
 
 
 class NoTable(ValueError):
-    """A name that selects no table, or several. The text lists the likely names."""
+    """A name that selects nothing, or several tables. The text lists the likely names."""
 
 
 def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
@@ -51,12 +51,27 @@ def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":
 
 
 def _empty_table(of: str, session: str) -> "pa.Table":
-    known = {name: topic.message for name, topic in topics.TOPICS.items()}
-    known |= {name: name for name in (*known.values(), *(command.message for command in COMMANDS.values()))}
-    known |= {name.rpartition(".")[2]: name for name in known.values()}
+    known = _known_names()
     if of in known:
         return ArrowSink(Layout(messages.message_class(known[of]).DESCRIPTOR).columns).table()
-    raise NoTable(f"{session} has no messages of {of}. {did_you_mean(of, known, 2)}".rstrip())
+    raise no_messages(of, session)
+
+
+def no_messages(of: str, session: str) -> NoTable:
+    """Return the error that a session has no messages of this name."""
+    return NoTable(f"{session} has no messages of {of}. {did_you_mean(of, _known_names(), 2)}".rstrip())
+
+
+def is_known(name: str) -> bool:
+    """Return True if a topic, a message, or a key of a topic or a command has this name, or if it has wildcards."""
+    return "*" in name or "@cmd/" in name or any(f"/{name}".endswith(f"/{known}") for known in _known_names())
+
+
+def _known_names() -> dict[str, str]:
+    """Return the message of each topic and of each name of a message."""
+    known = {name: topic.message for name, topic in topics.TOPICS.items()}
+    known |= {name: name for name in (*known.values(), *(command.message for command in COMMANDS.values()))}
+    return known | {name.rpartition(".")[2]: name for name in known.values()}
 
 
 def data_frame(table: "pa.Table") -> "pd.DataFrame":

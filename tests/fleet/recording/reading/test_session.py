@@ -8,6 +8,7 @@ import pytest
 from mcap.writer import Writer
 
 from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.tools.analysis import NoTable
 
 
 def mcap(*sequences: int) -> bytes:
@@ -102,3 +103,17 @@ def test_an_empty_directory_and_a_newer_format_are_refused(tmp_path: Path) -> No
     with pytest.raises(NoSession, match="format 99"):
         Session(tmp_path)
     assert len([*Session(tmp_path / "0001.mcap").messages()]) == 1
+
+
+def test_a_name_that_nobody_has_is_refused_with_the_likely_one(tmp_path: Path) -> None:
+    (tmp_path / "0001.mcap").write_bytes(mcap(1, 2))
+    session = Session(tmp_path / "0001.mcap")
+    with pytest.raises(NoTable, match=r"has no messages of sensor/rnge\. Did you mean sensor/range"):
+        session.messages("sensor/rnge")
+    with pytest.raises(NoTable, match=r"has no messages of red/sensor/rnge\."):
+        session.messages("red/sensor/rnge", decode=True)
+    assert len(list(session.messages("fleet/red/x"))) == 2, "recorded, but not ours"
+    for none in ("sensor/range", "red/sensor/range", "Range", "blue/**", "*/x/y"):
+        assert list(session.messages(none)) == [], none
+    (tmp_path / "0002.mcap").write_bytes(mcap(3)[:-20])
+    assert list(Session(tmp_path).messages("sensor/rnge")) == [], "without an index it is not known"
