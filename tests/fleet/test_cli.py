@@ -439,7 +439,7 @@ def test_one_release_of_a_fleet_wide_e_stop_has_one_line_per_car(cars: Cars) -> 
         "One release frees all cars: `fleet resume --estops`"
     ] * 3
     released = invoke("resume", "--estops")
-    assert released.exit_code == 0
+    assert released.exit_code == 0, released.output
     assert [line.split(";")[0] for line in released.output.splitlines()] == [
         f"{car}: e-stop released" for car in ("blue", "green", "red")
     ]
