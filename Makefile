@@ -60,6 +60,7 @@ lint: .venv/.docs ## ruff, mypy, import-linter, generated files up to date, the 
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m schemas.generate --check
+	$(BIN)/python -m pytest -q -n 0 tests/test_generated_pages.py
 	$(MAKE) --no-print-directory docs
 
 bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in the same run
