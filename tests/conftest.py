@@ -43,7 +43,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep tests that share a fixture of their module on one worker.
 
     Without a group every worker gets some of them, and starts the fleet or records the session once more.
+    Tests that compute come last, where workers in the background take them.
     """
+    items.sort(key=lambda item: scheduling.computes(item.nodeid))
     for item in items:
         if isinstance(item, pytest.Function) and item.get_closest_marker("xdist_group") is None:
             definitions = item._fixtureinfo.name2fixturedefs.values()

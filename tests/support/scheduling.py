@@ -36,6 +36,11 @@ _COMPUTING: Final = (
 """Rooms of tests that compute on virtual time, or read files. The other tests wait for processes, cars and seconds."""
 
 
+def computes(nodeid: str) -> bool:
+    """Return True if a test computes only."""
+    return nodeid.startswith(_COMPUTING)
+
+
 def in_background(worker: str, workers: int, tests: int) -> bool:
     """Return True if this worker (`gw7`) of so many has low priority, and runs tests that compute only."""
     return tests >= _MIN_TESTS and workers == WORKERS and int(worker.removeprefix("gw")) >= workers - _PROCESSORS
@@ -55,18 +60,12 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
     """
 
     def _assign_work_unit(self, node: WorkerController) -> None:
-        scope = self._next(node)
-        if scope is None:
-            node.shutdown()
-            return
-        self.workqueue.move_to_end(scope, last=False)
+        if in_background(node.gateway.id, self.numnodes, len(self.collection or ())):
+            # `computes` sorted the tests, so those that compute are last. Processes that a worker in the background
+            # started would be of low priority too, so it takes no others.
+            scope, unit = next(reversed(self.workqueue.items()))
+            if not computes(next(iter(unit))):
+                node.shutdown()
+                return
+            self.workqueue.move_to_end(scope, last=False)
         super()._assign_work_unit(node)
-
-    def _next(self, node: WorkerController) -> str | None:
-        """Return the next unit of work for a worker; None if there is none for it."""
-        background = in_background(node.gateway.id, self.numnodes, len(self.collection or ()))
-        for scope, unit in self.workqueue.items():
-            if next(iter(unit)).startswith(_COMPUTING) is background:
-                return scope
-        # Processes that a worker in the background started would be of low priority too.
-        return None if background else next(iter(self.workqueue), None)
