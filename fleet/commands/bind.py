@@ -26,7 +26,7 @@ from fleet.fleetfile.fleet_file import FleetFile
 from fleet.fleetfile.models import validate_link
 from fleet.fleetfile.scan import FoundLink
 from fleet.links import may_be_same, parse_fleet_link
-from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX, temporary_gateway
+from fleet.supervisor.temporary_gateway import temporary_gateway
 from schemas.links import TcpUrl
 from schemas.process import signals
 from schemas.yaml_document.document import BadFile, read_text
@@ -66,7 +66,7 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
     ):
         for number, each in enumerate(found, 1):
             click.echo(f"\n{number} of {len(found)}: {each.url}\n  {each.words}")
-            with temporary_gateway(client, f"{TEMPORARY_PREFIX}bind-{number}", each.url, _print_error) as name:
+            with temporary_gateway(client, f"bind-{number}", each.url, _print_error) as name:
                 if name is None:
                     continue
                 car = _which(client, name, file)

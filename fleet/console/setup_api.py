@@ -22,7 +22,7 @@ from fleet.fleetfile.models import validate_car_name, validate_link, validate_pl
 from fleet.fleetfile.scan import ScanFailed, scan
 from fleet.fleetfile.template import NewCar, format_new_file
 from fleet.links import may_be_same, parse_fleet_link
-from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX, temporary_gateway
+from fleet.supervisor.temporary_gateway import temporary_gateway
 from gateway.protocol.platforms import AUTO
 from schemas.atomic_file import write_atomically
 from schemas.yaml_document.document import read_text
@@ -100,7 +100,7 @@ class SetupApi:
         else:
             self._blinks += 1
             errors: list[str] = []
-            with temporary_gateway(client, f"{TEMPORARY_PREFIX}setup-{self._blinks}", link, errors.append) as name:
+            with temporary_gateway(client, f"setup-{self._blinks}", link, errors.append) as name:
                 if name is None:
                     return {"ok": False, "words": errors[-1]}
                 outcome = client.car(name).find()

@@ -23,6 +23,7 @@ _READY_POLL_S: Final = 0.1
 @contextlib.contextmanager
 def temporary_gateway(client: Fleet, name: str, link: str, on_error: Callable[[str], object]) -> Iterator[str | None]:
     """Run a gateway for this link. Yield its car's name, or None if the gateway did not come up. No car moves."""
+    name = f"{TEMPORARY_PREFIX}{name}"
     with tempfile.TemporaryDirectory() as directory, (Path(directory) / "log").open("w+", encoding="utf-8") as log:
         command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, *parent_option()]
         command += ["--fleet", client.name, "--connect", client.bus.endpoint, "--state-dir", directory]
