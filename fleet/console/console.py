@@ -289,7 +289,7 @@ class Console:
         if not ok:
             return ok, words
         ask = partial(self.operator.ask_coordinator, "plan", text, sender)
-        return await ask() or await self._plan_process.start(text, ask)
+        return await self._plan_process.set_plan(text, ask)
 
     def stop_all(
         self, stop_id: str, operator: ConsoleOperator | None = None, request: CommandRequest | None = None

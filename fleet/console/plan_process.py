@@ -26,8 +26,8 @@ class PlanProcess:
         self._process: Process | None = None
         self._starting = asyncio.Lock()
 
-    async def start(self, text: str, ask: Callable[[], Awaitable[tuple[bool, str] | None]]) -> tuple[bool, str]:
-        """Start a coordinator with this plan. Return its answer, or what went wrong.
+    async def set_plan(self, text: str, ask: Callable[[], Awaitable[tuple[bool, str] | None]]) -> tuple[bool, str]:
+        """Put a plan in force, and start a coordinator if there is none. Return its answer, or what went wrong.
 
         ask: put the plan in force. None if there is no coordinator.
         """
@@ -35,7 +35,7 @@ class PlanProcess:
             if (answer := await ask()) is not None:
                 return answer
             await self.close()
-            with tempfile.TemporaryDirectory(prefix="fleet-console-") as name:
+            with tempfile.TemporaryDirectory(prefix="fleet-console-", ignore_cleanup_errors=True) as name:
                 plan, errors = Path(name) / "plan.yaml", Path(name) / "errors"
                 await asyncio.to_thread(plan.write_text, text, "utf-8")
                 with await asyncio.to_thread(errors.open, "wb") as written:

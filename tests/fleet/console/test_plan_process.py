@@ -19,7 +19,7 @@ async def test_what_keeps_a_coordinator_from_starting_is_reported(tmp_path: Path
     try:
         async with Fleet(hub.endpoint) as fleet:
             process = PlanProcess(fleet, file)
-            ok, words = await process.start("roles: {guide: {mode: tracking}}", nobody_answers)
+            ok, words = await process.set_plan("roles: {guide: {mode: tracking}}", nobody_answers)
             assert not ok
             assert words.startswith(f"{file}:1:"), words
             await process.close()
