@@ -36,7 +36,7 @@ class CommandRequest:
     take: bool = False
     """True if a person takes the car over from another person."""
     sender: str = ""
-    """Who sends it, if not the client."""
+    """Its sender. Empty: the client."""
 
     @property
     def effect_verb(self) -> str:

@@ -99,13 +99,14 @@ class CarView:
     def motors(self) -> tuple[str, str]:
         """State of the motors and what it rests on. Without a gateway nobody knows it any more."""
         safety = self._newest.get("state/safety")
-        if safety is None or self._has_gone:
+        if safety is None or self._gone_at is not None:
             return "unknown", ""
         return safety[0].motors, safety[0].motors_basis
 
     @property
-    def _has_gone(self) -> bool:
-        return not self._present and self._changed_at is not None
+    def _gone_at(self) -> float | None:
+        """When the gateway left the bus. None if it is there, or was never seen."""
+        return None if self._present else self._changed_at
 
     def describe_gateway(self) -> list[tuple[str, str]]:
         """Return what the car's gateway knows, as names and texts."""
@@ -126,8 +127,8 @@ class CarView:
     def as_dict(self, now: float) -> dict[str, Any]:
         """Return what a page shows of the car, as JSON values. Numbers are rounded: most are equal next time."""
         shown: dict[str, Any] = {"name": self.name, "color": self.color, "gateway": self._present}
-        if self._changed_at is not None and self._has_gone:
-            shown["gone_s"] = int(now - self._changed_at)
+        if self._gone_at is not None:
+            shown["gone_s"] = int(now - self._gone_at)
         for part in (self._link, self._mode, self._motion, self._safety, self._health, self._sensors):
             shown |= part(now)
         if self.ledger:
@@ -164,7 +165,7 @@ class CarView:
             "mode": {
                 "asked": mode.asked,
                 "inferred": mode.inferred,
-                "verdict": "assumed" if self._has_gone else mode.verdict,
+                "verdict": mode.verdict if self._gone_at is None else "assumed",
                 "evidence": mode.evidence,
             }
         }

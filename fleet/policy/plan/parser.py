@@ -89,8 +89,8 @@ class _PlanParser:
         roles = {name: self._role(name, each) for name, each in entry.roles.items()}
         for car, each in entry.fixed.items():
             if (each.role is None) is (each.mode is None):
-                words = "has a role and a mode. Write one of them." if each.role else ""
-                words = words or "needs a role or a mode. Write: `{mode: manual}`"
+                needed = "needs a role or a mode. Write: `{mode: manual}`"
+                words = "has a role and a mode. Write one of them." if each.role else needed
                 self._report(("fixed", car), words, unless=("fixed", car))
             elif each.role is not None:
                 self._check_role(("fixed", car, "role"), each.role)

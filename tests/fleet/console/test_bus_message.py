@@ -1,4 +1,4 @@
-"""What the console takes from the bus, where anyone may publish."""
+"""The console leaves out messages of the bus with numbers that are not finite."""
 
 import math
 
