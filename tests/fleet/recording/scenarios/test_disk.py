@@ -1,5 +1,6 @@
 """A disk that is full, goes away or must not be written to, and a quota: what was written stays, and it is said."""
 
+import errno
 import json
 import os
 import shutil
@@ -61,8 +62,16 @@ class Disk:
 
     def fill(self, but: int = 0) -> None:
         with self._ballast.open("wb") as file:
-            size = min(self._size, shutil.disk_usage(self._ballast.parent).free) - but
-            os.posix_fallocate(file.fileno(), 0, size)
+            while True:
+                size = min(self._size, shutil.disk_usage(self._ballast.parent).free) - but
+                try:
+                    os.posix_fallocate(file.fileno(), 0, size)
+                except OSError as error:  # the recorder has written since we asked
+                    if error.errno != errno.ENOSPC:
+                        raise
+                    file.truncate(0)
+                else:
+                    return
 
     def free(self) -> None:
         self._ballast.unlink()
