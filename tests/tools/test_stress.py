@@ -1,5 +1,6 @@
 """`make stress` resumes each process that it paused, and leaves alone what a test has stopped."""
 
+import os
 import random
 import signal
 import subprocess
@@ -11,13 +12,16 @@ import pytest
 from tests.support.processes import wait_for
 from tests.tools.stress import PAUSE_S, Pauses, of_run
 
+ONE_TEST = f"one-test-of-{os.getpid()}"
+"""The name of a run. The tests of this file may run at the same time, in several workers."""
+
 
 @pytest.fixture
 def sleepers() -> Iterator[list[psutil.Process]]:
     """Two processes that do nothing."""
-    started = [subprocess.Popen(["sleep", "600"], env={"STRESS_RUN": "one-test"}) for _ in range(2)]
+    started = [subprocess.Popen(["sleep", "600"], env={"STRESS_RUN": ONE_TEST}) for _ in range(2)]
     # Until it has been executed, a child still has the environment of its parent.
-    wait_for(lambda: len(of_run("one-test", ())) == 2, "both can be found")
+    wait_for(lambda: len(of_run(ONE_TEST, ())) == 2, "both can be found")
     yield [psutil.Process(each.pid) for each in started]
     for each in started:
         each.kill()
@@ -51,4 +55,4 @@ def test_what_a_test_has_stopped_stays_stopped(sleepers: list[psutil.Process]) -
 
 
 def test_who_is_spared_is_not_found(sleepers: list[psutil.Process]) -> None:
-    assert of_run("one-test", {sleepers[0].pid}) == sleepers[1:]
+    assert of_run(ONE_TEST, {sleepers[0].pid}) == sleepers[1:]
