@@ -192,6 +192,11 @@ def main() -> None:
     except ModuleNotFoundError as error:
         sys.stderr.write(f"fleet: {_missing(error)}\n")
         code = 1
+    except RuntimeError as error:
+        # Python's locks raise it ("release unlocked lock") if Ctrl-C comes while a wait ends.
+        if not isinstance(error.__context__, KeyboardInterrupt):
+            raise
+        code = startup.INTERRUPTED
     except OSError as error:  # commands handle their own errors, so this one comes from the output
         code = stdio.silence_broken(error, "fleet")
     try:

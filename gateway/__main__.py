@@ -1,14 +1,17 @@
-"""The `gateway` command as a script and as `python -m gateway`: a Ctrl-C while it is imported is no traceback."""
+"""The `gateway` command as a script and as `python -m gateway`: a Ctrl-C while it starts or ends is no traceback."""
 
 from schemas.process import startup
 
 
 def main() -> None:
     """Entry point of the script."""
-    startup.begin()
+    startup.end_at_ctrl_c()
     from gateway.cli import main as run
 
-    run()
+    try:
+        run()
+    finally:
+        startup.end_at_ctrl_c()
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from schemas.bus.errors import BusError, NoFleet
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
 from schemas.bus.sample import Failure, Sample, sample_of, unread
+from schemas.process import signals
 from schemas.topics import Qos, Topic
 
 T = TypeVar("T")
@@ -61,13 +62,14 @@ class Bus:
                 "Nothing is running yet. Start your cars with `fleet up`, or simulated ones with `fleet up --sim 3`. "
                 f"(Looked at {where}; --connect names another place.)"
             )
-        try:
-            session = zenoh.open(client_config(where, timeout_s))
-        except zenoh.ZError as error:
-            raise BusError(
-                f"{where} does not answer, or is no Zenoh router. Name the fleet's address with --connect."
-            ) from error
-        return cls(session, where)
+        with signals.held_back():
+            try:
+                session = zenoh.open(client_config(where, timeout_s))
+            except zenoh.ZError as error:
+                raise BusError(
+                    f"{where} does not answer, or is no Zenoh router. Name the fleet's address with --connect."
+                ) from error
+            return cls(session, where)
 
     def __enter__(self) -> Self:
         return self
@@ -77,12 +79,13 @@ class Bus:
 
     def close(self) -> None:
         """Undeclare everything and close the session."""
-        atexit.unregister(self._close_at_exit)
-        self._declarations.clear()
-        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
-        # A daemon thread that is still in Zenoh's code when the interpreter ends would abort the process.
-        for thread in self._threads - {threading.current_thread()}:
-            thread.join(_THREAD_END_TIMEOUT_S)
+        with signals.held_back():
+            atexit.unregister(self._close_at_exit)
+            self._declarations.clear()
+            self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
+            # A daemon thread that is still in Zenoh's code when the interpreter ends would abort the process.
+            for thread in self._threads - {threading.current_thread()}:
+                thread.join(_THREAD_END_TIMEOUT_S)
 
     def _close_at_exit(self) -> None:
         if os.getpid() == self._pid:  # a forked process has no session of its own
@@ -106,9 +109,11 @@ class Bus:
                 self._threads |= _zenoh_threads() - before
 
         thread = threading.Thread(target=run, name="bus-declare", daemon=True)
-        thread.start()
-        thread.join()
-        self._declarations.append(declared.result())
+        # After a Ctrl-C here, nobody would join the threads, and an exit would abort the process.
+        with signals.held_back():
+            thread.start()
+            thread.join()
+            self._declarations.append(declared.result())
         return declared.result()
 
     @property

@@ -1,6 +1,8 @@
 """The signals that shut down a process: Ctrl-C, `kill`, and a closed terminal."""
 
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -46,7 +48,13 @@ def _taken(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType 
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Delay signals until the end of a block that must not be interrupted. Only for the main thread."""
+    """Delay signals until the end of a block that must not be interrupted.
+
+    Do nothing in other threads and in a loop: no signal interrupts them.
+    """
+    if threading.current_thread() is not threading.main_thread() or _in_loop():
+        yield
+        return
     came: list[int] = []
     try:
         with _taken(signals(), lambda number, _: came.append(number)):
@@ -54,6 +62,11 @@ def held_back() -> Iterator[None]:
     finally:
         for number in came:
             signal.raise_signal(number)
+
+
+def _in_loop() -> bool:
+    loops = sys.modules.get("asyncio")
+    return loops is not None and loops._get_running_loop() is not None
 
 
 @contextmanager

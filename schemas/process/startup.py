@@ -1,4 +1,4 @@
-"""The first steps of a process, before its imports, which take 0.1 s and more."""
+"""Ctrl-C during the first and the last steps of a process: imports take 0.1 s and more, and so does the exit."""
 
 # These imports run before Ctrl-C is handled. `typing` would take longer than all others together.
 from __future__ import annotations
@@ -15,9 +15,9 @@ INTERRUPTED: Final = 130
 """Exit code after Ctrl-C, as shells have it: 128 + SIGINT."""
 
 
-def begin() -> None:
+def end_at_ctrl_c() -> None:
     """Let Ctrl-C end the process at once and without a traceback, until `interruptible`."""
-    # There is nothing to clean up yet. An ignored SIGINT stays ignored.
+    # There is nothing to clean up yet, or no more. An ignored SIGINT stays ignored.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
 

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -444,6 +445,19 @@ def test_one_release_of_a_fleet_wide_e_stop_has_one_line_per_car(cars: Cars) -> 
         f"{car}: e-stop released" for car in ("blue", "green", "red")
     ]
     assert invoke("resume").exit_code == 0
+
+
+def test_a_lock_that_ctrl_c_left_unlocked_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(**_: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            threading.Lock().release()  # as `threading.Condition.wait` does
+
+    monkeypatch.setattr(cli.cli, "main", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 130
 
 
 def completed(words: str, endpoint: str) -> "subprocess.CompletedProcess[str]":

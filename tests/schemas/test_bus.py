@@ -92,6 +92,20 @@ def test_tokens_come_and_go(endpoint: str) -> None:
         assert watcher.tokens("fleet/*") == []
 
 
+def test_ctrl_c_does_not_interrupt_a_declaration(endpoint: str) -> None:
+    declared: list[bool] = []
+
+    def declare() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        threading.Event().wait(0.2)  # the main thread handles the signal meanwhile
+        declared.append(True)
+
+    with bus.Bus.open(endpoint) as opened:
+        with pytest.raises(KeyboardInterrupt):
+            opened._declare(declare)
+        assert declared == [True]
+
+
 def test_who_watches_tokens_sees_all_of_them_when_it_asks_at_once(endpoint: str) -> None:
     """Zenoh answers for a watch from what has come so far: a coordinator was told that there was no car."""
     there = {"fleet/red", "fleet/green", "fleet/blue"}

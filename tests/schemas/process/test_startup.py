@@ -1,4 +1,4 @@
-"""A process that is interrupted while it is imported, or was started without stdout, ends without a traceback."""
+"""A process that is interrupted while it starts or ends, or has no stdout, ends without a traceback."""
 
 import subprocess
 import sys
@@ -17,6 +17,13 @@ sys.meta_path.insert(0, Interrupting())
 from {package}.__main__ import main
 main()
 """
+AT_EXIT = """
+import atexit, signal
+from {package}.__main__ import main
+atexit.register(signal.raise_signal, signal.SIGINT)
+main()
+"""
+NOWHERE = ("monitor", "tcp://127.0.0.1:9")
 RUN = ("run", "--car", "red", "--link", "tcp://127.0.0.1:9", "--connect", "tcp/127.0.0.1:9")
 
 
@@ -38,6 +45,14 @@ def test_an_interrupt_during_an_import_is_no_traceback(package: str, imported: s
         [sys.executable, "-c", program, imported, *arguments], capture_output=True, text=True, check=False, timeout=60
     )
     assert (done.returncode, done.stdout, done.stderr.strip()) == (130, "", "")
+
+
+@pytest.mark.parametrize(("package", "arguments"), [("fleet", ("example", "list")), ("gateway", NOWHERE)])
+def test_an_interrupt_during_the_exit_is_no_traceback(package: str, arguments: tuple[str, ...]) -> None:
+    command = [sys.executable, "-c", AT_EXIT.format(package=package), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("package", ["fleet", "gateway"])
