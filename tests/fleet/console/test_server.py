@@ -214,13 +214,15 @@ def test_a_plan_is_set_under_the_persons_name_also_without_an_open_page(stage: S
         return True
 
     declared: Any = stage.fleet.bus.queryable("fleet/@coordinator/@cmd/plan", take)
-    for open_page in (False, True):
-        with teacher.socket() if open_page else contextlib.nullcontext() as page:
-            if page is not None:
-                page.recv()  # it has joined
-            status, text = teacher.ask("POST", "/plan/set", "roles:\n  guide: {mode: tracking}\n")
-        assert (status, json.loads(text)) == (200, {"ok": True, "words": "it is in force"})
-    declared.undeclare()
+    try:
+        for open_page in (False, True):
+            with teacher.socket() if open_page else contextlib.nullcontext() as page:
+                if page is not None:
+                    page.recv()  # it has joined
+                status, text = teacher.ask("POST", "/plan/set", "roles:\n  guide: {mode: tracking}\n")
+            assert (status, json.loads(text)) == (200, {"ok": True, "words": "it is in force"})
+    finally:
+        declared.undeclare()
     assert [name.partition("@")[0] for name in by] == ["teacher", "teacher"]
 
 
