@@ -23,12 +23,12 @@ class _OneThreadAtATime(ssl.SSLSocket):
     connections two failed with "internal error", or with an end of the stream.
     """
 
+    _used: threading.Lock
+
     def __new__(cls, *arguments: Any, **options: Any) -> Self:
         made = super().__new__(cls, *arguments, **options)
         made._used = threading.Lock()
         return made
-
-    _used: threading.Lock
 
     def recv(self, buflen: int = 1024, flags: int = 0) -> bytes:
         while True:

@@ -334,7 +334,7 @@ def test_a_killed_coordinator_is_followed_by_one_that_switches_no_mode(cars: Car
         mode = cars.state("mode", "red")
         return (mode.asked, mode.verdict) == ("tracking", "confirmed")
 
-    wait_for(tracks, "its gateway confirms the mode")  # or it is asked again
+    wait_for(tracks, "its gateway confirms the mode")  # the next coordinator requests an unconfirmed mode again
     asked: list[bus.Sample] = []
     cars.bus.subscribe("fleet/*/event/command", asked.append)
     process.kill()
