@@ -5,11 +5,12 @@ exactly one event, with two harmless exceptions. Separators (CR, LF, space, tab)
 a late `#` after a frame that silence has ended.
 A run of junk is one event per `max_frame` bytes. After an overlong frame, everything up to the next `$` is junk.
 
-The events depend only on the bytes and on gaps of 50 ms between them, not on the pieces. `parser` makes the reading of
-one whole frame.
+The events depend only on the bytes and on gaps of 50 ms and 0.5 s between them, not on the pieces. `parser` makes the
+reading of one whole frame.
 """
 
 import re
+from math import inf
 from typing import Final
 
 from gateway.protocol.events import ArmReading, Cause, Echo, Event, ImuReading, Reject, Rejected, Sensors
@@ -32,6 +33,10 @@ _MIN_FRAME: Final = 64  # a sensors frame in its longest observed spelling has 4
 MISSING_END_SILENCE_S: Final = (
     0.050  # docs/reference/protocol.md#readings: a missing `#` is accepted when nothing follows for 50 ms
 )
+# A link that was dead joins the begin of one frame with the end of another. Such a frame was never measured. A radio
+# repeats lost bytes in less time.
+CUT_FRAME_SILENCE_S: Final = 0.5
+"""Silence that ends an incomplete frame. It is rejected as truncated (docs/reference/protocol.md#readings)."""
 ECHO_S: Final = 2.0  # docs/reference/protocol.md#readings: bytes equal to a frame that we sent in the last 2 s
 _SENT_MAX: Final = 256  # the wire carries 101 frames of 19 bytes in 2 s; a lone `#` is one entry
 
@@ -49,13 +54,13 @@ class Decoder:
         self._max = max_frame
         self._buffer = bytearray()  # a frame from its `$` on, or junk from its first byte that is not a separator
         self._last = 0.0  # time of the last byte in the buffer
-        self._waiting = False  # True if silence would complete an event
+        self._silence_s = inf  # silence after the last byte that would complete an event
         self._late_end = False  # True if silence ended the last frame: its `#` may still come
         self._sent: dict[bytes, float] = {}
 
     def feed(self, data: bytes, now: float) -> list[Event]:
         """Return the events that these bytes complete. `now`: their time of arrival in seconds, any fixed origin."""
-        events = self.tick(now) if self._waiting else []
+        events = self.tick(now) if self._buffer else []
         buffer, sent, pos, size, most = self._buffer, self._sent, 0, len(data), self._max
         while pos < size:
             if not buffer and (found := match_ended_sensors(data, pos, pos + most)):  # the fast path
@@ -68,14 +73,14 @@ class Decoder:
             else:
                 pos = self._outside(data, pos, now, events)
         if size:
-            self._waiting = bool(buffer) and (buffer[0] != _START or is_complete(buffer))
+            self._silence_s = self._ending_silence_s()
         return events
 
     def tick(self, now: float) -> list[Event]:
         """Return the events that silence up to `now` completes; `feed` calls this first."""
-        if not self._waiting or now < self._last + MISSING_END_SILENCE_S:
+        if now < self._last + self._silence_s:
             return []
-        self._waiting = False
+        self._silence_s = inf
         if self._buffer[0] != _START:
             return self._junk()
         self._late_end = True
@@ -83,7 +88,7 @@ class Decoder:
 
     def deadline(self) -> float | None:
         """Return the time at which to call `tick`, on the clock of `now`. None if silence would complete nothing."""
-        return self._last + MISSING_END_SILENCE_S if self._waiting else None
+        return self._last + self._silence_s if self._buffer else None
 
     def sent(self, data: bytes, now: float) -> None:
         """Remember a frame as written, to recognize its echo for 2 s."""
@@ -94,10 +99,16 @@ class Decoder:
 
     def end(self) -> list[Event]:
         """Return the events of the buffered bytes at the end of the link or file, and empty the buffer."""
-        self._waiting = self._late_end = False
+        self._silence_s, self._late_end = inf, False
         if not self._buffer:
             return []
         return self._unended(by_silence=True) if self._buffer[0] == _START else self._junk()
+
+    def _ending_silence_s(self) -> float:
+        if not self._buffer:
+            return inf
+        whole = self._buffer[0] != _START or is_complete(self._buffer)
+        return MISSING_END_SILENCE_S if whole else CUT_FRAME_SILENCE_S
 
     def _outside(self, data: bytes, pos: int, now: float, events: list[Event]) -> int:
         """Consume junk up to the next `$` and that `$`, at most `max_frame` bytes. Return the next position."""
@@ -165,7 +176,7 @@ class Decoder:
         found = fullmatch_sensors(raw)
         if found:
             return [read_sensors(found, at, terminated=False, by_silence=by_silence)]
-        return [Rejected(raw, at, Cause.TRUNCATED, "another frame began, or the link ended")]
+        return [Rejected(raw, at, Cause.TRUNCATED, f"another frame began, nothing came for {CUT_FRAME_SILENCE_S:g} s, or the link ended")]
 
     def _is_echo(self, raw: bytes, at: float) -> bool:
         return raw in self._sent and at - self._sent[raw] <= ECHO_S

@@ -10,6 +10,7 @@ from gateway.control.stop_renewal import StopRenewal
 from gateway.control.stops import evidence
 from gateway.control.stops.evidence import StopCase, StopEvidence
 from gateway.control.stops.stopping import StopInProgress
+from gateway.protocol import decoder
 
 Patch = Callable[[object, str, Any], None]
 """`pytest.MonkeyPatch.setattr`."""
@@ -35,6 +36,10 @@ def _one_pause(patch: Patch) -> None:
 def _damaged_frames_count(patch: Patch) -> None:
     patch(evidence, "SETTLED_S", -1.0)
     patch(StopEvidence, "on_noise", lambda self, at, damaged=True: None)
+
+
+def _frames_continue_after_a_silence(patch: Patch) -> None:
+    patch(decoder, "CUT_FRAME_SILENCE_S", float("inf"))
 
 
 def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:
@@ -105,6 +110,7 @@ RULES: dict[str, Callable[[Patch], None]] = {
     "what is not shown is sent again": _no_second_try,
     "one pause is not enough": _one_pause,
     "damaged frames are no reports": _damaged_frames_count,
+    "a frame with a silence in it is none": _frames_continue_after_a_silence,
     "a report after LEFT_S does not show that a mode was left": _any_report_shows_that_a_mode_was_left,
     "nor one after more frames than MODE00": _any_frame_before_it,
     "a silent mode shows that it was left only if it was opened from a shown rest": _silent_mode_after_any_rest,

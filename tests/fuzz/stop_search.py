@@ -222,6 +222,14 @@ def _damaged_reports(seed: int, moments: random.Random) -> EpisodePlan:
     return _theme(seed, moments.choice(["light_seeking", "following"]), moments.uniform(0.5, 6.0), (lossy, lost))
 
 
+def _joined_reports(seed: int, moments: random.Random) -> EpisodePlan:
+    """The stop is lost, and the link joins the begin of one report with the end of a later one: it lacks some bytes."""
+    frames, lacking = moments.randrange(40, 70), moments.choice([1, 1, 2, 3])
+    joined = LinkFault(Kind.DEAD, Way.TO_HOST, -moments.uniform(0.2, 0.9), (41 * frames + lacking) / BYTES_PER_S)
+    lost = LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
+    return _theme(seed, "light_seeking", moments.uniform(2.0, 6.0), (joined, lost))
+
+
 def _misread_and_lost(seed: int, moments: random.Random) -> EpisodePlan:
     """Half a general frame and `MODE00` in one string open a silent mode while driving. Later tries are lost."""
     cut = LinkFault(Kind.DEAD, Way.TO_CAR, moments.uniform(2, 18) / BYTES_PER_S, 0.03)
@@ -247,6 +255,7 @@ THEMES = (
     _half_a_frame,
     _short_gap,
     _damaged_reports,
+    _joined_reports,
     _misread_and_lost,
     _driven_over,
 )

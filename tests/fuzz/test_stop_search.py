@@ -2,10 +2,35 @@
 
 import pytest
 
-from tests.fuzz.stop_search import explain, search
+from tests.fuzz.stop_search import Ending, Episode, EpisodePlan, Kind, LinkFault, Way, explain, search
 
 PARTS = 4
 EPISODES = 100
+
+# Each of these stops was claimed as shown while the motors ran.
+FOUND = (
+    # The link swallowed one report and held the next: a gap of 1.9 s. The stop had lost bytes, and started the motors.
+    EpisodePlan(
+        70010567, "arduino", "arduino", "echo", "rest", 0.7768374565829217, Ending.ESTOP,
+        (
+            LinkFault(Kind.DEAD, Way.BOTH, 0.0033732903838199673, 0.2877418303328459),
+            LinkFault(Kind.STUCK, Way.BOTH, -1.4007606644069566, 2.752822054732901),
+        ),
+    ),
+    # The begin of one report of light seeking and the end of a later one looked like a report of mode 0.
+    EpisodePlan(
+        70010883, "arduino", "arduino", "echo", "light_seeking", 7.667323754918615, Ending.STOP,
+        (
+            LinkFault(Kind.DEAD, Way.TO_HOST, -1.183403621766109, 3.2037874071570047),
+            LinkFault(Kind.DEAD, Way.TO_CAR, -0.5901843230079526, 4.990518586147078),
+        ),
+        report_every_s=0.9099851621644699, driven=True,
+    ),
+    EpisodePlan(
+        81004327, "arduino", "arduino", "echo", "light_seeking", 5.7784868346822424, Ending.STOP,
+        (LinkFault(Kind.DEAD, Way.BOTH, -0.3768883565749477, 3.0766070410981188),),
+    ),
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("part", range(PARTS))
@@ -15,3 +40,8 @@ def test_no_stop_is_claimed_and_false(part: int) -> None:
     assert total.ends["complete"] > EPISODES // 4
     assert total.ends["sent"] > 0
     assert total.ends["failed"] > 0
+
+
+@pytest.mark.parametrize("plan", FOUND, ids=lambda plan: str(plan.seed))
+def test_what_a_longer_search_found(plan: EpisodePlan) -> None:
+    assert Episode(plan).play().violations == []

@@ -44,7 +44,8 @@ NORMAL_MIN_S: Final = 0.8
 NORMAL_MAX_S: Final = 1.4
 """Range of the normal interval of two reports. The link has delayed closer ones, so their times show nothing."""
 # A link that loses both `MODE00` and the report after it leaves the same gap as a pause. Half of all outages of 0.6 s
-# around a stop do that, so one pause is not enough.
+# around a stop do that, so one pause is not enough. Not even at a rest that was shown before: a damaged frame of the
+# next stop can start the motors.
 PAUSES: Final = 2
 """Number of pauses that show a stop in mode 0."""
 # A link that holds the reports for two seconds leaves such a gap, too. Then the next report comes with the held one, or
@@ -299,7 +300,7 @@ class StopEvidence:
             self.obeyed_at = at
             if self._pauses < PAUSES:
                 return Finding.PAUSE
-            self.words = f"{self._pauses} pauses in its reports, each after MODE00"
+            self.words = f"{PAUSES} pauses in its reports, each after MODE00"
             self.settles_at = at + SETTLING_S
             return Finding.SETTLING
         if after_s <= self._window_s and gap_s <= NORMAL_MAX_S:
@@ -338,7 +339,7 @@ class StopEvidence:
     def _obeyed(self, at: float) -> Finding:
         self.obeyed_at = at
         self._pending = None
-        self._pauses = PAUSES  # until the next motion, one more pause shows the next stop
+        self._pauses = 0
         self._window_s = CLOSED_S
         self._leave_nothing()
         return Finding.SHOWN

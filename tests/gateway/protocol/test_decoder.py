@@ -111,12 +111,24 @@ def test_an_end_that_comes_late_is_no_junk() -> None:
 
 
 @pytest.mark.parametrize("cut", range(1, len(FOLLOWING)))
-def test_silence_completes_no_other_frame(cut: int) -> None:
+def test_the_rest_of_a_frame_may_be_late(cut: int) -> None:
     decoder = Decoder()
     decoder.feed(FOLLOWING[:cut], 1.0)
-    assert decoder.tick(5.0) == []
-    (event,) = decoder.feed(FOLLOWING[cut:] + b"#", 6.0)
-    assert isinstance(event, Sensors), "the rest may be late: a radio repeats what it lost"
+    assert decoder.tick(1.49) == []
+    (event,) = decoder.feed(FOLLOWING[cut:] + b"#", 1.49)
+    assert isinstance(event, Sensors), "a radio repeats what it lost"
+
+
+@pytest.mark.parametrize("ticks", [True, False])
+@pytest.mark.parametrize("cut", range(1, len(FOLLOWING)))
+def test_silence_ends_an_incomplete_frame(cut: int, *, ticks: bool) -> None:
+    decoder = Decoder()
+    decoder.feed(FOLLOWING[:cut], 1.0)
+    assert decoder.deadline() == pytest.approx(1.5)
+    events = decoder.tick(1.5) if ticks else []
+    events += decoder.feed(FOLLOWING[cut:] + b"#" + GOOD, 3.0)
+    assert isinstance(events[-1], Sensors)
+    assert [each.cause for each in events[:-1] if isinstance(each, Rejected)] == [Cause.TRUNCATED, Cause.NO_START]
 
 
 def test_silence_ends_a_run_of_junk() -> None:

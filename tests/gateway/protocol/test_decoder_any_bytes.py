@@ -27,7 +27,7 @@ PIECES = (
 )
 STREAM = st.lists(st.one_of(st.sampled_from(PIECES), st.binary(max_size=8)), max_size=12).map(b"".join)
 # bursts with the silence before each, seconds
-BURSTS = st.lists(st.tuples(STREAM, st.sampled_from([0.0, 0.01, 0.049, 0.051, 0.2])), min_size=1, max_size=5)
+BURSTS = st.lists(st.tuples(STREAM, st.sampled_from([0.0, 0.01, 0.049, 0.051, 0.2, 0.51, 3.0])), min_size=1, max_size=5)
 
 
 def timeless(events: list[Event]) -> list[Event]:

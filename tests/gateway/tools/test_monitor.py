@@ -53,7 +53,7 @@ def test_a_file_is_shown_decoded_beside_its_bytes(command: Command, kept: Path) 
         (3.1, PIECES[5].data.decode(), "obstacle 10  (following)"),
         (3.2, PIECES[6].data.decode(), "arm  joint_deg 90 80 70 60 0 180"),
         (3.3, PIECES[7].data.decode() + "\n" + " " * 57, "imu  gyro_raw -1 2 3.5  accel_raw 4 5 -16384"),
-        (4.0, "$4WD,CSB1", "rejected, truncated:  another frame began, or the link ended"),
+        (4.0, "$4WD,CSB1", "rejected, truncated:  another frame began, nothing came for 0.5 s, or the link ended"),
     ]
     assert done.stdout == "".join(f"{at:9.3f}  {raw:<46}  {words}\n" for at, raw, words in shown)
     assert done.stderr == (

@@ -106,14 +106,12 @@ def test_two_pauses_show_a_stop_and_one_does_not() -> None:
     assert PAUSES == 2
 
 
-def test_after_a_shown_stop_one_more_pause_shows_the_next_until_a_motion_is_sent() -> None:
+def test_two_pauses_are_needed_after_a_shown_stop_too() -> None:
     watch = EvidenceWatch()
     watch.pause(10.0)
-    watch.pause(12.95)
-    assert watch.pause(20.0) is SHOWN
-    watch.evidence.sent_other()
-    assert watch.pause(30.0) is SHOWN
-    watch.evidence.sent_motion()
+    assert watch.pause(12.95) is SHOWN
+    assert watch.pause(20.0) is PAUSE
+    assert watch.pause(22.95) is SHOWN
     assert watch.pause(40.0) is PAUSE
 
 
