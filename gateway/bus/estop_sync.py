@@ -27,7 +27,9 @@ FIRST_RETRY_S: Final = 0.5
 MAX_RETRY_S: Final = 30.0
 """Maximum retry interval. Retries never end: the gateway may be starting, and know of an e-stop that no other knows."""
 MAX_SINGLE_QUERIES: Final = 8
-"""Maximum gateways that are queried one by one. One query to all of them is cheaper for more."""
+"""Maximum gateways that are queried one by one, whatever their share of the fleet is."""
+MAX_SINGLE_SHARE: Final = 0.5
+"""Maximum share of the gateways that is queried one by one. For more, one query to all gateways is cheaper."""
 # After a restart of the hub each gateway queries all others: a hundred gateways cause 10,000 answers. If all queries
 # start at once, answers time out and are requested again, which keeps two processors busy for more than a minute. A new
 # e-stop does not wait for this: its gateway forwards it at once.
@@ -111,11 +113,13 @@ class EstopSync:
                 await self._changed.wait()
             await asyncio.sleep(batch_delay_s)
             batch_delay_s = min(2 * batch_delay_s, MAX_BATCH_DELAY_S)
-            if len(self._due) > MAX_SINGLE_QUERIES and not first:
+            if self._queries_all() and not first:
                 await asyncio.sleep(len(self._due) ** 2 / ANSWERS_PER_S * random.random())  # noqa: S311 - jitter, no secret
             first = False
             self._changed.clear()
-            for answer in await asyncio.to_thread(self._query, sorted(self._due)):
+            # If each gateway queried all others at every start, a hundred that start would cause 300,000 answers.
+            names = ("*",) if self._queries_all() else sorted(self._due)
+            for answer in await asyncio.to_thread(self._query, names):
                 try:
                     state: Any = answer.message()
                 except (messages.BadPayload, KeyError) as error:
@@ -129,11 +133,13 @@ class EstopSync:
                 retry = asyncio.get_running_loop().call_later(retry_s, self._changed.set)
             retry_s = min(2 * retry_s, MAX_RETRY_S) if self._due else FIRST_RETRY_S
 
+    def _queries_all(self) -> bool:
+        """Return True if so many gateways are due that one query goes to all."""
+        return len(self._due) > max(MAX_SINGLE_QUERIES, MAX_SINGLE_SHARE * len(self._alive))
+
     def _query(self, names: Sequence[str]) -> list[bus.Sample]:
-        """Return the states of these gateways. Runs on a thread."""
-        # If each gateway queried all others at every start, a hundred starting gateways would cause 300,000 answers.
-        targets = names if len(names) <= MAX_SINGLE_QUERIES else ("*",)
-        selectors = [keys.topic_key(self._fleet, name, "state/safety") for name in targets]
+        """Return the states of these gateways; `*` stands for all. Runs on a thread."""
+        selectors = [keys.topic_key(self._fleet, name, "state/safety") for name in names]
         return [
             answer for selector in selectors for answer in self._bus.query(selector) if isinstance(answer, bus.Sample)
         ]

@@ -176,7 +176,14 @@ class Decoder:
         found = fullmatch_sensors(raw)
         if found:
             return [read_sensors(found, at, terminated=False, by_silence=by_silence)]
-        return [Rejected(raw, at, Cause.TRUNCATED, f"another frame began, nothing came for {CUT_FRAME_SILENCE_S:g} s, or the link ended")]
+        return [
+            Rejected(
+                raw,
+                at,
+                Cause.TRUNCATED,
+                f"another frame began, nothing came for {CUT_FRAME_SILENCE_S:g} s, or the link ended",
+            )
+        ]
 
     def _is_echo(self, raw: bytes, at: float) -> bool:
         return raw in self._sent and at - self._sent[raw] <= ECHO_S

@@ -91,3 +91,38 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
             await asyncio.gather(keeping, return_exceptions=True)
     finally:
         fleet.close()
+
+
+async def test_a_dozen_that_came_to_a_large_fleet_are_asked_one_by_one(tmp_path: Path) -> None:
+    """With one query to all, the answers took half of the time in which a hundred gateways start."""
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    old, new = [f"old{number}" for number in range(24)], [f"new{number}" for number in range(12)]
+    asked: list[str] = []
+    learned: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        asked.append(name := str(query.key_expr).split("/")[1])
+        with query:
+            for car in old if name == "*" else [name]:
+                reply(query, f"fleet/{car}/state/safety", pb.Safety(car=car).SerializeToString(), SAFETY)
+
+    def learn(_: PersistedSafety, told_by: str) -> None:
+        learned.append(told_by)
+
+    try:
+        with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as cars, fleet.bus as opened:
+            cars.queryable("fleet/*/state/safety", Handover(asyncio.get_running_loop(), answer))
+            while not asked:  # until the hub knows of it
+                await asyncio.to_thread(lambda: list(opened.query("fleet/old0/state/safety", timeout_s=0.1)))
+            asked.clear()
+            neighbours = EstopSync(opened, "fleet", "red")
+            keeping = asyncio.ensure_future(neighbours.keep_synced(learn))
+            neighbours.on_tokens(dict.fromkeys(old, True))
+            await asyncio.to_thread(wait_for, lambda: sorted(learned) == sorted(old), "the old ones are asked")
+            neighbours.on_tokens(dict.fromkeys(new, True))
+            await asyncio.to_thread(wait_for, lambda: sorted(learned[24:]) == sorted(new), "the new ones are asked")
+            assert asked == ["*", *sorted(new)]
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
+    finally:
+        fleet.close()
