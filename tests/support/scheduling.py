@@ -7,10 +7,10 @@ import pytest
 from xdist.scheduler.loadgroup import LoadGroupScheduling
 from xdist.workermanage import WorkerController
 
-FOREGROUND_PER_PROCESSOR: Final = 3
+FOREGROUND_PER_PROCESSOR: Final = 3.5
 """Workers for tests of processes, for each processor. With four, simulated cars were late and tests of stops failed."""
 _PROCESSORS: Final = os.cpu_count() or 1
-WORKERS: Final = (FOREGROUND_PER_PROCESSOR + 1) * _PROCESSORS
+WORKERS: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS) + _PROCESSORS
 """One more for each processor is in the background."""
 _MIN_TESTS: Final = 1000
 """With fewer tests no worker is in the background."""
