@@ -33,6 +33,10 @@ def _one_pause(patch: Patch) -> None:
     patch(evidence, "PAUSES", 1)
 
 
+def _pauses_of_any_length(patch: Patch) -> None:
+    patch(evidence, "MATCH_S", 9.0)
+
+
 def _damaged_frames_count(patch: Patch) -> None:
     patch(evidence, "SETTLED_S", -1.0)
     patch(StopEvidence, "on_noise", lambda self, at, damaged=True: None)
@@ -109,6 +113,7 @@ RULES: dict[str, Callable[[Patch], None]] = {
     "evidence decides, not time": _time_decides,
     "what is not shown is sent again": _no_second_try,
     "one pause is not enough": _one_pause,
+    "nor are two, if one does not match the normal interval": _pauses_of_any_length,
     "damaged frames are no reports": _damaged_frames_count,
     "a frame with a silence in it is none": _frames_continue_after_a_silence,
     "a report after LEFT_S does not show that a mode was left": _any_report_shows_that_a_mode_was_left,

@@ -177,6 +177,17 @@ def _digit_lost(seed: int, moments: random.Random) -> EpisodePlan:
     return _theme(seed, load, moments.uniform(0.5, 6.0), (lost, later), report_every_s=moments.uniform(0.9, 1.0))
 
 
+def _opened_behind_a_held_report(seed: int, moments: random.Random) -> EpisodePlan:
+    """`MODE00` loses a digit while the car drives, what follows is lost, and the link holds the report before."""
+    lost = LinkFault(Kind.DEAD, Way.TO_CAR, moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S)
+    later = LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(3.0, 8.0))
+    held_s = moments.uniform(0.5, 1.5)
+    held = LinkFault(Kind.STUCK, Way.TO_HOST, moments.uniform(0.9, 1.4) - held_s, held_s)
+    return _theme(
+        seed, "drive", moments.uniform(0.5, 4.0), (lost, later, held), report_every_s=moments.uniform(0.9, 1.0)
+    )
+
+
 def _stop_while_opening(seed: int, moments: random.Random) -> EpisodePlan:
     """Old reports come late while a silent mode opens, and the stop is lost."""
     slow = LinkFault(Kind.SLOW, Way.TO_HOST, -3.0, 30.0, delay_s=1.2)  # in two steps: a gap of 3 s would show
@@ -250,6 +261,7 @@ def _driven_over(seed: int, moments: random.Random) -> EpisodePlan:
 THEMES = (
     _report_swallowed,
     _digit_lost,
+    _opened_behind_a_held_report,
     _stop_while_opening,
     _mode_over_a_lost_stop,
     _half_a_frame,

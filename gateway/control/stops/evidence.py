@@ -11,7 +11,7 @@ from typing import Final
 
 from gateway.protocol.enums import Mode
 from gateway.protocol.events import Sensors
-from gateway.protocol.timing import MODE_CLOSE_S
+from gateway.protocol.timing import FRAME_S, MODE_CLOSE_S
 
 # A reporting mode sends 20 frames a second. A corrupted frame of such a mode can look like mode 0, because there is no
 # checksum. But no silence comes before it.
@@ -48,6 +48,12 @@ NORMAL_MAX_S: Final = 1.4
 # next stop can start the motors.
 PAUSES: Final = 2
 """Number of pauses that show a stop in mode 0."""
+# A damaged `MODE00` may open mode 0 with the motors on, which blocks for 2.0 to 2.3 s. If the link held the report
+# before for a second, both gaps look like pauses. But they are not 1.0 s longer than the normal interval of this car.
+PAUSES_IN_DOUBT: Final = 3
+"""Number of pauses that are needed if one of them does not match the normal interval."""
+MATCH_S: Final = 0.12
+"""Maximum difference of a matching pause from the normal interval and the 1.0 s that `MODE00` takes."""
 # A link that holds the reports for two seconds leaves such a gap, too. Then the next report comes with the held one, or
 # 0.2 s later.
 SETTLING_S: Final = 0.25
@@ -97,7 +103,8 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     ),
     StopCase.MANUAL: EvidenceRow(
         "full or recovery, in mode 0 with a sonar echo",
-        "two pauses of 1.9 s between reports, each around a `MODE00`, and no reading for 0.25 s after the second",
+        "two pauses of 1.9 s between reports, each around a `MODE00` (three if one is not 1.0 s longer than a normal "
+        "interval), and no reading for 0.25 s after the last",
         "the stop goes on",
     ),
     StopCase.NO_ECHO: EvidenceRow(
@@ -146,7 +153,7 @@ class Finding(StrEnum):
     REPORT = "report"
     """A report of mode 0 with an echo, and no `MODE00` before it to judge. The car can react to a `MODE00` now."""
     PAUSE = "pause"
-    """The first pause; a second one is needed."""
+    """A pause; more are needed."""
     SETTLING = "settling"
     """The last pause that is needed. The stop is shown if no reading follows at once."""
     LOST = "lost"
@@ -178,6 +185,11 @@ class StopEvidence:
     _pending: float | None = None
     """When the last `MODE00` without a result was written."""
     _pauses: int = 0
+    _pauses_needed: int = PAUSES
+    _interval_s: float | None = None
+    """The last normal interval of two reports, without a frame that blocks in between."""
+    _blocked_s: float = 0.0
+    """For how long the frames since the last report block the car."""
     _window_s: float = CLOSED_S
     _shapes: int = 0
     _shape_at: float | None = None
@@ -195,7 +207,7 @@ class StopEvidence:
 
     def begin_link(self) -> None:
         """Forget everything: the link is new."""
-        self.obeyed_at = None
+        self.obeyed_at = self._interval_s = None
         self._last_at = self._foreign_at = float("-inf")
         self._window_s = CLOSED_S
         self.reset_times()
@@ -203,7 +215,7 @@ class StopEvidence:
 
     def sent_motion(self) -> None:
         """Drop the evidence: the car may drive."""
-        self._pauses = 0
+        self._drop_pauses()
         self._pending = self.settles_at = None
         self._leave_nothing()
 
@@ -218,6 +230,11 @@ class StopEvidence:
         """Record a frame that neither moves the car nor closes a mode."""
         if self._closed_at is None:
             self._plain = False
+
+    def blocked(self, block_s: float) -> None:
+        """Record a frame that blocks the car for so long: the next report comes later."""
+        if block_s > FRAME_S:
+            self._blocked_s += block_s
 
     def closed(self, now: float, *, awake: bool) -> None:
         """Record a `MODE00`. `awake`: no block of our frames runs, so the reports pause for exactly 1.0 s."""
@@ -243,7 +260,7 @@ class StopEvidence:
     def reset_times(self) -> None:
         """Drop the evidence that depends on times: after a stall of the loop the report times are too late."""
         self._before = self._pending = self.settles_at = None
-        self._pauses = 0
+        self._drop_pauses()
 
     def is_settled(self, event: Sensors) -> bool:
         """Return False for a report of mode 0 just after other frames: it may be a corrupted one of another mode."""
@@ -261,12 +278,13 @@ class StopEvidence:
         if quiet_s < SETTLED_S:
             self._before = None
             if quiet_s < BUNCHED_S:
-                self._pauses = 0
+                self._drop_pauses()
             return Finding.NOTHING
         if event.range_cm is None:  # a corrupted frame, which does not show whether there is an echo
             self._before = None
             return Finding.NOTHING
         before, self._before = self._before, at if event.range_cm else None
+        blocked_s, self._blocked_s = self._blocked_s, 0.0
         self.without_echo = 0 if event.range_cm else self.without_echo + 1
         if self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S):
             return self._obeyed(at)
@@ -274,13 +292,15 @@ class StopEvidence:
         if not event.range_cm:
             return Finding.NO_ECHO
         if pending is None:
+            if before is not None and not blocked_s and at - before < NORMAL_MAX_S:
+                self._interval_s = at - before
             return Finding.REPORT
         if before is None:
             if at <= pending + CLOSED_S:
                 return Finding.NOTHING
             self._pending = None
             return Finding.REPORT
-        return self._compare(at - before, at - pending, at)
+        return self._compare(at - before, at - pending, at, blocked_s)
 
     def settle(self, now: float) -> bool:
         """Return True if the pauses count from now on: no reading came just after them."""
@@ -290,29 +310,45 @@ class StopEvidence:
         self._obeyed(self._last_at)
         return True
 
-    def _compare(self, gap_s: float, after_s: float, at: float) -> Finding:
+    def _compare(self, gap_s: float, after_s: float, at: float, blocked_s: float) -> Finding:
         """Judge the interval of two reports. The later one came `after_s` after `MODE00`."""
         if after_s <= CLOSED_S:
             return Finding.NOTHING
         if PAUSE_MIN_S <= gap_s <= PAUSE_MAX_S:
             self._pending = None
             self._pauses += 1
+            if not self._matches(gap_s, blocked_s):
+                self._pauses_needed = PAUSES_IN_DOUBT
             self.obeyed_at = at
-            if self._pauses < PAUSES:
+            if self._pauses < self._pauses_needed:
                 return Finding.PAUSE
-            self.words = f"{PAUSES} pauses in its reports, each after MODE00"
+            self.words = f"{self._pauses} pauses in its reports, each after MODE00"
             self.settles_at = at + SETTLING_S
             return Finding.SETTLING
         if after_s <= self._window_s and gap_s <= NORMAL_MAX_S:
             return Finding.NOTHING
         self._pending = None
-        self._pauses = 0
-        return Finding.LOST if NORMAL_MIN_S < gap_s < NORMAL_MAX_S else Finding.REPORT
+        self._drop_pauses()
+        if not NORMAL_MIN_S < gap_s < NORMAL_MAX_S:
+            return Finding.REPORT
+        if not blocked_s:
+            self._interval_s = gap_s
+        return Finding.LOST
+
+    def _matches(self, gap_s: float, blocked_s: float) -> bool:
+        """Return True if a pause is as long as `MODE00` makes it: 1.0 s more than the normal interval of this car."""
+        if self._interval_s is None:  # a new link: the first pause is the measure of the next ones
+            self._interval_s = gap_s - MODE_CLOSE_S
+        return -MATCH_S <= gap_s - MODE_CLOSE_S - self._interval_s <= blocked_s + MATCH_S
+
+    def _drop_pauses(self) -> None:
+        self._pauses, self._pauses_needed = 0, PAUSES
 
     def _other_mode(self, at: float) -> None:
         self._shapes += 1
         self._foreign_at = at
-        self._before, self._pauses = None, 0
+        self._before = None
+        self._drop_pauses()
         if self._shapes >= SHAPES or self._shape_at is not None:
             self._shape_at = at
             self._silent_mode = None
@@ -339,7 +375,7 @@ class StopEvidence:
     def _obeyed(self, at: float) -> Finding:
         self.obeyed_at = at
         self._pending = None
-        self._pauses = 0
+        self._drop_pauses()
         self._window_s = CLOSED_S
         self._leave_nothing()
         return Finding.SHOWN

@@ -13,6 +13,7 @@ from gateway.control.stops.evidence import (
     CLOSED_S,
     EVIDENCE,
     LEFT_S,
+    MATCH_S,
     NORMAL_MAX_S,
     OPENING_SILENCE_S,
     PAUSE_MAX_S,
@@ -35,7 +36,8 @@ from tests.support.virtual import Pair
 ECHO = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
 SILENT = b"$4WD,CSB0.00,PV7.91,GS5,LF0000,HW00,GM00#"
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
-NOTHING, REPORT, PAUSE, LOST, SHOWN = Finding.NOTHING, Finding.REPORT, Finding.PAUSE, Finding.LOST, Finding.SHOWN
+NOTHING, REPORT, PAUSE, LOST = Finding.NOTHING, Finding.REPORT, Finding.PAUSE, Finding.LOST
+SETTLING, SHOWN = Finding.SETTLING, Finding.SHOWN
 
 
 def event(frame: bytes, at: float) -> Sensors:
@@ -106,6 +108,48 @@ def test_two_pauses_show_a_stop_and_one_does_not() -> None:
     assert PAUSES == 2
 
 
+@pytest.mark.parametrize(
+    ("reports", "acts", "found"),
+    [
+        ((9.0, 10.0, 12.0, 14.0), (), [PAUSE, SETTLING]),
+        ((9.0, 10.0, 12.0, 14.0 + MATCH_S - 0.01), (), [PAUSE, SETTLING]),
+        ((9.0, 10.0, 12.0, 14.0 + MATCH_S + 0.01, 16.2), (), [PAUSE, PAUSE, SETTLING]),
+        ((9.0, 10.0, 12.0 + MATCH_S + 0.01, 14.2, 16.2), (), [PAUSE, PAUSE, SETTLING]),
+        ((8.9, 10.0, 11.97, 14.0), (), [PAUSE, PAUSE]),
+        ((10.0, 12.2, 14.4), (), [PAUSE, SETTLING]),  # nothing is known of this car yet: the first pause is the measure
+        ((10.0, 12.2, 14.2, 16.3), (), [PAUSE, PAUSE, SETTLING]),
+        ((9.0, 10.3, 12.3, 14.3), (9.5,), [PAUSE, SETTLING]),  # a whistle makes an interval longer: it does not count
+        ((9.0, 10.0, 12.3, 14.3), (10.2,), [PAUSE, SETTLING]),
+        ((9.0, 10.0, 12.3 + MATCH_S + 0.01, 14.4), (10.2,), [PAUSE, PAUSE]),
+    ],
+)
+def test_three_pauses_are_needed_if_one_is_not_as_long_as_mode00_makes_it(
+    reports: tuple[float, ...], acts: tuple[float, ...], found: list[Finding]
+) -> None:
+    """A link that held a report, and a damaged frame that opens mode 0 for 2.3 s, make two gaps like pauses."""
+    watch, results = EvidenceWatch(), []
+    for at in sorted({*reports, *acts}):
+        if at in acts:
+            watch.evidence.blocked(0.3)
+            continue
+        results += watch.reports(at)
+        if at >= 10.0:
+            watch.closed(at + 0.1)
+    assert results[-len(found) :] == found
+
+
+def test_after_a_lost_mode00_the_interval_is_still_known() -> None:
+    """The stop is sent again at once. Then a report is held for 0.9 s, and a damaged frame opens mode 0 for 2.3 s."""
+    watch = EvidenceWatch()
+    watch.reports(9.0, 10.0)
+    watch.closed(10.1)
+    assert watch.reports(11.0, 12.0) == [NOTHING, LOST]
+    watch.closed(12.05)
+    assert watch.reports(13.92) == [PAUSE]
+    watch.closed(13.93)
+    assert watch.reports(16.33) == [PAUSE]
+
+
 def test_two_pauses_are_needed_after_a_shown_stop_too() -> None:
     watch = EvidenceWatch()
     watch.pause(10.0)
@@ -159,11 +203,11 @@ def test_bunched_reports_begin_anew(gaps: list[float]) -> None:
 
 
 def test_a_report_that_follows_the_second_pause_at_once_was_held_by_the_link() -> None:
-    """The link holds two reports for 2.2 s, and loses the second `MODE00`."""
+    """The link holds two reports for 2.0 s, and loses the second `MODE00`."""
     watch = EvidenceWatch()
     assert watch.pause(10.0) is PAUSE
     watch.closed(12.0)
-    assert watch.reports(14.2, 14.3) == [Finding.SETTLING, NOTHING]
+    assert watch.reports(13.95, 14.05) == [Finding.SETTLING, NOTHING]
     assert not watch.evidence.settle(20.0)
     assert watch.pause(21.0) is PAUSE, "the first one counts no more"
 
