@@ -181,10 +181,10 @@ def _opened_behind_a_held_report(seed: int, moments: random.Random) -> EpisodePl
     """`MODE00` loses a digit while the car drives, what follows is lost, and the link holds the report before."""
     lost = LinkFault(Kind.DEAD, Way.TO_CAR, moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S)
     later = LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(3.0, 8.0))
-    held_s = moments.uniform(0.5, 1.5)
-    held = LinkFault(Kind.STUCK, Way.TO_HOST, moments.uniform(0.9, 1.4) - held_s, held_s)
+    held_s = moments.uniform(1.0, 1.6)
+    held = LinkFault(Kind.STUCK, Way.TO_HOST, moments.uniform(0.95, 1.18) - held_s, held_s)
     return _theme(
-        seed, "drive", moments.uniform(0.5, 4.0), (lost, later, held), report_every_s=moments.uniform(0.9, 1.0)
+        seed, "drive", moments.uniform(0.5, 4.0), (lost, later, held), report_every_s=moments.uniform(0.93, 1.0)
     )
 
 
@@ -235,8 +235,8 @@ def _damaged_reports(seed: int, moments: random.Random) -> EpisodePlan:
 
 def _joined_reports(seed: int, moments: random.Random) -> EpisodePlan:
     """The stop is lost, and the link joins the begin of one report with the end of a later one: it lacks some bytes."""
-    frames, lacking = moments.randrange(40, 70), moments.choice([1, 1, 2, 3])
-    joined = LinkFault(Kind.DEAD, Way.TO_HOST, -moments.uniform(0.2, 0.9), (41 * frames + lacking) / BYTES_PER_S)
+    frames, lacking = moments.randrange(45, 60), moments.choice([1, 1, 1, 2])
+    joined = LinkFault(Kind.DEAD, Way.TO_HOST, -moments.uniform(0.3, 0.7), (41 * frames + lacking) / BYTES_PER_S)
     lost = LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
     return _theme(seed, "light_seeking", moments.uniform(2.0, 6.0), (joined, lost))
 
