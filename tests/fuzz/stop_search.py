@@ -133,6 +133,8 @@ class EpisodePlan:
     """The faults hit the opening of the mode as well. They count from its request, and from the stop again."""
     driven: bool = False
     """The car drives when the mode is asked for."""
+    rest_s: float = 0.0
+    """More rest before the load. A mode then opens at any moment between two reports, not only just after one."""
 
 
 @dataclass(slots=True)
@@ -170,11 +172,16 @@ def _report_swallowed(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _digit_lost(seed: int, moments: random.Random) -> EpisodePlan:
-    """`MODE00` loses a digit: it opens mode 0, with the motors on. What follows is lost."""
-    lost = LinkFault(Kind.DEAD, Way.TO_CAR, moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S)
+    """`MODE00` loses a digit or both: it opens mode 0, with the motors on. What follows is lost."""
+    at_s, for_s = moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S
     later = LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(1.0, 8.0))
     load = moments.choice(["tracking", "light_seeking", "following", "obstacle_avoidance", "color_led"])
-    return _theme(seed, load, moments.uniform(0.5, 6.0), (lost, later), report_every_s=moments.uniform(0.9, 1.0))
+    load_s, report_every_s = moments.uniform(0.5, 6.0), moments.uniform(0.9, 1.0)
+    rest_s = moments.choice([0.0, moments.uniform(3.0, 5.0)])
+    if moments.random() < 0.5:
+        at_s, for_s = 9.5 / BYTES_PER_S, 2 / BYTES_PER_S
+    lost = LinkFault(Kind.DEAD, Way.TO_CAR, at_s, for_s)
+    return _theme(seed, load, load_s, (lost, later), report_every_s=report_every_s, rest_s=rest_s)
 
 
 def _opened_behind_a_held_report(seed: int, moments: random.Random) -> EpisodePlan:
@@ -459,7 +466,7 @@ class Episode:
         self._run(2.0)
         self._connect()
         self._until(lambda: self.control.model.motors == "off", READY_S)
-        self._run(self._moments.random())
+        self._run(self._moments.random() + plan.rest_s)
         self.zero = self.now + 60.0  # the load says when
         self._load()
         self._run_to(self.zero)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.fuzz.stop_search import Ending, Episode, EpisodePlan, Kind, LinkFault, Way, explain, search
+from tests.fuzz.stop_search import BYTES_PER_S, Ending, Episode, EpisodePlan, Kind, LinkFault, Way, explain, search
 
 PARTS = 4
 EPISODES = 100
@@ -29,6 +29,15 @@ FOUND = (
     EpisodePlan(
         81004327, "arduino", "arduino", "echo", "light_seeking", 5.7784868346822424, Ending.STOP,
         (LinkFault(Kind.DEAD, Way.BOTH, -0.3768883565749477, 3.0766070410981188),),
+    ),
+    # `MODE00` lost both digits, which blocks for only 2.0 s. The mode had been opened just before a report was due.
+    EpisodePlan(
+        700013, "arduino", "arduino", "echo", "tracking", 2.8, Ending.STOP,
+        (
+            LinkFault(Kind.DEAD, Way.TO_CAR, 9.5 / BYTES_PER_S, 2 / BYTES_PER_S),
+            LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, 1.5),
+        ),
+        rest_s=3.15,
     ),
 )  # fmt: skip
 

@@ -22,9 +22,10 @@ BUNCHED_S: Final = 0.4
 """Maximum interval of reports that the link has delayed. A pause before them may be the link's."""
 CLOSED_S: Final = 0.95
 """Minimum time from `MODE00` to a report that the car sent after it obeyed: closing takes 1.0 s."""
-# 1.0 s of closing, 0.9 s to the report, and 0.2 s of turn and wire. A `MODE00` that lost a digit opens mode 0 instead,
-# with the motors on. That blocks for 2.3 s, so the report comes later.
-LEFT_S: Final = 2.2
+# 1.0 s of closing, up to 0.9 s to the report, and 0.1 s of wire. A `MODE00` that lost a digit or both opens mode 0
+# instead, with the motors on. That blocks for 2.3 s or 2.0 s. A report of 41 bytes or more can follow at once, so it
+# comes after 2.05 s.
+LEFT_S: Final = 2.05
 """Maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
 RANGING_S: Final = 1.0
 """Additional time of a report without an echo."""
@@ -92,8 +93,8 @@ class EvidenceRow:
 EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.LEFT_SHAPE: EvidenceRow(
         "full, out of tracking, light seeking or following",
-        "a mode-0 report that begins after `MODE00` and comes within 2.2 s (3.2 s without an echo), when `MODE00` was "
-        "the first frame since the mode was seen; else as in mode 0",
+        "a mode-0 report that begins after `MODE00` and comes within 2.05 s (3.05 s without an echo), when `MODE00` "
+        "was the first frame since the mode was seen; else as in mode 0",
         "the stop goes on",
     ),
     StopCase.LEFT_SILENT: EvidenceRow(
@@ -169,7 +170,7 @@ class StopEvidence:
     """Compares readings with written frames. Times: s, monotonic, when bytes arrived or frames were written."""
 
     obeyed_at: float | None = None
-    """When the car last reacted to a frame; None if never on this link."""
+    """When the car last reacted to a frame; None if never on this link, or not to the last stop."""
     words: str = ""
     """The evidence for `SHOWN`."""
     settles_at: float | None = None
