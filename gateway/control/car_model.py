@@ -93,6 +93,11 @@ class CarModel:
         return self.stop_style is StopStyle.MODE_FRAME
 
     @property
+    def is_deaf(self) -> bool:
+        """Return True if the car could have shown a stop, and has not reacted to the last one."""
+        return self.can_show and self.evidence.obeyed_at is None and not self.evidence.without_echo
+
+    @property
     def stop_style(self) -> StopStyle:
         """Return the kind of stop for this car now."""
         return stopping.style_of(self.profile, doubted=self.platform.doubted)

@@ -260,10 +260,8 @@ class Executor:
 
     def release(self, phase: Phase, reason: Reason | None, words: str, now: float) -> None:
         """End the held motion with a soft stop, unless the car is at rest."""
-        evidence = self.model.evidence
-        deaf = self.model.can_show and evidence.obeyed_at is None and not evidence.without_echo
-        if phase is Phase.COMPLETE and deaf:
-            doubt = f"{self.model.name} may not have moved: it has not reacted to any command since its link opened"
+        if phase is Phase.COMPLETE and self.model.is_deaf:
+            doubt = f"{self.model.name} may not have moved: it has not reacted to the last stop"
             words = f"{words}; {doubt}" if words else doubt
             self.queue.close_held(Phase.SENT, reason, words, now, Basis.SENT)
         else:

@@ -170,6 +170,9 @@ class StopExecutor:
     def _await(self, running: StopInProgress, now: float) -> None:
         """End a stop that the car cannot show. If the car can show it, and did not in time, send the stop again."""
         case = self._ends_as_sent(running, now)
+        if case is StopCase.SOFT and self.model.is_deaf:
+            self._doubt_soft(running, now)
+            return
         if case is not None:
             self._finish(running, Basis.SENT, EVIDENCE[case].words.format(car=self.model.name), now, case)
             return
@@ -198,6 +201,16 @@ class StopExecutor:
             return StopCase.UNKNOWN_PLATFORM
         return None
 
+    def _doubt_soft(self, running: StopInProgress, now: float) -> None:
+        """Go on with full stops after a soft one: the car has not reacted to the last full stop."""
+        words = f"{self.model.name} was driven again, and has not reacted to the last stop"
+        for pending in running.commands:
+            self._log.record(pending, Phase.SENT, now, words=words, basis=Basis.SENT)
+        self._start(self.full(now), FrameOrigin.RECOVERY, now, [])
+        assert self.running is not None
+        self.running.overdue = True  # the next drive need not wait for the evidence
+        self.model.learn(TrustEvent.NOT_SHOWN, now, words)
+
     def _try_again(self, running: StopInProgress, now: float) -> None:
         running.tries += 1
         context = self.model.for_stop(now)
@@ -218,6 +231,7 @@ class StopExecutor:
         if now >= running.gives_up_at and not running.overdue:
             running.overdue = True
             if self.model.mode.heard_at > running.began_at:
+                self.model.evidence.obeyed_at = None
                 self.model.learn(TrustEvent.NOT_SHOWN, now)
                 self._log.log(Level.ERROR, "not_shown", words, now)
             elif self.model.trust.state is not CarTrust.UNHEARD:

@@ -2,10 +2,12 @@
 
 import pytest
 
-from gateway.control.commands import Drive, Phase
+from gateway.control.commands import Drive, Phase, Stop
 from gateway.control.estimate.trust import CarTrust
 from gateway.protocol.enums import Motion
 from tests.support.virtual import Pair
+
+MODE00 = b"$4WD,MODE00#"
 
 
 def driven(*, deaf: bool) -> Pair:
@@ -31,6 +33,23 @@ def test_a_drive_of_a_deaf_car_was_sent_and_nothing_shows_that_it_moved() -> Non
 def test_a_drive_of_a_car_that_hears_is_complete() -> None:
     last = [record for record in driven(deaf=False).records if record.command.id == "drive"][-1]
     assert (last.phase, last.basis) == (Phase.COMPLETE, "")
+
+
+def test_a_drive_does_not_hide_that_the_last_stop_was_not_shown() -> None:
+    pair = Pair(start_s=2.0).ready()
+    pair.ask(Drive(Motion.FORWARD, 9.0))
+    pair.run(1.5)
+    pair.car.feed = lambda data, now: None  # type: ignore[method-assign]
+    pair.ask(Stop())
+    pair.until(lambda: pair.control.model.trust.state is CarTrust.UNPROVEN, 30.0)
+    pair.ask(Drive(Motion.FORWARD, 0.5), identity="again")
+    pair.run(12.0)
+    assert pair.car.truth.driving
+    last = pair.last_of("again")
+    assert last is not None
+    assert (last.phase, last.basis) == (Phase.SENT, "sent")
+    assert pair.control.model.trust.state is CarTrust.UNPROVEN, "the car drives: a soft stop is no reason to say `off`"
+    assert MODE00 in [data for at, data in pair.sent if at > pair.now - 10.0]
 
 
 @pytest.mark.parametrize("seconds", [3.0, 30.0, 90.0])
