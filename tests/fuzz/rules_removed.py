@@ -97,10 +97,6 @@ def _sent_without_a_report(patch: Patch) -> None:
     patch(StopExecutor, "_ends_as_sent", ends)
 
 
-def _drives_leave_evidence(patch: Patch) -> None:
-    patch(StopEvidence, "sent_motion", lambda self: None)
-
-
 def _a_stop_that_is_driven_over_ends_without_a_word(patch: Patch) -> None:
     patch(StopExecutor, "give_way", lambda self, now: setattr(self, "running", None))
 
@@ -124,7 +120,6 @@ RULES: dict[str, Callable[[Patch], None]] = {
     "a confirmation fades": _confirmations_stay,
     "a shutdown waits for evidence": _shutdown_waits_for_time,
     "only a car that can show nothing ends as sent": _sent_without_a_report,
-    "a motion takes back what was shown": _drives_leave_evidence,
     "a stop that is driven over has failed": _a_stop_that_is_driven_over_ends_without_a_word,
     "a stop that is not shown fails in time": _commands_wait_for_ever,
 }

@@ -157,6 +157,8 @@ def test_two_pauses_are_needed_after_a_shown_stop_too() -> None:
     assert watch.pause(20.0) is PAUSE
     assert watch.pause(22.95) is SHOWN
     assert watch.pause(40.0) is PAUSE
+    watch.evidence.sent_motion()
+    assert watch.pause(42.95) is PAUSE, "the car may have moved since the first one"
 
 
 def test_a_lost_report_makes_the_same_gap_as_a_pause_and_is_not_enough() -> None:
