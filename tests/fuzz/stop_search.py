@@ -242,8 +242,8 @@ def _damaged_reports(seed: int, moments: random.Random) -> EpisodePlan:
 
 def _joined_reports(seed: int, moments: random.Random) -> EpisodePlan:
     """The stop is lost, and the link joins the begin of one report with the end of a later one: it lacks some bytes."""
-    frames, lacking = moments.randrange(45, 60), moments.choice([1, 1, 1, 2])
-    joined = LinkFault(Kind.DEAD, Way.TO_HOST, -moments.uniform(0.3, 0.7), (41 * frames + lacking) / BYTES_PER_S)
+    bytes_lost = 41 * moments.randrange(30, 50) + moments.choice([1, 1, 1, 2])
+    joined = LinkFault(Kind.DEAD, Way.TO_HOST, -moments.uniform(0.1, 0.2), bytes_lost / BYTES_PER_S)
     lost = LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
     return _theme(seed, "light_seeking", moments.uniform(2.0, 6.0), (joined, lost))
 
