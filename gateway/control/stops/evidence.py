@@ -27,6 +27,8 @@ CLOSED_S: Final = 0.95
 # comes after 2.05 s.
 LEFT_S: Final = 2.05
 """Maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
+LATE_S: Final = 0.2
+"""Additional time of such a report on a slow link. It counts as a pause only, so one more shows the stop."""
 RANGING_S: Final = 1.0
 """Additional time of a report without an echo."""
 SHAPE_UNTIL_S: Final = 1.0
@@ -94,7 +96,7 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.LEFT_SHAPE: EvidenceRow(
         "full, out of tracking, light seeking or following",
         "a mode-0 report that begins after `MODE00` and comes within 2.05 s (3.05 s without an echo), when `MODE00` "
-        "was the first frame since the mode was seen; else as in mode 0",
+        "was the first frame since the mode was seen (0.2 s later it counts as a pause); else as in mode 0",
         "the stop goes on",
     ),
     StopCase.LEFT_SILENT: EvidenceRow(
@@ -287,8 +289,9 @@ class StopEvidence:
         before, self._before = self._before, at if event.range_cm else None
         blocked_s, self._blocked_s = self._blocked_s, 0.0
         self.without_echo = 0 if event.range_cm else self.without_echo + 1
-        if self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S):
-            return self._obeyed(at)
+        left = self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S)
+        if left is Finding.SHOWN or (left is Finding.PAUSE and event.range_cm):
+            return self._obeyed(at) if left is Finding.SHOWN else self._left_late(at)
         pending = self._pending
         if not event.range_cm:
             return Finding.NO_ECHO
@@ -354,24 +357,29 @@ class StopEvidence:
             self._shape_at = at
             self._silent_mode = None
 
-    def _left(self, at: float, quiet_s: float, within_s: float) -> bool:
-        """Return True if this report shows that `MODE00` alone closed the mode of the car."""
+    def _left(self, at: float, quiet_s: float, within_s: float) -> Finding:
+        """Return SHOWN if this report shows that `MODE00` alone closed the mode of the car, PAUSE if it is late."""
         closed_at = self._closed_at
         shape_at, silent = self._shape_at, self._silent_mode
         if closed_at is None or at <= closed_at + CLOSED_S:
-            return False
+            return Finding.NOTHING
         if silent is not None and (quiet_s < OPENING_SILENCE_S or at < self._opened_at + OPENED_S + CLOSED_S):
-            return False  # an older report, on a slow link
+            return Finding.NOTHING  # an older report, on a slow link
         self._shape_at = self._silent_mode = None
-        if not self._plain or at > closed_at + within_s:
-            return False
-        if silent is not None:
-            self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {silent}"
-            return True
-        if shape_at is None or shape_at > closed_at + SHAPE_UNTIL_S:
-            return False
-        self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of the mode that it reported"
-        return True
+        if not self._plain or at > closed_at + within_s + LATE_S:
+            return Finding.NOTHING
+        if silent is None and (shape_at is None or shape_at > closed_at + SHAPE_UNTIL_S):
+            return Finding.NOTHING
+        mode = "the mode that it reported" if silent is None else silent
+        self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {mode}"
+        return Finding.SHOWN if at <= closed_at + within_s else Finding.PAUSE
+
+    def _left_late(self, at: float) -> Finding:
+        self.obeyed_at = at
+        self._pending = None
+        self._drop_pauses()
+        self._pauses = 1
+        return Finding.PAUSE
 
     def _obeyed(self, at: float) -> Finding:
         self.obeyed_at = at

@@ -12,6 +12,7 @@ from gateway.control.stops.evidence import (
     BUNCHED_S,
     CLOSED_S,
     EVIDENCE,
+    LATE_S,
     LEFT_S,
     MATCH_S,
     NORMAL_MAX_S,
@@ -308,6 +309,20 @@ def test_a_mode_0_report_soon_after_mode00_shows_that_a_mode_was_left(
     if shown:
         assert "a report of mode 0" in watch.evidence.words
         assert ("out of color_led" in watch.evidence.words) == (mode is Mode.COLOR_LED)
+
+
+@pytest.mark.parametrize(
+    ("late_s", "found"),
+    [(0.01, [PAUSE, SETTLING]), (LATE_S - 0.01, [PAUSE, SETTLING]), (LATE_S + 0.01, [REPORT, PAUSE])],
+)
+@pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.COLOR_LED], ids=str)
+def test_such_a_report_on_a_slow_link_counts_as_a_pause(mode: Mode, late_s: float, found: list[Finding]) -> None:
+    watch = tracking(10.0) if mode is Mode.TRACKING else silent()
+    watch.closed(10.0)
+    at = 10.0 + LEFT_S + late_s
+    results = watch.reports(at)
+    watch.closed(at + 0.02)
+    assert [*results, *watch.reports(at + 1.95)] == found
 
 
 @pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.COLOR_LED], ids=str)
