@@ -53,7 +53,7 @@ def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:
 def _any_frame_before_it(patch: Patch) -> None:
     original = StopEvidence._left
 
-    def left(self: StopEvidence, at: float, quiet_s: float, within_s: float) -> bool:
+    def left(self: StopEvidence, at: float, quiet_s: float, within_s: float) -> evidence.Finding:
         self._plain = self._plain or self._shape_at is not None or self._silent_mode is not None
         return original(self, at, quiet_s, 20.0)
 
