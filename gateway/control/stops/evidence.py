@@ -290,8 +290,10 @@ class StopEvidence:
         blocked_s, self._blocked_s = self._blocked_s, 0.0
         self.without_echo = 0 if event.range_cm else self.without_echo + 1
         left = self._left(at, quiet_s, LEFT_S if event.range_cm else LEFT_S + RANGING_S)
-        if left is Finding.SHOWN or (left is Finding.PAUSE and event.range_cm):
-            return self._obeyed(at) if left is Finding.SHOWN else self._left_late(at)
+        if left is Finding.SHOWN:
+            return self._obeyed(at)
+        if left is Finding.PAUSE and event.range_cm:
+            return self._left_late(at)
         pending = self._pending
         if not event.range_cm:
             return Finding.NO_ECHO
