@@ -96,7 +96,7 @@ EVIDENCE: Final[dict[StopCase, EvidenceRow]] = {
     StopCase.LEFT_SHAPE: EvidenceRow(
         "full, out of tracking, light seeking or following",
         "a mode-0 report that begins after `MODE00` and comes within 2.05 s (3.05 s without an echo), when `MODE00` "
-        "was the first frame since the mode was seen (0.2 s later it counts as a pause); else as in mode 0",
+        "was the first frame since the mode was seen; up to 0.2 s later it counts as a pause; else as in mode 0",
         "the stop goes on",
     ),
     StopCase.LEFT_SILENT: EvidenceRow(
