@@ -55,13 +55,13 @@ soak: .venv/.ready browser ## what takes longer than a test may
 	@mkdir -p .tmp
 	$(BIN)/python -m pytest tests -m soak -s --timeout 3600
 
-lint: .venv/.docs ## ruff, mypy, import-linter, generated files up to date, the site without a broken link
+lint: .venv/.docs ## ruff, mypy, import-linter, generated files up to date, plain texts, the site without a broken link
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m schemas.generate --check
-	$(BIN)/python -m pytest -q -n 0 tests/test_generated_pages.py
+	$(BIN)/python -m pytest -q -n 0 tests/test_generated_pages.py tests/test_docs.py
 	$(MAKE) --no-print-directory docs
 
 bench: .venv/.ready ## speed and memory, each as a ratio to a floor measured in the same run
