@@ -128,6 +128,10 @@ class Pair:
         """The life of one command."""
         return [record.phase for record in self.records if record.command.id == identity]
 
+    def lose_frames(self) -> None:
+        """Lose all frames to the car from now on. Its readings still arrive."""
+        self.car.feed = lambda data, now: None  # type: ignore[method-assign]  # the car's end of the wire, cut
+
     def last_of(self, identity: str) -> CommandRecord | None:
         """The record that ends a stop, as shown, as sent or as failed; None while it goes on."""
         begun = (Phase.ASKED, Phase.QUEUED, Phase.SENT)

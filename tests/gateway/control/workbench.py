@@ -33,7 +33,7 @@ RUN = b"$1,0,0,0,0,0,0,0,0#"
 BACK = b"$2,0,0,0,0,0,0,0,0#"
 MODE00 = b"$4WD,MODE00#"
 SHOWN_STOP = [MODE00, STOP, MODE00, STOP]
-"""What a stop in mode 0 writes: the second `MODE00` asks for the second pause that shows it."""
+"""Frames of a stop in mode 0 until the car has shown it. Each `MODE00` makes a pause, and two pauses are needed."""
 
 PERSON = Sender("mia", SenderKind.PERSON)
 SCRIPT = Sender("script", SenderKind.SCRIPT)

@@ -22,7 +22,6 @@ from gateway.protocol.enums import Mode, Motion, SpeedStep
 from gateway.protocol.frames import ColorLed
 from tests.gateway.control.workbench import (
     COORDINATOR,
-    MODE00,
     PERSON,
     RUN,
     SCRIPT,
@@ -131,7 +130,7 @@ def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Workbench) ->
 def test_an_e_stop_at_rest_is_carried_out_too(desk: Workbench) -> None:
     desk.control.merge_estops([Estop("e1", "mia", "", 7, fleet_wide=True)], [], "blue", desk.now)
     desk.run(6.0)
-    assert desk.frames == [MODE00, STOP, MODE00, STOP]
+    assert desk.frames == SHOWN_STOP
 
 
 # ---------------------------------------------------------------------- lease

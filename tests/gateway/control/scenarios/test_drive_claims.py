@@ -5,16 +5,15 @@ import pytest
 from gateway.control.commands import Drive, Phase, Stop
 from gateway.control.estimate.trust import CarTrust
 from gateway.protocol.enums import Motion
+from tests.gateway.control.workbench import MODE00
 from tests.support.virtual import Pair
-
-MODE00 = b"$4WD,MODE00#"
 
 
 def driven(*, deaf: bool) -> Pair:
     """A car that was driven for a second, as far as it heard."""
     pair = Pair(start_s=2.0)
     if deaf:
-        pair.car.feed = lambda data, now: None  # type: ignore[method-assign]
+        pair.lose_frames()
     pair.connect()
     pair.run(20.0)
     assert pair.control.model.trust.state is (CarTrust.UNPROVEN if deaf else CarTrust.STOPPED)
@@ -39,7 +38,7 @@ def test_a_drive_does_not_hide_that_the_last_stop_was_not_shown() -> None:
     pair = Pair(start_s=2.0).ready()
     pair.ask(Drive(Motion.FORWARD, 9.0))
     pair.run(1.5)
-    pair.car.feed = lambda data, now: None  # type: ignore[method-assign]
+    pair.lose_frames()
     pair.ask(Stop())
     pair.until(lambda: pair.control.model.trust.state is CarTrust.UNPROVEN, 30.0)
     pair.ask(Drive(Motion.FORWARD, 0.5), identity="again")
