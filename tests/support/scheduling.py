@@ -34,7 +34,7 @@ _COMPUTING: Final = (
     "tests/test_",
 )
 """Rooms of tests that compute on virtual time, or read files. The other tests wait for processes, cars and seconds."""
-_STARTING: Final = ("tests/fleet/replay/rerun/test_live.py",)
+_STARTING: Final = ("tests/fleet/replay/analysis/test_replan.py", "tests/fleet/replay/rerun/test_live.py")
 """Files in these rooms that start processes. At low priority a Rerun viewer took longer than 40 s to go on."""
 
 
