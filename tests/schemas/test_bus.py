@@ -172,6 +172,7 @@ def test_a_killed_hub_comes_back_and_everything_with_it() -> None:
         )
         os.kill(int(found.stdout), signal.SIGKILL)
         wait_for(lambda: not car.connected)
+        wait_for(lambda: not bus.accepts(where))  # a killed process closes its links before its listening port
         bus.ensure_hub(where)
         wait_for(lambda: watcher.tokens("fleet/*") == ["fleet/red"])
         found = subprocess.run(
