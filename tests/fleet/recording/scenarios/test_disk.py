@@ -142,6 +142,9 @@ def test_a_full_disk_takes_nothing_that_was_written_and_recording_goes_on_when_t
             return {message.sequence for message in Session(session).messages() if message.key == out.key}
 
         wait_for(lambda: set(range(1, 301)) <= in_file(), "that is in the file")
+        # A chunk can be read before its flush has ended. The next chunk shows that it has.
+        publish()
+        wait_for(lambda: 301 in in_file(), "the next chunk is in the file")
         there.fill()
         publish_until("full")
         before = in_file()
