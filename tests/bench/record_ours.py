@@ -19,7 +19,10 @@ def main() -> None:
         recorder.start()
         print(json.dumps({"ready": True}), flush=True)
         before = time.process_time()
-        sys.stdin.readline()
+        published = int(sys.stdin.readline())
+        deadline = time.monotonic() + 10.0
+        while recorder._status().messages < published and time.monotonic() < deadline:
+            time.sleep(0.02)
         cpu_s = time.process_time() - before
         print(json.dumps({"messages": recorder.close().messages, "cpu_s": cpu_s}), flush=True)
 

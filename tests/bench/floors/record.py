@@ -1,11 +1,13 @@
 """Floor: a subscriber's callback that calls `add_message`. Arguments: endpoint, key expression, file.
 
-A line on stdin ends it; it answers with its number of messages and the CPU seconds that they cost, as JSON.
+A line on stdin, the number of messages that were published, ends it once it has them, or after ten seconds.
+It answers with its number of messages and the CPU seconds that they cost, as JSON.
 """
 
 import json
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import zenoh
@@ -15,6 +17,7 @@ from mcap.writer import Writer
 
 endpoint, expression, path = sys.argv[1:]
 channels: dict[str, int] = {}
+added: Counter[int] = Counter()
 
 
 def add(sample: zenoh.Sample) -> None:
@@ -24,6 +27,7 @@ def add(sample: zenoh.Sample) -> None:
         channel = channels[key] = writer.register_channel(key, "protobuf", 0)
     published = sample.timestamp.get_time_as_ntp64().as_nanos()
     writer.add_message(channel, time.time_ns(), sample.payload.to_bytes(), published, sample.source_info.source_sn)
+    added[channel] += 1
 
 
 with opened(endpoint) as session, Path(path).open("wb") as file:
@@ -33,7 +37,10 @@ with opened(endpoint) as session, Path(path).open("wb") as file:
     list(session.liveliness().get("bench/nobody"))  # what was declared is known when this is answered
     print(json.dumps({"ready": True}), flush=True)
     before = time.process_time()
-    sys.stdin.readline()
+    published = int(sys.stdin.readline())
+    deadline = time.monotonic() + 10.0
+    while added.total() < published and time.monotonic() < deadline:
+        time.sleep(0.02)
     cpu_s = time.process_time() - before
     subscriber.undeclare()
     writer.finish()  # type: ignore[no-untyped-call]
