@@ -4,6 +4,9 @@ A paused process is what a busy machine makes of any process: late, at any line.
 paused but the two controllers of pytest: workers, hubs, gateways, cars and what they leave behind.
 A seed repeats the times and the draws, not the processes that run at those times.
 
+Each suite has half of the workers. With all of them, twice the processes of `make test` would share the processors, and
+cars would be late without a pause.
+
 A process that a test itself has stopped is left alone. If a test stops a process during a pause, the end of the pause
 resumes it; that test may fail for this reason only.
 """
@@ -23,12 +26,17 @@ from typing import NoReturn
 
 import psutil
 
+from tests.support import scheduling
+
 ROOT = Path(__file__).parents[2]
 SUITES = ("first", "second")
 RUN = "STRESS_RUN"
 """Variable in the environment of all processes of a run: a hub has left the family of the test that needed it."""
 PAUSE_S = (0.010, 0.900)
 """Range of the length of a pause. Zenoh drops a session that is silent for 2 s, so a pause alone never does that."""
+GATEWAY_PAUSE_S = (0.010, 0.400)
+"""The same for a gateway. A gap of 0.5 s in its loop ends a drive (docs/explanation/how-it-works.md), as it must: each
+test that drives would fail. Tests of that rule stop a gateway themselves."""
 GAP_S = (0.0, 0.4)
 """Range from the begin of a pause to the begin of the next: two processes are paused on average."""
 LOOK_S = 1.0
@@ -59,19 +67,23 @@ class Pauses:
             self._found = sorted(self._find(), key=lambda each: each.pid)
         if now >= self._next_at and self._found:
             self._next_at = now + self._chance.uniform(*GAP_S)
-            self._pause(self._chance.choice(self._found), self._chance.uniform(*PAUSE_S), now)
+            process, share = self._chance.choice(self._found), self._chance.random()
+            self._pause(process, share, now)
 
     def resume_all(self) -> None:
         """Resume every process that is paused."""
         for process in list(self._paused):
             self._resume(process)
 
-    def _pause(self, process: psutil.Process, seconds: float, now: float) -> None:
+    def _pause(self, process: psutil.Process, share: float, now: float) -> None:
+        """Pause a process for a share of the range of lengths, 0 to 1."""
         if process in self._paused:
             return
         with suppress(psutil.Error):  # it has ended
             if process.status() == psutil.STATUS_STOPPED:
                 return
+            least, most = GATEWAY_PAUSE_S if is_gateway(process) else PAUSE_S
+            seconds = least + share * (most - least)
             self._paused[process] = now + seconds  # first, so that an interrupt here leaves nothing paused
             process.suspend()
             self.count += 1
@@ -82,6 +94,12 @@ class Pauses:
         with suppress(psutil.Error):
             process.resume()
         self._paused.pop(process, None)
+
+
+def is_gateway(process: psutil.Process) -> bool:
+    """Return True if this is `gateway run`, however it was started."""
+    words = process.cmdline()
+    return "run" in words and any(word == "gateway.cli" or Path(word).name == "gateway" for word in words)
 
 
 def of_run(run: str, spared: Iterable[int]) -> list[psutil.Process]:
@@ -98,7 +116,7 @@ def _start(name: str, tests: list[str], directory: Path) -> subprocess.Popen[byt
     options = ["-m", "not soak", "-n", "auto", "--dist", "loadgroup", "-p", "no:cacheprovider"]
     words = [sys.executable, "-m", "pytest", *tests, *options, "--basetemp", str(directory / name)]
     with (directory / f"{name}.log").open("wb") as log:
-        environment = os.environ | {RUN: str(directory)}
+        environment = os.environ | {RUN: str(directory), scheduling.SUITES: str(len(SUITES))}
         # In a session of its own, so that a Ctrl-C reaches a suite once, from here.
         return subprocess.Popen(
             words, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True

@@ -4,13 +4,14 @@ import os
 import random
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 
 import psutil
 import pytest
 
 from tests.support.processes import wait_for
-from tests.tools.stress import PAUSE_S, Pauses, of_run
+from tests.tools.stress import GATEWAY_PAUSE_S, PAUSE_S, Pauses, of_run
 
 ONE_TEST = f"one-test-of-{os.getpid()}"
 """The name of a run. The tests of this file may run at the same time, in several workers."""
@@ -41,6 +42,18 @@ def test_what_is_paused_is_resumed(sleepers: list[psutil.Process]) -> None:
     assert pauses.count == 1
     assert PAUSE_S[0] <= pauses.total_s <= PAUSE_S[1]
     assert pauses.processes == {sleepers[0].pid}
+
+
+def test_a_gateway_is_paused_for_less_than_a_stall() -> None:
+    words = [sys.executable, "-c", "import time; time.sleep(600)", "gateway.cli", "run"]
+    with subprocess.Popen(words) as process:
+        pauses = Pauses(random.Random(1), lambda: [psutil.Process(process.pid)])
+        for number in range(100):
+            pauses.step(number * 1.0)
+        pauses.resume_all()
+        process.kill()
+    assert pauses.count == 100
+    assert pauses.total_s <= 100 * GATEWAY_PAUSE_S[1]
 
 
 def test_what_a_test_has_stopped_stays_stopped(sleepers: list[psutil.Process]) -> None:
