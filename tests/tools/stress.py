@@ -34,7 +34,7 @@ RUN = "STRESS_RUN"
 """Variable in the environment of all processes of a run: a hub has left the family of the test that needed it."""
 PAUSE_S = (0.010, 0.900)
 """Range of the length of a pause. Zenoh drops a session that is silent for 2 s, so a pause alone never does that."""
-GATEWAY_PAUSE_S = (0.010, 0.400)
+GATEWAY_PAUSE_S = (0.010, 0.300)
 """The same for a gateway. A gap of 0.5 s in its loop ends a drive (docs/explanation/how-it-works.md), as it must: each
 test that drives would fail. Tests of that rule stop a gateway themselves."""
 GAP_S = (0.0, 0.4)
