@@ -112,7 +112,7 @@ class _Fleet:
         subscriber = self.up.bus.subscribe("fleet/*/frame/tx", wire)
         time.sleep(0.2)  # until all gateways know of it
         asked = time.time_ns()
-        # Until all have carried it out: a stop that joins another writes nothing. On a busy machine a car may show it late.
+        # Until all have carried it out: a stop that joins another writes nothing. A car may show it late.
         wait_for(lambda: all(outcome.ok for outcome in client.stop()), "all cars stand", 60.0)
         wait_for(lambda: len(wires) == self.size, "a stop is on every wire", 30.0)
         subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
