@@ -34,9 +34,10 @@ RUN = "STRESS_RUN"
 """Variable in the environment of all processes of a run: a hub has left the family of the test that needed it."""
 PAUSE_S = (0.010, 0.900)
 """Range of the length of a pause. Zenoh drops a session that is silent for 2 s, so a pause alone never does that."""
-GATEWAY_PAUSE_S = (0.010, 0.300)
-"""The same for a gateway. A gap of 0.5 s in its loop ends a drive (docs/explanation/how-it-works.md), as it must: each
-test that drives would fail. Tests of that rule stop a gateway themselves."""
+CONTROL_PAUSE_S = (0.010, 0.300)
+"""The same for a gateway and a simulator. A gap of 0.5 s in a gateway's loop ends a drive, and a car shows its stop by a
+pause of its reports (docs/explanation/how-it-works.md). So longer pauses would rightly fail each test that drives.
+Tests of these rules stop the process themselves."""
 GAP_S = (0.0, 0.4)
 """Range from the begin of a pause to the begin of the next: two processes are paused on average."""
 LOOK_S = 1.0
@@ -82,7 +83,7 @@ class Pauses:
         with suppress(psutil.Error):  # it has ended
             if process.status() == psutil.STATUS_STOPPED:
                 return
-            least, most = GATEWAY_PAUSE_S if is_gateway(process) else PAUSE_S
+            least, most = CONTROL_PAUSE_S if in_control(process) else PAUSE_S
             seconds = least + share * (most - least)
             self._paused[process] = now + seconds  # first, so that an interrupt here leaves nothing paused
             process.suspend()
@@ -96,10 +97,9 @@ class Pauses:
         self._paused.pop(process, None)
 
 
-def is_gateway(process: psutil.Process) -> bool:
-    """Return True if this is `gateway run`, however it was started."""
-    words = process.cmdline()
-    return "run" in words and any(word == "gateway.cli" or Path(word).name == "gateway" for word in words)
+def in_control(process: psutil.Process) -> bool:
+    """Return True if this is a gateway or a simulator, however it was started."""
+    return any(word in ("gateway.cli", "gateway.sim") or Path(word).name == "gateway" for word in process.cmdline())
 
 
 def of_run(run: str, spared: Iterable[int]) -> list[psutil.Process]:

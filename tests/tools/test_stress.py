@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from tests.support.processes import wait_for
-from tests.tools.stress import GATEWAY_PAUSE_S, PAUSE_S, Pauses, of_run
+from tests.tools.stress import CONTROL_PAUSE_S, PAUSE_S, Pauses, of_run
 
 ONE_TEST = f"one-test-of-{os.getpid()}"
 """The name of a run. The tests of this file may run at the same time, in several workers."""
@@ -53,7 +53,7 @@ def test_a_gateway_is_paused_for_less_than_a_stall() -> None:
         pauses.resume_all()
         process.kill()
     assert pauses.count == 100
-    assert pauses.total_s <= 100 * GATEWAY_PAUSE_S[1]
+    assert pauses.total_s <= 100 * CONTROL_PAUSE_S[1]
 
 
 def test_what_a_test_has_stopped_stays_stopped(sleepers: list[psutil.Process]) -> None:
