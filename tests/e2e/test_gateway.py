@@ -472,8 +472,8 @@ def test_a_joystick_that_dies_stops_the_car(fleet: FleetProcesses) -> None:
     joystick.end(signal.SIGKILL)
     wait_for(lambda: not driving(sim), "it stops", 8.0)
     wait_for(lambda: records[-1].words == "its sender stick disconnected", "it is said")
-    # A gateway that stood for half a second has stopped the car before, and taken the stream anew. It refuses a drive of
-    # the stream that was on its way for longer.
+    # A gateway that stood for half a second has stopped the car before, and taken the stream anew. It refuses a drive
+    # that was on its way for longer.
     taken = [record for record in records if record.reason != "stale"]
     assert [record.phase for record in taken[-3:]] == ["queued", "sent", "expired"]
     assert len(taken) % 3 == 0

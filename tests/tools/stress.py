@@ -35,9 +35,9 @@ RUN = "STRESS_RUN"
 PAUSE_S = (0.010, 0.900)
 """Range of the length of a pause. Zenoh drops a session that is silent for 2 s, so a pause alone never does that."""
 CONTROL_PAUSE_S = (0.010, 0.300)
-"""The same for a gateway and a simulator. A gap of 0.5 s in a gateway's loop ends a drive, and a car shows its stop by a
-pause of its reports (docs/explanation/how-it-works.md). So longer pauses would rightly fail each test that drives.
-Tests of these rules stop the process themselves."""
+"""The same for a gateway and a simulator. A gap of 0.5 s in a gateway's loop ends a drive
+(docs/explanation/how-it-works.md). A car shows its stop by a pause of its reports. So longer pauses would rightly fail
+each test that drives. Tests of these rules stop the process themselves."""
 GAP_S = (0.0, 0.4)
 """Range from the begin of a pause to the begin of the next: two processes are paused on average."""
 LOOK_S = 1.0
