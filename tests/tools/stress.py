@@ -113,7 +113,7 @@ def of_run(run: str, spared: Iterable[int]) -> list[psutil.Process]:
 
 
 def _start(name: str, tests: list[str], directory: Path) -> subprocess.Popen[bytes]:
-    options = ["-m", "not soak", "-n", "auto", "--dist", "loadgroup", "-p", "no:cacheprovider"]
+    options = ["-v", "-m", "not soak", "-n", "auto", "--dist", "loadgroup", "-p", "no:cacheprovider"]
     words = [sys.executable, "-m", "pytest", *tests, *options, "--basetemp", str(directory / name)]
     with (directory / f"{name}.log").open("wb") as log:
         environment = os.environ | {RUN: str(directory), scheduling.SUITES: str(len(SUITES))}
