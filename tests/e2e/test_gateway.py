@@ -184,7 +184,8 @@ def test_a_tcp_server_that_knows_nothing_of_us(
     assert fleet.state("safety").motors_basis == basis
     assert frames_of("recovery", told)[: len(connected)] == connected
     assert frames_of("command", told) == [RUN]
-    assert frames_of("stop", told)[: len(stopped)] == stopped
+    # If the repetition may be unread, the general stop goes first.
+    assert frames_of("stop", told)[: len(stopped)] in (stopped, stopped[::-1])
     assert {frame.data for frame in told if frame.data != RUN} <= {b"#", MODE00, STOP}, "until the car showed it"
     wait_for(lambda: tcp_car.received == [frame.data for frame in told], "one write per frame, and no other")
     assert tcp_car.received.count(RUN) == 2

@@ -6,7 +6,7 @@ from typing import Any
 
 from schemas import bus
 from tests.support.judge import Judge
-from tests.support.processes import FleetProcesses, wait_for
+from tests.support.processes import FleetProcesses, freeze, wait_for
 from tests.support.tap import Tap
 
 
@@ -38,7 +38,7 @@ def test_a_gateway_that_slept_longer_than_the_bus_waits_tells_of_it(fleet: Fleet
     fleet.ready()
     fleet.ask("drive", motion="forward", duration_s=10, id="drive")
     wait_for(lambda: judge.driving, "it drives")
-    gateway.popen.send_signal(signal.SIGSTOP)
+    freeze(gateway.popen.pid)
     wait_for(lambda: not fleet.bus.tokens("fleet/red"), "the bus has given it up")
     gateway.popen.send_signal(signal.SIGCONT)
     wait_for(lambda: "stalled" in records.codes(), "it says that it slept")
@@ -53,7 +53,7 @@ def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(flee
         fleet.gateway(tap.link)
         fleet.ready()
         records = Records(fleet)
-        fleet.hub.popen.send_signal(signal.SIGSTOP)  # nothing is delivered, and no new hub can begin at its port
+        freeze(fleet.hub.popen.pid)  # nothing is delivered, and no new hub can begin at its port
         tap.reset()
         fleet.hub.popen.send_signal(signal.SIGKILL)
         wait_for(lambda: fleet.left() and bus.accepts(fleet.endpoint), "another hub")

@@ -20,7 +20,7 @@ import pytest
 from fleet.client.supervision import ask_status
 from schemas import bus, keys
 from tests.support.ports import free_endpoint, free_port
-from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, wait_for
+from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, freeze, wait_for
 from tests.support.up import Up, fleet_command
 
 IN_ITS_PLACE_S = 9.5
@@ -85,7 +85,7 @@ def test_what_is_killed_is_started_again_and_nothing_else_is(up: Up, name: str) 
 @pytest.mark.parametrize("name", ["green", "@simulator", "@recorder", "@console"])
 def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
     pid = up.running(name)
-    os.kill(pid, signal.SIGSTOP)
+    freeze(pid)
     wait_for(lambda: not _exists(pid), f"{name} is killed")
     up.running(name, but=pid)
     assert up.state(name).words.startswith("hung: no heartbeat for")
@@ -97,7 +97,7 @@ def test_what_hangs_is_killed_and_started_again(up: Up, name: str) -> None:
 def test_a_stop_of_all_reaches_the_new_gateway_of_one_that_hangs(up: Up, token_is_gone: bool) -> None:
     """Its token is gone 2 s later, the supervisor replaces it after 4 s: it was left out meanwhile, and had no hold."""
     pid = up.running("green")
-    os.kill(pid, signal.SIGSTOP)
+    freeze(pid)
     if token_is_gone:
         wait_for(lambda: not up.bus.tokens(keys.car_token("fleet", "green")), "its token is gone")
     done = up.fleet("stop")
@@ -116,7 +116,7 @@ def test_a_hub_that_hangs_is_replaced_by_ours_or_by_a_gateways(tmp_path: Path) -
     with Up(tmp_path, free_endpoint(), "--sim", "1", "--no-record") as started:
         started.ready("red")
         hub, red = started.running("@hub"), started.running("red")
-        os.kill(hub, signal.SIGSTOP)
+        freeze(hub)
         wait_for(lambda: not _exists(hub), "it is killed")
         started.running("@hub", but=hub)
         started.ready("red")
@@ -125,7 +125,7 @@ def test_a_hub_that_hangs_is_replaced_by_ours_or_by_a_gateways(tmp_path: Path) -
 
 def test_one_that_sleeps_itself_blames_nobody(up: Up) -> None:
     before = {each.name: up.running(each.name) for each in up.processes()}
-    os.kill(up.process.pid, signal.SIGSTOP)
+    freeze(up.process.pid)
     try:
         began = time.monotonic()
         seen: list[object] = []
@@ -261,7 +261,7 @@ def test_ctrl_c_at_a_terminal_stops_the_cars_and_a_second_one_does_not_hurry(tmp
             wait_for(lambda: "red" in truths and truths["red"].message().motor_left, "red drives")  # type: ignore[attr-defined]
             (status,) = wait_for(lambda: ask_status(client, "fleet"), "it says what runs")
             (waited_for,) = (each.pid for each in status.processes if each.name == "green")
-            os.kill(waited_for, signal.SIGSTOP)  # or it may have ended before the second is typed
+            freeze(waited_for)  # or it may have ended before the second is typed
             os.write(master, b"\x03")
             wait_for(lambda: b"Ctrl-C: stopping every car" in shown, "it ends")
             os.write(master, b"\x03")
@@ -327,7 +327,7 @@ def test_the_end_stops_cars_whose_gateways_hang_or_were_killed_and_says_which_it
             assert started.ask("drive", car, motion="forward", duration_s=10)["status"] in TAKEN
             wait_for(lambda car=car, sim=sim: driving(sim, car), f"{car} drives")
         hung, killed, lost = (started.running(car) for car in sims)
-        os.kill(hung, signal.SIGSTOP)
+        freeze(hung)
         os.kill(killed, signal.SIGKILL)
         for pid in (lost, sims["blue"][0].pid):
             os.kill(pid, signal.SIGKILL)
@@ -410,7 +410,7 @@ def test_a_car_that_is_taken_out_is_stopped_though_its_gateway_hangs(fleet: Flee
         started.ready("green")
         assert started.ask("drive", "green", motion="forward", duration_s=10)["status"] in TAKEN
         wait_for(lambda: driving(sim, "green"), "green drives")
-        os.kill(started.running("green"), signal.SIGSTOP)
+        freeze(started.running("green"))
         file.write_text(_text(red=links[0]))
         assert started.fleet("reload").stdout == "green is removed\n"
         began = time.monotonic()

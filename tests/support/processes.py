@@ -15,6 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from schemas import bus, messages
 
 PATIENCE_S = 40.0
@@ -235,6 +237,12 @@ REPORT_S = 0.95
 """A car in mode 0 reports so often (docs/reference/protocol.md#rates)."""
 CLOSING_S = 1.0
 """`MODE00` blocks a car for so long (docs/reference/protocol.md#blocking-times), and so delays its next report."""
+
+
+def freeze(pid: int) -> None:
+    """Stop a process (SIGSTOP), after the end of a pause: `make stress` would resume it."""
+    wait_for(lambda: psutil.Process(pid).status() != psutil.STATUS_STOPPED, f"{pid} runs")
+    os.kill(pid, signal.SIGSTOP)
 
 
 class TcpCar:

@@ -16,7 +16,7 @@ from fleet.client.lease import LeaseMonitor
 from fleet.client.outcome import Outcome
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars, asked
-from tests.support.processes import LONG_S, driving, wait_for
+from tests.support.processes import LONG_S, driving, freeze, wait_for
 
 # ---------------------------------------------------------------- whether it is ours
 
@@ -197,7 +197,7 @@ def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars, late: 
                     await stopped(car)
 
         def paused_look(look: Callable[[], None]) -> None:
-            cars.gateways["blue"].popen.send_signal(signal.SIGSTOP)
+            freeze(cars.gateways["blue"].popen.pid)
             paused.start()
             look()
 

@@ -1,7 +1,6 @@
 """What tells a process that hangs from a slow one, a machine that stands, and a hub on which nobody is heard."""
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -23,7 +22,7 @@ from fleet.supervisor.hang import (
     longest_hub_silence_s,
     longest_silence_s,
 )
-from tests.support.processes import wait_for
+from tests.support.processes import freeze, wait_for
 
 
 @pytest.mark.parametrize(
@@ -115,7 +114,7 @@ def test_a_process_is_seen_to_be_blocked_to_spin_and_to_have_gone(tmp_path: Path
     try:
         begun = wait_for(lambda: cpu_time.read(process.pid), "there is a process")
         wait_for(lambda: (read := cpu_time.read(process.pid)) and read.run_s > begun.run_s + 0.05, "it runs")
-        process.send_signal(signal.SIGSTOP)
+        freeze(process.pid)
         wait_for(lambda: _state(process.pid) == "T", "it stands")
         stood = cpu_time.read(process.pid)
         time.sleep(0.1)

@@ -27,7 +27,7 @@ from schemas.colors import car_color
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint
-from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, wait_for
+from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, freeze, wait_for
 
 
 @pytest.fixture
@@ -183,7 +183,7 @@ def test_a_viewer_that_hangs_holds_up_nothing_and_takes_no_memory(
         ):
             publish(fleet.bus, "red", range(10))
             wait_for(lambda: following.step() >= 0 and following.sent == 10, "the viewer takes what there is")
-            os.kill(viewer.pid, signal.SIGSTOP)
+            freeze(viewer.pid)
             try:
 
                 def full() -> bool:
