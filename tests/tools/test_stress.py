@@ -49,7 +49,7 @@ def test_a_gateway_is_paused_for_less_than_a_stall() -> None:
     with subprocess.Popen(words) as process:
         pauses = Pauses(random.Random(1), lambda: [psutil.Process(process.pid)])
         for number in range(100):
-            pauses.step(number * 1.0)
+            pauses.step(number * 10.0)
         pauses.resume_all()
         process.kill()
     assert pauses.count == 100
