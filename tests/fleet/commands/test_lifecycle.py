@@ -29,7 +29,7 @@ class Down:
 
 
 def test_a_supervisor_whose_token_is_gone_for_a_moment_has_not_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lifecycle, "SUPERVISOR_LOST_S", 2.0)
+    monkeypatch.setattr(lifecycle, "SUPERVISOR_LOST_S", 5.0)
     endpoint = free_endpoint()
     with Bus.open(endpoint, start_hub=True) as ours, Bus.open(endpoint) as theirs:
         down = Down(ours)
