@@ -1,10 +1,19 @@
 """What explains afterwards what happened is not lost because the bus was away when it happened."""
 
 import signal
+import threading
 import time
+from pathlib import Path
 from typing import Any
 
+import pytest
+from mcap.reader import make_reader
+
+from fleet.recording.writing import backfill
+from fleet.recording.writing.recorder import SHUTDOWN_DRAIN_S, Recorder
 from schemas import bus
+from schemas.gen import fleet_v1_pb2 as pb
+from schemas.topics import TOPICS
 from tests.support.judge import Judge
 from tests.support.processes import FleetProcesses, freeze, wait_for
 from tests.support.tap import Tap
@@ -63,3 +72,24 @@ def test_what_happens_while_there_is_no_hub_is_told_when_there_is_one_again(flee
         assert lost.timestamp.ToNanoseconds() < back_ns, "with the time at which it happened"
     finally:
         tap.close()
+
+
+def test_a_hub_that_stands_when_a_recording_ends_costs_no_message(
+    fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backfill, "QUERY_AFTER_START_S", ())  # a query at the end would wait for the hub, too
+    key = "fleet/red/sensor/range"
+    with bus.Bus.open(fleet.endpoint) as own:
+        recorder = Recorder(own, "fleet", tmp_path)
+        session = recorder.start()
+        ranges = fleet.bus.publisher(key, TOPICS["sensor/range"], "red")
+        freeze(fleet.hub.popen.pid)
+        for _ in range(20):
+            ranges.put(pb.Range(range_m=1.0), time.time_ns())
+        closing = threading.Thread(target=recorder.close)
+        closing.start()
+        closing.join(3 * SHUTDOWN_DRAIN_S)
+        fleet.hub.popen.send_signal(signal.SIGCONT)
+        closing.join()
+    with (session / "0001.mcap").open("rb") as file:
+        assert sum(channel.topic == key for _, channel, _ in make_reader(file).iter_messages()) == 20

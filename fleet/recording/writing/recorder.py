@@ -39,7 +39,11 @@ SUBSCRIBER_QUEUE_SIZE: Final = 16_384
 MAX_READ_BATCH: Final = 4_096
 """Maximum messages read from one subscription before the next one."""
 SHUTDOWN_DRAIN_S: Final = 0.3
-"""Time at shutdown for messages that are still in transit."""
+"""Time at shutdown for messages that are still in transit, and timeout of the hub's answer after it."""
+MAX_DRAIN_DELAY_S: Final = 0.2
+"""Maximum delay of both together. Beyond it, hub or recorder stood still, and the time begins anew."""
+MAX_SHUTDOWN_DRAIN_S: Final = 5.0
+"""Maximum time for all of it, on a machine that stays too busy."""
 STATUS_TIMEOUT_S: Final = 5.0
 """Timeout for the status of another recorder, which answers only between two writes to its disk."""
 MAX_PENDING_QUERIES: Final = 64
@@ -164,7 +168,7 @@ class Recorder:
     def close(self) -> RecordingOutcome:
         """Write all received messages, and close the session; raises RecordingFailed."""
         if not self.ended.is_set():
-            time.sleep(SHUTDOWN_DRAIN_S)
+            self._await_messages_in_transit()
         self._backfill.close()
         self._closing.set()
         self._reader.join()
@@ -178,6 +182,17 @@ class Recorder:
         return RecordingOutcome(
             session.path, session.messages, session.bytes, dict(session.drops), session.missed, session.cost
         )
+
+    def _await_messages_in_transit(self) -> None:
+        end = began = time.monotonic()
+        end += MAX_SHUTDOWN_DRAIN_S
+        while began < end:
+            time.sleep(SHUTDOWN_DRAIN_S)
+            with contextlib.suppress(zenoh.ZError):  # without a bus nothing is in transit
+                self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER), SHUTDOWN_DRAIN_S)
+            began, before = time.monotonic(), began
+            if began - before < SHUTDOWN_DRAIN_S + MAX_DRAIN_DELAY_S:
+                return
 
     def _refuse_a_second(self) -> None:
         if not self._bus.tokens(keys.car_token(self._fleet, keys.RECORDER)):
