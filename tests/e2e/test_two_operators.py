@@ -13,7 +13,7 @@ import pytest
 from tests.support.ports import free_endpoint
 from tests.support.processes import LONG_S, FleetProcesses, GatewayProcess, driving, wait_for
 
-SCRIPT = """
+SCRIPT = f"""
 import sys, time
 from fleet import Fleet, LeaseLost, NotCarriedOut
 with Fleet(sender="bot") as fleet:
@@ -21,12 +21,12 @@ with Fleet(sender="bot") as fleet:
         with fleet.car("red").lease() as car:
             while True:
                 try:
-                    car.drive("spin_left", 0.5)
+                    car.drive("spin_left", {LONG_S})
                 except NotCarriedOut as error:
                     if error.outcome.reason != "stale":  # the machine stood while it was on its way
                         raise
     except LeaseLost as error:
-        sys.exit(f"lost: {error}")
+        sys.exit("lost: " + str(error))
 """
 
 LONG = f"{LONG_S:g}s"
@@ -193,7 +193,7 @@ def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> No
 
 
 def test_a_script_that_is_killed_leaves_no_car_driving_and_no_lease(fleet: FleetProcesses, sim: GatewayProcess) -> None:
-    script = fleet.start("-c", SCRIPT.replace('drive("spin_left", 0.5)', 'drive("spin_left", 10)'))
+    script = fleet.start("-c", SCRIPT)
     wait_for(lambda: drives(fleet, "bot") and driving(sim), "the script drives")
     script.kill()
     wait_for(lambda: not driving(sim), "it stands", 8.0)
