@@ -11,6 +11,8 @@ FOREGROUND_PER_PROCESSOR: Final = 3.5
 """Workers for tests of processes, for each processor. With four, simulated cars were late and tests of stops failed."""
 SUITES: Final = "SUITES_AT_ONCE"
 """Variable in the environment: how many suites share this machine (`make stress`). Each has its part of the workers."""
+SUITE: Final = "SUITE_NUMBER"
+"""Variable in the environment: the number of this suite, from 0. Each has its part of the ports."""
 _PROCESSORS: Final = max(1, (os.cpu_count() or 1) // int(os.environ.get(SUITES, "1")))
 WORKERS: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS) + _PROCESSORS
 """One more for each processor is in the background."""

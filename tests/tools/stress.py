@@ -119,7 +119,8 @@ def _start(name: str, tests: list[str], directory: Path) -> subprocess.Popen[byt
     options = ["-v", "-m", "not soak", "-n", "auto", "--dist", "loadgroup", "-p", "no:cacheprovider"]
     words = [sys.executable, "-m", "pytest", *tests, *options, "--basetemp", str(directory / name)]
     with (directory / f"{name}.log").open("wb") as log:
-        environment = os.environ | {RUN: str(directory), scheduling.SUITES: str(len(SUITES))}
+        number, suites = str(SUITES.index(name)), str(len(SUITES))
+        environment = os.environ | {RUN: str(directory), scheduling.SUITE: number, scheduling.SUITES: suites}
         # In a session of its own, so that a Ctrl-C reaches a suite once, from here.
         return subprocess.Popen(
             words, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import psutil
 import pytest
 
+from tests.support.ports import FIRST, LAST, ports_of
 from tests.support.processes import wait_for
 from tests.tools.stress import CONTROL_PAUSE_S, PAUSE_S, Pauses, of_run
 
@@ -69,3 +70,8 @@ def test_what_a_test_has_stopped_stays_stopped(sleepers: list[psutil.Process]) -
 
 def test_who_is_spared_is_not_found(sleepers: list[psutil.Process]) -> None:
     assert of_run(ONE_TEST, {sleepers[0].pid}) == sleepers[1:]
+
+
+def test_suites_that_run_at_once_share_no_port() -> None:
+    parts = [ports_of(worker, 4, suite, 2) for suite in range(2) for worker in range(4)]
+    assert sorted(port for part in parts for port in part) == list(range(FIRST, LAST + 1))
