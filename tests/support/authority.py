@@ -1,4 +1,4 @@
-"""A coordinator that wants a mode for ever, and a person who has stopped the car: both are killed, again and again."""
+"""A person stops a car of a plan. Then the car's gateway and the coordinator are killed again and again."""
 
 import time
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ PLAN = "fixed: {red: {mode: tracking}}\n"
 
 
 def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str]) -> list[float]:
-    """When motors went on after the person's stop was complete, s: never. `killed`: what is, round by round."""
+    """Return the times, s after the person's stop, at which motors went on: none. `killed`: victims of each round."""
     plan = directory / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
 
@@ -30,7 +30,7 @@ def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str])
     wait_for(lambda: judge.modes and judge.modes[-1][1] == "tracking", "the coordinator has its mode")
     with Client(fleet.endpoint, sender="mia", kind="person") as person:
         assert person.car("red").stop().ok
-    held_ns = time.time_ns()  # not the newest truth heard: what it did before may still be on its way
+    held_ns = time.time_ns()  # not the time of the newest truth: an older one may still be on its way
     for victims in killed:
         if "gateway" in victims:
             gateway.kill()
@@ -41,15 +41,15 @@ def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str])
             coordinator.wait()
             coordinator = coordinate()
         fleet.ready()
-        # It has seen the car stand, and knows that it may not.
+        # The coordinator has decided that the held car gets no mode.
         decided(coordinator, None)
         wait_for(lambda: fleet.state("safety").HasField("hold"), "it is on hold")
-        # Nor does it help to ask past the policy.
+        # The gateway rejects a mode of any other coordinator, too.
         answer = fleet.ask("mode", mode="tracking", kind="coordinator", sender="coordinator-x")
         assert (answer["status"], answer["reason"]) == ("rejected", "held"), answer
         assert judge.modes[-1][1] == "manual"
     moved = judge.on_after(held_ns)
-    # And it would still have it: the end of the hold is all that it needs.
+    # After the end of the hold, the coordinator assigns the mode again.
     with Client(fleet.endpoint, sender="mia", kind="person") as person:
         assert person.car("red").resume().ok
     wait_for(lambda: judge.modes[-1][1] == "tracking", "the coordinator has its mode again")

@@ -1,9 +1,9 @@
-"""A computer with Bluetooth, without any: a private system bus, and on it BlueZ and modules, for bleak's own backend.
+"""A fake BlueZ on a private D-Bus system bus, for bleak's own backend: Bluetooth on a computer without a radio.
 
-Whoever uses it has DBUS_SYSTEM_BUS_ADDRESS set to `address`. The bus is this program itself: it says who it is, takes
-match rules, hands calls to org.bluez and signals to whoever asked for them; so no dbus-daemon need be installed. BlueZ
-is what bleak's backend calls of it, with the limits that bite (measured on the real one): a piece longer than the MTU
-allows is refused, who is connected does not advertise, a connection outlives the program that made it.
+Its users set DBUS_SYSTEM_BUS_ADDRESS to `address`. This program is also the bus: it answers Hello, takes match rules,
+passes calls to org.bluez, and passes signals to their subscribers. So no dbus-daemon need be installed. The fake has
+the calls of bleak's backend, and the limits measured on the real BlueZ. BlueZ refuses a piece longer than the MTU allows.
+A connected module does not advertise. A connection outlives the program that made it.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ _names = itertools.count()
 
 
 def uuid(short: int) -> str:
-    """The 128 bits of a 16 bit UUID."""
+    """Return the 128 bits of a 16 bit UUID."""
     return f"0000{short:04x}-0000-1000-8000-00805f9b34fb"
 
 
@@ -59,18 +59,18 @@ BATTERY = ((uuid(0x180F), ((uuid(0x2A19), ("read", "notify")),)),)
 
 
 def free_address() -> str:
-    """An address that no other test on this computer has: links claim theirs from all programs."""
+    """Return an address that no other test on this computer has. A link claims its address from all programs."""
     number = os.getpid() << 16 | next(_names) & 0xFFFF
     return ":".join(f"{byte:02X}" for byte in number.to_bytes(6, "big"))
 
 
 class Refused(Exception):
-    """A D-Bus error: its name and words."""
+    """A D-Bus error: its name and text."""
 
 
 @dataclass(eq=False)
 class Module:
-    """A Bluetooth LE module, and what is wrong with it."""
+    """A Bluetooth LE module and its faults."""
 
     address: str
     name: str
@@ -80,28 +80,28 @@ class Module:
     connects: bool = True
     notifies: bool = True
     leaves: bool = True
-    """It can be disconnected; else that is never answered."""
+    """False if BlueZ never answers a call of Disconnect."""
     takes: int | None = None
-    """Pieces that it still takes; then a write is never answered."""
+    """Number of pieces that the module still takes. BlueZ never answers a later write."""
     refuses: int | None = None
-    """Pieces that it still takes; then a write is refused."""
+    """Number of pieces that the module still takes. BlueZ refuses a later write."""
     known: bool = False
     connected: bool = False
     notified: set[tuple["_Caller", str]] = field(default_factory=set)
-    """Who asked for the notifications of which characteristic."""
+    """The subscribers of notifications, each with its characteristic."""
     pieces: list[bytes] = field(default_factory=list)
-    """What was written, as it came."""
+    """The written pieces in order."""
     waiting: list[tuple["_Caller", Message]] = field(default_factory=list)
-    """Calls of Connect that are not answered yet."""
+    """Pending calls of Connect."""
     uart: int | None = None
-    """The descriptor of a car's serial port, to which it hands on what is written."""
+    """Descriptor of a car's serial port, to which the module passes written bytes."""
 
     @property
     def path(self) -> str:
         return f"{HCI}/dev_{self.address.replace(':', '_')}"
 
     def characteristics(self) -> Iterator[tuple[str, str, tuple[str, ...], str, str]]:
-        """Path, UUID, flags, and path and UUID of the service."""
+        """Yield each characteristic: path, UUID, flags, and path and UUID of the service."""
         number = 0x000C
         for service, inside in self.gatt:
             above = f"{self.path}/service{number:04x}"
@@ -112,7 +112,7 @@ class Module:
 
 
 class FakeBluez:
-    """The bus and BlueZ, in a thread of their own. What changes them may be called from any other thread."""
+    """The bus and BlueZ, in a thread of their own. Any other thread may call the methods that change them."""
 
     def __init__(self, *modules: Module) -> None:
         name = f"car-fleet-bluez-{os.getpid()}-{next(_names)}"
@@ -120,7 +120,7 @@ class FakeBluez:
         self.modules = list(modules)
         self.powered = True
         self.alive = True
-        """bluetoothd runs."""
+        """True while bluetoothd runs."""
         self._callers: set[_Caller] = set()
         self._wires: list[asyncio.Task[None]] = []
         self._changed = threading.Condition()
@@ -132,14 +132,14 @@ class FakeBluez:
     def _do(self, work: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(PATIENCE_S)
 
-    # ------------------------------------------------------------------ what a test does
+    # ------------------------------------------------------------------ calls of a test
 
     def notify(self, module: Module, data: bytes) -> None:
-        """Say this, in pieces as radio does; waits until the computer has taken it."""
+        """Send data from the module to the computer, in pieces as radio does. Wait until the computer has it."""
         self._do(self._notify(module, data))
 
     def written(self, module: Module, size: int) -> bytes:
-        """Wait until so many bytes were written to it; take them."""
+        """Wait until this many bytes were written to the module. Remove and return them."""
         with self._changed:
             assert self._changed.wait_for(lambda: sum(map(len, module.pieces)) >= size, PATIENCE_S), module.pieces
             data = b"".join(module.pieces)
@@ -158,7 +158,7 @@ class FakeBluez:
         self._do(work())
 
     def wire(self, module: Module, port: str) -> None:
-        """Solder a module to a (simulated) car's serial port: both ways, from now on."""
+        """Connect a module to the serial port of a simulated car, in both directions."""
 
         async def work() -> None:
             uart = module.uart = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -174,7 +174,7 @@ class FakeBluez:
             await self._notify(module, await said.get())
 
     def kill(self) -> None:
-        """Kill bluetoothd: no signal tells of it, and its connections are gone."""
+        """Kill bluetoothd. Its connections are lost, and no signal reports that."""
 
         async def work() -> None:
             self.alive = False
@@ -182,7 +182,7 @@ class FakeBluez:
         self._do(work())
 
     def restart(self) -> None:
-        """Start bluetoothd again; it knows no device."""
+        """Restart bluetoothd. It knows no device."""
 
         async def work() -> None:
             self.alive = True
@@ -194,7 +194,7 @@ class FakeBluez:
         self._do(work())
 
     def close(self) -> None:
-        """End the bus: every connection to it."""
+        """Close all connections to the bus."""
 
         async def work() -> None:
             for wire in self._wires:
@@ -230,7 +230,7 @@ class FakeBluez:
             self._callers.discard(caller)
             for module in self.modules:
                 module.notified = {asked for asked in module.notified if asked[0] is not caller}
-                # and no more: it stays connected
+                # the module stays connected
             writer.close()
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
@@ -304,7 +304,7 @@ class FakeBluez:
     async def _device_call(self, caller: "_Caller", message: Message, module: Module) -> tuple[str, list[Any]] | None:
         if message.member == "Connect":
             if not (module.on and module.connects):
-                module.waiting.append((caller, message))  # it tries for a very long time
+                module.waiting.append((caller, message))  # BlueZ tries for a very long time
                 return None
             module.connected = True
             await self._change(module.path, DEVICE, {"Connected": Variant("b", True)})
@@ -357,14 +357,14 @@ class FakeBluez:
         return "", []
 
     async def _notify(self, module: Module, data: bytes) -> None:
-        """BlueZ says it once for all, if anyone asked for notifications."""
+        """Send one signal for all subscribers, if there are any."""
         for path in {path for _, path in module.notified}:
             for start in range(0, len(data), module.mtu - 3):
                 piece = data[start : start + module.mtu - 3]
                 await self._change(path, CHARACTERISTIC, {"Value": Variant("ay", piece)})
 
     async def _advertise(self) -> None:
-        """What is on and not connected is heard, by whoever scans."""
+        """Report the modules that are on and not connected to all callers that scan."""
         if not any(caller.scans for caller in self._callers):
             return
         for module in self.modules:
@@ -484,7 +484,7 @@ async def _authenticate(reader: asyncio.StreamReader, writer: asyncio.StreamWrit
 
 
 async def _received(reader: asyncio.StreamReader) -> Message:
-    """One message, by the lengths in its header (D-Bus specification, message format)."""
+    """Return one message, by the lengths in its header (D-Bus specification, message format)."""
     head = await reader.readexactly(16)
     body, fields = struct.unpack("<4xI4xI" if head[:1] == b"l" else ">4xI4xI", head)
     rest = await reader.readexactly(fields + -fields % 8 + body)

@@ -1,7 +1,7 @@
-"""Judges what gateways claim of simulated cars by the cars' true motors and modes. Times: ns since the epoch.
+"""Judges the claims of gateways about simulated cars by the cars' true motors and modes. Times: ns since the epoch.
 
-All processes of a test share one clock, so the publishers' stamps are compared after the run: what arrives late on a
-busy machine is not held against anybody.
+All processes of a test share one clock. So the judge compares the publishers' stamps after the run, and a message that
+arrives late on a busy machine is no fault.
 """
 
 import threading
@@ -12,19 +12,19 @@ from schemas.bus import Bus, Sample
 from tests.support.judge import stamp_ns
 
 FALSE_S: Final = 0.3
-"""A claim of motors or of a result may be false for so long."""
+"""Maximum time for which a claim about motors or a result may be false."""
 VERDICT_S: Final = 5.5
-"""A mode may be confirmed for so long after it has ended (tests/fuzz/stop_search.py)."""
+"""Maximum time for which an ended mode may stay confirmed (tests/fuzz/stop_search.py)."""
 STATE_S: Final = 1.5
-"""A state counts for so long after its publication, which comes each second: a killed gateway claims nothing."""
+"""Lifetime of a claim. Gateways publish each second, and a killed gateway claims nothing."""
 TRUTH_GAP_S: Final = 0.5
-"""After so long without the truth, which comes ten times a second, nothing is known of the time between."""
+"""Maximum interval between two truths. In a longer gap the true state is unknown. Normal are ten a second."""
 
 MOTORS: Final = "motors off, shown, while they run"
 VERDICT: Final = "mode confirmed, another is true"
 RESULT: Final = "stop complete, while the motors run"
 SENT: Final = "motors off, sent, while they run"
-"""No false claim: `sent` says that nothing shows it. It is counted beside the others."""
+"""Not a false claim, because the basis `sent` promises no evidence. It is counted beside the others."""
 KINDS: Final = (MOTORS, VERDICT, RESULT)
 
 _S: Final = 1_000_000_000
@@ -32,20 +32,20 @@ _S: Final = 1_000_000_000
 
 @dataclass(slots=True)
 class Span:
-    """A time in which something was so."""
+    """A time for which a value was true, or claimed."""
 
     begin: int
     end: int
     value: str
 
     def shared_s(self, other: "Span") -> float:
-        """Return for how long both were so."""
+        """Return how long two spans overlap."""
         return (min(self.end, other.end) - max(self.begin, other.begin)) / _S
 
 
 @dataclass
 class _CarClaims:
-    """What was true of one car, and what was said of it."""
+    """The true states of one car, and the claims about it."""
 
     motors: list[Span] = field(default_factory=list)
     modes: list[Span] = field(default_factory=list)
@@ -56,20 +56,20 @@ class _CarClaims:
 
 @dataclass
 class Claims:
-    """Follows all cars of a bus. Call `follow` before anything happens, and `false` when all is over."""
+    """The claims about all cars of a bus. Call `follow` before the first command, and `false` after the last one."""
 
     cars: dict[str, _CarClaims] = field(default_factory=dict)
     results: int = 0
-    """Stops that ended as complete."""
+    """Number of stops that ended as complete."""
     shown: int = 0
-    """Times that motors became off, as shown."""
+    """Number of times that `motors` became `off` with the basis `shown`."""
     confirmed: int = 0
-    """Times that a mode became confirmed."""
+    """Number of times that a mode became confirmed."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
     def follow(cls, bus: Bus) -> "Claims":
-        """Begin to watch."""
+        """Subscribe to the truth, the states and the commands of all cars."""
         claims = cls()
         bus.subscribe("fleet/*/sim/truth", claims._truth)
         bus.subscribe("fleet/*/state/safety", claims._safety)
@@ -78,7 +78,7 @@ class Claims:
         return claims
 
     def false(self) -> dict[str, list[str]]:
-        """Return the false claims by kind, in words."""
+        """Return the false claims as texts, by kind."""
         found: dict[str, list[str]] = {kind: [] for kind in (*KINDS, SENT)}
         with self._lock:
             for name, car in sorted(self.cars.items()):
@@ -101,7 +101,7 @@ class Claims:
         counts += [f"{len(each):4} {kind}" for kind, each in self.false().items()]
         return "\n".join(counts)
 
-    # ------------------------------------------------------------------ what is heard
+    # ------------------------------------------------------------------ subscribers
 
     def _car(self, name: str) -> _CarClaims:
         return self.cars.setdefault(name, _CarClaims())
@@ -153,7 +153,7 @@ def _whole(spans: list[Span]) -> list[Span]:
 
 
 def _spans(said: list[tuple[int, str]]) -> list[Span]:
-    """Return for how long each value was claimed."""
+    """Return the spans of the claimed values."""
     spans: list[Span] = []
     ordered = sorted(said)
     for number, (at, value) in enumerate(ordered):
@@ -165,7 +165,7 @@ def _spans(said: list[tuple[int, str]]) -> list[Span]:
 
 
 def _merged(spans: list[Span], *, same: bool = False) -> list[Span]:
-    """Join spans that follow each other at once; `same`: only those of one value."""
+    """Join spans without a gap between them. `same`: join only spans of the same value."""
     joined: list[Span] = []
     for span in spans:
         last = joined[-1] if joined else None

@@ -1,4 +1,4 @@
-"""The console in a real browser: its process, Chromium, and a wire between the two that can be cut."""
+"""The console in a real browser: its process, Chromium, and a connection between them that a test can cut."""
 
 import contextlib
 import os
@@ -26,14 +26,14 @@ DESKTOP: dict[str, Any] = {"viewport": {"width": 1280, "height": 900}}
 
 
 def find_chromium(playwright: Playwright) -> str:
-    """The distribution's Chromium, else Playwright's own. Fails with what to type."""
+    """Return the path of the distribution's Chromium, else of Playwright's own. Fail with the installing command."""
     found = next(filter(None, map(shutil.which, CHROMIUM_NAMES)), playwright.chromium.executable_path)
     assert Path(found).exists(), "there is no Chromium: type `make browser`"
     return found
 
 
 def hold_until_driving(page: Page, judge: Judge) -> None:
-    """Hold the button of the pad until the car drives. After a stop a person pauses, and presses again."""
+    """Hold the button of the pad until the car drives. After a stop, release it and press again."""
     for _ in range(10):
         page.locator("[data-motion=forward]").hover()
         page.mouse.down()
@@ -48,7 +48,7 @@ def hold_until_driving(page: Page, judge: Judge) -> None:
 
 
 class StallProxy:
-    """A TCP wire to a port of loopback. Cut, it passes nothing and closes nothing, as lost Wi-Fi does."""
+    """A TCP proxy to a port of loopback. While cut, it passes nothing and closes nothing, as lost Wi-Fi does."""
 
     def __init__(self, port: int) -> None:
         self._target = ("127.0.0.1", port)
@@ -60,16 +60,16 @@ class StallProxy:
         threading.Thread(target=self._serve, daemon=True).start()
 
     def cut(self) -> int:
-        """Pass nothing from now on; when, ns since the epoch."""
+        """Pass nothing from now on. Return the time, ns since the epoch."""
         self._whole.clear()
         return time.time_ns()
 
     def mend(self) -> None:
-        """Deliver everything that waits, in a burst."""
+        """Deliver all buffered bytes in a burst."""
         self._whole.set()
 
     def close(self) -> None:
-        """Close the wire."""
+        """Close the proxy."""
         self._whole.set()
         for each in (self._listener, *self._sockets):
             with contextlib.suppress(OSError):
@@ -95,7 +95,7 @@ class StallProxy:
 
 
 class ConsoleProcess:
-    """One `fleet console` at a fleet."""
+    """One process of `fleet console`."""
 
     def __init__(self, fleet: FleetProcesses, *arguments: str, port: int | None = None) -> None:
         self.port = free_port() if port is None else port
@@ -126,14 +126,14 @@ class ConsoleStage:
         self._reports = 0
 
     def launch(self) -> Browser:
-        """Start a browser. In it, `localhost` is at the end of the wire."""
+        """Start a browser. Its `localhost` is behind the proxy."""
         return self.playwright.chromium.launch(
             executable_path=find_chromium(self.playwright),
             args=[f"--host-resolver-rules=MAP localhost:{self.console.port} 127.0.0.1:{self.wire.port}"],
         )
 
     def page(self, path: str = "", *, browser: Browser | None = None, wired: bool = False, **context: Any) -> Page:
-        """Open the console in a page of its own and wait for the cards' data."""
+        """Open the console in a new page, and wait for the data of the cards."""
         page = (browser or self.browser).new_context(**(context or DESKTOP)).new_page()
         if browser is None:
             self._pages.append(page)
@@ -145,7 +145,7 @@ class ConsoleStage:
         return page
 
     def phone(self, path: str = "") -> Page:
-        """The same on a phone."""
+        """Open the console as a phone does."""
         return self.page(path, **self.playwright.devices["Pixel 7"])
 
     def driving_page(self, *cars: str, **options: Any) -> Page:
@@ -173,7 +173,7 @@ class ConsoleStage:
         wait_for(lambda: not any(self.fleet.state("safety", car).HasField("lease") for car in CARS), "nobody drives")
 
     def renderers(self, browser_of: psutil.Process | None = None) -> list[psutil.Process]:
-        """The processes that run the pages."""
+        """Return the processes that run the pages."""
         found = []
         for each in (browser_of or psutil.Process()).children(recursive=True):
             with contextlib.suppress(psutil.Error):
@@ -182,18 +182,18 @@ class ConsoleStage:
         return found
 
     def close(self) -> None:
-        """End everything."""
+        """End the pages, the browsers, the console and the fleet."""
         self.browser.close()
         self.playwright.stop()
         self.wire.close()
         self.person.close()
         self.fleet.close()
 
-    # ------------------------------------------------------------------ what a person does
+    # ------------------------------------------------------------------ actions of a person
 
     @contextmanager
     def held(self, page: Page, motion: str, car: str = "red") -> Iterator[Locator]:
-        """Hold a button of the pad with the mouse until the car drives, and through the block."""
+        """Hold a button of the pad with the mouse until the car drives, and for the body of the `with`."""
         button = page.locator(f"[data-motion={motion}]")
         self.hold(page, button, car)
         try:
@@ -203,7 +203,7 @@ class ConsoleStage:
                 page.mouse.up()
 
     def hold(self, page: Page, button: Locator, car: str) -> None:
-        """Press until the car drives. On a busy machine the dead-man may end a press: press again, as a person does."""
+        """Press until the car drives. If the dead-man timer ends a press on a busy machine, press again."""
         began = time.monotonic()
         button.hover()
         while not self.judges[car].driving:
@@ -214,10 +214,10 @@ class ConsoleStage:
                 time.sleep(0.02)
             if not self.judges[car].driving:
                 page.mouse.up()
-                time.sleep(0.7)  # a gateway wants a pause after a stop
+                time.sleep(0.7)  # after a stop, the gateway rejects a stream that does not pause
 
     def report(self, page: Page, act: Callable[[], object]) -> Locator:
-        """Do what stops the cars; the page's report of that stop."""
+        """Stop the cars by an action. Return the page's report of that stop."""
         shown = page.locator("[data-report]")
         before = int(shown.get_attribute("data-report") or 0) if shown.count() else self._reports
         self._reports = before + 1
@@ -225,17 +225,17 @@ class ConsoleStage:
         return page.locator(f"[data-report='{before + 1}']")
 
     def stands(self, car: str = "red", *, since_ns: int | None = None) -> float:
-        """Wait until the car's true motors are off; how long after the moment, s."""
+        """Wait until the car's true motors are off. Return the time from the moment to then, s."""
         return self.judges[car].wait_off(since_ns or time.time_ns(), watched_s=0.6)
 
 
 def numbers(text: str) -> list[float]:
-    """The numbers in a text."""
+    """Return the numbers in a text."""
     return [float(each) for each in re.findall(r"\d+(?:\.\d+)?", text)]
 
 
 def browser_process(before: set[int]) -> psutil.Process:
-    """The main process of the browser that was started since then."""
+    """Return the main process of the browser that is not in `before`."""
     for each in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error):
             words = each.cmdline()
@@ -245,5 +245,5 @@ def browser_process(before: set[int]) -> psutil.Process:
 
 
 def pids() -> set[int]:
-    """All processes below this one."""
+    """Return the ids of this process and of its descendants."""
     return {each.pid for each in psutil.Process().children(recursive=True)} | {os.getpid()}

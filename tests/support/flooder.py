@@ -1,4 +1,4 @@
-"""A client that floods a bus: what, how many a second, for how many seconds. Says how many it sent."""
+"""A client that floods a bus. Arguments: kind, messages per second, seconds. It prints the number of sent messages."""
 
 import contextlib
 import json
@@ -15,16 +15,16 @@ from schemas.topics import Qos
 
 LARGE = 5_000_000
 NAMES = 200
-"""Tokens that come and go have so many: of ever more names a bare process is slow, too, for the hub is."""
+"""Number of names of tokens. With ever more names the hub becomes slow, and so does a process without a gateway."""
 AT_ONCE = 64
-"""Queries on their way: who asks faster than it is answered has at most so many open."""
+"""Maximum number of pending queries."""
 
 
 def _history(opened: bus.Bus) -> Callable[[int], object]:
     replies: list[Any] = []
 
     def ask(_: int) -> None:
-        channel: Any = zenoh.handlers.RingChannel(1)  # nobody reads them
+        channel: Any = zenoh.handlers.RingChannel(1)  # nobody reads the answers
         replies.append(opened._session.get("fleet/red/sensor/*?last=1500;format=json", channel, timeout=5.0))
         del replies[:-AT_ONCE]
 
@@ -40,7 +40,7 @@ def _tokens(opened: bus.Bus, expression: str, names: int) -> Callable[[int], obj
 
 
 def _talkers(opened: bus.Bus) -> Callable[[int], object]:
-    """Gateways that come, say how they are, and go."""
+    """Return a function that declares a gateway's token, publishes a state, and undeclares the token."""
     payload, encoding = pb.Health(platform="arduino").SerializeToString(), messages.encoding_of("fleet.v1.Health")
 
     def say(number: int) -> None:

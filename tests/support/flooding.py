@@ -1,4 +1,4 @@
-"""10,000 drives a second from three operators at one car, and stops among them: shared by tests/e2e and tests/soak."""
+"""Three operators send 10,000 drives a second to one car, and a fourth stops it. Shared by tests/e2e and tests/soak."""
 
 import itertools
 import time
@@ -15,35 +15,35 @@ KINDS: Final = ("person", "script", "coordinator")
 FLOOD: Final = Path(__file__).parents[1] / "e2e" / "flood.py"
 WARM_S: Final = 2.0
 FLIGHT_S: Final = 0.06
-"""docs/reference/protocol.md#pacing: a frame without a block of its own is in flight so long."""
+"""Time for which a frame that blocks nothing is in flight (docs/reference/protocol.md#pacing)."""
 STOPS: Final = (b"$4WD,MODE00#", b"$0,0,0,0,0,0,0,0,0#")
-"""What a stop may begin with."""
+"""The frames with which a stop may begin."""
 
 
 def stops_in(data: bytes) -> bool:
-    """Whether a stop is in what passed at once: the tap may have been late, and a drive before it."""
+    """Return True if the bytes of one read hold a stop. If the tap was late, a drive may precede it."""
     return any(frame in STOPS for frame in frames(data))
 
 
 @dataclass
 class Flooded:
-    """What was seen."""
+    """The measurements of one flood."""
 
     published: int = 0
     frames: list[tuple[int, bytes]] = field(default_factory=list)
-    """What passed the wire, and when (ns since the epoch)."""
+    """Time (ns since the epoch) and bytes of each write to the car."""
     apart_s: list[float] = field(default_factory=list)
-    """The time from each write to the next."""
+    """Time from each write to the next."""
     stopped_s: list[float] = field(default_factory=list)
-    """From each stop's question to its first frame on the wire."""
+    """Time from each request of a stop to its first frame on the wire."""
     drove_on_s: list[float] = field(default_factory=list)
-    """How long after the first stop motors went on again: nobody has let go."""
+    """Times after the first stop at which motors went on: none, because no operator has paused."""
     rss_mb: list[float] = field(default_factory=list)
     left_out: int = 0
 
 
 def flood(fleet: FleetProcesses, *, seconds: float, stops: int) -> Flooded:
-    """Three operators drive one car, each in its own direction every 0.3 ms; a fourth stops it now and then."""
+    """Let three operators drive one car, each in its own direction every 0.3 ms. Let a fourth stop it now and then."""
     judge = Judge.follow(fleet.bus)
     _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
     tap = Tap(link)
@@ -61,7 +61,7 @@ def flood(fleet: FleetProcesses, *, seconds: float, stops: int) -> Flooded:
             time.sleep(max(0.0, first_at + number * seconds / stops - time.monotonic()))
             found.rss_mb.append(gateway.rss_mb())
             if number:
-                fleet.ready()  # a stop that still ran would be joined
+                fleet.ready()  # a request during a stop would only join that stop
             asked_ns = time.time_ns()
             assert fleet.ask("stop", sender="ann", kind="person")["status"] in TAKEN
             on_wire = wait_for(
@@ -83,8 +83,9 @@ def flood(fleet: FleetProcesses, *, seconds: float, stops: int) -> Flooded:
         def told() -> list[int]:
             return [at for at, _, _ in judge.frames if at > began_ns]
 
-        wire = b"".join(data for _, data in found.frames)  # of which two frames may have passed at once
-        wait_for(lambda: len(told()) >= wire.count(b"#"), "what is on the wire is told")  # the answer was faster
+        wire = b"".join(data for _, data in found.frames)  # one read may hold two frames
+        # The answer to a command may arrive before the publications of its frames.
+        wait_for(lambda: len(told()) >= wire.count(b"#"), "what is on the wire is told")
         found.apart_s = [(later - earlier) / 1e9 for earlier, later in itertools.pairwise(told())]
     finally:
         tap.close()

@@ -1,6 +1,7 @@
-"""ForeignCars' cars behind wires with gaps, and what was claimed of them: shared by tests/e2e and tests/soak.
+"""Cars of foreign programs behind wires with gaps, and the claims about them. Shared by tests/e2e and tests/soak.
 
-Each car's own program says what is true (tests/e2e/strangers_car.py). A car stands if its motors are off in mode 0.
+Each car's own program reports the true state (tests/e2e/strangers_car.py). A car stands if its motors are off in mode
+0.
 """
 
 import contextlib
@@ -38,16 +39,16 @@ STANDS_S: Final = 12.0
 SHOWN_S: Final = 40.0
 """Maximum time from a whole link to the evidence, on a busy machine."""
 WATCHED_S: Final = 3.0
-"""A car that stands for so long, with the stop shown, stays."""
+"""Minimum time for which a car must stand after a shown stop."""
 ENTERED_S: Final = 10.0
 """Maximum time until a mode is open, on a busy machine."""
 STOP_BYTES: Final = 13
-"""Of `$4WD,MODE00#`, and one more."""
+"""Length of `$4WD,MODE00#`, and one byte more."""
 LENGTHS_S: Final = (0.3, 0.6, 2.0, 6.0)
 
 
 def gaps(cars: Iterable[str], seed: int) -> dict[str, ByteGap]:
-    """One gap for each car; every length and direction comes up among seven cars."""
+    """Return one gap for each car. Seven cars have every length and direction among them."""
     chance = random.Random(seed)
     cars = list(cars)
     lengths = [LENGTHS_S[each % len(LENGTHS_S)] for each in range(len(cars))]
@@ -63,7 +64,7 @@ def gaps(cars: Iterable[str], seed: int) -> dict[str, ByteGap]:
 
 
 def any_gaps(cars: Iterable[str], seed: int) -> dict[str, ByteGap]:
-    """One gap for each car, of any length and direction; some lose a tenth of the bytes."""
+    """Return one gap for each car, of any length and direction. Some gaps lose a tenth of the bytes."""
     chance = random.Random(seed)
     return {
         car: ByteGap(
@@ -80,7 +81,7 @@ def any_gaps(cars: Iterable[str], seed: int) -> dict[str, ByteGap]:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Somebody says that the car stands, from then until then, s since the epoch."""
+    """A claim that the car stands, with its begin and end, s since the epoch."""
 
     by: str
     since: float
@@ -89,29 +90,29 @@ class Claim:
 
 @dataclass
 class ForeignCar:
-    """One car, its wire, and all that gateways say of it."""
+    """One car, its wire, and all claims of gateways about it."""
 
     mode: str
-    """The mode in which it is stopped; also its name."""
+    """The mode in which the car is stopped. It is also the car's name."""
     process: GatewayProcess
     wire: GapProxy
     truths: list[tuple[float, bool, int]] = field(default_factory=list)
-    """When the motors or the mode changed."""
+    """Time, whether the motors are on, and mode, at each change."""
     read: list[tuple[float, str]] = field(default_factory=list)
-    """The strings that it read."""
+    """Time and text of each string that the car's program has read."""
     heard_until: float = 0.0
     claims: list[tuple[float, str, str, str]] = field(default_factory=list)
-    """state/safety: when, motors, basis, trust."""
+    """Each state/safety: time, motors, basis, trust."""
     records: list[Any] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def follow(self, bus: Bus) -> None:
-        """Begin to listen to what is said of it."""
+        """Subscribe to the claims about the car."""
         bus.subscribe(f"fleet/{self.mode}/state/safety", self._safety)
         bus.subscribe(f"fleet/{self.mode}/event/command", self._record)
 
     def look(self) -> "ForeignCar":
-        """Take what its program has said."""
+        """Take the reports of the car's program."""
         for line in self.process.lines():
             said = json.loads(line)
             self.heard_until = max(self.heard_until, said["t"])
@@ -132,22 +133,22 @@ class ForeignCar:
 
     @property
     def shown(self) -> bool:
-        """True if the newest claim is that it stands, and rests on the car's readings."""
+        """True if the newest claim is that the car stands, with the car's readings as its basis."""
         with self._lock:
             return bool(self.claims) and self.claims[-1][1:3] == ("off", "shown")
 
     def stands_since(self) -> float | None:
-        """Return since when it stands; None if it does not."""
+        """Return the time since which the car stands, None if it does not."""
         self.look()
         return next((at for at, on, mode in self.truths[-1:] if not on and mode == 0), None)
 
     def stays(self, since: float) -> bool:
-        """True if it has been standing for long enough, and after this moment, too."""
+        """Return True if the car has stood for long enough, and also since this moment."""
         at = self.stands_since()
         return at is not None and self.heard_until >= max(at, since) + WATCHED_S
 
     def moving(self) -> list[tuple[float, float]]:
-        """Return from when to when it did not stand."""
+        """Return begin and end of each time in which the car did not stand."""
         self.look()
         found: list[tuple[float, float]] = []
         began = None
@@ -170,7 +171,7 @@ class ForeignCar:
             ]
 
     def claimed(self, since: float) -> list[Claim]:
-        """Return what was claimed after this moment."""
+        """Return the claims after this moment."""
         found: list[Claim] = []
         since_at = None
         with self._lock:
@@ -187,7 +188,7 @@ class ForeignCar:
         return found + [Claim("stop complete", stamp_ns(each) / 1e9, float("inf")) for each in complete]
 
     def false_claims(self, since: float) -> list[str]:
-        """Return the claims that were false for longer than they may be."""
+        """Return the claims that were false for longer than FALSE_S."""
         return [
             f"{self.mode}: {claim.by} at {claim.since - since:.2f} s, but it moved from {begin - since:.2f} "
             f"to {end - since:.2f} s"
@@ -197,18 +198,18 @@ class ForeignCar:
         ]
 
     def late_s(self, whole_at: float) -> float:
-        """Return how long after this moment it moved last, s."""
+        """Return how long after this moment the car moved last, s."""
         return max((end - whole_at for _, end in self.moving()), default=0.0)
 
     def outcome(self, began: float, whole_at: float) -> str:
-        """Return in words how a stop ended: times in s after it was asked."""
+        """Return a text about the end of a stop. Times are s after its request."""
         stood = max((end for _, end in self.moving()), default=began) - began
         last = "; ".join(f"{each.phase} {stamp_ns(each) / 1e9 - began:.1f}" for each in self.stop_records(began))
         shown = next((f"{claim.since - began:.1f}" for claim in self.claimed(began)), "never")
         return f"whole {whole_at - began:.1f}, stands {max(0.0, stood):.1f}, shown {shown}, {last}"
 
     def story(self, since: float) -> str:
-        """Return what happened, in order, s after this moment."""
+        """Return all events in order, with their times in s after this moment."""
         self.look()
         with self._lock:
             told = [(at, f"says    {motors} {basis} {trust}") for at, motors, basis, trust in self.claims]
@@ -244,7 +245,7 @@ def _is_last(record: Any) -> bool:
 
 @dataclass
 class ForeignCars:
-    """Cars of their own programs, each in the mode of its name."""
+    """Cars of foreign programs, each in the mode of its name."""
 
     cars: list[ForeignCar]
 
@@ -254,7 +255,7 @@ class ForeignCars:
     def enter_modes(self, fleet: FleetProcesses | Up) -> None:
         """Bring each car into the mode in which it is to be stopped.
 
-        A gap may have left half a general stop in the car's buffer, in which the first command is lost: ask twice.
+        A gap may have left half a general stop in the car's buffer. That half swallows a command, so send it twice.
         """
         for _ in range(2):
             for car in self.cars:
@@ -270,7 +271,7 @@ class ForeignCars:
         return car.motors if car.mode == "manual" else car.true_mode == MODES[car.mode]
 
     def run(self, seconds: float) -> None:
-        """Let them go on for so long, by their own clocks."""
+        """Let the cars run for this time, by their own clocks."""
         ends = {car.mode: car.look().heard_until + seconds for car in self.cars}
         for car in self.cars:
             wait_for(lambda car=car: car.look().heard_until >= ends[car.mode], f"{car.mode} goes on")
@@ -324,7 +325,7 @@ class ForeignLot:
 
 
 def stop_all(lot: ForeignLot, wanted: dict[str, ByteGap], *, pause_s: float = 1.0, busy_s: float = BUSY_S) -> list[str]:
-    """Stop all cars with `fleet stop`, so long after they are in their modes. Return what was wrong."""
+    """Stop all cars with `fleet stop`, `pause_s` after they are in their modes. Return the faults."""
     lot.cars.enter_modes(lot.fleet)
     lot.cars.run(pause_s)
     lot.cars.arm(wanted)
@@ -341,7 +342,7 @@ def stop_all(lot: ForeignLot, wanted: dict[str, ByteGap], *, pause_s: float = 1.
 
 
 def judge(cars: ForeignCars, wanted: dict[str, ByteGap], began: float, busy_s: float) -> list[str]:
-    """Wait until each car stands and has shown it. Return what was wrong meanwhile, each with its story."""
+    """Wait until each car stands and its stop is shown. Return the faults until then, each with its story."""
     found: list[str] = []
     for car in cars:
         whole_at = wait_for(lambda car=car: car.wire.whole_at, f"a frame is written to {car.mode}")
@@ -357,7 +358,7 @@ def judge(cars: ForeignCars, wanted: dict[str, ByteGap], began: float, busy_s: f
 
 
 def verdict(car: ForeignCar, began: float, whole_at: float, busy_s: float) -> list[str]:
-    """Return what was wrong with one car after a stop."""
+    """Return the faults of one car after a stop."""
     wrong = car.false_claims(began)
     if (late_s := car.late_s(max(began, whole_at))) > STANDS_S + busy_s:
         wrong.append(f"{car.mode}: moved until {late_s:.1f} s after the wire was whole")
@@ -365,5 +366,5 @@ def verdict(car: ForeignCar, began: float, whole_at: float, busy_s: float) -> li
 
 
 def report(car: ForeignCar, gap: ByteGap, began: float, wrong: list[str]) -> list[str]:
-    """Return one text of what was wrong, with the story."""
+    """Return one text about the faults of a car, with its story."""
     return ["\n".join([*wrong, f"({gap})", car.story(began)])] if wrong else []

@@ -1,4 +1,4 @@
-"""A TCP wire between a gateway and its car that swallows bytes around a stop: from any byte on, in any direction."""
+"""A TCP proxy between a gateway and its car that loses bytes around a stop: from any byte on, in any direction."""
 
 import contextlib
 import random
@@ -44,7 +44,7 @@ class _Flow:
 
     name: GapDirection
     passed: list[tuple[float, bytes, bytes]] = field(default_factory=list)
-    """Time, bytes that came, bytes that went on."""
+    """Time, received bytes, and passed bytes."""
     last_at: float = 0.0
 
 
@@ -66,7 +66,7 @@ class GapProxy:
         self._thread.start()
 
     def arm(self, gap: ByteGap) -> None:
-        """Begin this gap at the gateway's next byte."""
+        """Begin this gap with the gateway's next byte."""
         with self._lock:
             self._count, self._until, self._chance = 0, float("inf"), random.Random(gap.seed)
             self._gap = gap
@@ -78,15 +78,15 @@ class GapProxy:
 
     @property
     def whole_at(self) -> float | None:
-        """When the wire passes everything again, s since the epoch; None while that is not known."""
+        """Return the time since which the proxy passes everything again, s since the epoch; None before."""
         return None if self._until == float("inf") else self._until
 
     def frames(self, since: float) -> list[tuple[float, bytes, bytes]]:
-        """What the gateway wrote: when, what, and what of it arrived."""
+        """Return the gateway's writes: time, bytes, and the bytes that arrived."""
         return [each for each in self.to_car.passed if each[0] >= since]
 
     def close(self) -> None:
-        """Hang up and end."""
+        """Close all connections and end."""
         self._closing = True
         self._thread.join()
         self._listener.close()
@@ -105,7 +105,7 @@ class GapProxy:
         return hit and self._chance.random() < gap.share
 
     def _filter(self, flow: _Flow, data: bytes) -> bytes:
-        """Return what of it goes on; each byte has its own time, as on a UART."""
+        """Return the bytes that the proxy passes. Each byte has its own time, as on a UART."""
         now, kept = time.time(), bytearray()
         with self._lock:
             for byte in data:

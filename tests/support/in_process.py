@@ -1,4 +1,4 @@
-"""`fleet` in the process of the test: the whole command but its start, which costs half a second of a processor."""
+"""Runs `fleet` in the process of the test, because the start of a process takes half a second of CPU time."""
 
 import contextlib
 import io
@@ -12,7 +12,7 @@ from tests.support.message_length import too_long
 
 
 def fleet(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run the command; return its exit code and its words. What would be a traceback is raised."""
+    """Run the command. Return its exit code, stdout and stderr. Raise an error that would print a traceback."""
     words = ["fleet", *map(str, arguments)]
     out, err = io.StringIO(), io.StringIO()
     with (

@@ -1,6 +1,6 @@
-"""Who says what was so: a simulated car's truth with its times, and what a gateway wrote to its car, with theirs.
+"""Records a simulated car's truth and the frames that a gateway wrote to the car, with their times.
 
-Times are ns since the epoch, as the publishers stamped them; all processes of a test share one clock.
+Times are the publishers' stamps, ns since the epoch. All processes of a test share one clock.
 """
 
 import threading
@@ -12,33 +12,33 @@ from tests.support.processes import wait_for
 
 
 def stamp_ns(message: Any) -> int:
-    """When a message was made."""
+    """Return the time at which a message was made."""
     return int(message.stamp.seconds * 1_000_000_000 + message.stamp.nanos)
 
 
 @dataclass
 class Judge:
-    """The motors of one simulated car and the frames that were written to it. `follow` it before anything happens."""
+    """The motors of one simulated car and the frames to it. Call `follow` before the first command."""
 
     car: str
     motors: list[tuple[int, bool]] = field(default_factory=list)
-    """When they went on or off, first the oldest."""
+    """Times at which the motors went on or off, the oldest first."""
     moved: list[tuple[int, float, float]] = field(default_factory=list)
-    """Where the car was, whenever that was another place."""
+    """Time and place, at each change of the place."""
     frames: list[tuple[int, str, bytes]] = field(default_factory=list)
-    """When, why, and what."""
+    """Time, origin and bytes of each frame."""
     modes: list[tuple[int, str]] = field(default_factory=list)
     opened: list[int] = field(default_factory=list)
-    """When a gateway had opened its link."""
+    """Times at which a gateway had opened its link."""
     motors_said: list[tuple[int, str]] = field(default_factory=list)
-    """What gateways say of the motors, whenever they say it."""
+    """Time and value of each claim about the motors."""
     heard_ns: int = 0
-    """The newest truth."""
+    """Time of the newest truth."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
     def follow(cls, bus: Bus, car: str = "red") -> "Judge":
-        """Begin to watch."""
+        """Subscribe to the truth, the frames and the states of a car."""
         judge = cls(car)
         bus.subscribe(f"fleet/{car}/sim/truth", judge._truth)
         bus.subscribe(f"fleet/{car}/frame/tx", judge._frame)
@@ -48,11 +48,11 @@ class Judge:
 
     @property
     def driving(self) -> bool:
-        """Whether the motors are on, as last heard."""
+        """True if the motors are on by the newest truth."""
         return bool(self.motors) and self.motors[-1][1]
 
     def wait_off(self, moment_ns: int, *, watched_s: float) -> float:
-        """Wait until the motors were off for so long; how long after a moment they went off, s, 0 if before it."""
+        """Wait until the motors were off for `watched_s`. Return how long after the moment they went off, s, or 0."""
 
         def off() -> bool:
             with self._lock:
@@ -65,17 +65,17 @@ class Judge:
             return max(0.0, (self.motors[-1][0] - moment_ns) / 1e9)
 
     def on_after(self, moment_ns: int) -> list[float]:
-        """The times after a moment, s, at which motors went on."""
+        """Return the times after a moment, s, at which motors went on."""
         with self._lock:
             return [(at - moment_ns) / 1e9 for at, on in self.motors if on and at > moment_ns]
 
     def written_after(self, moment_ns: int) -> list[tuple[float, bytes]]:
-        """The frames written after a moment: s after it, and what."""
+        """Return the frames written after a moment, with their times in s after it."""
         with self._lock:
             return [((at - moment_ns) / 1e9, data) for at, _, data in self.frames if at >= moment_ns]
 
     def said_after(self, moment_ns: int) -> list[str]:
-        """What was said of the motors after a moment."""
+        """Return the claims about the motors after a moment."""
         with self._lock:
             return [motors for at, motors in self.motors_said if at >= moment_ns]
 

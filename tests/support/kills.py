@@ -1,6 +1,6 @@
-"""Processes that are killed while a car drives, and how long the car went on: shared by tests/e2e and tests/soak.
+"""Kills processes while a car drives, and measures how long the car went on. Shared by tests/e2e and tests/soak.
 
-Nothing is judged here: each function says what was measured and what is allowed.
+Each function returns measured times and their limits. The callers judge them.
 """
 
 import os
@@ -16,28 +16,28 @@ from tests.support.processes import TAKEN, FleetProcesses, GatewayProcess, wait_
 from tests.support.tap import Tap
 
 BUSY_S: Final = 4.0 if scheduling.SUITES in os.environ else 2.0
-"""What a machine that runs other tests may add to a time: it may stand for a second, and then be slow.
+"""Time that a machine with other tests may add to a measured time: it may stall for a second, and then be slow.
 
-`make stress` pauses cars, too. Such a car may show a stop only after the next full stop. The soak, which runs alone,
-allows nothing.
+`make stress` pauses cars, too. Such a car may show a stop only after the next full stop. The soak runs alone and adds
+nothing.
 """
 BEGINS_S: Final = 0.1
-"""From a link that is open to the first byte of a recovery: at once."""
+"""Maximum time from an open link to the first byte of a recovery."""
 WATCHED_S: Final = 2.5
-"""Motors that are off for so long stay off: the longest block after a stop that is not obstacle avoidance is over."""
+"""Time after which motors that are off stay off. It covers the longest block outside obstacle avoidance."""
 OPERATOR: Final = Path(__file__).parents[1] / "e2e" / "operator_that_dies.py"
 
 
 @dataclass(frozen=True, slots=True)
 class Took:
-    """How long a car went on, s, and how long it may."""
+    """The time for which a car went on, s, and its limit."""
 
     took_s: float
     limit_s: float
 
     @property
     def late(self) -> bool:
-        """Whether it went on for too long."""
+        """True if the car went on for too long."""
         return self.took_s > self.limit_s
 
     def __str__(self) -> str:
@@ -50,7 +50,7 @@ WHISTLE: Final = ("whistle", "{}")
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """One that drives and is killed. `block_s`: what may block the car then."""
+    """A process that drives a car and is killed. `block_s`: the longest block of the car at that time."""
 
     car: str
     platform: str
@@ -65,7 +65,7 @@ class Operator:
         return f"{self.platform}, {self.how} of {self.duration_s:g} s, {'token' if self.watched else 'no token'}{also}"
 
     def start(self, fleet: FleetProcesses) -> GatewayProcess:
-        """Begin to drive."""
+        """Start the process that drives."""
         if self.how == "fleet drive":
             return fleet.start("-m", "fleet.cli", "drive", self.car, "forward", "--for", f"{self.duration_s:g}s")
         watched = "token" if self.watched else "-"
@@ -73,19 +73,19 @@ class Operator:
 
     @property
     def limit_s(self) -> float:
-        """From the kill: its time to live, or 1 s where its token tells sooner, the block, and 0.3 s."""
+        """Maximum time from the kill: the drive's time to live, or 1 s if the token ends sooner; the block; 0.3 s."""
         told_s = min(self.duration_s, 1.0) if self.watched else self.duration_s
         return told_s + self.block_s + 0.3
 
 
 OPERATORS: Final = (
-    # Driven by a stream, whose last drive holds for its time to live.
+    # A stream drives the car. Its last drive lasts for its time to live.
     Operator("a", "arduino", "stream", watched=False, duration_s=0.5),
     Operator("b", "raspberry_pi", "stream", watched=True, duration_s=10.0),
     # Front servo 0.65 s, whistle 0.3 s (docs/reference/protocol.md#blocking-times).
     Operator("c", "arduino", "stream", watched=False, duration_s=0.5, also=SERVO, block_s=0.65),
     Operator("d", "arduino", "stream", watched=True, duration_s=10.0, also=WHISTLE, block_s=0.3),
-    # Driven by one command; the command line's.
+    # One command of the command line drives the car.
     Operator("e", "arduino", "command", watched=False, duration_s=1.5),
     Operator("f", "stm32", "fleet drive", watched=True, duration_s=10.0),
 )
@@ -94,7 +94,7 @@ OPERATORS: Final = (
 def kill_operators(
     fleet: FleetProcesses, operators: tuple[Operator, ...] = OPERATORS, world: str = "room"
 ) -> dict[str, Took]:
-    """All at once, each with a car of its own: how long each car went on after its operator's death."""
+    """Kill all operators, each of which drives its own car. Return how long each car went on."""
     judges = {each.car: Judge.follow(fleet.bus, each.car) for each in operators}
     _, links = fleet.simulate(*(f"{each.car}:{each.platform}:tcp" for each in operators), truth=True, world=world)
     for each, link in zip(operators, links, strict=True):
@@ -103,7 +103,7 @@ def kill_operators(
         fleet.ready(each.car)
     started = {each: each.start(fleet) for each in operators}
     killed: dict[Operator, int] = {}
-    # First those whose drive ends by itself; on a machine that stands it may be over nevertheless.
+    # Kill first the operators whose drive ends by itself. On a machine that stalls, the drive may be over before.
     for each, process in sorted(started.items(), key=lambda one: one[0].how != "command"):
         if each.also or each.how == "command":
             assert process.line()["status"] in TAKEN, each
@@ -119,14 +119,14 @@ def kill_operators(
 
 @dataclass(frozen=True, slots=True)
 class Doing:
-    """What a car does when its gateway is killed, and the time of the recovery (docs/reference/protocol.md#stops)."""
+    """The state of a car whose gateway is killed, and the time of the recovery (docs/reference/protocol.md#stops)."""
 
     car: str
     what: str
     limit_s: float
 
     def begin(self, fleet: FleetProcesses, judge: Judge) -> None:
-        """Bring the car to it."""
+        """Bring the car to this state."""
         if self.what.startswith("driving"):
             fleet.ask("drive", self.car, motion="forward", duration_s=10)
             wait_for(lambda: judge.driving, f"{self.car} drives")
@@ -148,7 +148,7 @@ MODE_DIGITS: Final = {
     "light_seeking": 5,
     "following": 6,
 }
-# Recovery (docs/reference/protocol.md#stops): idle 0.06 s, and a report under way takes 0.04 s; else the rest of the
+# Recovery (docs/reference/protocol.md#stops): idle 0.06 s, and a report in transit takes 0.04 s. Else the rest of the
 # block; in theory 7.3 s outside avoidance, which blocks 4.3 s.
 DOINGS: Final = (
     Doing("a", "driving", 0.1),
@@ -166,7 +166,7 @@ MORE_DOINGS: Final = (
 
 
 def kill_gateways(fleet: FleetProcesses, doings: tuple[Doing, ...] = DOINGS) -> dict[str, Took]:
-    """Kill every car's gateway, then start new ones: how soon each begins, and how long the car goes on from there."""
+    """Kill every gateway and start new ones. Return how soon each begins, and how long its car goes on from there."""
     judges = {each.car: Judge.follow(fleet.bus, each.car) for each in doings}
     _, links = fleet.simulate(*(f"{each.car}:arduino:pty" for each in doings), truth=True)
     where = dict(zip(judges, links, strict=True))
@@ -182,7 +182,7 @@ def kill_gateways(fleet: FleetProcesses, doings: tuple[Doing, ...] = DOINGS) -> 
     for car, link in where.items():
         fleet.gateway(link, car=car)
     for car, judge in judges.items():
-        # The first that it says: its recovery may be over before the slowest of these is there.
+        # The first state of the new gateway: it may recover its car before the slowest gateway has started.
         said = wait_for(lambda judge=judge: judge.said_after(killed_ns), f"{car} is served again")
         assert said[0] == "unknown", car
     found = {}
@@ -203,7 +203,7 @@ def kill_gateways(fleet: FleetProcesses, doings: tuple[Doing, ...] = DOINGS) -> 
 
 
 def cut_links(fleet: FleetProcesses, directory: Path) -> dict[str, Took]:
-    """Cut the links of cars that drive, in three ways, then bring them back: as kill_gateways."""
+    """Cut the links of driving cars in three ways, and restore them. Return the times as `kill_gateways` does."""
     cuts = {"a": "pty closed", "b": "tcp reset", "c": "tcp stuck"}
     judges = {car: Judge.follow(fleet.bus, car) for car in cuts}
     sim, links = fleet.simulate(f"a:arduino:pty:{directory / 'tty'}", "b:arduino:tcp", "c:arduino:tcp", truth=True)
@@ -234,7 +234,7 @@ def cut_links(fleet: FleetProcesses, directory: Path) -> dict[str, Took]:
                 lambda judge=judge: next((at for at, data in judge.written_after(back_ns) if data == b"#"), None),
                 f"{car} is recovered",
             )
-            found[f"{cut}: begins"] = Took(first_s, 1.1)  # a report a second, or a try a second
+            found[f"{cut}: begins"] = Took(first_s, 1.1)  # one report a second, or one retry a second
             first_ns = back_ns + int(first_s * 1e9)
             found[f"{cut}: stands"] = Took(judge.wait_off(first_ns, watched_s=5.0), 0.1)
             fleet.ready(car)
@@ -255,11 +255,11 @@ STOPPED: Final = {
     "following": "stm32",
     "raspberry_pi": "raspberry_pi",
 }
-"""A car for each mode, and one that knows only mode 0."""
+"""Platform by mode: one car for each mode, and one whose program has only mode 0."""
 
 
 def stop_in_every_mode(fleet: FleetProcesses, rounds: int, moments: random.Random) -> dict[str, list[Took]]:
-    """Ask `stop` at random moments, in each mode: how long the motors went on, and what the answer had announced."""
+    """Send `stop` at random moments in each mode. Return how long the motors went on, and the announced worst case."""
     cars = {what: f"car{number}" for number, what in enumerate(STOPPED)}
     judges = {what: Judge.follow(fleet.bus, car) for what, car in cars.items()}
     specs = (f"{car}:{STOPPED[what]}:tcp" for what, car in cars.items())
@@ -278,7 +278,7 @@ def stop_in_every_mode(fleet: FleetProcesses, rounds: int, moments: random.Rando
             else:
                 fleet.ask("drive", cars[what], motion="forward", duration_s=10)
                 wait_for(lambda judge=judge: judge.driving, f"{what} drives")
-        time.sleep(3.6 + moments.random())  # whatever was opened has opened
+        time.sleep(3.6 + moments.random())  # the longest opening of a mode is over
         asked = {}
         for what, car in cars.items():
             at_ns = time.time_ns()

@@ -1,4 +1,4 @@
-"""What a recording must hold whoever is killed meanwhile, at random moments and under load."""
+"""Kills the hub or the recorder at random moments under load, and checks that the recording is complete."""
 
 import random
 import time
@@ -17,11 +17,11 @@ from tests.support.recording import RATE_HZ, Load, Recording, faults, kill_hub, 
 
 SECOND_S = 1.0
 LONGEST_S = 4.0
-"""Until a recorder is killed; at once, it may have nothing but a name."""
+"""Maximum time until a recorder is killed. A recorder that is killed at once has only a session's name."""
 SLACK_S = 0.75
-"""What a flush that is due may be late."""
+"""Maximum delay of a flush."""
 GATHER_S = 0.25
-"""From when it says that it records until all publishers know of it."""
+"""Time from the recorder's first line until all publishers have its subscription."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +30,15 @@ class Told:
 
     published: int
     recovered: int
-    """Missed at first and had again."""
+    """Number of messages that were missed at first and backfilled."""
     missing_s: tuple[float, ...] = ()
-    """Of each session that was cut off: how long before the kill it ends."""
+    """Time from the end of each interrupted session to the kill."""
 
 
 def hub_killed(
     fleet: FleetProcesses, out: Path, *, cars: int, times: int, chance: random.Random, rate_hz: float = RATE_HZ
 ) -> Told:
-    """Kill the hub so often: nothing is lost, nothing is there twice, and nothing is said to be."""
+    """Kill the hub `times` times. Check that no message is lost or recorded twice, nor reported as such."""
     recording = Recording(fleet, out)
     with Load(fleet.endpoint, cars, rate_hz) as load:
         wait_for(lambda: load.count() > 4 * cars, "a load")
@@ -55,25 +55,25 @@ def hub_killed(
 
 
 def fleet_back(fleet: FleetProcesses, cars: int) -> None:
-    """Wait until every publisher is back at the hub: who answers holds what the recorder still asks for."""
+    """Wait until every publisher is back at the hub, so that each can answer the recorder's backfill."""
 
     def answering() -> int:
         try:
             return len({str(sample.key_expr) for sample in fleet.bus.recall("fleet/*/sensor/line", 1.0)})
-        except BusError:  # nobody has started the next hub yet, or it does not answer yet
+        except BusError:  # there is no new hub yet, or it does not answer yet
             return 0
 
     wait_for(lambda: answering() == cars, "all back")
-    time.sleep(2 * SECOND_S)  # the recorder asks for the last time some seconds after a hub is back
+    time.sleep(2 * SECOND_S)  # the recorder sends its last backfill query some seconds after a hub is back
 
 
 def all_there(load: Load, sessions: list[Path]) -> None:
-    """Wait until the sessions hold all that a load published: a recorder at its end waits only for a moment."""
+    """Wait until the sessions hold all messages of a load. At its own end, a recorder waits only for a moment."""
     wait_for(lambda: not faults(load, sessions)[0], "all that was published is recorded")
 
 
 def ends_whole(fleet: FleetProcesses, load: Load, cars: int, recording: Recording, sessions: list[Path]) -> None:
-    """End a load, and then its recording: nothing is lost, nothing is there twice, and nothing is said to be."""
+    """End a load and its recording. Check that no message is lost or recorded twice, nor reported as such."""
     fleet_back(fleet, cars)
     load.rest()
     all_there(load, sessions)
@@ -85,9 +85,9 @@ def ends_whole(fleet: FleetProcesses, load: Load, cars: int, recording: Recordin
 def recorder_killed(
     fleet: FleetProcesses, out: Path, *, cars: int, times: int, chance: random.Random, slack_s: float = SLACK_S
 ) -> Told:
-    """Kill the recorder so often, each time starting the next.
+    """Kill the recorder `times` times, and start the next one each time.
 
-    Each session lacks what was published in the second before its kill at most, and says so; the next one has it.
+    A session lacks at most the messages of the second before the kill. It reports them, and the next session has them.
     """
     recording = Recording(fleet, out)
     sessions, recording_ns, killed_ns = [recording.session], [time.time_ns()], []
@@ -109,8 +109,8 @@ def recorder_killed(
         assert not verdict.whole
         assert "it crashed" in verdict.ended, words
         assert (verdict.twice, verdict.missed, verdict.dropped) == ([], {}, {}), words
-        # Everything from its beginning until then is here. Of what it had again from before it may lack some, if it
-        # was killed meanwhile: that, verify says exactly.
+        # The session has every message from its start to the kill. Backfilled messages from before its start may be
+        # missing, if the kill interrupted the backfill. `verify` names exactly these.
         have = numbers([path])
         said = {(one["key"], number) for one in verdict.missing for number in range(one["first"], one["last"] + 1)}
         assert said == {
@@ -126,7 +126,7 @@ def recorder_killed(
             lacks = [each for each, sent_ns in enumerate(sent, 1) if begun_ns < sent_ns < at_ns and each not in there]
             assert all(each > max(there, default=0) for each in lacks), (key, path)
             lacking_ns += [sent[each - 1] for each in lacks]
-        # By what was published, not by the last that is there: who publishes may have been held up, too.
+        # Compare with the published messages, not with the last recorded one: a publisher may have stalled, too.
         missing_s.append((at_ns - min(lacking_ns)) / 1e9)
         assert missing_s[-1] < SECOND_S + slack_s
         recovered = path.with_name(path.name + "-recovered")
@@ -134,7 +134,7 @@ def recorder_killed(
             rescued, _ = recover(session, recovered)
             assert rescued == verdict.messages
             assert not verify(Session(recovered)).damage
-        else:  # its first second was not over yet
+        else:  # the session's first second was not over
             with pytest.raises(NoSession):
                 recover(session, recovered)
         following = Session(sessions[number + 1]).description

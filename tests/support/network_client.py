@@ -32,7 +32,7 @@ class _OneThreadAtATime(ssl.SSLSocket):
 
     def recv(self, buflen: int = 1024, flags: int = 0) -> bytes:
         while True:
-            with self._used:  # not while it waits: what came may be of TLS alone
+            with self._used:  # hold no lock while waiting: the received bytes may belong to TLS only
                 self.setblocking(False)
                 try:
                     return super().recv(buflen, flags)
@@ -48,7 +48,7 @@ class _OneThreadAtATime(ssl.SSLSocket):
 
 
 def untrusting() -> ssl.SSLContext:
-    """TLS that takes the console's own certificate."""
+    """Return a TLS context that accepts any certificate, such as the console's own."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.sslsocket_class = _OneThreadAtATime
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
@@ -56,7 +56,7 @@ def untrusting() -> ssl.SSLContext:
 
 
 class NetworkDevice:
-    """A browser without a face. `127.0.0.1` is an address of the network's port like any other."""
+    """A client of the console's network port, as a phone is. It connects to `127.0.0.1`."""
 
     def __init__(self, port: int, host: str = "127.0.0.1", source: str | None = None) -> None:
         self.host, self.port = host, port
@@ -65,17 +65,17 @@ class NetworkDevice:
         self.cookie = ""
 
     def connection(self) -> http.client.HTTPSConnection:
-        """A connection for several requests."""
+        """Return a connection for several requests."""
         return http.client.HTTPSConnection(
             self.host, self.port, timeout=30, context=untrusting(), source_address=self._source
         )
 
     def ask(self, verb: str, path: str, body: str | None = None, **headers: str) -> tuple[int, bytes]:
-        """Ask the console; its status and its text. A new cookie is kept. A header without value is left out."""
+        """Send a request; return status and text. Store a new cookie. Leave out a header without value."""
         connection = self.connection()
         sent = {"Origin": self.origin, "Cookie": self.cookie} | headers
         connection.connect()
-        with contextlib.suppress(ConnectionError, ssl.SSLEOFError):  # it refuses a large body before its end
+        with contextlib.suppress(ConnectionError, ssl.SSLEOFError):  # the console rejects a large body before its end
             connection.request(verb, path, body=body, headers={name: value for name, value in sent.items() if value})
         response = connection.getresponse()
         if (cookie := response.getheader("set-cookie")) is not None:
@@ -86,7 +86,7 @@ class NetworkDevice:
         return found
 
     def pair(self, code: str) -> Any:
-        """Pair with a code; the answer."""
+        """Pair with a code; return the answer."""
         return json.loads(self.ask("POST", "/pair", code)[1])
 
     def socket(self, **headers: str) -> ClientConnection:
@@ -105,17 +105,17 @@ class NetworkDevice:
 
 
 def network_port(console: ConsoleProcess) -> int:
-    """The port of a console with `--lan`."""
+    """Return the network port of a console with `--lan`."""
     return int(find_line(console, r"On the network: https://.*:(\d+)"))
 
 
 def first_code(console: ConsoleProcess) -> str:
-    """The pairing code that it printed."""
+    """Return the pairing code that the console printed."""
     return find_line(console, r"type (\w{4}-\w{4})$")
 
 
 def find_line(console: ConsoleProcess, pattern: str) -> str:
-    """What a line that the console prints has at this place."""
+    """Return the first group of the pattern in a line that the console printed."""
 
     def found() -> str | None:
         console.lines.extend(console.process.lines())

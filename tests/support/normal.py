@@ -1,4 +1,4 @@
-"""Normal running of a car for hours of virtual time, and every alarm that was raised meanwhile: each is a false one."""
+"""Runs a car normally for hours of virtual time, and collects all alarms. Each of them is false."""
 
 import random
 from collections.abc import Callable
@@ -14,9 +14,9 @@ from tests.support.truth import WORLDS
 from tests.support.virtual import Pair
 
 LOOK_S = 0.2
-"""How often a gateway looks at its states."""
+"""Interval at which a gateway checks its states."""
 SETTLED_S = 2.5
-"""What is written sooner after a mode was left may be lost in the block of closing it: no alarm is false then."""
+"""Time after the end of a mode in which its closing block may lose frames. Alarms in that time are not false."""
 ALARMS = frozenset(
     {
         "mode_contradicted",
@@ -29,12 +29,12 @@ ALARMS = frozenset(
     }
 )
 EXPECTED = frozenset({Reason.SUPERSEDED, Reason.EXPIRED, Reason.QUEUE_FULL, Reason.UNSUPPORTED, Reason.WRONG_MODE})
-"""What may become of a command without anything being wrong."""
+"""Reasons for the end of a command that are no alarm."""
 MOTIONS = tuple(motion for motion in Motion if motion is not Motion.STOP)
 
 
 class NormalRun:
-    """One car that nothing happens to, its link watched as a gateway watches it."""
+    """One car without faults, whose link is checked as a gateway checks it."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class NormalRun:
         transport: Transport = Transport.SERIAL,
     ) -> None:
         self.world = world
-        # Whether the fan runs is not known of an unknown platform that is silent, so each of its stops gives up.
+        # A silent car of an unknown platform may have its fan on, so each of its stops would give up.
         self.acts = tuple(act for act in MANUAL if act is not _fan or told != "unknown")
         self.moments = random.Random(seed)
         self.pair = Pair(platform, seed=seed, world=WORLDS[world](), told=told, transport=transport, start_s=2.0)
@@ -66,14 +66,14 @@ class NormalRun:
         self.pair.logs.clear()
 
     def run(self, seconds: float) -> None:
-        """Let time pass, and look."""
+        """Let time pass, and check the states."""
         end = self.pair.now + seconds
         while self.pair.now < end:
             self.pair.run(min(LOOK_S, max(end - self.pair.now, 1e-3)))
             self.look()
 
     def look(self) -> None:
-        """Note what is wrong."""
+        """Note the alarms."""
         pair, mode = self.pair, self.pair.control.model.mode
         self.health.update(
             now=pair.now,
@@ -98,13 +98,13 @@ class NormalRun:
         del pair.sent[:-6]
 
     def ask(self, what: Action) -> None:
-        """Give a command."""
+        """Send a command."""
         self.commands += 1
         self.pair.ask(what, verb=type(what).__name__)
         self.look()
 
     def go(self, mode: Mode) -> None:
-        """Bring the car to a mode and see it there."""
+        """Bring the car to a mode, and wait until its true mode is this one."""
         self.ask(SetMode(mode))
         end = self.pair.now + 20.0
         while self.pair.car.truth.mode is not mode:
@@ -124,7 +124,7 @@ def _drives(run: NormalRun) -> None:
 
 
 def _joystick(run: NormalRun) -> None:
-    """A drive every 0.1 s, the motion now and then another."""
+    """Send a drive every 0.1 s, now and then with another motion."""
     motion = Motion.FORWARD
     for _ in range(run.moments.randint(5, 80)):
         if run.moments.random() < 0.2:
@@ -134,7 +134,7 @@ def _joystick(run: NormalRun) -> None:
 
 
 def _acts(run: NormalRun) -> None:
-    """One-shots of each kind, as fast as the queue takes them or slower."""
+    """Send one-shots of each kind, as fast as the queue takes them or slower."""
     one_shots: tuple[Action, ...] = (
         OneShot(General(Motion.STOP, whistle=True)),
         OneShot(Ptz(run.moments.randint(0, 180))),
@@ -150,14 +150,14 @@ def _acts(run: NormalRun) -> None:
 
 
 def _whistles(run: NormalRun) -> None:
-    """Whistles without a pause for half a minute: the loop of the car hardly turns."""
+    """Whistle without a pause for half a minute, so that the car's loop hardly runs."""
     for _ in range(80):
         run.ask(OneShot(General(Motion.STOP, whistle=True)))
         run.run(0.36)
 
 
 def _fan(run: NormalRun) -> None:
-    """The fan on for a while, in mode 0 and perhaps into a mode and back."""
+    """Switch the fan on for a while in mode 0, and perhaps go to a mode and back meanwhile."""
     run.ask(Fan())
     run.run(1.5 + 40.0 * run.moments.random())
     if run.moments.random() < 0.3:
@@ -177,7 +177,7 @@ MANUAL: tuple[Callable[[NormalRun], None], ...] = (_drives, _joystick, _acts, _w
 
 
 def normal(run: NormalRun, mode: Mode, seconds: float) -> None:
-    """The car lives in a mode, and comes back to mode 0 now and then for what only works there."""
+    """Run the car in a mode, and now and then in mode 0 for commands that only work there."""
     end = run.pair.now + seconds
     for_ever = mode is Mode.OBSTACLE_AVOIDANCE and run.world == "no-echo"  # docs/reference/protocol.md#blocking-times
     while run.pair.now < end:

@@ -1,4 +1,4 @@
-"""Endpoints that nobody else uses: every test that opens Zenoh has one of its own."""
+"""Endpoints for tests: every test that opens Zenoh has one of its own."""
 
 import contextlib
 import os
@@ -10,8 +10,9 @@ from itertools import chain
 from tests.support.scheduling import SUITE, SUITES
 
 FIRST, LAST = 10_000, 15_999
-"""Below those that a system gives to whoever does not name one: until a hub listens seconds may pass, and a port that
-was only looked at was given to somebody else meanwhile, in one run of the whole suite out of ten."""
+"""First and last port. They are below the ports that a system assigns by itself.
+
+A hub may take seconds to listen. In one of ten runs, the system gave a probed port to another process meanwhile."""
 
 
 def ports_of(worker: int, workers: int, suite: int = 0, suites: int = 1) -> range:
@@ -20,7 +21,7 @@ def ports_of(worker: int, workers: int, suite: int = 0, suites: int = 1) -> rang
 
 
 def _turn() -> Iterator[int]:
-    """The ports of this worker, over and over; another run on this machine begins elsewhere."""
+    """Yield the ports of this worker in a circle. Each run on a machine begins at a random one."""
     worker, workers = os.environ.get("PYTEST_XDIST_WORKER", "gw0"), os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")
     suite, suites = os.environ.get(SUITE, "0"), os.environ.get(SUITES, "1")
     mine = ports_of(int(worker.removeprefix("gw")), int(workers), int(suite), int(suites))
@@ -33,14 +34,14 @@ _ports = _turn()
 
 
 def free_port() -> int:
-    """A port of loopback that was free a moment ago, and that no other test of this run is given."""
+    """Return a port of loopback that is free and that no other test of this run gets."""
     while True:
         port = next(_ports)
-        with socket.socket() as probe, contextlib.suppress(OSError):  # it is taken
+        with socket.socket() as probe, contextlib.suppress(OSError):  # a process listens there
             probe.bind(("127.0.0.1", port))
             return port
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint with such a port."""
+    """Return a loopback endpoint with a port of `free_port`."""
     return f"tcp/127.0.0.1:{free_port()}"

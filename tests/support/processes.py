@@ -1,4 +1,4 @@
-"""A fleet of real processes for one test: hub, simulated cars, gateways; everything that was started is ended."""
+"""A fleet of real processes for one test: hub, simulated cars, gateways. `close` ends all of them."""
 
 import contextlib
 import json
@@ -20,26 +20,26 @@ import psutil
 from schemas import bus, messages
 
 PATIENCE_S = 40.0
-"""The machine may be busy with other tests; nothing here is waited for longer than it takes."""
+"""Timeout of each wait, long enough for a machine that is busy with other tests."""
 
 TAKEN = ("sent", "queued")
-"""Of a command that is carried out; queued: another frame was in flight."""
+"""Statuses of an accepted command. `queued`: another frame was in flight."""
 
 LONG_S = 60.0
-"""A drive that is still on when the next process has been started, and has asked for something."""
+"""Duration of a drive that goes on until a process that starts later has sent its command."""
 
 
 SHORTEST_POLL_S = 0.01
 LONGEST_POLL_S = 0.05
 POLL_SHARE = 0.05
-"""Interval of the questions while something is waited for, as a share of the time that was waited so far.
+"""Poll interval of a wait, as a share of the time that has passed.
 
-A question is a query of the bus: a hundred a second, of each of four workers, took half of two processors.
+A poll may be a query of the bus. With four workers, a hundred polls a second took half of two processors.
 """
 
 
 def wait_for(so: Callable[..., Any], what: str, seconds: float = PATIENCE_S) -> Any:
-    """Ask until it is so; returns what was so."""
+    """Poll until the result is true; return that result. Fail after the timeout."""
     began = time.monotonic()
     while not (found := so()):
         waited_s = time.monotonic() - began
@@ -69,22 +69,22 @@ class GatewayProcess:
 
     @property
     def stderr(self) -> str:
-        """What it has said so far."""
+        """Return the process's output on stderr until now."""
         return self.log.read_text()
 
     def line(self) -> Any:
-        """Its next line of JSON."""
+        """Wait for the process's next line of JSON, and return its value."""
         return json.loads(self._lines.get(timeout=PATIENCE_S))
 
     def lines(self) -> list[str]:
-        """Its lines that nobody has read; all, once it has ended."""
+        """Return the process's unread lines: after its end, all that are left."""
         found = []
         while not self._lines.empty():
             found.append(self._lines.get().rstrip("\n"))
         return found
 
     def say(self, fields: dict[str, Any]) -> Any:
-        """Give it a line of JSON, get its answer."""
+        """Write a line of JSON to the process's stdin. Return the answer."""
         assert self.popen.stdin is not None
         self.popen.stdin.write(json.dumps(fields) + "\n")
         self.popen.stdin.flush()
@@ -94,24 +94,24 @@ class GatewayProcess:
         return answer
 
     def kill(self) -> int:
-        """End it without a word; just before that, ns since the epoch."""
+        """Kill the process. Return the time just before, ns since the epoch."""
         at_ns = time.time_ns()
         self.popen.kill()
         return at_ns
 
     def rss_mb(self) -> float:
-        """What it holds in memory (Linux; elsewhere by `ps`)."""
+        """Return the process's resident memory by `ps`, MB."""
         listed = subprocess.run(["ps", "-o", "rss=", "-p", str(self.pid)], capture_output=True, text=True, check=True)
         return int(listed.stdout) * 1024 / 1e6
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """Send a signal and wait; the exit code."""
+        """Send a signal, and wait for the end. Return the exit code."""
         if self.popen.poll() is None:
             self.popen.send_signal(number)
         return self.wait()
 
     def wait(self) -> int:
-        """Wait until it has ended; the exit code."""
+        """Wait for the end of the process. Return the exit code."""
         code = self.popen.wait(PATIENCE_S)
         self._reader.join()
         for stream in (self.popen.stdin, self.popen.stdout):
@@ -135,7 +135,7 @@ class FleetProcesses:
         self.environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(directory / "state")}
         self._started: list[GatewayProcess] = []
         self._bus: bus.Bus | None = None
-        # On a busy machine the first that is its client may come later than a hub waits for one.
+        # On a busy machine, the first client may come later than a hub waits for one.
         self.hub = self.start("-m", "schemas.bus.hub", "--endpoint", endpoint, "--idle-s", str(2 * PATIENCE_S))
         wait_for(lambda: bus.accepts(endpoint), "the hub listens")
 
@@ -146,7 +146,7 @@ class FleetProcesses:
         return started
 
     def simulate(self, *cars: str, truth: bool = False, world: str = "room") -> tuple[GatewayProcess, list[str]]:
-        """Simulated cars, and their links; without `truth` they publish none, and are asked."""
+        """Start simulated cars; return process and links. Without `truth` they only answer requests."""
         described = [word for car in cars for word in ("--car", car)]
         published = () if truth else ("--no-truth",)
         sim = self.start("-m", "gateway.cli", "sim", *published, "--seed", "3", "--world", world, *described)
@@ -158,20 +158,20 @@ class FleetProcesses:
 
     @property
     def bus(self) -> bus.Bus:
-        """A client of the fleet's bus."""
+        """Return a client of the fleet's bus."""
         if self._bus is None:
             self._bus = bus.Bus.open(self.endpoint, timeout_s=PATIENCE_S)
         return self._bus
 
     def get(self, selector: str) -> list[Any]:
-        """The answers to a query, as messages; an error reply is its words."""
+        """Return the answers to a query as messages, and error replies as texts."""
         found: list[Any] = []
         for answer in self.bus.query(selector, timeout_s=5.0):
             found.append(answer.words if isinstance(answer, bus.Failure) else answer.message())
         return found
 
     def state(self, name: str, car: str = "red") -> Any:
-        """One state of one car; None while nobody answers."""
+        """Return one state of one car, None if no gateway answers."""
         found = self.get(f"fleet/{car}/state/{name}")
         return next((each for each in found if not isinstance(each, str)), None)
 
@@ -185,27 +185,27 @@ class FleetProcesses:
         wait_for(known, f"{car} is in a known state")
 
     def ask(self, verb: str, car: str = "red", **fields: Any) -> Any:
-        """Give a command as JSON; the answer as a dict."""
+        """Send a command as JSON; return the answer as a dict."""
         answers = self.ask_all(verb, car, **fields)
         assert len(answers) == 1, answers
         return answers[0]
 
     def ask_all(self, verb: str, car: str = "*", **fields: Any) -> list[Any]:
-        """Give a command as JSON to every car that matches; the answers."""
+        """Send a command as JSON to every matching car; return the answers."""
         key, payload = f"fleet/{car}/@cmd/{verb}", json.dumps(fields).encode()
         answers = list(self.bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=5.0))
         assert all(isinstance(answer, bus.Sample) for answer in answers), answers
         return [json.loads(answer.payload) for answer in answers if isinstance(answer, bus.Sample)]
 
     def left(self) -> list[str]:
-        """Processes that still run at this endpoint, by the system's own list."""
+        """Return the processes that still run at this endpoint, by the system's own list."""
         listed = subprocess.run(["ps", "-axwwo", "pid=,args="], capture_output=True, text=True, check=True).stdout
         mine = {str(process.pid) for process in self._started}
         found = [line.split(None, 1) for line in listed.splitlines()]
         return [pid for pid, args in found if self.endpoint in args and pid not in mine]
 
     def close(self) -> None:
-        """End everything that was started, and the hubs that gateways have started at this endpoint."""
+        """End all started processes, and the hubs that gateways have started at this endpoint."""
         if self._bus is not None:
             self._bus.close()
         for process in self._started:
@@ -218,38 +218,38 @@ class FleetProcesses:
 
 
 def driving(sim: GatewayProcess, car: str = "red") -> bool:
-    """Whether the motors of a simulated car are on, says the car."""
+    """Return True if the motors of a simulated car are on, by the car's own answer."""
     truth = sim.say({"car": car, "ask": "truth"})
     return bool(truth["motor_left"] or truth["motor_right"])
 
 
 def frames(data: bytes) -> list[bytes]:
-    """The frames of one receive; what has no end yet is the last."""
+    """Return the frames of one receive. The last one may lack its end."""
     return re.findall(rb"[^#]*#|[^#]+", data)
 
 
 MODE00 = b"$4WD,MODE00#"
 REPORT = b"$4WD,CSB57.00,PV7.91,GS5,LF0000,HW00,GM11#"
-"""What a car in mode 0 sends that has an echo and a good battery."""
+"""A report of a car in mode 0, with an echo and a good battery."""
 PI_REPORT = b"$4WD,CSB57,PV8.4,GS0,LF0000,HW00,GM00#"
-"""The same of a Raspberry Pi, whose voltage and grayscale are constants."""
+"""The same report of a Raspberry Pi car, whose voltage and grayscale are constants."""
 REPORT_S = 0.95
-"""A car in mode 0 reports so often (docs/reference/protocol.md#rates)."""
+"""Interval of the reports in mode 0 (docs/reference/protocol.md#rates)."""
 CLOSING_S = 1.0
-"""`MODE00` blocks a car for so long (docs/reference/protocol.md#blocking-times), and so delays its next report."""
+"""Time for which `MODE00` blocks a car and delays its report (docs/reference/protocol.md#blocking-times)."""
 
 
 def freeze(pid: int) -> None:
-    """Stop a process (SIGSTOP), after the end of a pause: `make stress` would resume it."""
+    """Stop a process by SIGSTOP. Wait for the end of a pause first, because `make stress` would resume the process."""
     wait_for(lambda: psutil.Process(pid).status() != psutil.STATUS_STOPPED, f"{pid} runs")
     os.kill(pid, signal.SIGSTOP)
 
 
 class TcpCar:
-    """A TCP server that knows nothing of us: it keeps what comes, and sends what it is told to.
+    """A plain TCP server in place of a car: it stores received frames, and sends the data of `send`.
 
-    Of writes that one receive brought together, for it was late to ask, each frame is kept by itself; half a frame is
-    kept as it came. `echoes`: it sends back all that comes. Until `obey` it shows nothing of what it was sent.
+    One receive may hold several writes: each frame is stored by itself, and half a frame as received. `echoes`: the
+    server sends all received bytes back. Until `obey`, it reacts to no frame.
     """
 
     def __init__(self, *, echoes: bool = False) -> None:
@@ -265,23 +265,23 @@ class TcpCar:
         self.received: list[bytes] = []
         self.connections = 0
         self.hung_up = 0
-        """Connections whose other end has gone, all that it sent having been kept."""
+        """Number of connections that the other end has closed, with all their data stored."""
         self._peers: list[socket.socket] = []
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
     def send(self, data: bytes) -> None:
-        """Send to the last that connected."""
+        """Send data to the newest connection."""
         self._peers[-1].sendall(data)
 
     def obey(self, report: bytes = REPORT) -> None:
-        """From now on do as a car in mode 0 does: report, and be blocked by each `MODE00`."""
+        """Behave as a car in mode 0 from now on: send reports, and pause after each `MODE00`."""
         with self._turn:
             self._report, self._report_at = report, time.monotonic()
             self._turn.notify()
 
     def pour(self, data: bytes, per_s: float, seconds: float) -> int:
-        """Send this over and over; how many bytes were taken."""
+        """Send data repeatedly; return the number of sent bytes."""
         began, sent = time.monotonic(), 0
         while (now := time.monotonic() - began) < seconds:
             while sent < now * per_s and time.monotonic() < began + seconds:
@@ -291,7 +291,7 @@ class TcpCar:
         return sent
 
     def close(self) -> None:
-        """Hang up and end."""
+        """Close all connections and end."""
         with self._turn:
             self._closed = True
             self._turn.notify()
@@ -333,6 +333,6 @@ class TcpCar:
                     self._turn.wait(left_s)
                     continue
                 for peer in self._peers:
-                    with contextlib.suppress(OSError):  # the other end has gone
+                    with contextlib.suppress(OSError):  # the other end has closed the connection
                         peer.sendall(self._report)
                 self._report_at = time.monotonic() + REPORT_S

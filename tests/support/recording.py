@@ -1,4 +1,4 @@
-"""A load on the bus whose every message is known, and what recordings hold of it, by number."""
+"""A load of numbered messages on the bus, and the comparison of recordings with it."""
 
 import os
 import random
@@ -24,15 +24,15 @@ READING = b"$4WD,CSB33,PV8.2,GS214,LF0110,HW00,GM00#"
 
 
 class Load:
-    """Cars that track a line: from each, for every frame a reading and the frame, from threads of their own.
+    """Cars that track a line. For each frame, every car publishes a reading and the frame, on a thread of its own.
 
-    What is slower than its topic (27 Hz) is held for longer than ten seconds.
+    A publisher slower than its topic's rate (27 Hz) caches more than ten seconds.
     """
 
     def __init__(self, endpoint: str, cars: int, rate_hz: float = RATE_HZ) -> None:
         self._rate_hz = rate_hz
         self.sent: dict[str, list[int]] = {}
-        """By key: when each was published, ns since the epoch; the first has number 1."""
+        """Publication times by key, ns since the epoch. The first message has number 1."""
         self._over = threading.Event()
         self._resting = threading.Event()
         self._rested = threading.Semaphore(0)
@@ -49,19 +49,19 @@ class Load:
         self.end()
 
     def rest(self) -> None:
-        """Publish no more; who published stays, and holds what it has."""
+        """Publish no more. The publishers stay and keep their caches."""
         self._resting.set()
         for _ in self._threads:
             assert self._rested.acquire(timeout=PATIENCE_S), "one still publishes"
 
     def end(self) -> None:
-        """Publish no more, and leave the bus: what publishers held is gone with them."""
+        """Publish no more, and close the publishers with their caches."""
         self._over.set()
         for thread in self._threads:
             thread.join()
 
     def count(self) -> int:
-        """How many were published until now."""
+        """Return the number of published messages."""
         return sum(len(times) for times in list(self.sent.values()))
 
     def _run(self, endpoint: str, cars: list[str]) -> None:
@@ -91,7 +91,7 @@ class Load:
 
 
 class Recording:
-    """`fleet record` as a process: its session, once nothing can be missed."""
+    """`fleet record` as a process, and its session. The recorder has subscribed when this object is made."""
 
     def __init__(self, fleet: FleetProcesses, out: Path, *options: str) -> None:
         self.process: GatewayProcess = fleet.start(
@@ -100,13 +100,13 @@ class Recording:
         self.session = Path(self.process.line()["session"])
 
     def end(self) -> Any:
-        """End it by a signal; what it said last."""
+        """End the recorder by a signal; return its last line."""
         assert self.process.end() == 0, self.process.stderr
         return self.process.line()
 
 
 def kill_hub(fleet: FleetProcesses, chance: random.Random, settled_s: float = 0.3) -> None:
-    """Kill the hub; return when there is another, which the recorder starts."""
+    """Kill the hub. Return when the recorder has started another one."""
     if fleet.hub.popen.poll() is None:
         fleet.hub.kill()
         fleet.hub.wait()
@@ -116,11 +116,11 @@ def kill_hub(fleet: FleetProcesses, chance: random.Random, settled_s: float = 0.
         for pid in gone:
             os.kill(int(pid), signal.SIGKILL)
     wait_for(lambda: set(fleet.left()) - gone, "another hub")
-    time.sleep(settled_s + chance.random())  # how long a hub lives is not what is waited for, but what is tried
+    time.sleep(settled_s + chance.random())  # not a wait: the hub's lifetime is what the test varies
 
 
 def numbers(sessions: Iterable[Path]) -> dict[str, Counter[int]]:
-    """By key: how often each number lies in these sessions, what is damaged left out."""
+    """Return by key how often each number is in these sessions. Leave out damaged parts."""
     found: dict[str, Counter[int]] = {}
     for path in sessions:
         for message in Session(path).messages():
@@ -129,7 +129,7 @@ def numbers(sessions: Iterable[Path]) -> dict[str, Counter[int]]:
 
 
 def faults(load: Load, sessions: Iterable[Path]) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
-    """By key: which numbers were published and are in none of the sessions, and which are there twice."""
+    """Return by key the published numbers that are in no session, and the numbers that are recorded twice."""
     found = numbers(sessions)
     lost = {
         key: missing

@@ -1,6 +1,6 @@
-"""Who judges a fleet under faults: roles filled in time, in force, none twice, no held car moved, nothing unexplained.
+"""Judges a fleet under faults: roles are filled and in force in time, no car has two roles, no held car moves.
 
-What cars truly do comes from the simulator, what was written to them from frame/tx; both with their own times.
+The simulator publishes the true states, and gateways publish written frames on frame/tx, with their own times.
 """
 
 import random
@@ -26,16 +26,16 @@ PLAN: Final = "roles:\n" + "".join(
     f"  {name}: {{mode: {mode}, count: {count}}}\n" for name, (mode, count) in ROLES.items()
 )
 ABLE: Final = ("red", "green", "blue", "orange", "violet", "white")
-"""Of eight simulated cars two are Raspberry Pi, which know no modes; so one able car is always free."""
+"""Cars that have modes. Two of eight simulated cars are Raspberry Pi cars without modes, so one able car is free."""
 HELD: Final = "yellow"
 FILL_S: Final = 3.0
-"""issue 5: a role that another free car can fill, and one whose only car has ended its recovery."""
+"""Maximum time until another free car fills a role, or until its only car fills it after a recovery (issue 5)."""
 NOTICED_S: Final = 4.5
-"""What a car that reset itself does looks as asked until three of its frames, one a second, say otherwise."""
+"""Maximum time to notice a reset. It takes three contradicting frames at one a second."""
 SHOWN_S: Final = 4.0
-"""Its stop, before the mode is opened again, is shown by two pauses in its reports."""
+"""Time for which a stop is shown before the mode is opened again: two pauses in the reports show it."""
 IN_FORCE_S: Final = 3.5 + 1.0
-"""The longest opening (docs/reference/protocol.md#blocking-times), and issue 5's second."""
+"""The longest opening (docs/reference/protocol.md#blocking-times), and one second (issue 5)."""
 STRAY_S: Final = 2.5
 """A misread MODE frame opens mode 0 for 2.3 s and keeps the motors on (docs/reference/protocol.md#hazards). Recovery
 stops them only after that."""
@@ -44,28 +44,28 @@ _FRAMES: Final = {encode(ModeOpen(mode)): mode for mode, _ in ROLES.values()}
 
 @dataclass
 class Watcher:
-    """What was so, from the first moment on; times are ns since the epoch."""
+    """The true states and openings of all cars from the start. Times are ns since the epoch."""
 
     modes: dict[str, list[tuple[int, str]]] = field(default_factory=dict)
-    """By car: its true mode, whenever it became another."""
+    """True mode by car, at each change."""
     motors: dict[str, bool] = field(default_factory=dict)
     frames: list[tuple[int, str, Mode]] = field(default_factory=list)
-    """Openings of the plan's modes that were written to cars."""
+    """Frames to cars that open modes of the plan."""
     known: dict[str, int] = field(default_factory=dict)
-    """When a car was last brought to a known state."""
+    """Time of each car's last recovery to a known state."""
     twice: list[str] = field(default_factory=list)
     """Cars that had two roles in one assignment."""
     moved: list[tuple[int, str]] = field(default_factory=list)
     stray: dict[str, int] = field(default_factory=dict)
-    """Since when motors are on in mode 0, where nobody drives."""
+    """Time since which a car's motors are on in mode 0 without a drive."""
     strays: dict[str, float] = field(default_factory=dict)
-    """For how long they were at most, s, where that was longer than they may."""
+    """Longest such time by car, s, if it is over STRAY_S."""
     _poses: dict[str, tuple[float, float]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
     def follow(cls, bus: Bus) -> "Watcher":
-        """Begin to watch."""
+        """Subscribe to the truth, the frames, the logs and the assignments of all cars."""
         watcher = cls()
         bus.subscribe("fleet/*/sim/truth", watcher._truth)
         bus.subscribe("fleet/*/frame/tx", watcher._frame)
@@ -74,21 +74,21 @@ class Watcher:
         return watcher
 
     def mode(self, car: str) -> str:
-        """Its true mode."""
+        """Return the car's true mode."""
         with self._lock:
             return self.modes[car][-1][1] if car in self.modes else ""
 
     def truly(self, mode: Mode) -> list[str]:
-        """The cars that are truly in this mode."""
+        """Return the cars whose true mode is this one."""
         return [car for car in ABLE if self.mode(car) == mode]
 
     @property
     def filled(self) -> bool:
-        """Whether every role has its cars in its mode, and the others rest."""
+        """Return True if every role has its cars in its mode, and all other cars rest."""
         return all(len(self.truly(mode)) == count for mode, count in ROLES.values())
 
     def opened_after(self, moment_ns: int, mode: Mode) -> list[tuple[int, str]]:
-        """When a role's mode was written to, or truly taken by, a car after a moment; each car once."""
+        """Return the times after a moment at which a car got the frame of a mode or truly entered it; each car once."""
         with self._lock:
             found = {car: at for at, car, opened in reversed(self.frames) if at > moment_ns and opened is mode}
             for car in ABLE:
@@ -98,7 +98,7 @@ class Watcher:
         return sorted((at, car) for car, at in found.items())
 
     def entered_after(self, moment_ns: int, car: str, mode: Mode) -> int:
-        """When a car was first truly in a mode after a moment; 0 if not yet."""
+        """Return the time at which a car first entered a mode after a moment, 0 if not yet."""
         with self._lock:
             return next((at for at, entered in self.modes.get(car, []) if at > moment_ns and entered == mode), 0)
 
@@ -125,7 +125,7 @@ class Watcher:
                 self.frames.append((stamp_ns(frame), frame.car, _FRAMES[frame.data]))
 
     def known_after(self, moment_ns: int, car: str, bus: Bus) -> bool:
-        """Whether a car was brought to a known state after a moment; who told it before we were back is asked again."""
+        """Return True if a car was recovered after a moment. If the log was missed, ask the gateway."""
         if self.known.get(car, 0) <= moment_ns:
             for sample in bus.recall(f"fleet/{car}/event/log", 60.0):
                 self._log(sample_of(sample))
@@ -147,7 +147,7 @@ class Watcher:
 
 @dataclass(frozen=True, slots=True)
 class JudgedFault:
-    """What was done, and what came of it, s after it; None: no role was left."""
+    """One fault and its consequences, s after it. None: no role was left."""
 
     what: str
     filled_s: float | None
@@ -156,7 +156,7 @@ class JudgedFault:
 
     @property
     def late(self) -> bool:
-        """Whether a role was filled, or in force, later than allowed."""
+        """True if a role was filled, or in force, later than allowed."""
         if self.filled_s is None or self.in_force_s is None:
             return False
         return self.filled_s > self.limit_s or self.in_force_s > self.filled_s + IN_FORCE_S
@@ -173,16 +173,16 @@ class RoleStage:
         self.held_ns = 0
 
     def begin(self) -> None:
-        """Wait until the plan is in force; a person stops one car, which is then held."""
+        """Wait until the plan is in force. Then stop one car as a person, so that the car is on hold."""
         watcher, bus = self.watcher, self.up.bus
         wait_for(lambda: all(watcher.known_after(0, car, bus) for car in (*ABLE, HELD)), "all cars are known", 90.0)
         assert self.up.ask("stop", HELD, sender="ann", kind="person")["status"] in TAKEN
         wait_for(lambda: watcher.filled, "the plan is in force", 90.0)
-        self.up.ready(HELD)  # it may have had a role, and its stop takes longer than another car to take that
+        self.up.ready(HELD)  # the car may have had a role, which another car takes before the stop is complete
         self.held_ns = time.time_ns()
 
     def strike(self, what: str) -> JudgedFault:
-        """One fault, and what came of it; returns when the fleet is whole again."""
+        """Cause one fault, and wait until the fleet is whole again. Return the fault's consequences."""
         watcher = self.watcher
         car = self.chance.choice(ABLE)
         before = {mode: set(watcher.truly(mode)) for mode, _ in ROLES.values()}
@@ -221,7 +221,7 @@ class RoleStage:
         wait_for(lambda: not self.up.exists(pid), f"{name} is gone")
 
     def judge(self) -> None:
-        """Raise for what must never be."""
+        """Fail if a car had two roles, a held car moved, or motors were on in mode 0 for too long."""
         watcher = self.watcher
         assert not watcher.twice, f"two roles: {watcher.twice}"
         strays = {car: stray_s for car, stray_s in watcher.strays.items() if stray_s > STRAY_S}
@@ -233,7 +233,7 @@ class RoleStage:
 
 
 def unexplained(sessions: Path) -> tuple[int, list[str]]:
-    """Openings in the recordings, and those of which no decision and no command tells."""
+    """Return the number of openings in the recordings, and those that no decision and no command explains."""
     decided: dict[str, set[str]] = {}
     commands: set[str] = set()
     frames: list[tuple[str, Mode, str]] = []

@@ -1,7 +1,7 @@
-"""`stop` at random moments in every mode and load: what is played, and what the simulated car's motors say of it.
+"""Plays `stop` at random moments in every mode and load, and measures the simulated car's motors.
 
-`rows` gives the distribution per state, for the soak's table and for whoever wants the numbers (the page on
-what happens when). A state is what control can tell apart; many loads lead to each.
+`rows` gives the distribution per state, for the soak's table and docs/explanation/what-happens-when.md. A state is a
+situation that control can distinguish. Many loads lead to each state.
 """
 
 import random
@@ -23,14 +23,14 @@ from gateway.sim.model.world import World
 from tests.support.virtual import Pair
 
 LONGEST_S = 4.0
-"""Outside obstacle avoidance and links just restored no stop takes longer."""
+"""Maximum time of a stop outside obstacle avoidance and restored links."""
 AVOIDING_S = 4.3
 ENDS_S = 18.5
-"""So long after it was asked, every stop has its last record (gateway/control/stops/stopping.py)."""
+"""Maximum time from the request of a stop to its last record (gateway/control/stops/stopping.py)."""
 OPENS_S = 14.0
-"""So long after it was asked, a mode opens: the stop before it is over within 10 s, or the mode is given up."""
+"""Maximum time from the request of a mode to its opening. The stop before it ends within 10 s, or control gives up."""
 RATIO = 1.5
-"""The announced worst case is at most so many times the worst seen."""
+"""Maximum ratio of the announced worst case to the measured one."""
 AVOIDANCE = Mode.OBSTACLE_AVOIDANCE
 READS_PINS = (Mode.REMOTE_CONTROL, Mode.TRACKING, Mode.LIGHT_SEEKING, Mode.FOLLOWING)
 WHISTLE = OneShot(General(Motion.STOP, whistle=True))
@@ -43,32 +43,32 @@ Load = Callable[[Pair, random.Random], None]
 
 
 def echoing() -> World:
-    """The room, and lamps that are seen from everywhere, so that light seeking drives."""
+    """Return the room with lamps that are visible everywhere, so that light seeking drives."""
     room = World.room()
     lamps = [Lamp(x_m, 0.0, reach_m=50.0, overhead=True) for x_m in (9.0, -9.0)]
     return World(room.walls, room.line, lamps)
 
 
 def before_a_wall() -> World:
-    """What following follows."""
+    """Return a world with a wall close ahead, so that following drives."""
     return World([(0.4, -9.0, 0.4, 9.0)])
 
 
 def in_a_pen() -> World:
-    """Walls on all sides: avoidance does nothing but back off, look and turn, 4.3 s each time."""
+    """Return walls on all sides, so that avoidance only backs off, looks and turns, 4.3 s each time."""
     corners = [(-0.25, -0.25), (0.25, -0.25), (0.25, 0.25), (-0.25, 0.25)]
     return World([(*a, *b) for a, b in zip(corners, (*corners[1:], corners[0]), strict=True)])
 
 
 def on_black() -> World:
-    """A floor that is all line: tracking takes its sharpest turn, for ever."""
+    """Return a floor that is all line, so that tracking takes its sharpest turn without an end."""
     rows = [0.01 * number for number in range(-30, 31)]
     line = [(x, y) for number, y in enumerate(rows) for x in ((0.3, -0.3) if number % 2 else (-0.3, 0.3))]
     return World([(3.0, -3.0, 3.0, 3.0)], [(0.0, 0.0), *line])
 
 
 class Flickering(World):
-    """The room, in which every second ranging gets no echo: what slanted walls and curtains do."""
+    """The room, in which every second ranging gets no echo, as with slanted walls and curtains."""
 
     def __init__(self, seed: int = 1) -> None:
         room = echoing()
@@ -102,14 +102,14 @@ def driving(pair: Pair, moments: random.Random) -> None:
 
 
 def steering(pair: Pair, moments: random.Random) -> None:
-    """A new motion every 50 to 250 ms: what a joystick does."""
+    """Send a new motion every 50 to 250 ms, as a joystick does."""
     for _ in range(12):
         pair.ask(Drive(moments.choice(MOTIONS), 0.5))
         pair.run(0.05 + 0.2 * moments.random())
 
 
 def lossy(before: Load) -> Load:
-    """And what the car sends is lost from just before the stop on."""
+    """Return the load, with the car's readings lost from just before the stop."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         before(pair, moments)
@@ -119,13 +119,13 @@ def lossy(before: Load) -> Load:
 
 
 def let_go(pair: Pair, moments: random.Random) -> None:
-    """Within the soft stop after a drive."""
+    """Enter the soft stop after a drive."""
     pair.ask(Drive(Motion.FORWARD, 0.3))
     pair.run(0.3 + 1.3 * moments.random())
 
 
 def acting(pair: Pair, moments: random.Random) -> None:
-    """One-shots of every kind queue while it drives."""
+    """Queue one-shots of every kind while the car drives."""
     pair.ask(Drive(Motion.FORWARD, 10.0))
     for what in (WHISTLE, OneShot(Ptz(45)), OneShot(ColorLed(255, 2, 3)), WHISTLE, OneShot(Ptz(120))):
         pair.ask(what)
@@ -133,7 +133,7 @@ def acting(pair: Pair, moments: random.Random) -> None:
 
 
 def one_shot(what: OneShot | Fan | Find | ChangeSpeed, block_s: float) -> Load:
-    """While driving, from just before it is written to the end of its block."""
+    """Return a load: a one-shot during a drive, from just before its frame to the end of its block."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(Drive(Motion.FORWARD, 10.0))
@@ -145,7 +145,7 @@ def one_shot(what: OneShot | Fan | Find | ChangeSpeed, block_s: float) -> Load:
 
 
 def fan(pair: Pair, moments: random.Random) -> None:
-    """No reading comes while it runs."""
+    """Switch the fan on. While it runs, no reading comes."""
     pair.ask(Fan())
     pair.run(1.5)
     pair.ask(Drive(Motion.FORWARD, 10.0))
@@ -153,14 +153,14 @@ def fan(pair: Pair, moments: random.Random) -> None:
 
 
 def again(pair: Pair, moments: random.Random) -> None:
-    """A second stop while the first is under way."""
+    """Send a second stop during the first one."""
     steering(pair, moments)
     pair.ask(Stop(), verb="stop")
     pair.run(1.2 * moments.random() ** 3)
 
 
 def opening(mode: Mode) -> Load:
-    """From the stop before it to the end of its block."""
+    """Return a load: the opening of a mode, from the stop before it to the end of its block."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(Drive(Motion.FORWARD, 10.0))
@@ -176,7 +176,7 @@ def opening(mode: Mode) -> Load:
 
 
 def last_moment(mode: Mode) -> Load:
-    """About the end of its block, when it is not sure any more that the stop comes before the first turn."""
+    """Return a load: the end of an opening's block, when the stop may come after the mode's first turn."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(SetMode(mode))
@@ -196,7 +196,7 @@ def inside(mode: Mode) -> Load:
 
 
 def closing(mode: Mode) -> Load:
-    """While `mode manual` is under way."""
+    """Return a load: the closing of a mode by `mode manual`."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         inside(mode)(pair, moments)
@@ -215,9 +215,9 @@ class StopTestCase:
     platform: str = "arduino"
     world: str = "echo"
     where: Callable[[], World] | None = None
-    """Another world than the one named."""
+    """A world that replaces the named one."""
     told: str | None = None
-    """The platform that the gateway was told, if not the true one."""
+    """The platform that the gateway is configured with, if not the true one."""
     transport: Transport = Transport.SERIAL
 
     def __str__(self) -> str:
@@ -225,7 +225,7 @@ class StopTestCase:
         return f"{platform}-{self.name}-{self.world}{f'-told-{self.told}' if self.told else ''}"
 
     def pair(self, seed: int) -> Pair:
-        """The two, just set up, the car running for two seconds."""
+        """Return controller and car, two seconds after the car's start."""
         world = (self.where or WORLDS[self.world])()
         return Pair(self.platform, seed=seed, world=world, told=self.told, transport=self.transport, start_s=2.0)
 
@@ -268,7 +268,7 @@ def _cases() -> Iterable[StopTestCase]:
         for name, load in (*EVERY_CAR, *NAMED):
             yield StopTestCase(name, load, world=world)
         for name, load in IN_MODES:
-            # Avoiding without an echo it is deaf for ever, with the motors braked (test_stops.py).
+            # Avoiding without an echo, the car is deaf without an end, with the motors braked (test_stopping.py).
             if AVOIDANCE not in name or world == "echo":
                 yield StopTestCase(name, load, world=world)
         for name, load in EVERY_CAR:
@@ -293,11 +293,11 @@ def _cases() -> Iterable[StopTestCase]:
 CASES = tuple(_cases())
 
 
-# ---------------------------------------------------------------------- links just restored
+# ---------------------------------------------------------------------- restored links
 
 
 def half(*whats: Drive | OneShot | SetMode) -> Load:
-    """The write is cut anywhere in its frame, and the link with it."""
+    """Return a load: the link breaks anywhere in the write of a frame."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.cut = 1 + int(17 * moments.random())
@@ -309,7 +309,7 @@ def half(*whats: Drive | OneShot | SetMode) -> Load:
 
 
 def cut_off(before: Load) -> Load:
-    """And the link is lost, comes back after a moment, and a stop is asked for while it recovers."""
+    """Return the load, then a link that is lost and comes back. The stop is sent during the recovery."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         before(pair, moments)
@@ -322,7 +322,7 @@ def cut_off(before: Load) -> Load:
 
 
 def half_closing(count: int) -> Load:
-    """The frame that closes a mode is cut, late in a turn of it."""
+    """Return a load: the frame that closes a mode is cut, late in a turn of the mode."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.cut = count
@@ -334,7 +334,7 @@ def half_closing(count: int) -> Load:
 
 
 def found(mode: Mode) -> Load:
-    """A gateway that was told nothing finds a car in a mode."""
+    """Return a load: a gateway without a configured platform finds a car in a mode."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         driving(pair, moments)
@@ -377,7 +377,7 @@ RESTORED = (
         for name, load in LOST_NAMED
         if AVOIDANCE not in name or world == "echo"
     ),
-    # Ended by `#` and with two `MODE00` behind it, all within one turn of 4.3 s, this half opens the colour LED mode.
+    # This half, with `#` and two `MODE00` behind it in one turn of 4.3 s, opens the color LED mode.
     *(
         StopTestCase(
             f"restored-half-mode-{count}", then(inside(AVOIDANCE), half_closing(count)), world="pen", where=in_a_pen
@@ -399,32 +399,32 @@ RESTORED = (
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One stop. Times from when it was asked, s."""
+    """One stop. Times are s after its request."""
 
     case: str
     seed: int
     state: str
     announced_s: float
     motors_off_s: float
-    """Motors off, and off for good; 0 if they were off."""
+    """Time until the motors were off for good, 0 if they were off."""
     settled_s: float
-    """And back in mode 0, where nothing but a command of ours turns them on."""
+    """Time until the car was also in mode 0, where only a command of ours turns them on."""
     complete_s: float
-    """What the final record says, as shown or as sent; inf if the stop has none."""
+    """Time until the final record, shown or sent; inf if the stop has none."""
     shown_s: float
-    """When the car had shown that it stands; inf if it did not."""
+    """Time until the car had shown that it stands, inf if it did not."""
     motors: str
-    """What control says of them in the end."""
+    """Control's final claim about the motors."""
     basis: str
-    """On what that rests."""
+    """The basis of that claim."""
     phase: str
-    """How the stop's life ended, the basis of that, and the words."""
+    """The stop's last phase, its basis and its text."""
     phase_basis: str
     words: str
 
 
 def state_of(pair: Pair) -> str:
-    """What control can tell apart when a stop is asked."""
+    """Return the state that control can distinguish when the stop is requested."""
     control, now = pair.control, pair.now
     style = control.model.profile.stop_style
     kind = {
@@ -446,7 +446,7 @@ def state_of(pair: Pair) -> str:
     if mode is None or mode is Mode.MANUAL:
         pacing = control.model.pacing
         if control.model.at_rest and control.model.basis is Basis.SENT and pacing.blocked_at(now):
-            return f"{kind[style]}at rest, a renewal blocks"  # the motors are off, so the ratio says nothing
+            return f"{kind[style]}at rest, a renewal blocks"  # the motors are off, so the ratio has no meaning
         unread = "a frame may be unread" if not pacing.clear_at(now) else ""
         what = unread or ("in a block of ours" if pacing.blocked_at(now) else "nothing unread")
         return f"{kind[style]}{Mode.MANUAL}, {what}"
@@ -458,7 +458,7 @@ def state_of(pair: Pair) -> str:
 
 
 def play(case: StopTestCase, seed: int) -> Seen:
-    """Bring a car into the case's load, ask for a stop at a random moment, and watch until it is over."""
+    """Bring a car into the case's load, request a stop at a random moment, and run until the stop is over."""
     moments = random.Random(f"{case} {seed}")
     pair = case.pair(seed).ready()
     pair.run(moments.random())
@@ -497,7 +497,7 @@ def play(case: StopTestCase, seed: int) -> Seen:
 
 @dataclass(frozen=True, slots=True)
 class StopRow:
-    """All stops that were asked for in one state; s."""
+    """All stops that were requested in one state. Times are in s."""
 
     state: str
     stops: int
@@ -505,22 +505,22 @@ class StopRow:
     p90_s: float
     worst_s: float
     announced_s: float
-    """The longest that was announced."""
+    """The longest announced worst case."""
     ratio: float
-    """Of the longest announced to the worst seen."""
+    """Ratio of the longest announced time to the longest measured one."""
     worst_motors_s: float
-    """The worst until the motors were off: 0 where a mode is opened, in which they never come on."""
+    """Longest time until the motors were off. It is 0 during the opening of a mode, in which they never come on."""
     shown: int
-    """Stops that the car has shown."""
+    """Number of stops that the car has shown."""
     shown_p50_s: float
-    """When these were shown."""
+    """Median time until the stop was shown."""
     shown_worst_s: float
     worst_case: str
-    """Where the worst was seen."""
+    """The case with the longest time."""
 
 
 def rows(seen: Iterable[Seen]) -> list[StopRow]:
-    """The distribution per state."""
+    """Return the distribution per state."""
     states: dict[str, list[Seen]] = {}
     for one in seen:
         states.setdefault(one.state, []).append(one)
@@ -556,20 +556,20 @@ def _play(chosen: tuple[int, int]) -> Seen:
 PLAYED = range(len(CASES) + len(RESTORED))
 """Numbers of all cases."""
 CHUNK = 50
-"""Stops that a process plays at a time."""
+"""Number of stops that a process plays at a time."""
 
 
 def distribution(moments: int, cases: range = PLAYED) -> list[StopRow]:
-    """Play each case at so many moments, on all processors, and return the distribution."""
+    """Play each case at this number of moments, on all processors. Return the distribution."""
     chosen = list(product(cases, range(moments)))
-    if len(chosen) <= CHUNK:  # one process has all the work
+    if len(chosen) <= CHUNK:  # too little work for a second process
         return rows(map(_play, chosen))
     with ProcessPoolExecutor() as pool:
         return rows(pool.map(_play, chosen, chunksize=CHUNK))
 
 
 def tsv(table: Iterable[StopRow]) -> str:
-    """The rows as tab-separated text with a heading."""
+    """Return the rows as tab-separated text with a heading."""
     lines = ["\t".join(field.name for field in fields(StopRow))]
     for row in table:
         lines.append("\t".join(f"{v:.3f}" if isinstance(v, float) else str(v) for v in asdict(row).values()))

@@ -1,4 +1,4 @@
-"""A wire between a gateway and its car, TCP, that can be watched, held up, and cut."""
+"""A TCP proxy between a gateway and its car that a test can read, stall and cut."""
 
 import contextlib
 import select
@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 
 class Tap:
-    """Passes bytes both ways to the car at `link`; what went to the car is kept with its times (ns since the epoch)."""
+    """Passes bytes in both directions, and stores the bytes to the car at `link` with times (ns since the epoch)."""
 
     def __init__(self, link: str) -> None:
         parts = urlsplit(link)
@@ -27,29 +27,29 @@ class Tap:
         self._thread.start()
 
     def stall(self) -> None:
-        """Take bytes from both ends no more, and say so to neither."""
+        """Take no more bytes from either end, without a sign to them."""
         self._flows.clear()
 
     def flow(self) -> None:
-        """Go on; what was held up arrives at once."""
+        """Pass bytes again. The delayed ones arrive at once."""
         self._flows.set()
 
     def reset(self, *, refuse: bool = True) -> None:
-        """Reset the connection, as a bridge that lost its power; with `refuse` until `accept`."""
+        """Reset the connection, as a bridge without power does. With `refuse`, refuse new ones until `accept`."""
         if refuse:
             self._listener.close()
         self._cut()
         self._flows.set()
 
     def accept(self) -> None:
-        """Listen again where it was."""
+        """Listen again at the same port."""
         self._thread.join()
         self._listener = socket.create_server(self._address)
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
     def close(self) -> None:
-        """Hang up and end."""
+        """Close all connections and end."""
         self._closing = True
         self._listener.close()
         self._cut()
@@ -69,7 +69,7 @@ class Tap:
                 if not select.select([listener], [], [], 0.05)[0]:
                     continue
                 host, _ = listener.accept()
-            except (OSError, ValueError):  # closed meanwhile
+            except (OSError, ValueError):  # another thread has closed the socket
                 return
             with contextlib.suppress(OSError), host, socket.create_connection(self._car) as car:
                 for end in (host, car):
@@ -79,7 +79,7 @@ class Tap:
             self._ends = []
 
     def _pass(self, host: socket.socket, car: socket.socket) -> None:
-        while not self._closing:  # who connects while this is being closed would keep it
+        while not self._closing:  # a client that connects during the close would prevent its end
             self._flows.wait()
             ready, _, _ = select.select([host, car], [], [], 0.05)
             if not self._flows.is_set():

@@ -1,4 +1,4 @@
-"""A person at a real terminal: a process on a pseudo terminal, which is read and typed to."""
+"""A person at a terminal: a process on a pseudo terminal, whose screen a test reads and to which it types."""
 
 import os
 import pty
@@ -15,7 +15,7 @@ _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 class Terminal:
-    """A program, `python -m MODULE` if none is named, whose stdin, stdout and stderr are one terminal."""
+    """A program on one terminal for stdin, stdout and stderr. Without a program: `python -m MODULE`."""
 
     def __init__(
         self,
@@ -42,11 +42,11 @@ class Terminal:
 
     @property
     def shown(self) -> str:
-        """All that was shown so far, without colours and moves."""
+        """Return all output until now, without colors and cursor moves."""
         return _ESCAPES.sub("", self._shown.decode(errors="replace")).replace("\r\n", "\n")
 
     def until(self, words: str) -> str:
-        """Wait until these words are shown, after those waited for before; what was shown up to them."""
+        """Wait until these words appear after those of the last wait. Return the output up to them."""
 
         def there() -> bool:
             return words in self.shown[self._seen :] or (self.popen.poll() is not None and not self._reader.is_alive())
@@ -63,13 +63,13 @@ class Terminal:
         os.write(self._controller, text.encode() + b"\n")
 
     def wait(self) -> int:
-        """Wait until it has ended; the exit code."""
+        """Wait for the end of the process. Return the exit code."""
         code = self.popen.wait(PATIENCE_S)
         self._reader.join(PATIENCE_S)
         return code
 
     def close(self) -> None:
-        """End it if it still runs."""
+        """End the process if it still runs."""
         if self.popen.poll() is None:
             self.popen.terminate()
         self.wait()
@@ -79,7 +79,7 @@ class Terminal:
         while True:
             try:
                 data = os.read(self._controller, 4096)
-            except OSError:  # the last who had the terminal has gone
+            except OSError:  # the last process on the terminal has ended
                 return
             if not data:
                 return

@@ -1,7 +1,7 @@
-"""A script that drives and stops cars while their links fail and processes are killed, each car on its own time.
+"""Drives and stops cars while their links fail and processes are killed, each car on its own time.
 
-Each stop comes around one failure of the link. Nobody asks again, and the car must stand when the link was whole for a
-while: a stopped car is on hold, so the coordinator leaves it alone.
+Each stop comes around one failure of the link, and nobody repeats it. The car must stand soon after the link is whole:
+a stopped car is on hold, so the coordinator leaves it alone.
 """
 
 import contextlib
@@ -22,9 +22,9 @@ from tests.support.processes import TAKEN
 from tests.support.up import Up
 
 STANDS_S: Final = 20.0
-"""So long after its link is whole, a car that was stopped stands: issue 10, in obstacle avoidance."""
+"""Maximum time from a whole link until a stopped car stands (issue 10, in obstacle avoidance)."""
 RECOVERS_S: Final = 10.0
-"""A car whose gateway was killed later than so long before its stop is not judged: another gateway must come first."""
+"""Minimum time between the kill of a car's gateway and a judged stop: another gateway must come first."""
 KILL_EVERY_S: Final = 25.0
 FAULTS: Final[dict[str, dict[str, Any]]] = {
     "deaf": {},
@@ -42,24 +42,24 @@ MODES: Final = tuple(mode.value for mode in Mode if mode is not Mode.MANUAL)
 
 @dataclass
 class Trouble:
-    """Plays episodes on all cars at once; `play` returns when the time is over and each car was judged."""
+    """Plays episodes on all cars at once. `play` returns when the time is over and each car is judged."""
 
     up: Up
     cars: tuple[str, ...]
     chance: random.Random
     kills: tuple[str, ...] = ("gateway", "hub", "coordinator")
-    """What is killed now and then; empty: nothing."""
+    """Kinds of processes that are killed now and then; empty for none."""
     counts: Counter[str] = field(default_factory=Counter)
     driving: list[str] = field(default_factory=list)
-    """Cars that did not stand in time, in words."""
+    """Texts about cars that did not stand in time."""
     _due: list[tuple[float, int, Callable[..., object]]] = field(default_factory=list)
     _numbers: "itertools.count[int]" = field(default_factory=itertools.count)
     _killed: dict[str, float] = field(default_factory=dict)
-    """When a car's gateway was killed last."""
+    """Time of the last kill of each car's gateway."""
     _ends: float = 0.0
 
     def play(self, seconds: float) -> None:
-        """Play for so long, and until the last episode is over."""
+        """Play for this time, and until the last episode is over."""
         self._ends = time.monotonic() + seconds
         for car in self.cars:
             self._after(5 * self.chance.random(), lambda car=car: self._begin(car))
@@ -77,7 +77,7 @@ class Trouble:
         if time.monotonic() > self._ends:
             return
         chance = self.chance
-        # A drive or a mode of a script ends the hold. `role`: the coordinator gives the car something to do.
+        # A drive or a mode of a script ends the hold. `role`: the coordinator gives the car a role.
         load = chance.choice(["role", "rest", "drive", "drive", "steer", "mode", "mode", "mode"])
         stop_s = 1.0 + 3.0 * chance.random()
         match load:
@@ -96,7 +96,7 @@ class Trouble:
             case _:
                 pass
         what = chance.choice(list(FAULTS))
-        for_s = 0.3 * 20 ** chance.random()  # 0.3 to 6 s, short ones as often as long ones
+        for_s = 0.3 * 20 ** chance.random()  # 0.3 to 6 s, short times as often as long ones
         fault_s = max(0.1, stop_s + chance.uniform(-min(for_s, 1.5), 0.3))
         self._after(fault_s, lambda: self._fail(car, what, for_s))
         self._after(stop_s, lambda: self._stop(car, f"{load}, {what} for {for_s:.1f} s", fault_s + for_s - stop_s))
@@ -114,13 +114,13 @@ class Trouble:
         def judge() -> None:
             truth = self.up.simulator(ask="truth", car=car)
             if not truth["alive"]:
-                # A damaged frame kills the program of a Raspberry Pi. A person switches it off and on.
+                # A damaged frame kills the program of a Raspberry Pi. A person switches the car off and on.
                 # See docs/reference/protocol.md#hazards-of-raspberry-pi-programs.
                 self.counts["programs that died"] += 1
                 for fields in (
                     {"fault": "brownout"},
                     {"fault": "link_drop", "for_s": 0.2},
-                ):  # and plugs its link in again
+                ):  # and connects its link again
                     assert self.up.simulator(car=car, **fields)["ok"]
             elif taken and self._killed.get(car, 0.0) < asked_at - RECOVERS_S:
                 self.counts["stops judged"] += 1
@@ -131,7 +131,7 @@ class Trouble:
         self._after(max(0.0, whole_s) + STANDS_S, judge)
 
     def _ask(self, car: str, verb: str, **fields: Any) -> bool:
-        """Give a command; return False if nobody took it: its gateway may just have been killed."""
+        """Send a command. Return False without an answer: the gateway may have been killed a moment ago."""
         payload = json.dumps({**fields, "sender": "soak", "kind": "script"}).encode()
         with contextlib.suppress(BusError):
             for answer in self._bus.query(

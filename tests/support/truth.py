@@ -1,4 +1,4 @@
-"""Worlds for a car, and ways to make its true mode another than the one that was asked. The simulated car judges."""
+"""Worlds for a car, and ways to make its true mode differ from the commanded one. The simulated car judges."""
 
 import random
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from tests.support.virtual import Pair
 
 
 def near_walls() -> World:
-    """A cupboard: whichever way the car looks, a wall is near; a lamp stands in it."""
+    """Return a cupboard with a lamp: a wall is near in every direction."""
     return World((*_box(1.0), *_box(3.0)), (), (Lamp(0.3, 0.1),))
 
 
@@ -23,19 +23,19 @@ def _box(metres: float) -> tuple[Segment, ...]:
 
 
 RENEWED_S = 26.0
-"""The renewals with `MODE00` of a rest that nothing has shown are over."""
+"""Time after which control has ended its renewals of an unshown rest with `MODE00`."""
 WORLDS: dict[str, Callable[[], World]] = {"room": World.room, "no-echo": World.open_field, "near-walls": near_walls}
 
 
 def frame_of(mode: Mode) -> bytes:
-    """The frame that brings a car into a mode."""
+    """Return the frame that brings a car into a mode."""
     return encode(ModeClose() if mode is Mode.MANUAL else ModeOpen(mode))
 
 
 def car_in(mode: Mode, world: str, *, seed: int, platform: str = "arduino") -> Pair:
-    """A car that was brought to a mode, has been there for a while, and of which nothing else is to be expected.
+    """Return a car that has been in a mode for a while, with no frame of control pending.
 
-    A rest that nothing has shown is renewed with `MODE00` at first, which would end another mode.
+    Control first renews an unshown rest with `MODE00`, which would end another mode.
     """
     moments = random.Random(seed)
     pair = Pair(platform, seed=seed, world=WORLDS[world](), start_s=1.0 + moments.random()).ready()
@@ -51,7 +51,7 @@ def car_in(mode: Mode, world: str, *, seed: int, platform: str = "arduino") -> P
 
 
 def lose_next_mode_frame(pair: Pair) -> list[float]:
-    """The next mode frame of control does not reach the car; the list then has the moment when it was written."""
+    """Lose control's next mode frame. The returned list then has the time of its write."""
     feed = pair.car.feed
     lost: list[float] = []
 

@@ -1,4 +1,4 @@
-"""`fleet up` as a process: what it says, its status, its processes; everything that it left behind is ended."""
+"""`fleet up` as a process: its events, its status, its processes. The end of the `with` ends all processes it left."""
 
 import contextlib
 import io
@@ -22,8 +22,8 @@ from tests.support.processes import GatewayProcess, wait_for
 
 
 def fleet_command(*arguments: str, environment: dict[str, str]) -> "subprocess.CompletedProcess[str]":
-    """Run `fleet` from its entry point on, in this process: a new one takes half a second of a processor."""
-    # With a buffer of bytes below, as a real stdout: tables are written as bytes.
+    """Run `fleet` from its entry point in this process, because a new process takes half a second of CPU time."""
+    # A text layer on bytes, as a real stdout has: tables are written as bytes.
     stdout, stderr = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True), io.StringIO()
     with (
         pytest.MonkeyPatch.context() as patched,
@@ -45,7 +45,7 @@ def fleet_command(*arguments: str, environment: dict[str, str]) -> "subprocess.C
 
 
 class Up:
-    """One `fleet up --json`; use it with `with`."""
+    """One `fleet up --json`, for a `with` statement."""
 
     def __init__(self, directory: Path, endpoint: str, *arguments: str) -> None:
         self.directory = directory
@@ -73,7 +73,7 @@ class Up:
                 os.kill(pid, signal.SIGTERM)
 
     def left(self, *, ours: bool = False) -> list[int]:
-        """Processes that still run at this endpoint, by the system's own list; `ours`: but the hub, which lingers."""
+        """Return the processes that still run at this endpoint, by the system's own list. `ours`: without the hub."""
         return [pid for pid, words in self._mine() if not (ours and "schemas.bus.hub" in words)]
 
     def _mine(self) -> list[tuple[int, str]]:
@@ -83,7 +83,7 @@ class Up:
 
     @property
     def bus(self) -> Bus:
-        """A client of the fleet's bus."""
+        """Return a client of the fleet's bus."""
         if self._bus is None:
             self._bus = wait_for(self._open, "there is a bus")
         return self._bus
@@ -94,7 +94,7 @@ class Up:
         return None
 
     def until(self, what: str, name: str, words: str) -> dict[str, Any]:
-        """The next happening of this kind."""
+        """Wait for the next event of this kind, and return it."""
         while True:
             said: dict[str, Any] = self.process.line()
             self.heard.append(said)
@@ -102,26 +102,26 @@ class Up:
                 return said
 
     def simulator(self, **fields: Any) -> Any:
-        """Say something to the simulator; its answer."""
+        """Send a request to the simulator; return its answer."""
         assert self.process.popen.stdin is not None
         self.process.popen.stdin.write(json.dumps(fields) + "\n")
         self.process.popen.stdin.flush()
         return json.loads(self.until("simulator", "@simulator", "ok")["words"])
 
     def status(self) -> Any:
-        """The supervisor's status; None while it does not answer."""
+        """Return the supervisor's status, None without an answer."""
         return next(iter(ask_status(self.bus, "fleet")), None)
 
     def processes(self) -> list[Any]:
-        """Its processes, as soon as it answers: it may be on its way back to the bus."""
+        """Wait until the supervisor answers, as it may be on its way back to the bus. Return its processes."""
         return list(wait_for(self.status, "it answers").processes)
 
     def state(self, name: str) -> Any:
-        """Of one process, as soon as the supervisor answers; None if there is none."""
+        """Wait until the supervisor answers. Return the state of one process, None if there is none."""
         return next((each for each in self.processes() if each.name == name), None)
 
     def running(self, name: str, but: int = 0) -> int:
-        """Wait until it runs, with another process id than that; which. A hub may be a gateway's by then: 1."""
+        """Wait until a process runs with another id than `but`. Return the id; 1 for a hub that a gateway started."""
 
         def pid() -> int | None:
             found = self.state(name)
@@ -132,16 +132,16 @@ class Up:
         return int(wait_for(pid, f"{name} runs"))
 
     def kill(self, pid: int) -> None:
-        """End a process of this fleet without a word."""
+        """Kill a process of this fleet."""
         os.kill(pid, signal.SIGKILL)
 
     def exists(self, pid: int) -> bool:
-        """Whether there is such a process; one that only waits for its parent to look is none (a gateway's hub)."""
+        """Return True if the process exists and is no zombie, as a gateway's ended hub is."""
         listed = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False)
         return listed.stdout.strip()[:1] not in ("", "Z")
 
     def hub(self) -> int:
-        """The hub, the supervisor's or one that a gateway started; by the system's own list."""
+        """Return the hub by the system's own list: the supervisor's, or one that a gateway started."""
 
         def one() -> int | None:
             return next((pid for pid, words in self._mine() if "schemas.bus.hub" in words), None)
@@ -149,7 +149,7 @@ class Up:
         return int(wait_for(one, "there is a hub"))
 
     def get(self, key: str) -> Any:
-        """The latest value; None while nobody answers."""
+        """Return the latest value, None without an answer."""
         for answer in self.bus.query(f"fleet/{key}", timeout_s=5.0):
             if isinstance(answer, Sample):
                 return answer.message()
@@ -160,7 +160,7 @@ class Up:
         wait_for(lambda: (safety := self.get(f"{car}/state/safety")) and safety.motors == "off", f"{car} is ready")
 
     def ask(self, verb: str, car: str, **fields: Any) -> Any:
-        """Give a command as JSON; the answer."""
+        """Send a command as JSON; return the answer."""
         key = f"fleet/{car}/@cmd/{verb}"
         payload = json.dumps(fields).encode()
         (answer,) = self.bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=5.0)
@@ -168,11 +168,11 @@ class Up:
         return json.loads(answer.payload)
 
     def fleet(self, *arguments: str) -> "subprocess.CompletedProcess[str]":
-        """Run another `fleet` command at this fleet, in this process."""
+        """Run another `fleet` command for this fleet, in this process."""
         return fleet_command(*arguments, environment=self.environment)
 
     def fleet_process(self, *arguments: str) -> "subprocess.CompletedProcess[str]":
-        """Run another `fleet` command at this fleet, in a process of its own: on any thread."""
+        """Run another `fleet` command for this fleet in a process of its own. Any thread may call it."""
         command = [sys.executable, "-m", "fleet.cli", *arguments]
         environment = os.environ | self.environment
         return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=90)

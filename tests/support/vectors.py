@@ -9,7 +9,7 @@ _VECTORS = Path(__file__).resolve().parents[1] / "vectors"
 
 
 def rows(name: str) -> list[dict[str, str]]:
-    """The rows of one file as dicts by column; every row has as many columns as the header, and a source."""
+    """Return the rows of one file as dicts by column. Each row must have the header's columns and a source."""
     lines = (_VECTORS / f"{name}.tsv").read_text(encoding="utf-8").splitlines()
     header, *table = [line.split("\t") for line in lines if line and not line.startswith("// ")]
     assert "source" in header, name
@@ -19,10 +19,10 @@ def rows(name: str) -> list[dict[str, str]]:
 
 
 def ids(table: list[dict[str, str]]) -> list[str]:
-    """Test ids: the source and the first column."""
+    """Return the test ids: source and first column."""
     return [f"{row['source']}: {next(iter(row.values()))}" for row in table]
 
 
 def wire(text: str) -> bytes:
-    """The bytes of a cell; Python escapes such as \\r and \\xff are allowed."""
+    """Return the bytes of a cell, in which Python escapes such as \\r and \\xff are allowed."""
     return text.encode("latin-1").decode("unicode_escape").encode("latin-1")

@@ -14,9 +14,9 @@ from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.world import World
 
 TICK_S = 0.05
-"""How often control weighs silence. All else wakes the loop when it is due: bytes, deadlines, what the car does."""
+"""Interval at which control checks silence. Bytes, deadlines and events of the car wake the loop when they are due."""
 SHORTEST_S = 1e-6
-"""Time passes in steps that are no shorter than this."""
+"""Minimum step of time."""
 
 
 class Pair:
@@ -44,42 +44,42 @@ class Pair:
         self.records: list[CommandRecord] = []
         self.logs: list[LogRecord] = []
         self.shown_at: list[float] = []
-        """When control learned from the car that it stands."""
+        """Times at which the car's readings showed control that the car stands."""
         self.number = 0
         self.cut: int | None = None
-        """How many bytes of the next write get through before the link breaks; None: all, and it holds."""
+        """Number of bytes of the next write that arrive before the link breaks. None: all, and the link stays."""
         self.deaf_until = 0.0
-        """Until when what the car sends is lost on the way."""
+        """Time until which the car's readings are lost."""
         self._next_tick = 0.0
         self._control_at = 0.0
-        """When control is polled next; what it learns until then may make it earlier, not later, as in the gateway."""
+        """Time of control's next poll. News may make it earlier, but not later, as in the gateway."""
         self._touched = False
-        """Whether control has learned something since it was asked when."""
+        """True if control got news since `_control_at` was computed."""
         self._awake = 0
-        """How often the loop turned without sleeping."""
+        """Number of turns of the loop without a sleep."""
         self.run(start_s, linked=False)
 
     def connect(self) -> None:
-        """Open the link; recovery begins."""
+        """Open the link, so that recovery begins."""
         if isinstance(self.car, RaspberryPiCar):
             self.car.connected(self.now)
         self.decoder = Decoder()
         self.control.link_up(self.now)
 
     def lose(self, reason: str = "unplugged") -> None:
-        """The link is cut: what is on the wire is lost."""
+        """Cut the link. All bytes in transit are lost."""
         self.car.drop_link(self.now)
         self.control.link_down(reason, self.now)
         self._take()
 
     def ready(self) -> "Pair":
-        """Connect and wait until recovery is complete and a reading has come."""
+        """Connect, and wait until recovery is complete and a reading has arrived."""
         self.connect()
         self.until(lambda: self.control.model.known and self.control.model.mode.inferred is not None, 30.0)
         return self
 
     def ask(self, what: Action, *, verb: str = "test", sender: Sender | None = None, identity: str = "") -> Answer:
-        """Give a command, and pump once."""
+        """Send a command, and run one turn."""
         self.number += 1
         command = Command(identity or f"c{self.number}", verb, sender or Sender(), what)
         answer = self.control.command(command, self.now)
@@ -89,12 +89,12 @@ class Pair:
     def run(self, seconds: float, *, linked: bool = True) -> None:
         """Let time pass."""
         end = self.now + seconds
-        self._touched = True  # a test may have told control something
+        self._touched = True  # the test may have called control
         while self.now < end - 1e-9:
             self.turn(end, linked=linked)
 
     def until(self, condition: Callable[..., bool], seconds: float) -> float:
-        """Let time pass until a condition holds; returns how long it took, fails if it takes longer."""
+        """Let time pass until a condition holds. Return how long that took; fail if it takes longer than `seconds`."""
         began = self.now
         end = began + seconds
         self._touched = True
@@ -104,7 +104,7 @@ class Pair:
         return self.now - began
 
     def turn(self, end: float, *, linked: bool = True) -> None:
-        """Go to whatever happens next, at `end` at the latest."""
+        """Go to the next event, at `end` at the latest."""
         wake = min(end, self.car.next_event())
         if linked:
             deadline = self.decoder.deadline()
@@ -119,13 +119,13 @@ class Pair:
         self._take()
 
     def off_for_good_at(self) -> float:
-        """When the motors went off and stayed off; the run so far is the judge."""
+        """Return the time at which the motors went off for good, by the run until now."""
         time, left, right = self.car.motor_log[-1]
         assert (left, right) == (0, 0), f"the motors are on since {time}: {self.sent[-6:]}"
         return time
 
     def phases(self, identity: str) -> list[Phase]:
-        """The life of one command."""
+        """Return the phases of one command."""
         return [record.phase for record in self.records if record.command.id == identity]
 
     def lose_frames(self) -> None:
@@ -133,18 +133,18 @@ class Pair:
         self.car.feed = lambda data, now: None  # type: ignore[method-assign]  # the car's end of the wire, cut
 
     def last_of(self, identity: str) -> CommandRecord | None:
-        """The record that ends a stop, as shown, as sent or as failed; None while it goes on."""
+        """Return the record that ends a stop (shown, sent or failed), None while the stop goes on."""
         begun = (Phase.ASKED, Phase.QUEUED, Phase.SENT)
         life = (record for record in self.records if record.command.id == identity)
         return next((record for record in life if record.phase not in begun or record.basis), None)
 
     def shown_since(self, since: float) -> float | None:
-        """When the car first showed after `since` that it stands; None if it did not."""
+        """Return the time after `since` at which the car first showed that it stands, None if it did not."""
         return next((at for at in self.shown_at if at > since), None)
 
     def _wanted_at(self) -> float:
         """Return when control is to be polled."""
-        # Most turns are the car's own, and tell control nothing. Polling in each of them took a third of a run.
+        # Most turns are the car's own, without news for control. Polling in each turn took a third of a run.
         if self._touched:
             self._touched = False
             self._control_at = min(self._control_at, self.control.next_at(self.now))
@@ -163,7 +163,7 @@ class Pair:
             self.tick()
 
     def tick(self) -> None:
-        """Let control weigh silence, if it is time."""
+        """Let control check silence, if it is time."""
         if self.now >= self._next_tick:
             self._next_tick = self.now + TICK_S
             self._touched = True
