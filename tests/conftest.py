@@ -1,4 +1,4 @@
-"""How tests are collected and spread over workers, how long an example of Hypothesis may take, and what a Ctrl-C is."""
+"""Collects tests, spreads them over workers, sets the timeout of Hypothesis' examples, and restores SIGINT."""
 
 import gc
 import signal
@@ -10,8 +10,8 @@ from xdist.remote import Producer
 
 from tests.support import scheduling
 
-# By default an example that takes 200 ms fails, and so do examples that take a second to make: a machine that stalls
-# for as long says nothing of the product. What never ends is pytest's time-out's.
+# By default, Hypothesis fails an example that takes 200 ms, or a second to make. A stall of the machine is no fault of
+# the product. pytest's timeout ends an endless example.
 settings.register_profile(
     "patient",
     parent=settings(),
@@ -20,7 +20,7 @@ settings.register_profile(
 )
 settings.load_profile("patient")
 
-# In the background of a script SIGINT comes ignored, and is in every process that a test starts and would end by it.
+# In the background of a script, SIGINT is ignored, also by each process that a test starts and ends by SIGINT.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -37,7 +37,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> schedul
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Collect without the garbage collector, which looked at thousands of tests again and again: half of the time."""
+    """Collect without the garbage collector, which took half of the time for thousands of tests."""
     gc.disable()
     try:
         return (yield)
@@ -55,7 +55,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep tests that share a fixture of their module on one worker.
 
-    Without a group every worker gets some of them, and starts the fleet or records the session once more.
+    Without a group, every worker gets some of these tests, and starts the fleet or records the session once more.
     Tests that compute come last, where workers in the background take them.
     """
     items.sort(key=lambda item: scheduling.computes(item.nodeid))

@@ -1,4 +1,4 @@
-"""The judge of the soak finds false claims, and no others: each row is what was published and what it finds."""
+"""The judge of the soak finds all false claims, and only these. Each row: published values, and the findings."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ def sample(message: Any, at_s: float) -> Sample:
 def judged(
     on_s: tuple[float, float], safety: pb.Safety, confirmed: str = "", complete_s: float = 0.0
 ) -> dict[str, int]:
-    """Play 20 s: the motors of a tracking car are on between two times; what is claimed is claimed all the time."""
+    """Play 20 s: the motors of a tracking car are on between two times, and the claim stays the same all the time."""
     claims = Claims()
     for tenth in range(TENTHS):
         at_s = tenth / 10

@@ -1,6 +1,6 @@
-"""Citations of pages in the code, links between pages and the navigation are whole, and the prose stays short.
+"""Tests that citations in the code, links between pages and the navigation resolve, and that sentences are short.
 
-The code cites a page by its path from the root, with the anchor of a heading where it means one:
+The code cites a page by its path from the root, with the anchor of a heading if it cites a section:
 docs/reference/protocol.md#blocking-times. Pages of docs/ link to each other with relative links, and to other files of
 the repository with the address of its `main`. README.md has addresses only: package indexes show it, too.
 """
@@ -63,7 +63,7 @@ def anchors(page: Path) -> set[str]:
 
 
 def fault(target: Path, anchor: str) -> str:
-    """Return why a page or its heading is not there; empty if both are."""
+    """Return an error if the page or its heading does not exist; empty if both do."""
     if not target.exists():
         return f"no file {target.relative_to(ROOT) if target.is_relative_to(ROOT) else target}"
     if anchor and anchor not in anchors(target):
@@ -79,7 +79,7 @@ def code_files() -> Iterator[Path]:
 
 
 def faults_of(text: str, where: str) -> list[str]:
-    """Return the citations in a text that lead nowhere."""
+    """Return the citations in a text that do not resolve."""
     cited = [(match[1], match[2] or "") for match in CITATION.finditer(text)]
     return [f"{where}: {path}: {why}" for path, anchor in cited if (why := fault(ROOT / path, anchor))]
 
@@ -124,7 +124,7 @@ def navigation(part: Any) -> Iterator[str]:
 
 
 def test_the_navigation_is_complete() -> None:
-    """Every page is in it once. The pages of commands are listed by an index of their own."""
+    """Every page is in the navigation once. The pages of commands have an index of their own."""
     with (ROOT / "docs" / CONFIGURATION).open("rb") as file:
         found = Counter(navigation(tomllib.load(file)["project"]["nav"]))
     index = (CLI_INDEX).read_text(encoding="utf-8")
@@ -171,7 +171,7 @@ BRITISH: Final = re.compile(r"(?i)\b(?:colour\w*|metres?|behaviour|neighbour\w*|
 
 @pytest.mark.parametrize("page", [README, *DOCS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_words_are_plain(page: Path) -> None:
-    """No participle stands as a noun, and no synonym stands for a word of the glossary."""
+    """No page uses a participle as a noun, or a synonym of a word of the glossary."""
     glossary = GLOSSARY.read_text(encoding="utf-8")
     rows = re.findall(r"^\| [^|]+ \| [^|]+ \| ([^|]+?) ?\|$", glossary, re.MULTILINE)
     refused = {word.strip() for row in rows for word in row.split(",")} - {"", "instead of"}
@@ -184,7 +184,7 @@ def test_words_are_plain(page: Path) -> None:
 
 
 def messages(tree: ast.Module) -> Iterator[str]:
-    """Yield the texts in a module that are no docstrings; X stands for a value in a text."""
+    """Yield the texts in a module that are no docstrings, with X for each value."""
     parts: set[int] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):

@@ -1,4 +1,4 @@
-"""Everything that a user can type, write into a file or meet in a message has its place in docs/."""
+"""Tests that docs/ describes all commands, options, fields of files, events, reasons and variables."""
 
 import argparse
 import ast
@@ -25,7 +25,7 @@ PRODUCT: Final = ("gateway", "fleet", "schemas")
 SHELL: Final = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 FILE_BLOCK: Final = re.compile(r'^```yaml title="(fleet|plan|world)\.yaml"\n(.*?)^```', re.MULTILINE | re.DOTALL)
 NO_EXAMPLE: Final = frozenset({"down", "status", "reload", "whistle"})
-"""Commands that take nothing: their usage is the example."""
+"""Commands without arguments, whose usage is their example."""
 OURS: Final = re.compile(r"FLEET_\w+|_FLEET_COMPLETE")
 
 

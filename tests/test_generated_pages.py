@@ -1,4 +1,4 @@
-"""What the pages of docs/ show is what the code says."""
+"""Tests that the generated parts of docs/ are up to date with the code."""
 
 from pathlib import Path
 

@@ -1,11 +1,11 @@
-"""Tests that must not run at once do not, and tests that share what is costly run on one worker."""
+"""Tests that pytest-xdist runs each group of tests on one worker."""
 
 import pytest
 
 
 @pytest.mark.xdist_group("together")
 def test_groups_are_in_force(request: pytest.FixtureRequest) -> None:
-    """pytest-xdist tells nobody when a newer pytest makes `--dist loadgroup` group nothing (pytest-xdist#1386)."""
+    """With a newer pytest, `--dist loadgroup` groups no tests, without a warning (pytest-xdist#1386)."""
     if getattr(request.config.option, "loadgroup", False):
         assert request.node.nodeid.endswith("@together"), "xdist_group has no effect with this pytest: see constraints"
 

@@ -1,4 +1,4 @@
-"""Rules of names and imports that no linter has. CONTRIBUTING.md explains them."""
+"""Tests rules of names and imports that no linter has. CONTRIBUTING.md explains them."""
 
 import ast
 import re
@@ -22,7 +22,7 @@ TWINS = frozenset({"Fleet", "Car", "Lease", "Watch"})
 """Classes of the SDK that have an asyncio twin of the same name in fleet/aio.py."""
 
 LAZY_IMPORTS = 133
-"""Maximum number of imports inside functions. Each is there so that a command line starts fast; no more come in."""
+"""Maximum number of imports inside functions. Each of them shortens the start of a command line."""
 
 NO_MODULE_NAMES = re.compile(
     r"(asking|asked|hearing|heard|telling|told|saying|said|keeping|kept|waiting|wanted|known|seen|shown|found|begun|given"
@@ -68,7 +68,7 @@ def test_a_module_is_named_after_a_noun_of_the_field() -> None:
 
 
 def number(node: ast.expr) -> float | None:
-    """The value of a literal number, also of a negated one."""
+    """Return the value of a literal number, also of a negated one."""
     try:
         value = ast.literal_eval(node)
     except ValueError:
@@ -93,7 +93,7 @@ def test_constants_of_one_name_have_one_value() -> None:
 
 
 def imports(path: Path, *, lazy: bool) -> Iterator[ast.Import | ast.ImportFrom]:
-    """The import statements of a module: those at its top, or those inside functions. Not those for type checkers."""
+    """Yield the imports at a module's top, or those inside functions. Skip imports for type checkers."""
     tree = parsed(path)
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     typing_only = [
@@ -107,7 +107,7 @@ def imports(path: Path, *, lazy: bool) -> Iterator[ast.Import | ast.ImportFrom]:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """The names of all modules that a module may import at its top."""
+    """Yield the names of all modules that a module may import at its top."""
     for node in imports(path, lazy=False):
         if isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
@@ -118,7 +118,7 @@ def imported(path: Path) -> Iterator[str]:
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
     files = {module_name(path): path for path in source_files(*PRODUCT)}
-    # A package imports its modules to export their names: that is no circle.
+    # A package imports its modules to export their names. Such imports make no cycle.
     packages = {name for name, path in files.items() if path.name == "__init__.py"}
     graph = {
         name: {each for each in imported(path) if each in files and each not in packages and each != name}
@@ -170,7 +170,7 @@ def messages_with_lines(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def test_a_message_to_users_has_at_most_two_lines() -> None:
-    """Faults of a file and changes are lists: their lines are in no constant."""
+    """Lists of a file's faults and changes are exempt, because no constant holds them."""
     raised = ("ClickException", "UsageError", "BadParameter", ".fail", ".echo", "stderr.write")
     faults = []
     for path in source_files(*PRODUCT):

@@ -1,4 +1,4 @@
-"""What the parts cost, each beside the least that the same machine can do at the same moment (`make bench`).
+"""Benchmarks: the cost of each part beside a floor, measured in turns on the same machine (`make bench`).
 
-No speed is asserted here or in any test: a ratio to a floor is read by a person, on a machine that is otherwise idle.
+No test asserts a speed. A person reads the ratios to the floors, on a machine that is otherwise idle.
 """

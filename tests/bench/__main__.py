@@ -1,6 +1,6 @@
 """`python -m tests.bench [NAME...] [--small] [--json]`: run the benchmarks, print a table.
 
-Ends 0 unless something broke.
+The exit code is 0 unless a program broke.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def row_of(one: Measured) -> str:
 
 
 def main() -> int:
-    """Run what is named, or all; only a program that broke is a failure."""
+    """Run the named benchmarks, or all. Fail only if a program broke."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"which: {', '.join(BENCHMARKS)} (default all)")
     parser.add_argument("--json", action="store_true", help="one JSON object per line instead of a table")

@@ -1,4 +1,4 @@
-"""From typing a command to its end, in absolute times; the floor is a Python that does nothing."""
+"""Time from the start of a command to its end, in absolute times. The floor is a Python that does nothing."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ from tests.support.processes import FleetProcesses
 
 CARS = ("red", "green", "blue")
 RUNS = 20
-"""Short processes: the median of more runs than elsewhere."""
+"""Number of runs, more than elsewhere because the processes are short."""
 HELP_MS, LIST_MS = 200.0, 300.0
 
 

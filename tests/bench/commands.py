@@ -1,4 +1,4 @@
-"""From a command's query to its bytes on the tty; the floor is a query that a bare process answers at once."""
+"""Time from a command's query to its bytes on the tty. The floor is a query that a bare process answers at once."""
 
 import json
 from itertools import cycle
@@ -11,7 +11,7 @@ from tests.support.processes import PATIENCE_S
 
 COMMANDS = 30
 GAP_S = 0.1
-"""More than the 60 ms for which a motion is in flight: what is measured is the way, not the pacing."""
+"""Interval of the commands, over the 60 ms for which a motion is in flight. So pacing delays none of them."""
 TURNS = cycle([("left", b"$3,0,0,0,0,0,0,0,0#"), ("right", b"$4,0,0,0,0,0,0,0,0#")])
 
 
@@ -31,7 +31,7 @@ def _command(here: Stage, port: Tty, count: int) -> float:
             seen += port.read()
         times.append((perf_counter() - began) * 1e3)
         assert all(reply.ok is not None for reply in replies)
-    return median(times[1:])  # the first may have met the stop of what was held before
+    return median(times[1:])  # the first command may have waited for the stop of the motion before
 
 
 def _query(here: Stage, count: int) -> float:
@@ -52,7 +52,7 @@ def run(scale: Scale) -> list[Measured]:
         watch = here.session.liveliness().declare_subscriber("bench/answer/alive", alive.note, history=True)
         here.bare("answer", "bench/answer")
         alive.wait()
-        with frames(port, READING, rate_hz=1.0):  # a car that is silent for long is not driven
+        with frames(port, READING, rate_hz=1.0):  # the gateway does not drive a silent car
             count = scale.count(COMMANDS, 3)
             ours, floor = in_turns(scale, lambda: _command(here, port, count), lambda: _query(here, count))
         watch.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type

@@ -1,4 +1,4 @@
-"""Decoding one sensors frame; the floor is one regular expression that captures its six fields."""
+"""Time to decode one sensors frame. The floor is one regular expression that captures its six fields."""
 
 import re
 from time import perf_counter

@@ -1,6 +1,6 @@
-"""A fleet of simulated cars as `fleet up` runs it: what a car costs, how long a question and a stop of all take.
+"""A fleet of simulated cars under `fleet up`: the cost of a car, and the times of a query and a stop of all cars.
 
-The floors: a bare process that answers at once; for what grows with the fleet, the smallest fleet. PSS is Linux's.
+The floor is a bare process that answers at once, or the smallest fleet for figures that grow. PSS is Linux's.
 """
 
 import contextlib
@@ -20,28 +20,28 @@ from tests.support.up import Up
 
 SIZES = (1, 50, 100)
 GOALS = 50
-"""The fleet's size for questions and stops; in a small round its only one."""
+"""Number of cars for queries and stops. A small round has only this size."""
 QUERIES = 40
 STOPS = 12
 WINDOW_S = 5.0
 QUERY_MS, STOP_MS = 100.0, 150.0
 LONGEST_UP_S, LOOK_S = 300.0, 0.5
 UP_S = 60.0
-"""Until a hundred cars are at rest, on two processors (issue 10)."""
+"""Maximum time until a hundred cars are at rest, on two processors (issue 10)."""
 
 
 def _cpu_s(pids: list[int]) -> float:
-    """Time on a processor of these processes, by the scheduler's own count."""
+    """Return the CPU time of these processes, by the scheduler's own count."""
     total = 0
     for pid in pids:
         for thread in Path(f"/proc/{pid}/task").glob("*/schedstat"):
-            with contextlib.suppress(OSError):  # a thread that has just ended
+            with contextlib.suppress(OSError):  # the thread has just ended
                 total += int(thread.read_text(encoding="ascii").split()[0])
     return total / 1e9
 
 
 def _pss_mb(pid: int) -> float:
-    """Memory, what is shared divided among those who share it."""
+    """Return the proportional set size: shared memory is divided among its processes."""
     for line in Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines():
         if line.startswith("Pss:"):
             return int(line.split()[1]) * 1024 / 1e6
@@ -49,7 +49,7 @@ def _pss_mb(pid: int) -> float:
 
 
 class _Fleet:
-    """So many cars, up and at rest."""
+    """A fleet of this size, up and at rest."""
 
     def __init__(self, up: Up, size: int, scale: Scale) -> None:
         self.up = up
@@ -63,27 +63,27 @@ class _Fleet:
         assert not again, f"started again: {again}"
 
     def at_rest(self) -> int:
-        """Cars that are known to stand."""
+        """Return the number of cars that are known to stand."""
         answers = list(self.up.bus.query("fleet/*/state/safety", timeout_s=5.0))
         return sum(isinstance(each, Sample) and each.message().motors == "off" for each in answers)  # type: ignore[attr-defined]
 
     def pids(self) -> list[int]:
-        """The gateways' processes."""
+        """Return the process ids of the gateways."""
         return [each.pid for each in self.up.status().processes if each.kind == "gateway" and each.HasField("pid")]
 
     def cpu(self) -> float:
-        """Of one gateway, percent of a core."""
+        """Return the CPU time of one gateway, percent of a core."""
         pids = self.pids()
         before, began = _cpu_s(pids), perf_counter()
         time.sleep(self.scale.seconds(WINDOW_S, 1.2))  # a report comes once a second
         return (_cpu_s(pids) - before) / (perf_counter() - began) / self.size * 100
 
     def pss(self) -> float:
-        """Of one gateway, MB."""
+        """Return the memory of one gateway, MB."""
         return statistics.fmean(_pss_mb(pid) for pid in self.pids())
 
     def queries(self) -> list[float]:
-        """A wildcard query for one reading of every car, until its last answer, ms."""
+        """Return the times of wildcard queries for one reading of every car, until the last answer, ms."""
         times = []
         for _ in range(self.scale.count(QUERIES, 3)):
             began = perf_counter()
@@ -93,7 +93,7 @@ class _Fleet:
         return times
 
     def track(self, client: Fleet) -> None:
-        """Bring all that can into tracking; the others (a Raspberry Pi) go on in mode 0."""
+        """Bring all cars into tracking. Raspberry Pi cars stay in mode 0."""
         outcomes = [client.car(car).mode("tracking") for car in client.cars() if self._may_track(car)]
         assert all(outcome.ok for outcome in outcomes), [outcome for outcome in outcomes if not outcome.ok]
 
@@ -101,7 +101,7 @@ class _Fleet:
         return not self.up.get(f"{car}/state/health").platform.startswith("raspberry")
 
     def stops(self, client: Fleet) -> list[float]:
-        """From asking all cars to stop until the first frame of it is on a car's wire, ms, one for each car."""
+        """Return the time from a stop of all cars until its first frame is on the wire, ms, for each car."""
         wires: dict[str, int] = {}
 
         def wire(sample: Sample) -> None:
@@ -110,9 +110,9 @@ class _Fleet:
                 wires.setdefault(sample.key, stamp_ns(frame))
 
         subscriber = self.up.bus.subscribe("fleet/*/frame/tx", wire)
-        time.sleep(0.2)  # until all gateways know of it
+        time.sleep(0.2)  # until all gateways have the subscription
         asked = time.time_ns()
-        # Until all have carried it out: a stop that joins another writes nothing. A car may show it late.
+        # Wait until all stops are over: a stop that joins another one writes nothing. A car may show its stop late.
         wait_for(lambda: all(outcome.ok for outcome in client.stop()), "all cars stand", 60.0)
         wait_for(lambda: len(wires) == self.size, "a stop is on every wire", 30.0)
         subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type

@@ -1,7 +1,7 @@
-"""`stop` while the bus is flooded: from asking to its first frame on the tty, and what the gateway holds in memory.
+"""`stop` while the bus is flooded: time from the request to the first frame on the tty, and the gateway's memory.
 
-The floor is the same gateway without a flood. The goal of each is 50 ms more at most. What a bare process takes to
-answer under the same flood of tokens is told with it: Zenoh's own work for a token is most of what there is.
+The floor is the same gateway without a flood. The goal of each is 50 ms more at most. The output also has the time in
+which a bare process answers under the same flood of tokens: most of the work for a token is Zenoh's own.
 """
 
 import json
@@ -15,19 +15,19 @@ from tests.support.processes import PATIENCE_S, TAKEN, wait_for
 
 FLOODER = Path(__file__).parents[1] / "support" / "flooder.py"
 RATES = {"history": 330.0, "operators": 1200.0, "cars": 1200.0, "large": 20.0, "drives": 10_000.0}
-"""Of each flood, a second, as far as the machine goes."""
+"""Maximum messages a second of each flood."""
 TOKENS = ("operators", "cars")
 STOPS = 5
 WARM_S = 2.0
 RESTED_S = 2.5
-"""A stop is over, and another is not joined to it."""
+"""Time after which a stop is over, so that the next request joins no other stop."""
 KEPT = 1500
-"""Values that a gateway keeps of each reading."""
+"""Values of each reading that a gateway caches."""
 REPORT_S = 0.04
 LONGEST_FRAME = 26
 CLOSE = b"$4WD,MODE00#"
 CLOSING_S = 1.0
-"""How long a car is silent that closes a mode."""
+"""Time for which a car is silent while it closes a mode."""
 
 
 class _Car:
@@ -36,7 +36,7 @@ class _Car:
     def __init__(self, port: Tty) -> None:
         self._port = port
         self.stops: list[float] = []
-        """When a stop's first frame came."""
+        """Arrival times of the first frame of each stop."""
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -62,14 +62,14 @@ class _Car:
 
 
 def _drives(here: Stage, sender: str) -> bool:
-    """Ask for a drive; whether it is carried out."""
+    """Request a drive. Return True if the gateway carries it out."""
     fields = {"motion": "forward", "duration_s": 10, "sender": sender, "kind": "person"}
     drive = here.session.get("fleet/red/@cmd/drive", payload=json.dumps(fields), timeout=PATIENCE_S)
     return any(reply.ok is not None and json.loads(reply.ok.payload.to_bytes())["status"] in TAKEN for reply in drive)
 
 
 def _stops(here: Stage, car: _Car, count: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Drive and stop; each stop's time from its question to the tty, ms, and that of a bare query before it."""
+    """Drive and stop. Return the times from each stop's request to the tty, ms, and those of a bare query before."""
     times, bare = [], []
     for number in range(count):
         sleep(RESTED_S)

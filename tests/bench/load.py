@@ -1,6 +1,6 @@
-"""A gateway under load: its CPU at 25 tracking frames a second, commands meanwhile, its memory after an hour of them.
+"""A gateway at 25 tracking frames a second: its CPU, the time of commands, and its memory after an hour's frames.
 
-The floors: a bare loop that publishes the same; a query that a bare process answers at once; its own memory before.
+The floors: a bare loop that publishes the same, a query that a bare process answers at once, its own memory before.
 """
 
 import json
@@ -20,16 +20,16 @@ COMMANDS = 30
 HOUR = 3600 * RATE_HZ
 """Frames in an hour of tracking."""
 SETTLED = HOUR // 10
-"""Every ring is full by then: 1,500 readings are kept, and it takes a minute."""
+"""Number of frames after which every ring of 1,500 readings is full."""
 AT_ONCE = 100
 LOST_AFTER_S = 3.0
-"""Frames that `state/link` has not counted by then (it comes once a second) were dropped."""
+"""Time after which uncounted frames are dropped frames. `state/link` comes once a second."""
 
 
 def cpu_s(process: GatewayProcess) -> float:
-    """Time on a processor, user and system: by the scheduler's own count (Linux), elsewhere by `ps` in hundredths.
+    """Return the CPU time, user and system: on Linux by the scheduler's own count, elsewhere by `ps` in hundredths.
 
-    Ticks of 10 ms, as /proc/PID/stat has them, miss most of what runs for a fraction of one.
+    The ticks of /proc/PID/stat take 10 ms, and miss most of the threads that run for a fraction of one.
     """
     threads = list(Path(f"/proc/{process.pid}/task").glob("*/schedstat"))
     if threads:
@@ -40,7 +40,7 @@ def cpu_s(process: GatewayProcess) -> float:
 
 
 def _cpu(process: GatewayProcess, port: Tty, window_s: float) -> float:
-    """Share of a core, in percent."""
+    """Return the share of a core, in percent."""
     with frames(port, TRACKING, RATE_HZ):
         sleep(0.5)
         before, began = cpu_s(process), monotonic()
@@ -49,7 +49,7 @@ def _cpu(process: GatewayProcess, port: Tty, window_s: float) -> float:
 
 
 def _track(here: Stage, port: Tty) -> None:
-    """Bring the gateway's car into tracking, and have it confirmed."""
+    """Bring the gateway's car into tracking, and wait until the mode is confirmed."""
     here.fleet.ask("mode", mode="tracking")
 
     def opened() -> bool:
@@ -62,7 +62,7 @@ def _track(here: Stage, port: Tty) -> None:
 
 
 def _commands(here: Stage, port: Tty, count: int) -> list[float]:
-    """From asking to the tty, ms, while mode-0 frames (six readings each) come at the same rate."""
+    """Return the times from request to tty, ms, while mode-0 frames (six readings each) come at the same rate."""
     times = []
     for _ in range(count):
         motion, frame = next(TURNS)
@@ -77,7 +77,7 @@ def _commands(here: Stage, port: Tty, count: int) -> list[float]:
             seen += port.read()
         times.append((perf_counter() - began) * 1e3)
         assert all(reply.ok is not None for reply in replies)
-    return times[1:]  # the first may have met the stop of what was held before
+    return times[1:]  # the first command may have waited for the stop of the motion before
 
 
 def _queries(here: Stage, count: int) -> list[float]:
@@ -91,7 +91,7 @@ def _queries(here: Stage, count: int) -> list[float]:
 
 
 def _feed(here: Stage, port: Tty, count: int) -> None:
-    """Give the gateway frames as fast as it takes them, until `state/link` has counted `count` more of them."""
+    """Send frames as fast as the gateway takes them, until `state/link` has counted `count` more of them."""
     first = here.fleet.state("link").rx_frames
     written = taken = 0
     deadline = monotonic() + PATIENCE_S
@@ -104,7 +104,7 @@ def _feed(here: Stage, port: Tty, count: int) -> None:
         if taken > before:
             deadline = monotonic() + PATIENCE_S
         elif monotonic() > deadline - PATIENCE_S + LOST_AFTER_S:
-            written = taken  # a gateway that was held up drops bytes that are too old: write as many again
+            written = taken  # a stalled gateway drops bytes that are too old: write as many again
         assert monotonic() < deadline
         sleep(0.02)
 

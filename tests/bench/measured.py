@@ -1,4 +1,4 @@
-"""A measured cost and the floor under it; runs of each take turns, so that both see the same machine."""
+"""A measured cost and its floor. Their runs take turns, so that both meet the same state of the machine."""
 
 import statistics
 from collections.abc import Callable
@@ -10,10 +10,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How much a benchmark does."""
+    """The size of a benchmark."""
 
     runs: int
-    """Runs of ours, and of the floor."""
+    """Number of runs of ours, and of the floor."""
     share: float = 1.0
     """Share of the full count, time or size of one run."""
 
@@ -28,7 +28,7 @@ class Scale:
 
 FULL = Scale(runs=5)
 SMALL = Scale(runs=1, share=0.01)
-"""One round that shows that a benchmark runs, in seconds. Its figures say nothing."""
+"""One round of seconds that shows that a benchmark runs. Its figures have no meaning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +40,9 @@ class Measured:
     floor: tuple[float, ...]
     unit: str
     goal: float | None
-    """The ratio that is wanted at most; None where issue 3 sets none."""
+    """Maximum ratio, None if issue 3 sets none."""
     slack: float = 0.0
-    """What may come on top of goal x floor, in `unit`. With a goal of 0 it is an absolute limit."""
+    """Allowance beside goal x floor, in `unit`. With a goal of 0 it is an absolute limit."""
 
     @property
     def ours_median(self) -> float:
@@ -54,7 +54,7 @@ class Measured:
 
     @property
     def ratio(self) -> float | None:
-        """Ours to the floor; None if there is no floor."""
+        """Ratio of ours to the floor, None if there is no floor."""
         return self.ours_median / self.floor_median if self.floor_median > 0 else None
 
     @property
@@ -62,7 +62,7 @@ class Measured:
         return self.goal is None or self.ours_median <= self.goal * self.floor_median + self.slack
 
     def to_dict(self) -> dict[str, Any]:
-        """One JSON object."""
+        """Return one JSON object."""
         return {
             "name": self.name,
             "ours": self.ours_median,
@@ -78,7 +78,7 @@ class Measured:
 
 
 def in_turns(scale: Scale, ours: Callable[[], T], floor: Callable[[], T]) -> tuple[list[T], list[T]]:
-    """Run both in turns and return the results of each. Who goes first changes; an extra turn warms both up."""
+    """Run both in turns and return the results of each. The order alternates, and an extra turn warms both up."""
     if scale.runs > 1:
         ours(), floor()
     mine: list[T] = []
@@ -90,5 +90,5 @@ def in_turns(scale: Scale, ours: Callable[[], T], floor: Callable[[], T]) -> tup
 
 
 def percentile(values: list[float], share: float) -> float:
-    """The value that `share` of all are not above."""
+    """Return the value at this share of the sorted values."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]

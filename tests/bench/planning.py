@@ -1,4 +1,4 @@
-"""One decision of the coordinator for 50 cars and 20 rules; the floor is looking at each reading once."""
+"""Time of one decision of the coordinator for 50 cars and 20 rules. The floor reads each reading once."""
 
 from dataclasses import replace
 from time import perf_counter
@@ -28,7 +28,7 @@ STEPS = 100
 
 
 def _pictures(count: int) -> list[FleetSnapshot]:
-    """New readings from every car in each; one car more or less in every second."""
+    """Return snapshots with new readings of every car. Every second one has one car more or less."""
     found = []
     for number in range(count):
         readings = {

@@ -1,6 +1,6 @@
-"""From a write on the tty to a subscriber's callback; the floor is a bare process with pyserial's read and a put.
+"""Time from a write on the tty to a subscriber's callback. The floor is a bare process with pyserial's read and a put.
 
-Ours is timed to `sensor/range`, the first of the six readings and the frame that one sensors frame becomes.
+The gateway publishes a sensors frame as six readings and the frame. The time ends with `sensor/range`, the first one.
 """
 
 from time import perf_counter, sleep
@@ -10,7 +10,7 @@ from tests.bench.stage import READING, Arrival, Stage, Tty, stage
 
 FRAMES = 100
 GAP_S = 0.02
-"""Between two frames; a car sends at most one in 37 ms."""
+"""Interval of the frames. A car sends at most one in 37 ms."""
 
 
 def _times(port: Tty, arrival: Arrival, count: int) -> list[float]:

@@ -1,6 +1,6 @@
-"""What benchmark `record` measures: the recorder in a process of its own. Arguments: endpoint, fleet, directory.
+"""The recorder in a process of its own, for the benchmark `record`. Arguments: endpoint, fleet, directory.
 
-Speaks as floors/record.py does.
+Its lines are those of floors/record.py.
 """
 
 import json

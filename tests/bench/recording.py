@@ -1,7 +1,7 @@
-"""CPU per recorded message, and of a hundred cars; the floor is a subscriber's callback that calls `add_message`.
+"""CPU time per recorded message, and of a hundred cars. The floor is a subscriber's callback with `add_message`.
 
-Both are processes of their own, given the same messages at the same pace: what forty cars send that track a line.
-Everything that a process does is in its CPU time, so ours pays for its flushes, its status and its counting, too.
+Both are processes of their own, and get the same messages at the same pace: those of forty cars that track a line.
+The CPU time is that of the whole process, so ours includes flushes, status and counting.
 """
 
 import tempfile
@@ -28,7 +28,7 @@ CROWD = 100
 CROWD_S = 60.0
 CROWD_FLOOR_S = 20.0
 SETTLE_S = 0.3
-"""Before the CPU time of a crowd is measured: its publishers have all begun."""
+"""Time until all publishers of a crowd have begun, before the CPU time is measured."""
 
 
 def _publishers(opened: bus.Bus, fleet: str) -> list[bus.Publisher]:
@@ -40,7 +40,7 @@ def _publishers(opened: bus.Bus, fleet: str) -> list[bus.Publisher]:
 
 
 def _cost(here: Stage, fleet: str, rounds: int, start: Callable[[Path], GatewayProcess]) -> float:
-    """CPU microseconds per message."""
+    """Return the CPU time per message, microseconds."""
     publishers = _publishers(here.fleet.bus, fleet)
     line = pb.Line(left_outer=True)
     frame = pb.RxFrame(data=READING, verdict="sensors", published=["sensor/line"])
@@ -61,9 +61,9 @@ def _cost(here: Stage, fleet: str, rounds: int, start: Callable[[Path], GatewayP
 
 
 def _known(opened: bus.Bus, publishers: list[bus.Publisher]) -> None:
-    """Wait until the publishers know of the subscriber: the hub tells them a moment after it is ready."""
+    """Wait until the publishers have the subscription, a moment after the subscriber is ready."""
     for publisher in publishers:
-        with opened._session.declare_publisher(publisher.key) as plain:  # zenoh.ext's publishers cannot be asked this
+        with opened._session.declare_publisher(publisher.key) as plain:  # zenoh.ext's have no such method
             wait_for(lambda: plain.matching_status.matching, f"a subscriber of {publisher.key}")  # type: ignore[attr-defined]
 
 
@@ -77,7 +77,7 @@ def _told_to_end(process: GatewayProcess, published: int = 0) -> Any:
 
 
 def _crowd(here: Stage, scale: Scale) -> list[Measured]:
-    """Record cars that track, their readings and raw frames: the recorder drops and misses nothing."""
+    """Record readings and raw frames of tracking cars. Check that the recorder drops and misses no message."""
     cars, crowd_s, floor_s = scale.count(CROWD), scale.seconds(CROWD_S, 1.0), scale.seconds(CROWD_FLOOR_S, 1.0)
     directory = here.fleet.directory / "crowd"
     recording = Recording(here.fleet, directory)
@@ -101,7 +101,7 @@ def _crowd(here: Stage, scale: Scale) -> list[Measured]:
 
 
 def _share(process: GatewayProcess, load: Load, seconds: float) -> tuple[float, float]:
-    """Share of a core, in percent, and messages a second."""
+    """Return the share of a core, in percent, and the messages a second."""
     sleep(SETTLE_S)
     count, before, began = load.count(), cpu_s(process), perf_counter()
     sleep(seconds)

@@ -1,4 +1,4 @@
-"""Export per message; the floor is Rerun's own MCAP importer, which writes the messages without a layout or lenses."""
+"""Export time per message. The floor is Rerun's own MCAP importer, which writes no layout and no lenses."""
 
 from pathlib import Path
 from time import perf_counter

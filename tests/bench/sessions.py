@@ -1,4 +1,4 @@
-"""Sessions: the last minute of a long one against the stock reader, and tables against Rerun's importer."""
+"""Time to read the last minute of a long session, and to export tables. The floors: mcap's reader, Rerun's importer."""
 
 import os
 import shutil
@@ -68,7 +68,7 @@ def _last_minute(directory: Path, scale: Scale) -> Measured:
 
     mine, least = in_turns(scale, ours, floor)
     path.unlink()
-    # The goal is a second, whatever the stock reader takes.
+    # The goal is one second, independent of mcap's reader.
     return Measured(
         f"read the last minute of a {size / 1e9:g} GB session", tuple(mine), tuple(least), "s", 0.0, slack=1.0
     )
@@ -86,7 +86,7 @@ def _tables(directory: Path, name: str, source: Path, count: int, scale: Scale) 
         return took / count * 1e6
 
     mine, least = in_turns(scale, ours, lambda: import_s(source, directory) / count * 1e6)
-    # The goal of twice the importer is the .rrd's (replaying.py); what a table costs beside it is only told.
+    # The goal of twice the importer is that of the .rrd (replaying.py). A table has no goal.
     return Measured(f"export a message to {name}", tuple(mine), tuple(least), "us", None)
 
 

@@ -1,4 +1,4 @@
-"""Where a benchmark plays: a hub of its own, processes, a PTY. Everything that was started is ended."""
+"""The stage of a benchmark: a hub of its own, processes, a PTY. All started processes are ended."""
 
 import contextlib
 import os
@@ -20,19 +20,19 @@ FLOORS = Path(__file__).parent / "floors"
 SCRATCH = Path(__file__).resolve().parents[2] / ".tmp"
 READING = b"$4WD,CSB57.24,PV7.91,GS214,LF1011,HW01,GM10#"
 LOOK_S = 0.1
-"""Interval at which the gateway is asked for its state."""
+"""Poll interval of the gateway's state."""
 
 
 @contextlib.contextmanager
 def scratch() -> Iterator[Path]:
-    """A directory inside the clone, for as long as it is needed."""
+    """Yield a directory inside the clone, and remove it afterwards."""
     SCRATCH.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=SCRATCH, prefix="bench-") as directory:
         yield Path(directory)
 
 
 class Tty:
-    """A PTY: we hold the car's end, `path` is the port."""
+    """A PTY. This process has the car's end, and `path` is the port."""
 
     def __init__(self) -> None:
         self._car, self._port = os.openpty()
@@ -43,12 +43,12 @@ class Tty:
         os.write(self._car, data)
 
     def read(self, timeout_s: float = PATIENCE_S) -> bytes:
-        """What has come, as soon as something has; empty if nothing comes."""
+        """Wait for bytes, and return them; empty after the timeout."""
         ready, _, _ = select.select([self._car], [], [], timeout_s)
         return os.read(self._car, 4096) if ready else b""
 
     def drain(self, quiet_s: float = 0.0) -> None:
-        """Read until nothing has come for so long."""
+        """Read until no byte has come for `quiet_s`."""
         while self.read(quiet_s):
             pass
 
@@ -59,7 +59,7 @@ class Tty:
 
 @contextlib.contextmanager
 def frames(port: Tty, frame: bytes, rate_hz: float) -> Iterator[None]:
-    """A frame at a rate, from a thread of its own."""
+    """Write a frame at a rate, on a thread of its own."""
     over = threading.Event()
 
     def send() -> None:
@@ -78,7 +78,7 @@ def frames(port: Tty, frame: bytes, rate_hz: float) -> Iterator[None]:
 
 
 def play_car(port: Tty, until: Callable[[], bool], report: Callable[[], bytes] = lambda: READING) -> None:
-    """Report as a car in mode 0 does, and pause after each `MODE00`, until it is so."""
+    """Send reports as a car in mode 0 does, and pause after each `MODE00`, until a condition holds."""
     deadline = monotonic() + PATIENCE_S
     report_at = monotonic()
     while not until():
@@ -90,11 +90,11 @@ def play_car(port: Tty, until: Callable[[], bool], report: Callable[[], bytes] =
 
 
 class Stage:
-    """A hub, its endpoint and a bare session at it."""
+    """A hub, its endpoint, and a bare session to it."""
 
     def __init__(self, directory: Path) -> None:
         self.fleet = FleetProcesses(free_endpoint(), directory)
-        # Where Python may not keep what it has compiled, every start would be measured as the first one ever.
+        # If Python may not write compiled modules, every start would be measured as a first start.
         self.fleet.environment["PYTHONDONTWRITEBYTECODE"] = ""
         self._ttys: list[Tty] = []
         config = zenoh.Config()
@@ -104,11 +104,11 @@ class Stage:
         self.session = zenoh.open(config)
 
     def bare(self, name: str, *arguments: str) -> GatewayProcess:
-        """Start one of the floors: a program that knows nothing of ours."""
+        """Start the program of a floor, which uses no code of ours."""
         return self.fleet.start(str(FLOORS / f"{name}.py"), self.fleet.endpoint, *arguments)
 
     def tty(self) -> Tty:
-        """A new PTY."""
+        """Return a new PTY."""
         self._ttys.append(Tty())
         return self._ttys[-1]
 
@@ -132,7 +132,7 @@ class Stage:
 
 @contextlib.contextmanager
 def stage() -> Iterator[Stage]:
-    """A stage, and its end whatever happens."""
+    """Yield a stage, and end it afterwards."""
     with scratch() as directory:
         built = Stage(directory)
         try:
@@ -142,7 +142,7 @@ def stage() -> Iterator[Stage]:
 
 
 class Arrival:
-    """When the next thing came, noted on the thread that it came on."""
+    """The time of the next arrival, noted on the thread that received it."""
 
     def __init__(self) -> None:
         self._came = threading.Event()
@@ -153,7 +153,7 @@ class Arrival:
         self._came.set()
 
     def wait(self) -> float:
-        """The time at which it came, on `perf_counter`; what comes next is waited for anew."""
+        """Wait for the arrival, and return its time by `perf_counter`. Then reset, for the next one."""
         assert self._came.wait(PATIENCE_S), "nothing came"
         self._came.clear()
         return self._at

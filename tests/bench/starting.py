@@ -1,6 +1,6 @@
-"""From the start of a gateway to its liveliness token, and its memory; the floor is a process that declares a token.
+"""Time from a gateway's start to its liveliness token, and its memory. The floor is a process that declares a token.
 
-A token is worth what stands behind it, so the first answer to a query asked at that moment is timed, too.
+The time of the first answer to a query after the token is measured, too: a token alone serves nobody.
 """
 
 import subprocess
@@ -20,7 +20,7 @@ def _rss_mb(pid: int) -> float:
 
 
 def _start(here: Stage, token: str, asked: str, start: Callable[[], GatewayProcess]) -> tuple[float, float, float]:
-    """(ms until the token, ms until the answer to what is asked then, MB of memory a second later)."""
+    """Return (ms until the token, ms until the answer to a query sent then, MB of memory a second later)."""
     alive, gone = Arrival(), Arrival()
     watch = here.session.liveliness().declare_subscriber(
         token, lambda sample: (alive if sample.kind == sample.kind.PUT else gone).note()

@@ -1,7 +1,7 @@
-"""`stop` at random moments in every mode and load: the longest announced, and the worst that the motors showed.
+"""`stop` at random moments in every mode and load: the longest announced time, and the longest time of the motors.
 
-On virtual time, so a figure is the same on every machine. `make vectors` writes the same distribution into
-tests/vectors/stops.tsv for docs/reference/stopping-times.md; the soak plays more moments.
+It runs on virtual time, so its figures are the same on every machine. `make vectors` writes the same distribution into
+tests/vectors/stops.tsv for docs/reference/stopping-times.md. The soak plays more moments.
 """
 
 from tests.bench.measured import Measured, Scale
@@ -17,6 +17,6 @@ def run(scale: Scale) -> list[Measured]:
 
 
 def measured(row: StopRow) -> Measured:
-    """Judge what was announced: by the worst that was seen, or by an absolute limit if the motors were always off."""
+    """Judge the announced time by the longest measured one, or by an absolute limit if the motors were always off."""
     goal, slack = (RATIO, 0.0) if row.worst_s > 0 else (0.0, LONGEST_S)
     return Measured(f"stop, {row.state}", (row.announced_s,), (row.worst_s,), "s", goal, slack)

@@ -1,4 +1,4 @@
-"""Each benchmark runs: one small round of it, as `python -m tests.bench --small` does. No speed is asserted."""
+"""Runs one small round of each benchmark, as `python -m tests.bench --small` does. No speed is asserted."""
 
 import importlib
 import math

@@ -1,4 +1,4 @@
-"""What deploy/ offers: read by our own eyes, and by the tools whose files they are where this computer has them."""
+"""Tests the files of deploy/: by their content, and with the tools that read them, if this computer has them."""
 
 import configparser
 import json
@@ -82,7 +82,7 @@ def test_udev_rules_give_each_car_a_name_of_its_own() -> None:
         names += [value for key, operator, value in found if (key, operator) == ("SYMLINK", "+=")]
     assert names == ["fleet/red", "fleet/green"]
     assert f"/dev/{names[1]}" in (EXAMPLES / "fleets" / "mixed.yaml").read_text()
-    # 60-serial.rules must have told the ids before, 73-seat-late.rules acts on the tag after.
+    # 60-serial.rules sets the ids, so it must come before. 73-seat-late.rules acts on the tag, so it must come after.
     assert "60" < rules.name[:2] < "73"
     udevadm = shutil.which("udevadm")
     knows = udevadm and not subprocess.run([udevadm, "verify", "--help"], check=False, capture_output=True).returncode
@@ -104,18 +104,18 @@ def test_the_unit_gives_cars_the_time_to_stop(tmp_path: Path) -> None:
     assert (service["Restart"], service["KillMode"], service["KillSignal"]) == ("on-failure", "mixed", "SIGTERM")
     first_s = (
         2 * GATEWAY_GRACE_S + GATEWAY_START_TIMEOUT_S + CAR_LINK_TIMEOUT_S
-    )  # a gateway hangs, and the gateway that replaces it is slow
+    )  # if a gateway hangs and its replacement is slow
     longest_s = max(first_s, CAR_STOP_RETRY_S + GATEWAY_GRACE_S) + RECORDER_EXIT_TIMEOUT_S + 2 * SERVICE_EXIT_TIMEOUT_S
     assert int(service["TimeoutStopSec"]) >= longest_s
     assert re.fullmatch(r"/usr/bin/env %h/\S+/\.venv/bin/fleet up fleet\.yaml", service["ExecStart"])
-    assert unit["Install"]["WantedBy"] == "default.target"  # of a user's systemd: multi-user.target is the system's
+    assert unit["Install"]["WantedBy"] == "default.target"  # for a user's systemd; multi-user.target is the system's
     verifier = shutil.which("systemd-analyze")
     if verifier:
-        # It looks whether the program is there: this one is, at the home of whoever runs the test.
+        # The tool checks that the program exists. This path is in the home of the user who runs the test.
         home, runtime = (
             tmp_path / "home",
             Path(tempfile.mkdtemp(dir="/tmp")),
-        )  # the path of a socket is at most 107 long
+        )  # the path of a socket has at most 107 characters
         program = home / "zenoh-car-fleet" / ".venv" / "bin" / "fleet"
         (home / ".config" / "fleet").mkdir(parents=True)
         program.parent.mkdir(parents=True)

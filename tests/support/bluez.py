@@ -2,8 +2,8 @@
 
 Its users set DBUS_SYSTEM_BUS_ADDRESS to `address`. This program is also the bus: it answers Hello, takes match rules,
 passes calls to org.bluez, and passes signals to their subscribers. So no dbus-daemon need be installed. The fake has
-the calls of bleak's backend, and the limits measured on the real BlueZ. BlueZ refuses a piece longer than the MTU allows.
-A connected module does not advertise. A connection outlives the program that made it.
+the calls of bleak's backend, and the limits measured on the real BlueZ. BlueZ refuses a piece longer than the MTU
+allows. A connected module does not advertise. A connection outlives the program that made it.
 """
 
 import asyncio
