@@ -1,7 +1,7 @@
-"""Anything that can happen to a controller, at random, and what must hold whatever happens.
+"""Random events for a controller, and the rules that always hold.
 
-No car is at the other end here, so nothing limits what is heard: readings of every mode, halves, noise. What a stop
-does to a car's motors is `driven.py`'s part; here: from every state a stop is all that is written, and it completes.
+No car is at the other end, so any bytes may come: readings of every mode, half frames, noise. From every state, a stop
+must write only stop frames, and must end. `driven.py` judges what a stop does to a car's motors.
 """
 
 import copy
@@ -64,15 +64,15 @@ READINGS = (
 GAPS_S = (0.0, 0.001, 0.01, 0.05, 0.06, 0.2, 0.3, 0.7, 1.1, 1.1, 2.5, 4.6, 30.0)
 JUMPS_S = (600.0, 86_400.0, 1e8)
 ALL = ("all",)
-"""To be replaced by those in force."""
+"""Placeholder. `_command` puts the ids of the active e-stops in its place."""
 SMALL = 300
-"""No container of a controller holds more than this."""
+"""Maximum number of items in any container of a controller or decoder."""
 STOP_WITHIN_S = 45.0
-"""The longest a stop may go on once the link carries everything."""
+"""Maximum time of a stop on a link that loses nothing."""
 
 
 def anything(moments: random.Random) -> Action:
-    """One command, most of them drives."""
+    """Return a random command, most often a drive."""
     match moments.randrange(16):
         case 0:
             return SetMode(moments.choice(list(Mode)))
@@ -105,7 +105,7 @@ def anything(moments: random.Random) -> Action:
 
 
 def noise(moments: random.Random) -> bytes:
-    """What a car, or a link, may send."""
+    """Return bytes that a car or a link may send."""
     match moments.randrange(6):
         case 0:
             return moments.randbytes(moments.randrange(64))
@@ -117,7 +117,7 @@ def noise(moments: random.Random) -> bytes:
 
 
 class Wild:
-    """A controller to which anything happens. `step` does one thing and checks what must hold."""
+    """A controller with random events. `step` does one random thing and checks the rules."""
 
     control: Controller
 
@@ -142,14 +142,14 @@ class Wild:
         self.linked = False
         self.ending = False
         self.doubted = False
-        """What is heard has ever spoken against the platform: what stops any car may be sent."""
+        """True if readings have ever contradicted the platform. Control may then send the frames that stop any car."""
         self.free_at = float("-inf")
         self.owed = {"whistle": 0, "fan": 0, "speed": 0, "servo": 0, "named": 0}
 
-    # ------------------------------------------------------------------ what happens
+    # ------------------------------------------------------------------ random events
 
     def step(self) -> None:
-        """One thing happens."""
+        """Do one random thing."""
         moments = self.moments
         chance = moments.random()
         if chance < 0.45:
@@ -207,7 +207,7 @@ class Wild:
     def _ask(self, what: Action) -> None:
         answer = self.control.command(self._command(what), self.now)
         assert answer.status in (Phase.SENT, Phase.QUEUED, Phase.REJECTED)
-        # A resume that ends a part of what stops a car is carried out, and says what stays.
+        # Control carries out a resume that ends only some of the stops. Its reason says what still stops the car.
         half = isinstance(what, Resume) and answer.reason in (Reason.ESTOPPED, Reason.HELD)
         assert half or (answer.reason is not None) == (answer.status is Phase.REJECTED)
         if answer.status is Phase.QUEUED:
@@ -251,7 +251,7 @@ class Wild:
         self.linked = not self.linked
 
     def _pump(self) -> None:
-        """What the loop does when it wakes: it never turns more than a few times without sleeping."""
+        """Turn as the gateway's loop does when it wakes: at most three times before it sleeps."""
         for _ in range(3):
             self._turn()
             if self.control.next_at(self.now) > self.now:
@@ -273,7 +273,7 @@ class Wild:
             assert self.control.poll(self.now) is None, "one frame in flight"
         self.control.take_records()
 
-    # ------------------------------------------------------------------ what must hold
+    # ------------------------------------------------------------------ rules
 
     def _check_write(self, write: OutgoingFrame) -> None:
         frame, control = write.frame, self.control
@@ -288,18 +288,18 @@ class Wild:
         self._check_once(frame, write.why)
 
     def _check_motion(self, write: OutgoingFrame) -> None:
-        """E-stopped, held or ending, a car is never set going."""
+        """Require that control starts no car that is e-stopped or held, or whose gateway shuts down."""
         frame = write.frame
         if isinstance(frame, ModeOpen) or (isinstance(frame, General) and frame.motion is not Motion.STOP):
             assert not self.control.safety.estops
             assert self.control.safety.hold is None
             assert not self.ending
             self._check_mover(write)
-            # A car that is heard but shows no stop may be driven by whoever sees it; a car of unknown state may not.
+            # A person who sees the car may drive it if it reports but shows no stop. An unknown state forbids driving.
             assert self.control.model.known or self.control.model.trust.state is CarTrust.UNPROVEN
 
     def _check_mover(self, write: OutgoingFrame) -> None:
-        """Paused, a car is set going by a lead only; lent, by the borrower or a lead."""
+        """Require that only a lead starts a paused car, and only the borrower or a lead starts a lent car."""
         queue, people, safety = self.control._queue, self.control.people, self.control.safety
         pending = queue.mode_change if isinstance(write.frame, ModeOpen) else queue.held and queue.held.pending
         assert pending is not None, "nobody moves it"
@@ -311,7 +311,7 @@ class Wild:
             assert borrowed or mover.kind is SenderKind.COORDINATOR or people.may_drive(mover.person)
 
     def _check_once(self, frame: Frame, why: FrameOrigin) -> None:
-        """What acts once is written once for each command that was accepted, and never repeated."""
+        """Require that control writes a one-time action at most once for each accepted command, never as a repeat."""
         acts: dict[str, bool] = {}
         if isinstance(frame, General):
             acts = {
@@ -329,14 +329,14 @@ class Wild:
                 assert self.owed[name] >= 0, f"{name} was doubled"
 
     def check_memory(self) -> None:
-        """Nothing grows."""
+        """Require that no container of the controller or the decoder has grown too large."""
         for name, size in sizes(self.control):
             assert size <= SMALL, f"{name} holds {size}"
         for name, size in sizes(self.decoder):
             assert size <= SMALL, f"{name} holds {size}"
 
     def check_stop(self) -> None:
-        """From the state that it is in now a stop is all that is written, and it completes; this state itself stays."""
+        """Require that a stop from the current state writes only stop frames, and ends. The stop runs on a copy."""
         control = copy.deepcopy(self.control)
         now, linked = self.now, self.linked
         command = Command("the-stop", "stop", SENDERS[0], Stop())
@@ -351,7 +351,7 @@ class Wild:
         self.stops += 1
         last = until_off(control, now)
         assert last is not None, "it has no end"
-        # What joined a stop that nobody had answered for long may fail; the stop itself goes on until it is over.
+        # A command may fail if it joined a stop that got no answer for long. The stop itself goes on until it ends.
         assert last.phase is Phase.FAILED or last.basis == control.model.basis, last
         assert last.phase is not Phase.FAILED or last.reason is Reason.NOT_SHOWN, last
         assert (last.phase is Phase.COMPLETE) == (last.basis == Basis.SHOWN), last
@@ -359,7 +359,10 @@ class Wild:
 
 
 def until_off(control: Controller, now: float) -> CommandRecord | None:
-    """The link carries everything, and the car reports once a second in which it is not blocked: how the stop ends."""
+    """Return the record that ends the stop. None if the stop does not end in time.
+
+    The link loses nothing, and the car reports once a second while it is not blocked.
+    """
     end, report_at, last = now + STOP_WITHIN_S, now + 1.0, None
     pi = control.model.profile.kind is Platform.RASPBERRY_PI
     while now < end and (last is None or control.model.motors != "off"):
@@ -382,12 +385,12 @@ def until_off(control: Controller, now: float) -> CommandRecord | None:
 
 
 def is_end(record: CommandRecord) -> bool:
-    """Return True for the last record of a stop: as shown, as sent, or as failed."""
+    """Return True if the record ends a stop: as shown, as sent or as failed."""
     return record.phase in (Phase.COMPLETE, Phase.FAILED) or (record.phase is Phase.SENT and record.basis != "")
 
 
 def sizes(thing: object, name: str = "", depth: int = 4) -> list[tuple[str, int]]:
-    """The containers in an object, and how much each holds."""
+    """Return the name and size of each container in an object."""
     if isinstance(thing, dict | list | set | tuple | bytearray) or hasattr(thing, "popleft"):
         return [(name, len(thing))]  # type: ignore[arg-type]  # a deque
     if depth == 0:
@@ -402,7 +405,7 @@ def sizes(thing: object, name: str = "", depth: int = 4) -> list[tuple[str, int]
 
 
 def run(seed: int, steps: int, *, stop_every: int = 500) -> tuple[int, int]:
-    """So many steps; how many frames were written, and how many stops were checked."""
+    """Do `steps` steps. Return the number of written frames and the number of checked stops."""
     wild = Wild(seed)
     for number in range(steps):
         try:

@@ -1,4 +1,4 @@
-"""Anything that can come from a car, in any pieces, and what the decoder owes for it."""
+"""Random bytes from a car, in random pieces, and the rules of the decoder."""
 
 import random
 
@@ -7,11 +7,11 @@ from gateway.protocol.events import Sensors
 from tests.fuzz.controller import MANUAL, READINGS
 
 FRESH = 2_000
-"""So many pieces until another decoder is taken, as for a new connection."""
+"""Number of pieces until a new decoder takes over, as after a new connection."""
 
 
 def piece(moments: random.Random) -> bytes:
-    """One read from the link."""
+    """Return the bytes of one read from the link."""
     chance = moments.randrange(12)
     if chance == 0:
         return moments.randbytes(moments.randrange(40))
@@ -30,7 +30,7 @@ def piece(moments: random.Random) -> bytes:
 
 
 def run(seed: int, pieces: int) -> int:
-    """So many pieces; how many events they made."""
+    """Feed `pieces` pieces. Return the number of events that they made."""
     moments = random.Random(seed)
     decoder, now, made = Decoder(), 0.0, 0
     for number in range(pieces):
@@ -47,7 +47,7 @@ def run(seed: int, pieces: int) -> int:
             assert len(decoder._buffer) <= 256
             assert len(decoder._sent) <= 256
             if number % FRESH == FRESH - 1:
-                # Whatever was held: the next but one good frame after a silence decodes.
+                # Whatever the decoder has buffered, the second good frame after a silence decodes.
                 decoder.sent(b"#", now - 10.0)
                 event = decoder.feed(b"#\r\n" + MANUAL + MANUAL, now + 10.0)[-1]
                 assert isinstance(event, Sensors)

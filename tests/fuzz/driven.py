@@ -1,4 +1,4 @@
-"""A controller and a simulated car to which anything happens, and again and again a stop: its motors are the judge."""
+"""Random events for a controller and a simulated car, with frequent stops. The car's motors are the judge."""
 
 import random
 from dataclasses import dataclass
@@ -12,23 +12,23 @@ from tests.support.stops import WORLDS, state_of
 from tests.support.virtual import Pair
 
 LIFE = 60
-"""So many steps until another car in another world is taken."""
+"""Number of steps with one car in one world, before another car follows."""
 WATCHED_S = 9.0
 RESTORED_S = 22.0
 
 
 @dataclass
 class Fuzzed:
-    """What was done."""
+    """Result of a run."""
 
     steps: int = 0
     stops: int = 0
     states: frozenset[str] = frozenset()
-    """In which a stop was asked."""
+    """States of the car before each stop."""
 
 
 class Driven:
-    """One car after another. `step` does one thing; `stop` judges."""
+    """One car after another. `step` does one random thing. `stop` stops the car and judges its motors."""
 
     def __init__(self, seed: int) -> None:
         self.moments = random.Random(seed)
@@ -50,12 +50,12 @@ class Driven:
         )
         self.pair.connect()
         self.linked = True
-        # Half a named frame kills a Raspberry Pi's program, whatever follows it: no stop can help against that.
+        # Half a named frame ends the program of a Raspberry Pi, whatever follows. After that no stop works.
         self.cuts = moments.random() < 0.5
         self.named = not self.cuts or not isinstance(self.pair.car, RaspberryPiCar)
 
     def step(self) -> None:
-        """One thing happens."""
+        """Do one random thing."""
         moments, pair = self.moments, self.pair
         chance = moments.random()
         if not self.linked and chance < 0.5:
@@ -85,19 +85,19 @@ class Driven:
         self._see_cut()
 
     def _see_cut(self) -> None:
-        """A write was cut: control knows that the link is gone."""
+        """Note that the link is gone if control lost it, because a write was cut."""
         if self.linked and pair_lost(self.pair):
             self.linked = False
 
     def _stall(self, gap_s: float) -> None:
-        """The loop sleeps; the car does not."""
+        """Stall the loop while the car goes on."""
         self.pair.now += gap_s
         self.pair.control.on_stall(gap_s, self.pair.now)
 
     def _ask(self) -> None:
         what = anything(self.moments)
         if self.world != "echo" and what == SetMode(Mode.OBSTACLE_AVOIDANCE):
-            return  # without an echo the car is deaf there for ever
+            return  # without an echo this car never reads a frame again
         if isinstance(what, Resume | EmergencyStop):
             what = Resume(tuple(estop.id for estop in self.pair.control.safety.estops))
         if isinstance(what, Find | OneShot) and not self.named:
@@ -106,7 +106,10 @@ class Driven:
         self.pair.ask(what, sender=self.moments.choice(SENDERS), identity=f"f{self.asked}")
 
     def stop(self) -> str | None:
-        """Stop now, and return the state before: off for good within what is announced. None if the link is down."""
+        """Stop the car, and return the state before the stop. The motors must be off within the announced time.
+
+        None if the link is down, or if no frame of recovery can stop the car.
+        """
         pair, moments = self.pair, self.moments
         pair.cut = None
         if not self.linked:
@@ -128,7 +131,7 @@ class Driven:
         return state
 
     def _judge_claims(self, since: float) -> None:
-        """Require that what the car showed since then was so: no motor ran, or ran on."""
+        """Require that the motors were off whenever the car showed a stop after `since`."""
         pair = self.pair
         for at in pair.shown_at:
             if at <= since:
@@ -139,17 +142,17 @@ class Driven:
 
 
 def wedged(pair: Pair) -> bool:
-    """The one string that no frame of recovery clears (test_stops.py, "in_one_millisecond")."""
+    """Return True for the one string that no frame of recovery clears (test_stopping.py, "in_one_millisecond")."""
     return isinstance(pair.car, ArduinoCar) and pair.car._string.startswith("4WD")
 
 
 def pair_lost(pair: Pair) -> bool:
-    """Whether control was told that the link is gone."""
+    """Return True if control knows that the link is down."""
     return not pair.control.model.link_open
 
 
 def run(seed: int, steps: int, *, stop_every: int = 12) -> Fuzzed:
-    """So many steps, with a stop now and then."""
+    """Do `steps` steps, with a stop now and then."""
     driven, done, states = Driven(seed), Fuzzed(), set()
     sender = Sender("fuzz")
     for number in range(steps):

@@ -1,4 +1,4 @@
-"""Each rule of a stop, taken out: the search must find the fault that the rule is there for."""
+"""The rules of a stop, each with a function that removes it. The search must find the fault that the rule prevents."""
 
 from collections.abc import Callable
 from typing import Any
@@ -123,4 +123,4 @@ RULES: dict[str, Callable[[Patch], None]] = {
     "a stop that is driven over has failed": _a_stop_that_is_driven_over_ends_without_a_word,
     "a stop that is not shown fails in time": _commands_wait_for_ever,
 }
-"""What each rule says, and how it is taken out."""
+"""Each rule in words, and the function that removes it."""

@@ -1,7 +1,7 @@
-"""Search for a stop that is claimed and false: the real control, a simulated car, and a link that fails at random.
+"""Searches for false claims of a stop, with the real control, a simulated car, and a link that fails at random.
 
-One episode: a car is brought into a state, the link fails around a stop, and the car's true motors judge what control
-claims. `EpisodePlan` is all that is random about an episode, so a failure can be shrunk to the faults that it needs.
+An episode brings a car into a state and lets the link fail around a stop. The car's true motors judge the claims of
+control. `EpisodePlan` has all random values of an episode, so a failure can be shrunk to the faults that it needs.
 Everything runs on virtual time.
 """
 
@@ -42,16 +42,16 @@ from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black
 BYTES_PER_S = 960
 TICK_S = 0.2
 FALSE_S = 0.3
-"""A claim may be false for so long."""
+"""Maximum time that a claim may be false."""
 STANDS_S, AVOIDING_STANDS_S = 15.0, 20.0
-"""So long after the link is whole, the motors of a car that was stopped are off for good."""
+"""Maximum time from the last fault or stop until the motors are off for good. The second is for obstacle avoidance."""
 ENDS_S = 17.5
-"""Every stop has ended so long after it was asked."""
+"""Maximum time from the request of a stop to its end."""
 VERDICT_S = 5.5
-"""A mode may be confirmed for so long after it has ended: 3 s of silence, a block of ours, and a reading on its way."""
+"""Maximum time that an ended mode stays confirmed: 3 s of silence, a block of ours, and a reading in transit."""
 READY_S = 14.0
 EARLY_S = 3.0
-"""Time before a mode is asked for in which the link may fail already."""
+"""Time before the request of a mode in which the link may already fail."""
 
 ALL_WORLDS = {**WORLDS, "black": on_black, "pen": in_a_pen, "wall": before_a_wall}
 
@@ -65,30 +65,30 @@ class Way(StrEnum):
 
 
 class Kind(StrEnum):
-    """How a link fails."""
+    """The kinds of faults of a link."""
 
     DEAD = "dead"
-    """Bytes are swallowed, also in the middle of a frame."""
+    """The link loses all bytes, also from the middle of a frame."""
     LOSSY = "lossy"
-    """Some bytes are lost, by chance."""
+    """The link loses some bytes at random."""
     SLOW = "slow"
     """Bytes come later, in order."""
     STUCK = "stuck"
-    """Bytes are held, and come all at once at the end."""
+    """The link holds all bytes, and delivers them at once at the end."""
     DOUBLED = "doubled"
     """Each piece comes twice."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkFault:
-    """One failure of the link, s from the stop."""
+    """One fault of the link. Its times count in seconds from the stop."""
 
     kind: Kind
     way: Way
     at_s: float
     for_s: float
     share: float = 0.0
-    """Of bytes lost."""
+    """Share of the bytes that a lossy link loses."""
     delay_s: float = 0.0
 
     @property
@@ -97,7 +97,7 @@ class LinkFault:
 
 
 class Ending(StrEnum):
-    """Which stop the episode is about."""
+    """How the episode stops the car."""
 
     STOP = "stop"
     ESTOP = "estop"
@@ -111,7 +111,7 @@ class Ending(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class EpisodePlan:
-    """All that is random about one episode."""
+    """All random values of one episode."""
 
     seed: int
     platform: str
@@ -123,36 +123,37 @@ class EpisodePlan:
     ending: Ending
     faults: tuple[LinkFault, ...]
     opening: bool = False
-    """The stop comes `load_s` after the frame that opens the mode, else so long after the mode is open."""
+    """True if `load_s` counts from the frame that opens the mode. If not, it counts from the open mode."""
     report_every_s: float = 0.9
     again_s: float = 0.0
-    """A second stop so long after the first; 0: none."""
+    """Time from the first stop to a second one. 0 for none."""
     drive_again_s: float = 0.0
-    """A drive so long after the stop, and a stop after it; 0: none."""
+    """Time from the last stop to another drive, which a stop ends. 0 for none."""
     early: bool = False
-    """The faults hit the opening of the mode as well. They count from its request, and from the stop again."""
+    """True if the faults also hit the opening of the mode. Their times then count from `load_s` after its request, and
+    again from the stop."""
     driven: bool = False
-    """The car drives when the mode is asked for."""
+    """True if the car drives when the mode is requested."""
     rest_s: float = 0.0
-    """More rest before the load. A mode then opens at any moment between two reports, not only just after one."""
+    """Additional rest before the load. A mode then opens at any moment between two reports, not only after one."""
 
 
 @dataclass(slots=True)
 class Report:
-    """What one episode showed."""
+    """Result of one episode."""
 
     plan: EpisodePlan
     violations: list[str] = field(default_factory=list)
     ends: Counter[str] = field(default_factory=Counter)
-    """How stops ended, by what they rest on."""
+    """Number of stops by their end, and of shutdowns by the basis of the stop."""
     false_sent: Counter[str] = field(default_factory=Counter)
-    """Claims of rest that are only `sent` and were false for longer than `FALSE_S`, by what they rest on."""
+    """Number of `sent` claims that were false for longer than `FALSE_S`, by the case of the stop."""
     sent: Counter[str] = field(default_factory=Counter)
     wedged: bool = False
 
 
 def draw(seed: int) -> EpisodePlan:
-    """Return an episode: every other one of a theme that is known to be hard, the others of anything."""
+    """Return the plan of a seed. Even seeds play themes that are known to be hard. Odd seeds play anything."""
     moments = random.Random(f"episode {seed}")
     return _any(seed, moments) if seed % 2 else THEMES[seed // 2 % len(THEMES)](seed, moments)
 
@@ -163,7 +164,7 @@ def _theme(seed: int, load: str, load_s: float, faults: tuple[LinkFault, ...], *
 
 
 def _report_swallowed(seed: int, moments: random.Random) -> EpisodePlan:
-    """The link swallows the stop and the report after it, so that the reports pause as if it had been obeyed."""
+    """Lose the stop and the report after it, so that the reports pause as if the car had obeyed."""
     gap = LinkFault(Kind.DEAD, Way.BOTH, moments.uniform(-0.2, 0.0), moments.uniform(0.5, 1.9))
     return _theme(
         seed, moments.choice(["drive", "steer"]), moments.uniform(0.5, 4.0), (gap,),
@@ -172,7 +173,7 @@ def _report_swallowed(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _digit_lost(seed: int, moments: random.Random) -> EpisodePlan:
-    """`MODE00` loses a digit or both: it opens mode 0, with the motors on. What follows is lost."""
+    """Lose one or both digits of `MODE00`, which then opens mode 0 with the motors on. Lose later frames."""
     at_s, for_s = moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S
     later = LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(1.0, 8.0))
     load = moments.choice(["tracking", "light_seeking", "following", "obstacle_avoidance", "color_led"])
@@ -185,7 +186,7 @@ def _digit_lost(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _opened_behind_a_held_report(seed: int, moments: random.Random) -> EpisodePlan:
-    """`MODE00` loses a digit while the car drives, what follows is lost, and the link holds the report before."""
+    """Lose a digit of `MODE00` while the car drives, and the frames after it. Hold the report before it."""
     lost = LinkFault(Kind.DEAD, Way.TO_CAR, moments.choice([9.5, 10.5]) / BYTES_PER_S, 1 / BYTES_PER_S)
     later = LinkFault(Kind.DEAD, Way.TO_CAR, 0.5, moments.uniform(3.0, 8.0))
     held_s = moments.uniform(1.0, 1.6)
@@ -196,7 +197,7 @@ def _opened_behind_a_held_report(seed: int, moments: random.Random) -> EpisodePl
 
 
 def _stop_while_opening(seed: int, moments: random.Random) -> EpisodePlan:
-    """Old reports come late while a silent mode opens, and the stop is lost."""
+    """Delay old reports while a silent mode opens, and lose the stop."""
     slow = LinkFault(Kind.SLOW, Way.TO_HOST, -3.0, 30.0, delay_s=1.2)  # in two steps: a gap of 3 s would show
     slower = LinkFault(Kind.SLOW, Way.TO_HOST, -1.5, 28.5, delay_s=moments.uniform(1.8, 2.5))
     lost = LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
@@ -205,7 +206,7 @@ def _stop_while_opening(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _mode_over_a_lost_stop(seed: int, moments: random.Random) -> EpisodePlan:
-    """Without an echo nothing shows the stop before a mode. That stop, the opening and the next stop are lost."""
+    """Lose the stop before a mode, the opening and the next stop. Without an echo nothing shows the first stop."""
     load_s = moments.uniform(0.1, 2.0)
     lost = LinkFault(Kind.DEAD, Way.TO_CAR, -load_s - 0.01, moments.uniform(12.0, 20.0))
     unheard = LinkFault(Kind.DEAD, Way.TO_HOST, moments.uniform(-1.0, 0.5), moments.uniform(1.0, 2.5))
@@ -216,7 +217,7 @@ def _mode_over_a_lost_stop(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _half_a_frame(seed: int, moments: random.Random) -> EpisodePlan:
-    """The first frame of the stop is cut, so what follows is read behind it; later tries are lost."""
+    """Cut the first frame of the stop, so that the car reads the next frame behind it. Often lose later tries."""
     cut = LinkFault(Kind.DEAD, Way.TO_CAR, moments.uniform(1, 18) / BYTES_PER_S, 0.03)
     later = LinkFault(Kind.DEAD, Way.TO_CAR, moments.uniform(1.3, 1.9), moments.uniform(6.0, 15.0))
     load = moments.choice(["steer", "steer", "tracking", "light_seeking", "acts"])
@@ -224,7 +225,7 @@ def _half_a_frame(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _short_gap(seed: int, moments: random.Random) -> EpisodePlan:
-    """The fault that began this: 0.6 s of bytes swallowed around a stop, in any mode."""
+    """Lose all bytes for a time around a stop, in any mode. A gap of 0.6 s was the reason for this search."""
     gap = LinkFault(Kind.DEAD, moments.choice(list(Way)), moments.uniform(-0.5, 0.0), moments.uniform(0.3, 6.0))
     load = moments.choice(["drive", *(mode.value for mode in Mode if mode is not Mode.MANUAL)])
     ending = moments.choice([Ending.STOP, Ending.STOP, Ending.SHUTDOWN, Ending.MANUAL])
@@ -232,7 +233,7 @@ def _short_gap(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _damaged_reports(seed: int, moments: random.Random) -> EpisodePlan:
-    """The stop is lost, and the link drops digits of the car's frames, so that some look like reports of mode 0."""
+    """Lose the stop, and some bytes of the car's frames, so that some frames look like reports of mode 0."""
     lossy = LinkFault(
         Kind.LOSSY, Way.TO_HOST, -0.1, moments.uniform(3.0, 9.0), share=moments.choice([0.01, 0.02, 0.04])
     )
@@ -241,7 +242,7 @@ def _damaged_reports(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _joined_reports(seed: int, moments: random.Random) -> EpisodePlan:
-    """The stop is lost, and the link joins the begin of one report with the end of a later one: it lacks some bytes."""
+    """Lose the stop, and join the start of one report with the end of a later one. The result lacks some bytes."""
     bytes_lost = 41 * moments.randrange(30, 50) + moments.choice([1, 1, 1, 2])
     joined = LinkFault(Kind.DEAD, Way.TO_HOST, -moments.uniform(0.1, 0.2), bytes_lost / BYTES_PER_S)
     lost = LinkFault(Kind.DEAD, Way.TO_CAR, -0.01, moments.uniform(3.0, 6.0))
@@ -249,7 +250,7 @@ def _joined_reports(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _misread_and_lost(seed: int, moments: random.Random) -> EpisodePlan:
-    """Half a general frame and `MODE00` in one string open a silent mode while driving. Later tries are lost."""
+    """Join half a general frame and `MODE00`, which opens a silent mode while driving. Lose later tries."""
     cut = LinkFault(Kind.DEAD, Way.TO_CAR, moments.uniform(2, 18) / BYTES_PER_S, 0.03)
     later = LinkFault(Kind.DEAD, Way.TO_CAR, 1.5, moments.uniform(9.0, 15.0))
     again_s = moments.uniform(0.02, 0.2) if moments.random() < 0.5 else 0.0
@@ -257,7 +258,7 @@ def _misread_and_lost(seed: int, moments: random.Random) -> EpisodePlan:
 
 
 def _driven_over(seed: int, moments: random.Random) -> EpisodePlan:
-    """Nothing shows the stop, since the link is mute or the car hears nothing; then somebody drives all the same."""
+    """Hide the stop with a link that is dead in one direction. Then drive all the same."""
     way = moments.choice([Way.TO_CAR, Way.TO_CAR, Way.TO_HOST])
     fault = LinkFault(Kind.DEAD, way, -0.1, moments.uniform(14.0, 24.0))
     return _theme(
@@ -331,11 +332,11 @@ def _any(seed: int, moments: random.Random) -> EpisodePlan:
 
 _WITH_MODES = {("arduino", "arduino"), ("arduino", "stm32")}
 _FRAME_S = 12 / BYTES_PER_S
-"""`$4WD,MODE00#` on the wire."""
+"""Time of `$4WD,MODE00#` on the wire."""
 
 
 def _faults(moments: random.Random) -> tuple[LinkFault, ...]:
-    """Return faults: half of the time one that hits the stop itself, else any."""
+    """Return random faults. In 60 % of the plans one fault aims at the stop itself."""
     chance = moments.random()
     if chance < 0.25:  # a gap around the stop
         for_s = 0.1 * 60 ** moments.random()
@@ -357,7 +358,7 @@ def _faults(moments: random.Random) -> tuple[LinkFault, ...]:
 
 
 def _fault(moments: random.Random) -> LinkFault:
-    for_s = 0.05 * 400 ** moments.random()  # 0.05 to 20 s, short ones as often as long ones
+    for_s = 0.05 * 400 ** moments.random()  # 0.05 to 20 s, log-uniform
     at_s = moments.uniform(-min(for_s, 4.0), 2.5)
     kind = moments.choices(list(Kind), [8, 4, 2, 2, 1])[0]
     return LinkFault(
@@ -371,7 +372,7 @@ def _fault(moments: random.Random) -> LinkFault:
 
 
 class SearchedDirection:
-    """One direction of the link: pieces of bytes go in, later and fewer come out."""
+    """One direction of the link, which loses, delays or doubles pieces of bytes."""
 
     def __init__(self, faults: Sequence[LinkFault], moments: random.Random) -> None:
         self._faults = faults
@@ -379,7 +380,7 @@ class SearchedDirection:
         self._held: deque[tuple[float, bytes]] = deque()
 
     def put(self, data: bytes, at: float, end: float) -> None:
-        """Send bytes that take the wire from `at` to `end`, from the stop."""
+        """Send bytes that occupy the wire from `at` to `end`, in seconds from the stop."""
         each_s = (end - at) / len(data)
         out = bytearray()
         due = end
@@ -415,7 +416,7 @@ class SearchedDirection:
         return self._held[0][0] if self._held else float("inf")
 
     def take(self, now: float) -> Iterable[tuple[float, bytes]]:
-        """Return what has come through by now."""
+        """Yield each piece that has come through by `now`, with its time."""
         while self._held and self._held[0][0] <= now + 1e-9:
             yield self._held.popleft()
 
@@ -435,7 +436,7 @@ class Episode:
         self.decoder = Decoder()
         self.now = 0.0
         self.zero = float("inf")
-        """When the stop is asked."""
+        """Time of the stop."""
         down = [fault for fault in plan.faults if fault.way is not Way.TO_HOST]
         up = [fault for fault in plan.faults if fault.way is not Way.TO_CAR]
         self._down, self._up = SearchedDirection(down, moments), SearchedDirection(up, moments)
@@ -448,7 +449,7 @@ class Episode:
         self._on_since: float | None = None
         self._claim_since: float | None = None
         self._complete = False
-        """A stop was complete, and nothing was asked since that may move the car."""
+        """True if a stop was complete, and no command came later that may move the car."""
         self._complete_since = 0.0
         self._verdict_since: float | None = None
         self._case = ""
@@ -461,13 +462,13 @@ class Episode:
     # ------------------------------------------------------------------ the play
 
     def play(self) -> Report:
-        """Play it to its end."""
+        """Play the plan to its end, and return the report."""
         plan = self.plan
         self._run(2.0)
         self._connect()
         self._until(lambda: self.control.model.motors == "off", READY_S)
         self._run(self._moments.random() + plan.rest_s)
-        self.zero = self.now + 60.0  # the load says when
+        self.zero = self.now + 60.0  # `_load` sets the time
         self._load()
         self._run_to(self.zero)
         self._end()
@@ -555,7 +556,7 @@ class Episode:
                 pass
 
     def _shut_down(self) -> None:
-        """End the gateway; where its car was not stopped, another one follows, as under `fleet up`."""
+        """Shut the gateway down. If its car is not stopped, start another gateway, as `fleet up` does."""
         for _ in range(6):
             self.control.shut_down(self.now)
             self._until(lambda: self.control.stops.finished, 18.0)
@@ -612,7 +613,7 @@ class Episode:
             self._turn(end)
 
     def _turn(self, end: float) -> None:
-        """Go to whatever happens next."""
+        """Advance to the next event."""
         zero = self.zero if self.zero < float("inf") else 0.0
         wake = min(end, self.car.next_event(), self._up.next_at + zero, self._down.next_at + zero)
         if self._linked:
@@ -644,7 +645,7 @@ class Episode:
             self._hear(data, at + zero)
 
     def _faulty(self, at: float) -> bool:
-        """Return True if the bytes may meet a fault: the others go straight on."""
+        """Return True if a fault may hit the bytes. Other bytes go straight to the decoder."""
         return self.zero < float("inf") and (self._up.next_at < float("inf") or self._touched(at))
 
     def _touched(self, at: float) -> bool:
@@ -717,7 +718,7 @@ class Episode:
 
     @property
     def _shows(self) -> bool:
-        """Return True if the car can show a stop, and nothing hides that."""
+        """Return True if the car can show a stop, and nothing hides the evidence."""
         plan = self.plan
         return (
             (plan.platform, plan.told) in _WITH_MODES
@@ -726,7 +727,7 @@ class Episode:
         )
 
     def _judge(self) -> None:
-        """Hold the claims against the true motors."""
+        """Compare the claims with the true motors."""
         if self.zero == float("inf"):
             return
         control, truth, now = self.control, self.car.truth, self.now
@@ -744,7 +745,7 @@ class Episode:
         if self._on_since is not None:
             if self._claim_since is not None and now - max(self._on_since, self._claim_since) > FALSE_S:
                 self._violate(f"(1) off, shown ({control.model.trust.evidence}), while the motors run")
-            # A claim that was true and is withdrawn is none: a frame that loses bytes on the way can start the motors.
+            # A true claim that control has withdrawn no longer counts: a damaged frame can start the motors later.
             claimed = self._complete and (shown or self._on_since <= self._complete_since)
             if claimed and now - max(self._on_since, self._complete_since) > FALSE_S:
                 self._violate("(1) complete, while the motors run")
@@ -793,7 +794,7 @@ class Episode:
                 if _is_lost(self.car) or (_is_wedged(self.car) and self.control.model.basis == "sent"):
                     self.report.wedged = True
                 elif self._ended_as_sent:
-                    self.report.false_sent["shutdown"] += 1  # nothing showed it, and no gateway is left
+                    self.report.false_sent["shutdown"] += 1  # nothing showed the stop, and no gateway is left
                 else:
                     self._violate("(2) the motors run")
                 break
@@ -810,7 +811,7 @@ class Episode:
 
 
 def _is_lost(car: object) -> bool:
-    """Return True for a string without its first bytes, which no frame of recovery clears (test_stops.py, an xfail)."""
+    """Return True if the car keeps a string without its first bytes, which no recovery clears (test_stopping.py)."""
     return isinstance(car, ArduinoCar) and car._string.startswith(("4WD", "WD", "D,", "MODE"))
 
 
@@ -824,7 +825,7 @@ def _is_wedged(car: object) -> bool:
 
 @dataclass(slots=True)
 class Total:
-    """What many episodes showed."""
+    """Results of many episodes."""
 
     episodes: int = 0
     failures: list[Report] = field(default_factory=list)
@@ -885,17 +886,17 @@ def shrink(plan: EpisodePlan) -> EpisodePlan:
 
 
 def explain(total: Total, limit: int = 5) -> str:
-    """Return the failures with their seeds, and what is left of their plans when they are shrunk."""
+    """Return the failures with their seeds and their shrunk plans."""
     shrunk = [f"seed {each.plan.seed}: {each.violations}\n  {shrink(each.plan)}" for each in total.failures[:limit]]
     return "\n".join([f"{len(total.failures)} failures", *shrunk])
 
 
 def found_at(seeds: Iterable[int]) -> str:
-    """Return the first seed that fails and its violations; empty if none does. For a control with a rule taken out."""
+    """Return the first seed that fails, and its violations. Empty if no seed fails. Used with a rule removed."""
     for seed in seeds:
         try:
             violations = play(seed).violations
-        except AssertionError as error:  # the car was not even brought to a known state
+        except AssertionError as error:  # control did not even bring the car to a known state
             violations = [str(error)]
         if violations:
             return f"seed {seed}: {'; '.join(violations)}"
@@ -903,7 +904,7 @@ def found_at(seeds: Iterable[int]) -> str:
 
 
 def search(seeds: Iterable[int], *, processes: int = 1) -> Total:
-    """Play many episodes."""
+    """Play many episodes, and return their results."""
     total = Total()
     if processes == 1:
         for seed in seeds:

@@ -1,4 +1,4 @@
-"""The fuzzing of the soak, for seconds instead of minutes: the same seeds every time, so that it passes or fails."""
+"""The fuzzing of `make soak`, for seconds instead of minutes. The seeds are fixed, so every run has the same result."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The search for a stop that is claimed and false: 400 episodes, the same every time. `make soak` plays 30,000."""
+"""The search for false claims of a stop, in 400 episodes that never change. `make soak` plays 30,000."""
 
 import pytest
 
@@ -7,9 +7,9 @@ from tests.fuzz.stop_search import BYTES_PER_S, Ending, Episode, EpisodePlan, Ki
 PARTS = 4
 EPISODES = 100
 
-# Each of these stops was claimed as shown while the motors ran.
+# Control once claimed each of these stops as shown while the motors ran.
 FOUND = (
-    # The link swallowed one report and held the next: a gap of 1.9 s. The stop had lost bytes, and started the motors.
+    # The link lost one report and delayed the next, a gap of 1.9 s. The stop had lost bytes, and started the motors.
     EpisodePlan(
         70010567, "arduino", "arduino", "echo", "rest", 0.7768374565829217, Ending.ESTOP,
         (
@@ -17,7 +17,7 @@ FOUND = (
             LinkFault(Kind.STUCK, Way.BOTH, -1.4007606644069566, 2.752822054732901),
         ),
     ),
-    # The begin of one report of light seeking and the end of a later one looked like a report of mode 0.
+    # The start of one light-seeking report and the end of a later report together looked like a mode-0 report.
     EpisodePlan(
         70010883, "arduino", "arduino", "echo", "light_seeking", 7.667323754918615, Ending.STOP,
         (
@@ -30,7 +30,7 @@ FOUND = (
         81004327, "arduino", "arduino", "echo", "light_seeking", 5.7784868346822424, Ending.STOP,
         (LinkFault(Kind.DEAD, Way.BOTH, -0.3768883565749477, 3.0766070410981188),),
     ),
-    # `MODE00` lost both digits, which blocks for only 2.0 s. The mode had been opened just before a report was due.
+    # `MODE00` lost both digits, which blocks for only 2.0 s. Control had opened the mode just before a report was due.
     EpisodePlan(
         700013, "arduino", "arduino", "echo", "tracking", 2.8, Ending.STOP,
         (
