@@ -1,4 +1,4 @@
-"""Fixtures of the commands for a person at a desk: simulated cars, and the commands as processes."""
+"""Fixtures for tests of the `gateway` commands: simulated cars, and the commands as processes."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ PATIENCE_S = 60
 
 @pytest.fixture
 def command() -> Command:
-    """Run `gateway ...` to its end."""
+    """Return a function that runs `gateway ...` to its end."""
 
     def run(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
         done = subprocess.run(
@@ -36,7 +36,7 @@ def command() -> Command:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Started]:
-    """Start `gateway ...`; what still runs at the end is ended."""
+    """Yield a function that starts `gateway ...`. Kill the processes that still run at the end."""
     started: list[GatewayProcess] = []
 
     def begin(*arguments: str | Path) -> GatewayProcess:
@@ -53,7 +53,7 @@ def start(tmp_path: Path) -> Iterator[Started]:
 
 @pytest.fixture
 def simulate(start: Started) -> Callable[..., tuple[GatewayProcess, list[str]]]:
-    """Simulated cars (NAME:PLATFORM:LINK), and their links."""
+    """Return a function that starts simulated cars (NAME:PLATFORM:LINK), and returns the process and their links."""
 
     def begin(*cars: str) -> tuple[GatewayProcess, list[str]]:
         described = [word for car in cars for word in ("--car", car)]

@@ -1,4 +1,4 @@
-"""A capture gives back what was kept; a file that was cut or damaged gives whole pieces or says where it is bad."""
+"""A capture returns the bytes that it saved. A truncated or corrupted file yields whole pieces or names the line."""
 
 import json
 import os

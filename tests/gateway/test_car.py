@@ -1,4 +1,4 @@
-"""A whole gateway in the process of the test, with a real bus and a TCP car, so that its loop can be held up."""
+"""Tests of a whole gateway in the test's own process, with a real bus and a TCP car. The test can stall its loop."""
 
 import asyncio
 import time
@@ -15,7 +15,7 @@ from tests.support.processes import MODE00, REPORT, REPORT_S, FleetProcesses, Tc
 
 
 async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(tmp_path: Path) -> None:
-    """The car obeys one `MODE00`, but not the next. The loop stalls until the gap of reports is like a pause."""
+    """The car obeys one `MODE00`, but not the next. The loop stalls until the gap of reports looks like a pause."""
     fleet, car = FleetProcesses(free_endpoint(), tmp_path), TcpCar()
     shown: list[int] = []
 
@@ -38,9 +38,9 @@ async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(tmp_path: Pat
         try:
             await until_closed(1)
             car.obey()
-            await until_closed(3)  # after the first pause the next MODE00 is written at once
+            await until_closed(3)  # after the first pause the gateway writes the next MODE00 at once
             time.sleep(REPORT_S)  # noqa: ASYNC251 - the loop stalls
-            car.send(REPORT)  # as if the car had not got it
+            car.send(REPORT)  # as if the car had not received MODE00
             time.sleep(2.2 - REPORT_S)  # noqa: ASYNC251
             await asyncio.to_thread(wait_for, lambda: shown or car.received.count(MODE00) > 3, "it goes on")
             assert not shown, "one pause is no evidence"

@@ -1,4 +1,4 @@
-"""The `gateway` command as a whole: help, wrong use, and what `gateway run` does not pay for."""
+"""Tests of the `gateway` command as a whole: help, wrong use, and the imports of `gateway run`."""
 
 import io
 import subprocess
@@ -23,7 +23,7 @@ def test_the_help_names_every_command(command: Command) -> None:
 def test_a_help_that_cannot_be_written_fails(
     words: str, unbuffered: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With a buffer the writing fails at the end, without one (`python -u`) at once and once only."""
+    """A buffered write fails at the end. An unbuffered one (`python -u`) fails at once, with only one error."""
     with (
         Path("/dev/full").open("wb", buffering=0 if unbuffered else -1) as raw,
         io.TextIOWrapper(raw, write_through=unbuffered) as full,
@@ -87,7 +87,7 @@ def test_a_limit_out_of_range_is_told_with_the_range(command: Command, option: s
 
 
 def test_run_imports_none_of_the_other_commands() -> None:
-    """It is started a hundred times."""
+    """A fleet starts `gateway run` up to a hundred times."""
     program = (
         "import sys; sys.argv = ['gateway', 'run', '--car', 'red', '--link', 'nothing']\n"
         "import gateway.cli\n"

@@ -1,4 +1,4 @@
-"""Stamps of moments: their order is theirs, whatever kept the process from running meanwhile."""
+"""Wall-clock times keep the order of their moments, even if the scheduler interrupts the process."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ MS = 1_000_000
 
 
 class Clocks:
-    """A monotonic clock and a wall clock; each look takes as long as `takes` says next, in ns."""
+    """A monotonic clock and a wall clock. Each reading takes the next time of `takes`, in ns."""
 
     def __init__(self, takes: Iterator[int]) -> None:
         self.now = 5_000 * MS
@@ -41,7 +41,7 @@ def test_a_moment_has_its_wall_time() -> None:
 
 @pytest.mark.parametrize("held_up", [0, 1, 2])
 def test_a_process_that_is_held_up_between_two_looks_gives_one_moment_one_stamp(held_up: int) -> None:
-    """At each look in turn, once in a while, for 0.3 s."""
+    """Interrupt the process for 0.3 s now and then, at each of the three readings in turn."""
     clocks, wall = _wall(lambda look: 300 * MS if look % 99 == held_up + 33 else 50)
     stamps = {wall.ns(4.0) for _ in range(300)}
     assert len(stamps) == 1

@@ -1,4 +1,4 @@
-"""What survives a restart: written whole, read back, and a file that cannot be read counts as a hold."""
+"""The state file survives a restart. The gateway writes it whole, and an unreadable file counts as a hold."""
 
 import json
 from pathlib import Path

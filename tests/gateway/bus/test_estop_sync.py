@@ -1,4 +1,4 @@
-"""What a gateway learns of the e-stops that the other gateways of its fleet know, on a real bus."""
+"""A gateway learns e-stops from the other gateways of its fleet, on a real bus."""
 
 import asyncio
 from functools import partial
@@ -19,7 +19,7 @@ SAFETY = encoding_of("fleet.v1.Safety")
 
 
 async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) -> None:
-    """It may still be starting, or held up, and know of an e-stop of the whole fleet."""
+    """A gateway that does not answer may be starting or stalled, and may know a fleet-wide e-stop."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     asked: list[zenoh.Query] = []
     awake = asyncio.Event()
@@ -38,7 +38,7 @@ async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) ->
     try:
         with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as blue, fleet.bus as opened:
             blue.queryable(KEY, Handover(asyncio.get_running_loop(), answer))
-            while not asked:  # until the hub knows of it
+            while not asked:  # until the hub knows the queryable
                 await asyncio.to_thread(lambda: list(opened.query(KEY, timeout_s=0.1)))
             neighbours, before = EstopSync(opened, "fleet", "red"), len(asked)
             keeping = asyncio.ensure_future(neighbours.keep_synced(unite))
@@ -55,7 +55,7 @@ async def test_one_that_did_not_answer_in_time_is_asked_again(tmp_path: Path) ->
 
 
 async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -> None:
-    """Else a hundred gateways that start one after the other have 300,000 answers to give."""
+    """Otherwise a hundred gateways that start one after the other would have to send 300,000 answers."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     asked: dict[str, int] = {"blue": 0, "green": 0}
     learned: list[str] = []
@@ -73,7 +73,7 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
             loop = asyncio.get_running_loop()
             for car in asked:
                 cars.queryable(f"fleet/{car}/state/safety", Handover(loop, partial(answer, car=car)))
-            while not all(asked.values()):  # until the hub knows of both
+            while not all(asked.values()):  # until the hub knows both queryables
                 await asyncio.to_thread(lambda: list(opened.query("fleet/*/state/safety", timeout_s=0.1)))
             neighbours = EstopSync(opened, "fleet", "red")
             keeping = asyncio.ensure_future(neighbours.keep_synced(learn))
@@ -94,7 +94,7 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
 
 
 async def test_a_dozen_that_came_to_a_large_fleet_are_asked_one_by_one(tmp_path: Path) -> None:
-    """With one query to all, the answers took half of the time in which a hundred gateways start."""
+    """With one query to all gateways, the answers took half of the time in which a hundred gateways start."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     old, new = [f"old{number}" for number in range(24)], [f"new{number}" for number in range(12)]
     asked: list[str] = []
@@ -114,7 +114,7 @@ async def test_a_dozen_that_came_to_a_large_fleet_are_asked_one_by_one(tmp_path:
     try:
         with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as cars, fleet.bus as opened:
             cars.queryable("fleet/*/state/safety", Handover(asyncio.get_running_loop(), answer))
-            while not asked:  # until the hub knows of it
+            while not asked:  # until the hub knows the queryable
                 await asyncio.to_thread(lambda: list(opened.query("fleet/old0/state/safety", timeout_s=0.1)))
             asked.clear()
             neighbours = EstopSync(opened, "fleet", "red")

@@ -1,4 +1,4 @@
-"""Rings of values, and the time ranges that a query may ask for: tables, and any text is a range or a BadRange."""
+"""Tests of the history buffers, and of the time ranges in queries. Any text is a range or raises BadRange."""
 
 import contextlib
 

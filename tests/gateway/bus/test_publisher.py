@@ -1,4 +1,4 @@
-"""What a gateway answers of what it has published, on a real bus."""
+"""Tests of the messages that a gateway publishes, and of its answers to queries, on a real bus."""
 
 import queue
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 
 
 def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
-    """As JSON it takes longer than a car may be left alone."""
+    """As JSON, a long history takes longer than a gateway may leave its car alone."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         with Bus.open(fleet.endpoint) as opened:
@@ -55,7 +55,7 @@ def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
 
 
 class Published:
-    """What others on the bus get of a car that is driven at a desk, on virtual time."""
+    """The messages that the bus carries about a car on the workbench, on virtual time."""
 
     def __init__(self, fleet: FleetProcesses, opened: Bus) -> None:
         self.desk = Workbench()
@@ -75,19 +75,19 @@ class Published:
         self._out.publish_states(self.desk.control, self.health, self.desk.now, force=True)
 
     def states(self) -> dict[str, dict[str, Any]]:
-        """Publish all states; return the fields of each, as JSON has them."""
+        """Publish all states. Return the fields of each, as in JSON."""
         self._states()
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
         return self._before
 
     def told_health(self, platform: PlatformDetector) -> dict[str, Any]:
-        """Publish the health; return its fields, as JSON has them."""
+        """Publish the health. Return its fields, as in JSON."""
         self._out.publish_health(self.desk.now, loop_lag_s=0.0, bus_drops=0, platform=platform)
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
         return self._before["state/health"]
 
     def record(self, record: CommandRecord) -> dict[str, Any]:
-        """Publish a command's record; return its fields, as JSON has them."""
+        """Publish a command's record. Return its fields, as in JSON."""
         self._out.publish_command(record, None)
         while True:
             topic, fields = self._said.get(timeout=PATIENCE_S)

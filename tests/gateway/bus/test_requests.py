@@ -1,4 +1,4 @@
-"""From a payload to a command: the table of verbs, what is refused and with which words, and any bytes at all."""
+"""Tests that turn payloads into commands: the table of verbs, the words of each refusal, and random bytes."""
 
 import json
 import time
@@ -49,7 +49,7 @@ def refused(verb: str, payload: Any, encoding: str = messages.JSON, **more: Any)
 
 
 def parsed(request: ParsedRequest) -> tuple[Command, str]:
-    """The command, or what is known of it and why it is refused."""
+    """Return the command. If the request is bad, return the known part of the command, and the reason."""
     try:
         return parse(request), ""
     except BadRequest as error:

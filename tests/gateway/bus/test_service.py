@@ -1,4 +1,4 @@
-"""What a gateway takes from the bus, and what it refuses, on a real bus: what is too large, too much, too often."""
+"""Tests of the limits of a gateway's bus service, on a real bus: payloads too large, queries too many or too often."""
 
 import asyncio
 from collections.abc import AsyncIterator, Mapping
@@ -17,7 +17,7 @@ LARGE = b"x" * 5_000_000
 
 
 class Hall:
-    """Who stands behind the doors: keeps what comes."""
+    """The receiver behind the bus service. It stores all commands, drives and token changes."""
 
     def __init__(self, doors: CarService) -> None:
         self.doors = doors
@@ -53,13 +53,13 @@ async def hall(tmp_path: Path) -> AsyncIterator[tuple[Hall, bus.Bus]]:
 
 
 def ask(asker: bus.Bus, selector: str, payload: bytes | None = None, timeout_s: float = 0.3) -> list[str]:
-    """The words of every error that answers."""
+    """Send a query. Return the words of every error among the answers."""
     answers = list(asker.query(f"fleet/red/{selector}", payload=payload, timeout_s=timeout_s))
     return [answer.words for answer in answers if isinstance(answer, bus.Failure)]
 
 
 async def test_what_is_too_large_is_handed_over_with_the_reason_and_not_read(hall: tuple[Hall, bus.Bus]) -> None:
-    """A megabyte of JSON stalled the gateway for 0.2 s, 64 of them until it was killed."""
+    """A megabyte of JSON stalled the gateway for 0.2 s. 64 megabytes stalled it until a kill."""
     there, asker = hall
     there.attach()
     for verb in ("drive", "stop"):
@@ -88,13 +88,13 @@ async def test_questions_of_the_past_wait_by_themselves_and_not_too_many(hall: t
     assert await asyncio.to_thread(flood) == [bus.BUSY] * 3
     assert there.doors.dropped == 3
     await asyncio.to_thread(ask, asker, "state/link", timeout_s=0.02)
-    family, query = await asyncio.wait_for(there.doors.values.next(), 20.0)  # none of them is before it
+    family, query = await asyncio.wait_for(there.doors.values.next(), 20.0)  # no history query is before it
     assert (family, str(query.key_expr)) == ("state", "fleet/red/state/link")
     assert await there.doors.histories.next()
 
 
 async def test_a_stop_finds_room_where_other_commands_find_none(hall: tuple[Hall, bus.Bus]) -> None:
-    there, asker = hall  # nobody takes anything yet
+    there, asker = hall  # no receiver is attached yet
 
     def fill() -> list[str]:
         for _ in range(MAX_QUEUED_QUERIES):  # nobody answers them
